@@ -1,10 +1,11 @@
-"""Make the demo object: an ammonite in a slab of rock, a mesh without symmetry for scans to be aligned on.
+"""Make the demo object: an ammonite in a slab of rock, a mesh without symmetry for scans to be
+aligned on.
 
     python assets/make_demo_object.py
 
-writes ``assets/objects/ammonite.ply``: binary PLY, mm, watertight, its front towards -z (towards the camera, when its
-frame is turned like the camera's), the origin near its middle. The front is a relief over the plane, free of undercuts;
-its sides and back are closed.
+writes ``assets/objects/ammonite.ply``: binary PLY, mm, watertight, its front towards -z (towards
+the camera, when its frame is turned like the camera's), the origin near its middle. The front is a
+relief over the plane, free of undercuts; its sides and back are closed.
 """
 
 from pathlib import Path
@@ -17,11 +18,14 @@ RINGS = 142  # triangles of half a millimetre on the front
 SIDE_RINGS = 6
 HALF_WIDTH_MM = 70.0
 GROWTH = np.log(2.15) / (2 * np.pi)  # the spiral's radius grows 2.15-fold in a turn
-TUBE = (2.15 - 1) / (2.15 + 1)  # tube radius as a share of the spiral's: neighbouring whorls just touch
+TUBE = (2.15 - 1) / (
+    2.15 + 1
+)  # tube radius as a share of the spiral's: neighbouring whorls just touch
 
 
 def disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """A triangulated unit disc: points (n, 2), ring k has 6 k of them; triangles (m, 3), anticlockwise."""
+    """A triangulated unit disc: points (n, 2), ring k has 6 k of them; triangles (m, 3),
+    anticlockwise."""
     points, triangles, start = [np.zeros((1, 2))], [], [0, 1]
     for k in range(1, rings + 1):
         angle = 2 * np.pi * np.arange(6 * k) / (6 * k)
@@ -40,8 +44,14 @@ def disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 def outline(angle: np.ndarray) -> np.ndarray:
     """The slab's half width in mm by direction: a worn, lopsided stone."""
-    waves = 0.06 * np.cos(2 * angle - 0.5) + 0.045 * np.cos(3 * angle + 1.1) + 0.02 * np.cos(5 * angle + 2.3)
-    return HALF_WIDTH_MM * (0.95 + waves + 0.008 * np.cos(11 * angle) + 0.006 * np.cos(17 * angle + 0.8))
+    waves = (
+        0.06 * np.cos(2 * angle - 0.5)
+        + 0.045 * np.cos(3 * angle + 1.1)
+        + 0.02 * np.cos(5 * angle + 2.3)
+    )
+    return HALF_WIDTH_MM * (
+        0.95 + waves + 0.008 * np.cos(11 * angle) + 0.006 * np.cos(17 * angle + 0.8)
+    )
 
 
 def dome(x: np.ndarray, y: np.ndarray, rim: np.ndarray) -> np.ndarray:
@@ -55,15 +65,24 @@ def roughness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     rough = np.zeros_like(x)
     for length, height in ((41, 1.6), (23, 0.9), (13, 0.5), (7.5, 0.26), (4.3, 0.13)):
         for _ in range(11):
-            a, phase, wavelength = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), length * rng.uniform(0.75, 1.3)
-            rough += height / 3.3 * np.sin(2 * np.pi / wavelength * (x * np.cos(a) + y * np.sin(a)) + phase)
+            a, phase, wavelength = (
+                rng.uniform(0, 2 * np.pi),
+                rng.uniform(0, 2 * np.pi),
+                length * rng.uniform(0.75, 1.3),
+            )
+            rough += (
+                height
+                / 3.3
+                * np.sin(2 * np.pi / wavelength * (x * np.cos(a) + y * np.sin(a)) + phase)
+            )
     return rough
 
 
 def ammonite(
     x: np.ndarray, y: np.ndarray, size: float, turns: float, turn: float, ribs: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A coiled, ribbed shell about the origin: its height in mm, -inf beside it, and (bool) the ground that it covers.
+    """A coiled, ribbed shell about the origin: its height in mm, -inf beside it, and (bool) the
+    ground that it covers.
 
     `size`: greatest radius in mm; `turn`: direction of the mouth; `ribs`: their number in a turn.
     """
@@ -71,7 +90,9 @@ def ammonite(
     outer = size / (1 + TUBE)  # the spiral's radius at the mouth
     height, covered = np.full_like(x, -np.inf), np.zeros(x.shape, bool)
     for whorl in range(int(turns) + 1):
-        along = np.mod(angle, 2 * np.pi) - 2 * np.pi * (whorl + 1)  # 0 at the mouth, negative inwards
+        along = np.mod(angle, 2 * np.pi) - 2 * np.pi * (
+            whorl + 1
+        )  # 0 at the mouth, negative inwards
         centre = outer * np.exp(GROWTH * along)
         tube = 1.05 * TUBE * centre
         across = (radius - centre) / tube
@@ -79,7 +100,9 @@ def ammonite(
         inside = (np.abs(across) < 1) & (along > -2 * np.pi * turns)
         phase = ribs * along + 1.1 * (across + 0.4) ** 2  # ribs sweep forward on the outer flank
         share = np.clip((across + 0.1) / 0.6, 0, 1)  # and split in two towards the keel
-        ornament = (1 - share) * (0.5 + 0.5 * np.cos(phase)) ** 1.3 + share * (0.5 + 0.5 * np.cos(2 * phase + 0.4))
+        ornament = (1 - share) * (0.5 + 0.5 * np.cos(phase)) ** 1.3 + share * (
+            0.5 + 0.5 * np.cos(2 * phase + 0.4)
+        )
         profile = np.sqrt(np.clip(1 - across**2, 0, 1))
         keel = 0.10 * np.exp(-(((across - 0.62) / 0.09) ** 2))
         mouth = np.sqrt(np.clip(-along / 0.12, 0, 1))  # the last chamber is broken off
@@ -91,12 +114,15 @@ def ammonite(
 
 
 def scallop(x: np.ndarray, y: np.ndarray, size: float) -> np.ndarray:
-    """Height in mm of a small fan-shaped shell with its hinge at the origin, opening towards +y; -inf beside it."""
+    """Height in mm of a small fan-shaped shell with its hinge at the origin, opening towards +y;
+    -inf beside it."""
     radius, angle = np.hypot(x, y), np.arctan2(x, y)
     reach = size * (0.80 + 0.2 * np.cos(1.5 * angle)) * (1 + 0.02 * np.cos(22 * angle))
     s = radius / reach
     inside = (s < 1) & (np.abs(angle) < 1.15)
-    vault = np.sqrt(np.clip(1 - s**2, 0, 1)) * np.sqrt(np.clip(np.sin(np.pi * np.clip(s * 0.8 + 0.2, 0, 1)), 0, 1))
+    vault = np.sqrt(np.clip(1 - s**2, 0, 1)) * np.sqrt(
+        np.clip(np.sin(np.pi * np.clip(s * 0.8 + 0.2, 0, 1)), 0, 1)
+    )
     edge = np.sqrt(np.clip(1 - (angle / 1.15) ** 2, 0, 1))
     ribs = 1 + 0.10 * np.cos(22 * angle) * s
     growth = 1 + 0.03 * np.cos(2 * np.pi * s * 6)

@@ -1,11 +1,13 @@
 """Render a data set of simulated images: make_sample_data.py [sample|letter] [ARCHIVE].
 
-Folders of lossless PNG images, each beside a description of its pattern sequence, of the simulated rig of the Letter:
-`sample`, which ships with slviewer, has a sixth of the resolution and ideal lenses; `letter`, which is attached to
-releases, has half the resolution, local distortion, more target poses and scans in front of and behind them.
-An archive is the same every time on processors of one kind; others round a few grey values differently.
+Folders of lossless PNG images, each beside a description of its pattern sequence, of the simulated
+rig of the Letter: `sample`, which ships with slviewer, has a sixth of the resolution and ideal
+lenses; `letter`, which is attached to releases, has half the resolution, local distortion, more
+target poses and scans in front of and behind them. An archive is the same every time on processors
+of one kind; others round a few grey values differently.
 
-`--release URL` writes assets/datasets/released.json: where the archive will be, and its hash. The next build ships it.
+`--release URL` writes assets/datasets/released.json: where the archive will be, and its hash. The
+next build ships it.
 """
 
 import argparse
@@ -32,8 +34,10 @@ Licence: MIT. Target in poses/: circles:21x16:9. The sphere's radius is 98 mm.
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is rendered: the camera's resolution as a share of 1600x1200, the displacement by local distortion (None:
-    the rig's own), the number of target poses and of phase steps, and the folders {name: captures} of scans."""
+    """What is rendered: the camera's resolution as a share of 1600x1200, the displacement by local
+    distortion (None: the rig's own), the number of target poses and of phase steps, and the folders
+    {name: captures} of scans.
+    """
 
     scale: float
     local_distortion_px: float | None
@@ -43,7 +47,9 @@ class Recipe:
 
 
 RECIPES = {
-    "sample": Recipe(0.15, 0.0, 6, 4, {"scan": ("plane_04",), "sphere": ("sphere_3",), "object": ("object_r2",)}),
+    "sample": Recipe(
+        0.15, 0.0, 6, 4, {"scan": ("plane_04",), "sphere": ("sphere_3",), "object": ("object_r2",)}
+    ),
     "letter": Recipe(
         0.5,
         None,
@@ -89,12 +95,21 @@ def render(name: str, archive: Path) -> None:
 
 def main() -> None:
     """Render the data set that the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("name", nargs="?", choices=RECIPES, default="sample")
-    parser.add_argument("archive", nargs="?", type=Path, help="default: assets/datasets/sample.zip, or letter.zip here")
+    parser.add_argument(
+        "archive",
+        nargs="?",
+        type=Path,
+        help="default: assets/datasets/sample.zip, or letter.zip here",
+    )
     parser.add_argument("--release", metavar="URL", help="the folder of the release's files")
     options = parser.parse_args()
-    archive = options.archive or (DATASETS / "sample.zip" if options.name == "sample" else Path(f"{options.name}.zip"))
+    archive = options.archive or (
+        DATASETS / "sample.zip" if options.name == "sample" else Path(f"{options.name}.zip")
+    )
     render(options.name, archive)
     data = archive.read_bytes()
     if options.release:
@@ -103,7 +118,9 @@ def main() -> None:
             "sha256": hashlib.sha256(data).hexdigest(),
             "bytes": len(data),
         }
-        (DATASETS / "released.json").write_text(json.dumps({options.name: record}, indent=2) + "\n", encoding="utf-8")
+        (DATASETS / "released.json").write_text(
+            json.dumps({options.name: record}, indent=2) + "\n", encoding="utf-8"
+        )
     print(f"{archive}: {len(data) / 1e6:.1f} MB, {hashlib.sha256(data).hexdigest()}")
 
 

@@ -1,8 +1,9 @@
 """Sphinx configuration of the site: ``python -m sphinx -W -b html docs docs/_build``.
 
-Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings. The command line's reference is
-written by the build, from the commands themselves. Neither building nor reading needs a network: a page that loads
-something from one is a warning. Links between pages are checked by a test.
+Sphinx, as NumPy, Open3D, napari and scikit-image use it: it reads the docstrings. The command
+line's reference is written by the build, from the commands themselves. Neither building nor reading
+needs a network: a page that loads something from one is a warning. Links between pages are checked
+by a test.
 """
 
 import ast
@@ -54,7 +55,9 @@ html_title = "slviewer"
 html_show_sourcelink = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_sidebars = {page: [] for page in ("index", "quickstart", "architecture")}  # these have no pages beside them
+html_sidebars = {
+    page: [] for page in ("index", "quickstart", "architecture")
+}  # these have no pages beside them
 html_context = {"default_mode": "auto"}
 html_theme_options = {
     "navbar_align": "left",
@@ -77,11 +80,15 @@ def read_help(*arguments: str) -> str:
     finally:
         sys.argv = saved
     lines = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip().splitlines()
-    return "\n".join(textwrap.fill(line, 88, break_on_hyphens=False) if line[:1].strip() else line for line in lines)
+    return "\n".join(
+        textwrap.fill(line, 88, break_on_hyphens=False) if line[:1].strip() else line
+        for line in lines
+    )
 
 
 def list_options() -> str:
-    """Return the page of the command line: the help of each command, and of each layout of `import`."""
+    """Return the page of the command line: the help of each command, and of each layout of
+    `import`."""
     lines = [
         "# Command line",
         "",
@@ -90,7 +97,11 @@ def list_options() -> str:
     ]
     for name in cli.COMMANDS:
         lines += [f"## {name}", "", "```text", read_help(name), "```", ""]
-        for layout in re.findall(r"\{([\w,-]+)\}", read_help(name).splitlines()[0])[:1] if name == "import" else []:
+        for layout in (
+            re.findall(r"\{([\w,-]+)\}", read_help(name).splitlines()[0])[:1]
+            if name == "import"
+            else []
+        ):
             for each in layout.split(","):
                 lines += [f"### import {each}", "", "```text", read_help(name, each), "```", ""]
     return "\n".join(lines)
@@ -104,17 +115,31 @@ def list_functions() -> str:
         if inspect.ismodule(public):
             # once is enough for what slviewer exports itself
             again = ", ".join(sorted(set(slviewer.__all__) & set(getattr(public, "__all__", ()))))
-            lines += [f".. automodule:: {public.__name__}", "   :members:", f"   :exclude-members: {again}", ""]
+            lines += [
+                f".. automodule:: {public.__name__}",
+                "   :members:",
+                f"   :exclude-members: {again}",
+                "",
+            ]
             continue
-        lines += [f".. {'autoclass' if isinstance(public, type) else 'autofunction'}:: slviewer.{name}", ""]
+        lines += [
+            f".. {'autoclass' if isinstance(public, type) else 'autofunction'}:: slviewer.{name}",
+            "",
+        ]
     return "\n".join([*lines, "```", ""])
 
 
 def write_references(app: Sphinx) -> None:
     """Write the pages that are made from the program, where they changed."""
     gallery = list_gallery()
-    pages = {f"gallery/{name}": text for name, text in gallery.items()} | {"gallery/index": list_gallery_index(gallery)}
-    for page, text in {"reference/cli": list_options(), "reference/python": list_functions(), **pages}.items():
+    pages = {f"gallery/{name}": text for name, text in gallery.items()} | {
+        "gallery/index": list_gallery_index(gallery)
+    }
+    for page, text in {
+        "reference/cli": list_options(),
+        "reference/python": list_functions(),
+        **pages,
+    }.items():
         path = DOCS / f"{page}.md"
         path.parent.mkdir(exist_ok=True)
         if not path.exists() or path.read_text(encoding="utf-8") != text:
@@ -122,7 +147,8 @@ def write_references(app: Sphinx) -> None:
 
 
 def list_gallery() -> dict[str, str]:
-    """Return the pages of the gallery by name: each script and notebook of docs/examples with its pictures."""
+    """Return the pages of the gallery by name: each script and notebook of docs/examples with its
+    pictures."""
     pages = {}
     for script in sorted((DOCS / "examples").glob("*.py")):
         text = script.read_text(encoding="utf-8")
@@ -132,8 +158,8 @@ def list_gallery() -> dict[str, str]:
         code = text.partition('"""\n')[2] if text.startswith('"""') else text
         more = more.strip()
         pages[script.stem] = (
-            f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}```python\n{code.strip()}\n```\n"
-            f"\n{{download}}`{script.name} <../examples/{script.name}>`\n"
+            f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}```python\n{code.strip()}\n```\n\n{{download}}`{script.name}"
+            f" <../examples/{script.name}>`\n"
         )
     for notebook in sorted((DOCS / "examples").glob("*.ipynb")):
         cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
@@ -149,14 +175,22 @@ def list_gallery() -> dict[str, str]:
 
 def _show_picture(name: str) -> str:
     """Return the lines that show a picture of the gallery; empty where there is none."""
-    return f"![{name}](../images/gallery/{name})\n\n" if (DOCS / "images" / "gallery" / name).exists() else ""
+    return (
+        f"![{name}](../images/gallery/{name})\n\n"
+        if (DOCS / "images" / "gallery" / name).exists()
+        else ""
+    )
 
 
 def _describe_card(name: str, page: str) -> str:
-    """Return the HTML of a gallery page's entry: its last picture, where it has one, above its title."""
+    """Return the HTML of a gallery page's entry: its last picture, where it has one, above its
+    title."""
     pictures = re.findall(r"!\[\S+\]\(\.\./images/gallery/(\S+)\)", page)
     shown = f'<img src="../_images/{pictures[-1]}" alt="">' if pictures else ""
-    return f'<a class="entry" href="{name}.html">{shown}<span>{html.escape(page[2:].splitlines()[0])}</span></a>'
+    return (
+        '<a class="entry"'
+        f' href="{name}.html">{shown}<span>{html.escape(page[2:].splitlines()[0])}</span></a>'
+    )
 
 
 def list_gallery_index(pages: dict[str, str]) -> str:
@@ -164,7 +198,10 @@ def list_gallery_index(pages: dict[str, str]) -> str:
     lines = [
         "# Gallery",
         "",
-        "Scripts and notebooks of `docs/examples`. The tests run them, and `python docs/figures.py --pictures` draws",
+        (
+            "Scripts and notebooks of `docs/examples`. The tests run them, and `python"
+            " docs/figures.py --pictures` draws"
+        ),
         "their pictures. A script takes the path of its picture.",
         "",
         '<div class="gallery">',
@@ -200,7 +237,8 @@ def check_pages(app: Sphinx, exception: Exception | None) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Write the pages that are made from the program before all are read, and check the finished site."""
+    """Write the pages that are made from the program before all are read, and check the finished
+    site."""
     app.connect("builder-inited", write_references)
     app.connect("build-finished", check_pages)
     app.add_html_math_renderer("svg", (write_equation, None), (write_equation, None))

@@ -7,10 +7,11 @@ A page names a command in a comment, and its output follows up to the end mark:
     <!-- figures: slviewer plan-rig webcam-1080p pocket-720p 500 -->
     <!-- end of figures -->
 
-Single numbers in a sentence or a table follow a comment ``<!-- = NAME -->``, never at the start of a line, and end with
-``<!-- . -->``; `SOURCES` names the commands, and how the numbers follow from their JSON. These, and ``slow figures:``,
-need commands of minutes, which run with ``--slow``. ``--check`` changes nothing, and ends with status 1 where a number
-is off by more than 2 % and more than its last digit. ``--pictures`` runs the examples and writes their pictures into
+Single numbers in a sentence or a table follow a comment ``<!-- = NAME -->``, never at the start of
+a line, and end with ``<!-- . -->``; `SOURCES` names the commands, and how the numbers follow from
+their JSON. These, and ``slow figures:``, need commands of minutes, which run with ``--slow``.
+``--check`` changes nothing, and ends with status 1 where a number is off by more than 2 % and more
+than its last digit. ``--pictures`` runs the examples and writes their pictures into
 docs/images/gallery, and those of docs/diagrams.py into docs/images/diagrams.
 """
 
@@ -37,7 +38,8 @@ from slviewer import cli  # noqa: E402
 EXAMPLES = ROOT / "docs" / "examples"
 GALLERY = ROOT / "docs" / "images" / "gallery"
 BLOCK = re.compile(
-    r"<!-- (?P<slow>slow )?figures: (?P<command>[^\n]+) -->\n(?P<body>.*?)<!-- end of figures -->", re.DOTALL
+    r"<!-- (?P<slow>slow )?figures: (?P<command>[^\n]+) -->\n(?P<body>.*?)<!-- end of figures -->",
+    re.DOTALL,
 )
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 TOLERANCE = 0.02
@@ -46,14 +48,26 @@ VALUE = re.compile(r"<!-- = (?P<name>[^\n>]+) -->(?P<number>[\d.]+)<!-- \. -->")
 
 def compute_values(data: dict[str, Any]) -> dict[str, float]:
     """Return the numbers of the pages by name, from the JSON of ``reproduce``."""
-    inside = {name: each for name, each in data["planes"].items() if each["incidence"]["R2"] >= 87.0}
+    inside = {
+        name: each for name, each in data["planes"].items() if each["incidence"]["R2"] >= 87.0
+    }
     values = {"inside ratio": data["in_range_ratio"]}
-    for group, captures in (("planes", data["planes"]), ("inside", inside), ("spheres", data["spheres"])):
+    for group, captures in (
+        ("planes", data["planes"]),
+        ("inside", inside),
+        ("spheres", data["spheres"]),
+    ):
         for model in ("stereo", "pixelwise"):
-            values[f"{group} {model}"] = _mean(each["models"][model]["rms_mm"] for each in captures.values())
-        values[f"{group} floor"] = _mean(each["models"]["stereo"]["noise_floor_mm"] for each in captures.values())
+            values[f"{group} {model}"] = _mean(
+                each["models"][model]["rms_mm"] for each in captures.values()
+            )
+        values[f"{group} floor"] = _mean(
+            each["models"]["stereo"]["noise_floor_mm"] for each in captures.values()
+        )
     for model in ("stereo", "pixelwise"):
-        values[f"radius {model}"] = _mean(each["models"][model]["radius_mm"] for each in data["spheres"].values())
+        values[f"radius {model}"] = _mean(
+            each["models"][model]["radius_mm"] for each in data["spheres"].values()
+        )
         values[f"spacing {model}"] = data["spacing_rms_mm"][model]
     for place, plane in (("front", "plane_01"), ("behind", "plane_07")):
         models = data["planes"][plane]["models"]
@@ -73,7 +87,10 @@ def compute_accuracy(data: dict[str, Any]) -> dict[str, float]:
     """Return the numbers of the pages by name, from the JSON of ``prove --only accuracy``."""
     record = data["accuracy"]
     means = {
-        model: [_mean(plane["rms_mm"][model] for plane in rig["planes"].values()) for rig in record["rigs"]]
+        model: [
+            _mean(plane["rms_mm"][model] for plane in rig["planes"].values())
+            for rig in record["rigs"]
+        ]
         for model in ("stereo", "splined", "floor")
     }
     largest = _find_largest(record["checks"])
@@ -82,7 +99,10 @@ def compute_accuracy(data: dict[str, Any]) -> dict[str, float]:
         "accuracy stereo most": max(means["stereo"]),
         "accuracy splined": max(means["splined"]),
         "accuracy floor": max(means["floor"]),
-        **{f"accuracy {region}": largest[f"splined over the floor in {region}"] for region in ("R1", "R2", "R3")},
+        **{
+            f"accuracy {region}": largest[f"splined over the floor in {region}"]
+            for region in ("R1", "R2", "R3")
+        },
         "accuracy radius": largest["largest error of a sphere's radius in mm"],
         "accuracy spacing": largest["largest error of a spacing in mm"],
     }
@@ -146,7 +166,8 @@ SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], dict[str, float]]]] = {
     "surfaces": ("slviewer prove --only surfaces", compute_surfaces),
     "": ("slviewer reproduce --quick", compute_values),
 }
-"""{first word of a number's name: the command, some minutes, and the numbers that follow from it}."""
+"""{first word of a number's name: the command, some minutes, and the numbers that follow from
+it}."""
 
 
 def find_value(name: str) -> float:
@@ -177,7 +198,11 @@ def run(command: str) -> str:
     if name != "slviewer":
         raise SystemExit(f"{command}: figures come from commands of slviewer")
     printed = io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(printed),
+    ):
         status = cli.main(arguments)
     if status:
         raise SystemExit(f"{command} failed with status {status}")
@@ -189,7 +214,9 @@ def agree(written: str, printed: str) -> bool:
     if NUMBER.sub("#", written) != NUMBER.sub("#", printed):
         return False
     pairs = zip(NUMBER.findall(written), NUMBER.findall(printed), strict=True)
-    return all(abs(float(a) - float(b)) <= max(TOLERANCE * float(b), _last_digit(a)) for a, b in pairs)
+    return all(
+        abs(float(a) - float(b)) <= max(TOLERANCE * float(b), _last_digit(a)) for a, b in pairs
+    )
 
 
 def _last_digit(number: str) -> float:
@@ -212,7 +239,10 @@ def update(page: Path, check: bool, slow: bool) -> bool:
             return match[0]
         right = False
         print(f"{page.name}: {match['command']}\n--- written{match['body']}--- printed{printed}")
-        return f"<!-- {match['slow'] or ''}figures: {match['command']} -->\n{printed}<!-- end of figures -->"
+        return (
+            f"<!-- {match['slow'] or ''}figures: {match['command']} -->\n{printed}<!-- end of"
+            " figures -->"
+        )
 
     def replace_value(match: re.Match[str]) -> str:
         """Return the number with its marks."""
@@ -234,16 +264,23 @@ def update(page: Path, check: bool, slow: bool) -> bool:
 
 
 def draw_pictures() -> None:
-    """Run the scripts and notebooks of docs/examples, and write their pictures for the site's gallery."""
+    """Run the scripts and notebooks of docs/examples, and write their pictures for the site's
+    gallery."""
     GALLERY.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
     for script in sorted(EXAMPLES.glob("*.py")):
-        if "sys.argv[1:]" not in script.read_text(encoding="utf-8"):  # its only argument is a picture's path
+        if "sys.argv[1:]" not in script.read_text(
+            encoding="utf-8"
+        ):  # its only argument is a picture's path
             picture = GALLERY / f"{script.stem}.png"
             subprocess.run([sys.executable, str(script), str(picture)], env=environment, check=True)
-    subprocess.run([sys.executable, str(ROOT / "docs" / "diagrams.py")], env=environment, check=True)
+    subprocess.run(
+        [sys.executable, str(ROOT / "docs" / "diagrams.py")], env=environment, check=True
+    )
     for notebook in sorted(EXAMPLES.glob("*.ipynb")):
-        subprocess.run([sys.executable, __file__, "--notebook", str(notebook)], env=environment, check=True)
+        subprocess.run(
+            [sys.executable, __file__, "--notebook", str(notebook)], env=environment, check=True
+        )
     for picture in GALLERY.glob("*.png"):
         _reduce(picture)
 
@@ -258,7 +295,8 @@ def _reduce(picture: Path) -> None:
 
 
 def run_notebook(notebook: Path, folder: Path | None = None, scale: float | None = None) -> None:
-    """Run the code of a notebook in this process; write the pictures of cell k as NAME_k.png into ``folder``.
+    """Run the code of a notebook in this process; write the pictures of cell k as NAME_k.png into
+    ``folder``.
 
     ``scale`` replaces the resolution that the notebook states, to be quicker.
     """
@@ -285,7 +323,9 @@ def main() -> int:
     parser.add_argument("pages", nargs="*", type=Path, help="by default README and all of docs")
     parser.add_argument("--check", action="store_true", help="compare, and change nothing")
     parser.add_argument("--slow", action="store_true", help="also commands that take minutes")
-    parser.add_argument("--pictures", action="store_true", help="run the examples, and write their pictures")
+    parser.add_argument(
+        "--pictures", action="store_true", help="run the examples, and write their pictures"
+    )
     parser.add_argument("--notebook", type=Path, help="run one notebook, and write its pictures")
     given = parser.parse_args()
     if given.notebook:
@@ -294,7 +334,9 @@ def main() -> int:
     if given.pictures:
         draw_pictures()
         return 0
-    right = [update(page.resolve(), given.check, given.slow) for page in given.pages or find_pages()]
+    right = [
+        update(page.resolve(), given.check, given.slow) for page in given.pages or find_pages()
+    ]
     return int(given.check and not all(right))
 
 

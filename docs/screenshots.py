@@ -1,9 +1,10 @@
-"""Draw the pictures of the wizard in README and the quick start: an Autopilot run on the simulated rig.
+"""Draw the pictures of the wizard in README and the quick start: an Autopilot run on the simulated
+rig.
 
     python docs/screenshots.py
 
-Needs Chromium and the packages of the extra `test`; it takes some minutes. Writes `assets/readme/wizard.webp`, which is
-animated, and `docs/images/wizard_*.png`.
+Needs Chromium and the packages of the extra `test`; it takes some minutes. Writes
+`assets/readme/wizard.webp`, which is animated, and `docs/images/wizard_*.png`.
 """
 
 import re
@@ -39,7 +40,8 @@ PICTURES = {
 
 
 def draw_autopilot(page: Page, folder: Path) -> list[tuple[str, Path]]:
-    """Run the Autopilot, and return (the step's title, screenshot) at intervals until it has ended."""
+    """Run the Autopilot, and return (the step's title, screenshot) at intervals until it has
+    ended."""
     page.get_by_role("button", name="Autopilot").click()
     page.get_by_role("button", name="Stop autopilot").wait_for()
     shots: list[tuple[str, Path]] = []
@@ -69,7 +71,15 @@ def write_animation(shots: list[Path], path: Path) -> None:
         frame.thumbnail((SHOWN_WIDTH, SHOWN_WIDTH), Image.Resampling.LANCZOS)
         frames.append(frame)
     durations = [FRAME_MS] * (len(frames) - 1) + [4 * FRAME_MS]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, quality=60, method=6)
+    frames[0].save(
+        path,
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
+        quality=60,
+        method=6,
+    )
 
 
 def main() -> None:
@@ -77,8 +87,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         scans = Path(tempfile.gettempdir(), "scans")  # a name that may be shown
         scans.mkdir()
-        command = [sys.executable, "-m", "slviewer.cli", "wizard", f"{scans}/first-session", "--port", "0"]
-        server = subprocess.Popen([*command, "--no-browser"], stdout=subprocess.PIPE, text=True, cwd=folder)
+        command = [
+            sys.executable,
+            "-m",
+            "slviewer.cli",
+            "wizard",
+            f"{scans}/first-session",
+            "--port",
+            "0",
+        ]
+        server = subprocess.Popen(
+            [*command, "--no-browser"], stdout=subprocess.PIPE, text=True, cwd=folder
+        )
         try:
             assert server.stdout is not None
             link = next(line for line in server.stdout if "slviewer is ready" in line).split()[3]
@@ -101,11 +121,19 @@ def main() -> None:
         by_step: dict[str, list[Path]] = {"start": [Path(folder) / "start.png"]}
         for step, path in shots:
             by_step.setdefault(step, []).append(path)
-        animated = [path for paths in by_step.values() for path in (paths[:1] + paths[1:][-MOST_A_STEP + 1 :])]
+        animated = [
+            path for paths in by_step.values() for path in paths[:1] + paths[1:][-MOST_A_STEP + 1 :]
+        ]
         write_animation(animated, ROOT / "assets" / "readme" / "wizard.webp")
         for step, name in PICTURES.items():
-            image = Image.open(by_step[step][-1]).convert("RGB").resize((960, 600), Image.Resampling.LANCZOS)
-            image.quantize(96, dither=Image.Dither.NONE).save(ROOT / "docs" / "images" / f"{name}.png", optimize=True)
+            image = (
+                Image.open(by_step[step][-1])
+                .convert("RGB")
+                .resize((960, 600), Image.Resampling.LANCZOS)
+            )
+            image.quantize(96, dither=Image.Dither.NONE).save(
+                ROOT / "docs" / "images" / f"{name}.png", optimize=True
+            )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """slviewer: a camera and a projector as a metrology-grade 3D scanner.
 
-``import slviewer as sl`` gives what a notebook needs, imported when it is first used. On a session, a folder that holds
-captures and results, work `import_captures`, `calibrate`, `reconstruct`, `verify`, `merge`, `mesh` and `measure`, named
-after their commands.
-On arrays, without a session, work `read_captures`, `decode`, `detect_board`, `calibrate_frames`, `reconstruct_cloud`,
-`evaluate_plane`, `evaluate_sphere`, `align_clouds`, `fuse_clouds`, `mesh_cloud`, `draw_error_maps` and `write_ply`.
+``import slviewer as sl`` gives what a notebook needs, imported when it is first used. On a session,
+a folder that holds captures and results, work `import_captures`, `calibrate`, `reconstruct`,
+`verify`, `merge`, `mesh` and `measure`, named after their commands. On arrays, without a session,
+work `read_captures`, `decode`, `detect_board`, `calibrate_frames`, `reconstruct_cloud`,
+`evaluate_plane`, `evaluate_sphere`, `align_clouds`, `fuse_clouds`, `mesh_cloud`, `draw_error_maps`
+and `write_ply`.
 
 Conventions, the same everywhere:
 
@@ -23,12 +24,12 @@ invalid            NaN in float maps and clouds, False in masks (True = valid)
 depth ranges       R1 in front of the calibrated depths, R2 inside, R3 behind
 =================  ==========================================================================================
 
-"The Letter" is Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for a structured light system*,
-Optics Letters 2023; symbols follow it, and docstrings cite its equation or step.
+"The Letter" is Vargas, Romero, Zhang and Marrugo, *Pixel-wise rational model for a structured light
+system*, Optics Letters 2023; symbols follow it, and docstrings cite its equation or step.
 
-Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, surface, evaluation,
-inspection, simulation, devices, session, report, pipeline, preflight, wizard, server, gui, validation, and the
-command line at the end. A package imports only from those before it.
+Data flows one way: geometry, fringe, target, calibration, reconstruction, registration, surface,
+evaluation, inspection, simulation, devices, session, report, pipeline, preflight, wizard, server,
+gui, validation, and the command line at the end. A package imports only from those before it.
 """
 
 from importlib import import_module
@@ -52,7 +53,12 @@ if TYPE_CHECKING:
     from slviewer.pipeline.accept import accept
     from slviewer.pipeline.align import align
     from slviewer.pipeline.batch import batch
-    from slviewer.pipeline.calibrate import CalibrationResult, calibrate, calibrate_frames, save_calibration
+    from slviewer.pipeline.calibrate import (
+        CalibrationResult,
+        calibrate,
+        calibrate_frames,
+        save_calibration,
+    )
     from slviewer.pipeline.capture import capture
     from slviewer.pipeline.check import check
     from slviewer.pipeline.compare import compare
@@ -150,7 +156,8 @@ _EXPORTS = {
     "verify": "pipeline.verify",
     "write_ply": "session.ply",
 }
-"""{public name: module}, or module:name where it has another name there, or module:* for the module itself."""
+"""{public name: module}, or module:name where it has another name there, or module:* for the module
+itself."""
 
 __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan",

@@ -1,7 +1,9 @@
-"""The command line: every command is a function of ``slviewer.pipeline``, ``preflight`` or ``validation``.
+"""The command line: every command is a function of ``slviewer.pipeline``, ``preflight`` or
+``validation``.
 
-Results go to standard output, progress and warnings to standard error. Exit status: 0 done, 1 failed, 2 usage,
-3 calibration rejected, 130 cancelled. Nothing heavy is imported before a command needs it.
+Results go to standard output, progress and warnings to standard error. Exit status: 0 done, 1
+failed, 2 usage, 3 calibration rejected, 130 cancelled. Nothing heavy is imported before a command
+needs it.
 """
 
 import os
@@ -14,7 +16,8 @@ from typing import Any
 
 import tyro
 
-# Several threads multiply small matrices; OpenBLAS would wake threads of its own for each, which then wait for work.
+# Several threads multiply small matrices; OpenBLAS would wake threads of its own for each, which
+# then wait for work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 from slviewer import __version__, terminal
@@ -38,7 +41,10 @@ def _describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     """Describe how many captures were simulated, and the next command."""
     from slviewer.pipeline.simulate import TARGET
 
-    return f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session} --target {TARGET}"
+    return (
+        f"{len(names)} captures simulated into {session}; next: slviewer calibrate {session}"
+        f" --target {TARGET}"
+    )
 
 
 def _describe_dataset(fetched: Path, **_: Any) -> str:
@@ -52,7 +58,9 @@ CONFIG = (
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.PositionalMetavarFromFieldName,
 )
-DESCRIPTION = "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
+DESCRIPTION = (
+    "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
+)
 
 
 class Commands(Mapping[str, Callable[..., Any]]):
@@ -75,8 +83,8 @@ class Commands(Mapping[str, Callable[..., Any]]):
 
 
 def _make_operation_command(name: str) -> Callable[..., Any]:
-    """Return the command of an operation that is registered in this process; its settings without defaults are
-    positional. Raises KeyError where there is none."""
+    """Return the command of an operation that is registered in this process; its settings without
+    defaults are positional. Raises KeyError where there is none."""
     registry = sys.modules.get("slviewer.pipeline.operation")
     operation = getattr(registry, "OPERATIONS", {})[name]
     required = [each.name for each in fields(operation.settings) if each.default is MISSING]
@@ -84,7 +92,9 @@ def _make_operation_command(name: str) -> Callable[..., Any]:
     return read_command(source, "session", *required, options=JSON)
 
 
-def _define_command(source: str, *positional: str, **options: Any) -> Callable[[], Callable[..., Any]]:
+def _define_command(
+    source: str, *positional: str, **options: Any
+) -> Callable[[], Callable[..., Any]]:
     """Return a function that reads a command from its source, see `read_command`."""
     return partial(read_command, source, *positional, **options)
 
@@ -94,12 +104,22 @@ COMMANDS = Commands(
         "wizard": lambda: wizard,
         "devices": _define_command("pipeline.devices:devices"),
         "plugins": _define_command("pipeline.plugins:plugins"),
-        "preflight": _define_command("preflight.check_rig:check_rig", options=CHECKED, run=run_preflight),
-        "capture": _define_command("pipeline.capture:capture", "session", "name", options=PAGES, run=run_capture),
-        "turn": _define_command("pipeline.turn:turn", "session", options=[*PAGES, *JSON], run=run_turn),
-        "plan-rig": _define_command("pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=JSON),
+        "preflight": _define_command(
+            "preflight.check_rig:check_rig", options=CHECKED, run=run_preflight
+        ),
+        "capture": _define_command(
+            "pipeline.capture:capture", "session", "name", options=PAGES, run=run_capture
+        ),
+        "turn": _define_command(
+            "pipeline.turn:turn", "session", options=[*PAGES, *JSON], run=run_turn
+        ),
+        "plan-rig": _define_command(
+            "pipeline.plan_rig:plan_rig", "camera", "projector", "distance", options=JSON
+        ),
         "import": make_import_command,
-        "calibrate": _define_command("pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate),
+        "calibrate": _define_command(
+            "pipeline.calibrate:calibrate", "session", options=CALIBRATED, run=run_calibrate
+        ),
         "validate": _define_command("pipeline.validate:validate", "session", options=JSON),
         "decode": _define_command(
             "pipeline.decode:write_decoded", "session", "capture", names={"file_format": "format"}
@@ -116,8 +136,12 @@ COMMANDS = Commands(
         ),
         "align": _define_command("pipeline.align:align", "session", "captures", options=JSON),
         "merge": _define_command("pipeline.merge:merge", "session", "captures", options=JSON),
-        "mesh": _define_command("pipeline.mesh:mesh", "session", "names", options=[*MESHING, *JSON], run=run_meshing),
-        "compare": _define_command("pipeline.compare:compare", "session", "scan", "nominal", options=JSON),
+        "mesh": _define_command(
+            "pipeline.mesh:mesh", "session", "names", options=[*MESHING, *JSON], run=run_meshing
+        ),
+        "compare": _define_command(
+            "pipeline.compare:compare", "session", "scan", "nominal", options=JSON
+        ),
         "measure": _define_command(
             "pipeline.measure:measure",
             "session",
@@ -161,9 +185,13 @@ COMMANDS = Commands(
         "prove": _define_command("validation.prove:prove", options=JSON, names={"cases": "case"}),
         "patterns": _define_command("pipeline.printouts:patterns"),
         "target": _define_command("pipeline.printouts:target", "board"),
-        "detect": _define_command("pipeline.detect:detect_board", "images", options=JSON, names={"csv_out": "csv"}),
+        "detect": _define_command(
+            "pipeline.detect:detect_board", "images", options=JSON, names={"csv_out": "csv"}
+        ),
         "report": _define_command("pipeline.report:report", "session"),
-        "verify-report": _define_command("pipeline.certificate:verify_report", "session", "report", options=JSON),
+        "verify-report": _define_command(
+            "pipeline.certificate:verify_report", "session", "report", options=JSON
+        ),
         "inspect": _define_command("pipeline.inspect:inspect", "session"),
         "restore": _define_command("pipeline.restore:restore", "session", "names"),
         "bench": _define_command("validation.bench:bench", options=JSON),
@@ -185,7 +213,13 @@ def main(arguments: list[str] | None = None) -> int:
         if name in COMMANDS:
             run = tyro.cli(COMMANDS[name], prog=f"slviewer {name}", args=rest, config=CONFIG)
         else:
-            run = tyro.cli(union(COMMANDS), prog="slviewer", description=DESCRIPTION, args=arguments, config=CONFIG)
+            run = tyro.cli(
+                union(COMMANDS),
+                prog="slviewer",
+                description=DESCRIPTION,
+                args=arguments,
+                config=CONFIG,
+            )
         run()
     except SystemExit as stop:
         return int(stop.code or 0)
@@ -198,9 +232,14 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # the help, or a result, is piped into `head`
         return 1
     except (MemoryError, RecursionError) as error:
-        reason = "needs more memory than there is" if isinstance(error, MemoryError) else "nests values too deep"
+        reason = (
+            "needs more memory than there is"
+            if isinstance(error, MemoryError)
+            else "nests values too deep"
+        )
         terminal.print_message(
-            f"slviewer: an unexpected end: what was read {reason}: give a smaller or an undamaged file"
+            f"slviewer: an unexpected end: what was read {reason}: give a smaller or an undamaged"
+            " file"
         )
         return 1
     except OSError as error:

@@ -1,4 +1,5 @@
-"""Plugins: what other packages add under entry points. A broken one is reported, and never stops the program."""
+"""Plugins: what other packages add under entry points. A broken one is reported, and never stops
+the program."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Plugin:
-    """An entry point of a package: ``value`` is the object that it names, None where ``problem`` states why not."""
+    """An entry point of a package: ``value`` is the object that it names, None where ``problem``
+    states why not."""
 
     group: str
     name: str
@@ -29,7 +31,8 @@ def list_names(group: str) -> list[str]:
 
 @dataclass(frozen=True)
 class PluginGroup(Generic[T]):
-    """Plugins under the entry points ``name``: objects of ``kind``, called otherwise than what is ``built_in()``."""
+    """Plugins under the entry points ``name``: objects of ``kind``, called otherwise than what is
+    ``built_in()``."""
 
     name: str
     kind: type[T]
@@ -39,11 +42,13 @@ class PluginGroup(Generic[T]):
     def plugins(self) -> tuple[Plugin, ...]:
         """All of them, in order of their names, imported when this is first read.
 
-        One has a ``problem`` where its import fails, it is no instance of ``kind``, its ``name`` is not the entry
-        point's, or the name is one of ``built_in`` or of a plugin before it.
+        One has a ``problem`` where its import fails, it is no instance of ``kind``, its ``name`` is
+        not the entry point's, or the name is one of ``built_in`` or of a plugin before it.
         """
         plugins: list[Plugin] = []
-        for entry in sorted(entry_points(group=self.name), key=lambda entry: (entry.name, _name_package(entry))):
+        for entry in sorted(
+            entry_points(group=self.name), key=lambda entry: (entry.name, _name_package(entry))
+        ):
             taken = {*self.built_in(), *(plugin.name for plugin in plugins if not plugin.problem)}
             plugins.append(_load(entry, self.kind, taken))
         return tuple(plugins)
@@ -53,7 +58,8 @@ class PluginGroup(Generic[T]):
         return {plugin.name: plugin.value for plugin in self.plugins if not plugin.problem}
 
     def explain_missing(self, name: str) -> str:
-        """Return why a plugin cannot be used, as an addition to a message; empty where no plugin has this name."""
+        """Return why a plugin cannot be used, as an addition to a message; empty where no plugin
+        has this name."""
         if name not in list_names(self.name):
             return ""
         return "; a plugin of this name cannot be used: `slviewer plugins` shows why"
@@ -63,15 +69,28 @@ def _load(entry: EntryPoint, kind: type, taken: set[str]) -> Plugin:
     """Import one plugin, and check it."""
     package = _name_package(entry)
     if entry.name in taken:
-        return Plugin(entry.group, entry.name, package, problem=f"the name {entry.name} is taken: choose another")
+        return Plugin(
+            entry.group,
+            entry.name,
+            package,
+            problem=f"the name {entry.name} is taken: choose another",
+        )
     try:
         value = entry.load()
     except Exception as error:  # whatever a package's import raises must not stop the program
-        return Plugin(entry.group, entry.name, package, problem=f"its import failed, {type(error).__name__}: {error}")
+        return Plugin(
+            entry.group,
+            entry.name,
+            package,
+            problem=f"its import failed, {type(error).__name__}: {error}",
+        )
     if not isinstance(value, kind):
         problem = f"{entry.value} is a {type(value).__name__}, not a {kind.__name__}"
     elif getattr(value, "name", None) != entry.name:
-        problem = f"{entry.value} is called {getattr(value, 'name', None)!r}: use the same name for the entry point"
+        problem = (
+            f"{entry.value} is called {getattr(value, 'name', None)!r}: use the same name for the"
+            " entry point"
+        )
     else:
         return Plugin(entry.group, entry.name, package, value)
     return Plugin(entry.group, entry.name, package, problem=problem)
@@ -79,4 +98,6 @@ def _load(entry: EntryPoint, kind: type, taken: set[str]) -> Plugin:
 
 def _name_package(entry: EntryPoint) -> str:
     """Return name and version of the package of an entry point."""
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown package"
+    return (
+        f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown package"
+    )

@@ -1,15 +1,19 @@
 """What can go wrong, by how the program ends.
 
-Every message states in one sentence what happened and what to do; it is shown to the operator as it is.
+Every message states in one sentence what happened and what to do; it is shown to the operator as it
+is.
 """
 
 import re
 
-_CREDENTIALS = re.compile(r"(?<=://)[^\s\"']+(?=@)")  # up to the last @, as passwords hold all kinds of characters
+_CREDENTIALS = re.compile(
+    r"(?<=://)[^\s\"']+(?=@)"
+)  # up to the last @, as passwords hold all kinds of characters
 
 
 def hide_passwords(text: str) -> str:
-    """Return the text with user and password in addresses, such as rtsp://user:password@camera, replaced by "…".
+    """Return the text with user and password in addresses, such as rtsp://user:password@camera,
+    replaced by "…".
 
     Whatever is shown, logged or exported passes through here.
     """
@@ -17,7 +21,8 @@ def hide_passwords(text: str) -> str:
 
 
 class SlviewerError(Exception):
-    """Base of all errors of slviewer; the message states what happened and what to do, without passwords."""
+    """Base of all errors of slviewer; the message states what happened and what to do, without
+    passwords."""
 
     exit_status = 1
 
@@ -44,11 +49,13 @@ class SessionError(SlviewerError):
 
 
 class DamagedError(SessionError):
-    """A stored capture or result that is not what was saved: a file of it is missing, cut short or altered."""
+    """A stored capture or result that is not what was saved: a file of it is missing, cut short or
+    altered."""
 
 
 class DeviceError(SlviewerError):
-    """A camera or projector that does not answer, was unplugged, or cannot do what was requested."""
+    """A camera or projector that does not answer, was unplugged, or cannot do what was
+    requested."""
 
 
 class TurntableError(DeviceError):

@@ -1,4 +1,5 @@
-"""What a package needs to add cameras, projectors, turntables, boards, importers and exporters to slviewer.
+"""What a package needs to add cameras, projectors, turntables, boards, importers and exporters to
+slviewer.
 
 A plugin is an object under an entry point, whose name is the object's ``name``:
 

@@ -1,4 +1,5 @@
-"""Text and tables with content from outside, made harmless for terminals, pages and spreadsheets."""
+"""Text and tables with content from outside, made harmless for terminals, pages and
+spreadsheets."""
 
 import csv
 import io
@@ -13,9 +14,11 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|nan)")
 
 
 def escape_controls(text: str) -> str:
-    """Return text with the control and direction characters in it (but line breaks and tabs) as escapes: `\\x1b`.
+    """Return text with the control and direction characters in it (but line breaks and tabs) as
+    escapes: `\\x1b`.
 
-    Names and files from outside may hold some, which would drive a terminal or hide what a page shows.
+    Names and files from outside may hold some, which would drive a terminal or hide what a page
+    shows.
     """
 
     def escape(match: re.Match[str]) -> str:
@@ -29,14 +32,18 @@ def escape_controls(text: str) -> str:
 
 
 def format_csv(rows: Iterable[Iterable[object]]) -> str:
-    """Return rows as comma-separated values; text in them holds no control characters and no formula."""
+    """Return rows as comma-separated values; text in them holds no control characters and no
+    formula."""
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows([_make_cell(value) for value in row] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(
+        [_make_cell(value) for value in row] for row in rows
+    )
     return text.getvalue()
 
 
 def _make_cell(value: object) -> object:
-    """Return a value that a spreadsheet shows as it is: numbers unchanged, also those that were formatted."""
+    """Return a value that a spreadsheet shows as it is: numbers unchanged, also those that were
+    formatted."""
     if not isinstance(value, str):
         return value
     text = escape_controls(value)

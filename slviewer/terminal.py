@@ -7,17 +7,24 @@ from slviewer.printable import escape_controls
 
 
 def accept_all_characters() -> None:
-    """Let the standard streams replace what their encoding lacks, such as an arrow in Windows' code pages."""
+    """Let the standard streams replace what their encoding lacks, such as an arrow in Windows' code
+    pages."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace" if stream is sys.stderr else "replace")
 
 
 def progress(done: float, doing: str) -> None:
-    """Print the share `done`, 0 ... 1, as one line that is redrawn in place; silent unless on a terminal."""
+    """Print the share `done`, 0 ... 1, as one line that is redrawn in place; silent unless on a
+    terminal."""
     if sys.stderr.isatty():
         end = "\n" if done >= 1 else ""
-        print(f"\r\033[K{100 * done:3.0f} % {escape_controls(doing)}", end=end, file=sys.stderr, flush=True)
+        print(
+            f"\r\033[K{100 * done:3.0f} % {escape_controls(doing)}",
+            end=end,
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def print_message(message: str) -> None:

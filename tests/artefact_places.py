@@ -1,6 +1,8 @@
-"""Where an artefact is held in an acceptance test, for one rig: so that a test covers what the rig measures.
+"""Where an artefact is held in an acceptance test, for one rig: so that a test covers what the rig
+measures.
 
-The volume is what camera and projector both see, from in front of the calibrated depths (R1) to behind them (R3).
+The volume is what camera and projector both see, from in front of the calibrated depths (R1) to
+behind them (R3).
 """
 
 from dataclasses import dataclass
@@ -18,7 +20,8 @@ STEEPEST = np.radians(60.0)
 """A bar that does not fit is turned towards the depth, no further than this."""
 _Place = tuple[str, tuple[float, float, float], tuple[float, float], float]
 _BAR: tuple[_Place, ...] = (
-    # words; direction; where its middle stands, from -1 to 1 of the free room; depth, 0 nearest to 1 farthest in R2
+    # words; direction; where its middle stands, from -1 to 1 of the free room; depth, 0 nearest to
+    # 1 farthest in R2
     ("across, in the middle", (1.0, 0.0, 0.0), (0.0, 0.0), 0.5),
     ("upright, in the middle", (0.0, 1.0, 0.0), (0.0, 0.0), 0.5),
     ("diagonal, rising to the right, upper left", (1.0, -0.7, 0.0), (-0.8, -0.8), 0.7),
@@ -51,7 +54,8 @@ _PLANE = (
 class Place:
     """Where to hold an artefact: ``T_camera_artefact`` (4, 4), mm.
 
-    A bar lies along its x axis about its middle, a plane is its xy plane with z away from the camera.
+    A bar lies along its x axis about its middle, a plane is its xy plane with z away from the
+    camera.
     """
 
     words: str
@@ -65,8 +69,11 @@ def bar_places(
     return [_placed(rig, depth_range_mm, place, spacing_mm, diameter_mm) for place in _BAR]
 
 
-def sphere_places(rig: StereoRig, depth_range_mm: tuple[float, float], diameter_mm: float) -> list[Place]:
-    """Seven places of a single sphere. Raises InputError where it is too large for what the rig sees."""
+def sphere_places(
+    rig: StereoRig, depth_range_mm: tuple[float, float], diameter_mm: float
+) -> list[Place]:
+    """Seven places of a single sphere. Raises InputError where it is too large for what the rig
+    sees."""
     return [_placed(rig, depth_range_mm, place, 0.0, diameter_mm) for place in _SPHERE]
 
 
@@ -77,12 +84,19 @@ def plane_places(rig: StereoRig, depth_range_mm: tuple[float, float]) -> list[Pl
     for words, (about_x, about_y), depth in _PLANE:
         z = near + depth * (far - near)
         middle = _room(rig, z)[0]
-        places.append(Place(words, _pose(_turn(np.radians(about_x), np.radians(about_y)), np.append(middle, z))))
+        places.append(
+            Place(
+                words, _pose(_turn(np.radians(about_x), np.radians(about_y)), np.append(middle, z))
+            )
+        )
     return places
 
 
-def _placed(rig: StereoRig, depth_range: tuple[float, float], place: _Place, spacing: float, diameter: float) -> Place:
-    """A bar as its place says, moved to the middle and then turned towards the depth as far as it must to be seen."""
+def _placed(
+    rig: StereoRig, depth_range: tuple[float, float], place: _Place, spacing: float, diameter: float
+) -> Place:
+    """A bar as its place says, moved to the middle and then turned towards the depth as far as it
+    must to be seen."""
     words, direction, offset, depth = place
     near, far = depth_range
     z = near + depth * (far - near)
@@ -99,23 +113,28 @@ def _placed(rig: StereoRig, depth_range: tuple[float, float], place: _Place, spa
             if _seen(rig, _outline(ends, diameter / 2)):
                 z_axis = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [-1.0, 0.0, 0.0])
                 z_axis /= np.linalg.norm(z_axis)
-                return Place(words, _pose(np.stack([axis, np.cross(z_axis, axis), z_axis], 1), centre))
+                return Place(
+                    words, _pose(np.stack([axis, np.cross(z_axis, axis), z_axis], 1), centre)
+                )
     size = f"of {spacing:g} mm with balls of {diameter:g} mm" if spacing else f"of {diameter:g} mm"
     raise InputError(
-        f"an artefact {size} does not fit into what camera and projector see at {z:.0f} mm ({2 * free[0]:.0f} x "
-        f"{2 * free[1]:.0f} mm): use a smaller one"
+        f"an artefact {size} does not fit into what camera and projector see at {z:.0f} mm"
+        f" ({2 * free[0]:.0f} x {2 * free[1]:.0f} mm): use a smaller one"
     )
 
 
 def _room(rig: StereoRig, z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Middle (2,) and half size (2,), mm, of the part of a depth that camera and projector both see."""
+    """Middle (2,) and half size (2,), mm, of the part of a depth that camera and projector both
+    see."""
     width, height = rig.camera.size
     u, v = np.meshgrid(np.linspace(0, width - 1, 41), np.linspace(0, height - 1, 31))
     rays = rig.camera.undistort(np.stack([u.ravel(), v.ravel()], 1))
     points = np.concatenate([rays, np.ones((len(rays), 1))], 1) * z
     seen = points[_inside(rig, points)]
     if len(seen) < 9:
-        raise InputError(f"camera and projector see nothing together at {z:.0f} mm: turn them towards each other")
+        raise InputError(
+            f"camera and projector see nothing together at {z:.0f} mm: turn them towards each other"
+        )
     low, high = seen[:, :2].min(0), seen[:, :2].max(0)
     return (low + high) / 2, (high - low) / 2
 
@@ -127,7 +146,10 @@ def _seen(rig: StereoRig, points: np.ndarray) -> bool:
 def _inside(rig: StereoRig, points: np.ndarray) -> np.ndarray:
     """(n,) bool: points (n, 3) that lie within both images, a little away from their edges."""
     inside = points[:, 2] > 0
-    for lens, pixels in ((rig.camera, rig.camera.project(points)), (rig.projector, rig.project(points))):
+    for lens, pixels in (
+        (rig.camera, rig.camera.project(points)),
+        (rig.projector, rig.project(points)),
+    ):
         size = np.array(lens.size)
         edge = EDGE * size[0]
         with np.errstate(invalid="ignore"):
@@ -144,7 +166,9 @@ def _outline(centres: np.ndarray, radius: float) -> np.ndarray:
 
 def _turn(about_x: float, about_y: float) -> np.ndarray:
     cx, sx, cy, sy = np.cos(about_x), np.sin(about_x), np.cos(about_y), np.sin(about_y)
-    return np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]) @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]]) @ np.array(
+        [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]
+    )
 
 
 def _pose(R: np.ndarray, t: np.ndarray) -> np.ndarray:

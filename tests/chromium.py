@@ -23,7 +23,8 @@ _INSTALL = [sys.executable, "-m", "playwright", "install", "chromium"]
 
 
 def launched(chromium: BrowserType, *flags: str) -> Browser:
-    """The first Chromium that starts: the one that is asked for, the system's, Playwright's own, one fetched now."""
+    """The first Chromium that starts: the one that is asked for, the system's, Playwright's own,
+    one fetched now."""
     asked = os.environ.get("SLVIEWER_CHROMIUM")
     if asked:
         return chromium.launch(executable_path=asked, args=[*_FLAGS, *flags])
@@ -32,15 +33,18 @@ def launched(chromium: BrowserType, *flags: str) -> Browser:
         return why
     fetch = [_INSTALL]
     if shutil.which("apt-get") and hasattr(os, "geteuid") and os.geteuid() == 0:
-        fetch += [["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]]
+        fetch += [
+            ["apt-get", "update"],
+            ["apt-get", "install", "-y", "--no-install-recommends", "chromium"],
+        ]
     for command in fetch:
         subprocess.run(command, capture_output=True, timeout=600, check=False)
         why = _tried(chromium, flags)
         if isinstance(why, Browser):
             return why
     raise RuntimeError(
-        f"No Chromium starts here ({why}). Run `{' '.join(_INSTALL)}`, or `apt-get install chromium` as root, or name "
-        "one in SLVIEWER_CHROMIUM."
+        f"No Chromium starts here ({why}). Run `{' '.join(_INSTALL)}`, or `apt-get install"
+        " chromium` as root, or name one in SLVIEWER_CHROMIUM."
     )
 
 

@@ -21,7 +21,8 @@ def until(condition: Callable[[], Any], seconds: float = HANG_S) -> bool:
 
 
 class SteppingClock:
-    """A clock that nothing but its use moves: each look at it by ``step_s``, each wait by its duration."""
+    """A clock that nothing but its use moves: each look at it by ``step_s``, each wait by its
+    duration."""
 
     def __init__(self, step_s: float = 0.0) -> None:
         self._now_s, self._step_s = 1000.0, step_s

@@ -1,4 +1,5 @@
 """What all tests may use."""
+
 # ruff: noqa: E402 (the number of threads is read where libraries are imported)
 
 import os
@@ -23,7 +24,9 @@ from numba.core import event
 from playwright.sync_api import Browser, sync_playwright
 from small_fields import fit_few_cells
 
-os.environ["SLVIEWER_NO_PREPARATION"] = "1"  # wizards that tests start compile what they use, and nothing beside it
+os.environ["SLVIEWER_NO_PREPARATION"] = (
+    "1"  # wizards that tests start compile what they use, and nothing beside it
+)
 sys.dont_write_bytecode = False  # what tests start as processes need not compile the sources again
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
@@ -31,7 +34,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 NEEDS = ("browser", "process", "computes", "slow")
 """What a test may need; one that needs none of these is quick."""
 MAX_QUICK_COMPILE_S = 10.0
-"""Processor seconds that a quick test may spend compiling kernels, on a busy machine; 3 s on a quiet one."""
+"""Processor seconds that a quick test may spend compiling kernels, on a busy machine; 3 s on a
+quiet one."""
 
 
 @pytest.hookimpl(wrapper=True)
@@ -45,7 +49,8 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what the shared fixtures need, and put heavy files first: both workers end at about the same time."""
+    """Mark what the shared fixtures need, and put heavy files first: both workers end at about the
+    same time."""
     weight: dict[Path, int] = {}
     for item in items:
         fixtures = getattr(item, "fixturenames", ())
@@ -79,7 +84,8 @@ class CompilerTime(event.Listener):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Fail a quick test that starts a process or compiles for long: it is to be marked with what it needs."""
+    """Fail a quick test that starts a process or compiles for long: it is to be marked with what it
+    needs."""
     if item.get_closest_marker("quick") is None:
         return (yield)
 
@@ -91,13 +97,17 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
         patch.setattr(subprocess.Popen, "__init__", refuse)
         result = yield
     if compiler.seconds > MAX_QUICK_COMPILE_S:
-        pytest.fail(f"a quick test compiles for {compiler.seconds:.1f} s: mark it with `computes`", pytrace=False)
+        pytest.fail(
+            f"a quick test compiles for {compiler.seconds:.1f} s: mark it with `computes`",
+            pytrace=False,
+        )
     return result
 
 
 @pytest.fixture(scope="session", autouse=True)
 def disk_without_waits() -> Iterator[None]:
-    """Nobody pulls the plug in a test: what the system was given is not waited for until the disk has it as well."""
+    """Nobody pulls the plug in a test: what the system was given is not waited for until the disk
+    has it as well."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
@@ -114,20 +124,25 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real captures: SLVIEWER_REAL_DATA, else ``../shared/data`` beside the repository."""
+    """The folder of real captures: SLVIEWER_REAL_DATA, else ``../shared/data`` beside the
+    repository."""
     given = os.environ.get("SLVIEWER_REAL_DATA")
     folder = Path(given) if given else Path(__file__).parents[2] / "shared" / "data"
     if not folder.is_dir():
-        pytest.skip(f"no real captures: {folder} is missing; name their folder in SLVIEWER_REAL_DATA")
+        pytest.skip(
+            f"no real captures: {folder} is missing; name their folder in SLVIEWER_REAL_DATA"
+        )
     return folder
 
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a ``session`` as the commands simulate and calibrate it, and ``calibration.json``, what they found.
+    """A folder with a ``session`` as the commands simulate and calibrate it, and
+    ``calibration.json``, what they found.
 
-    8 poses, planes, spheres and objects at quarter resolution, made once for all workers: only to be read or copied.
-    The frames of all captures are checked, as the wizard does when it opens a session.
+    8 poses, planes, spheres and objects at quarter resolution, made once for all workers: only to
+    be read or copied. The frames of all captures are checked, as the wizard does when it opens a
+    session.
     """
     from slviewer.cli import main
     from slviewer.wizard.operator import Operator
@@ -139,7 +154,19 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if not folder.exists():
             with fit_few_cells():
                 assert main(["simulate", str(session), "--scale", "0.25", "--poses", "8"]) == 0
-                assert main(["calibrate", str(session), "--target", "circles:21x16:9", "--json", str(found)]) == 0
+                assert (
+                    main(
+                        [
+                            "calibrate",
+                            str(session),
+                            "--target",
+                            "circles:21x16:9",
+                            "--json",
+                            str(found),
+                        ]
+                    )
+                    == 0
+                )
             with Operator(session) as operator:
                 operator.wait_until_idle(HANG_S)
     assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"

@@ -1,8 +1,9 @@
 """Strangers at the wizard's port: `python -m tests.crowd --connections 2000 --seconds 60`.
 
-So many connections without a token are opened to a wizard in a process of its own, and opened again when the server
-ends them, while the operator's link is followed. Prints the operator's waiting times, and the server's memory, open
-files, threads and lines of log; ends with status 1 where the operator was kept out or the server's use is not bounded.
+So many connections without a token are opened to a wizard in a process of its own, and opened again
+when the server ends them, while the operator's link is followed. Prints the operator's waiting
+times, and the server's memory, open files, threads and lines of log; ends with status 1 where the
+operator was kept out or the server's use is not bounded.
 """
 
 import argparse
@@ -18,7 +19,13 @@ import threading
 import time
 from pathlib import Path
 
-SAID = (b"", b"GET / HTTP/1.1\r\n", b"\x16\x03\x01", b"GET /x HTTP/1.1\r\nHost: a\r\n\r\n", b"junk\r\n\r\n")
+SAID = (
+    b"",
+    b"GET / HTTP/1.1\r\n",
+    b"\x16\x03\x01",
+    b"GET /x HTTP/1.1\r\nHost: a\r\n\r\n",
+    b"junk\r\n\r\n",
+)
 PATIENCE_S, AGAIN_S, THREADS = 300.0, 1.0, 8
 MAX_LINES, MAX_GROWTH_MB, MAX_FILES = 100, 50.0, 1000
 
@@ -28,9 +35,20 @@ class Server:
 
     def __init__(self, folder: Path) -> None:
         self.log = folder / "log"
-        command = [sys.executable, "-u", "-m", "slviewer.cli", "wizard", str(folder / "S"), "--rig", "simulated:0.1"]
+        command = [
+            sys.executable,
+            "-u",
+            "-m",
+            "slviewer.cli",
+            "wizard",
+            str(folder / "S"),
+            "--rig",
+            "simulated:0.1",
+        ]
         with self.log.open("wb") as log:
-            self.process = subprocess.Popen([*command, "--no-browser", "--port", "0"], stdout=log, stderr=log)
+            self.process = subprocess.Popen(
+                [*command, "--no-browser", "--port", "0"], stdout=log, stderr=log
+            )
         end = time.monotonic() + PATIENCE_S
         while not (link := re.search(r"http://127\.0\.0\.1:(\d+)/#(\S+)", self.log.read_text())):
             if time.monotonic() > end or self.process.poll() is not None:
@@ -45,10 +63,16 @@ class Server:
             int(re.search(rf"{name}:\s+(\d+)", (folder / "status").read_text())[1])  # type: ignore[index]
             for name in ("VmRSS", "Threads")
         )
-        return memory / 1000, len([*(folder / "fd").iterdir()]), threads, len(self.log.read_text().splitlines())
+        return (
+            memory / 1000,
+            len([*(folder / "fd").iterdir()]),
+            threads,
+            len(self.log.read_text().splitlines()),
+        )
 
     def follow_link(self) -> float:
-        """Follow the operator's link to the page, and return the seconds that it took. Raises OSError."""
+        """Follow the operator's link to the page, and return the seconds that it took. Raises
+        OSError."""
         began = time.monotonic()
         login = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         login.request("GET", "/login", headers={"Authorization": f"Bearer {self.token}"})
@@ -69,7 +93,8 @@ class Crowd:
         self._port, self._over = port, threading.Event()
         self._open: list[list[socket.socket]] = [[] for _ in range(THREADS)]
         self._threads = [
-            threading.Thread(target=self._hold, args=(mine, count // THREADS), daemon=True) for mine in self._open
+            threading.Thread(target=self._hold, args=(mine, count // THREADS), daemon=True)
+            for mine in self._open
         ]
         for thread in self._threads:
             thread.start()
@@ -146,12 +171,14 @@ def main() -> int:
         finally:
             server.process.terminate()
             server.process.wait(60)
-    growth, files, threads, lines = (max(each[k] for each in used) - (0, before[k])[k in (0, 3)] for k in range(4))
+    growth, files, threads, lines = (
+        max(each[k] for each in used) - (0, before[k])[k in (0, 3)] for k in range(4)
+    )
     print(
-        f"{crowd.made} connections of strangers, at most {max(held)} open at once, in {options.seconds:g} s: the "
-        f"operator's page came in {max(waited):.2f} s at most ({alone:.2f} s without them), {len(waited)} of "
-        f"{len(waited)} times; the server's memory {growth:+.1f} MB, {files} files, {threads} threads at most, "
-        f"{lines} lines of log"
+        f"{crowd.made} connections of strangers, at most {max(held)} open at once, in"
+        f" {options.seconds:g} s: the operator's page came in {max(waited):.2f} s at most"
+        f" ({alone:.2f} s without them), {len(waited)} of {len(waited)} times; the server's memory"
+        f" {growth:+.1f} MB, {files} files, {threads} threads at most, {lines} lines of log"
     )
     return int(growth > MAX_GROWTH_MB or files > MAX_FILES or lines > MAX_LINES)
 

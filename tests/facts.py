@@ -11,9 +11,11 @@ E = TypeVar("E", bound=Exception)
 
 
 def missing_facts(text: str, *facts: object) -> list[str]:
-    """Return the facts (numbers, names, options, terms of the field) that a text lacks, in any order and any case.
+    """Return the facts (numbers, names, options, terms of the field) that a text lacks, in any
+    order and any case.
 
-    A fact stands in the text by itself: 12 is not in "120" nor in "0.12", and "line" not in "outline".
+    A fact stands in the text by itself: 12 is not in "120" nor in "0.12", and "line" not in
+    "outline".
     """
     return [str(fact) for fact in facts if not re.search(_pattern(str(fact)), text, re.IGNORECASE)]
 
@@ -26,7 +28,9 @@ def _pattern(fact: str) -> str:
 
 
 @contextmanager
-def raises(error: type[E] | tuple[type[E], ...], *facts: object) -> Iterator[pytest.ExceptionInfo[E]]:
+def raises(
+    error: type[E] | tuple[type[E], ...], *facts: object
+) -> Iterator[pytest.ExceptionInfo[E]]:
     """Expect an error of a type whose message states all facts, see `missing_facts`."""
     with pytest.raises(error) as caught:
         yield caught

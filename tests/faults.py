@@ -1,10 +1,11 @@
-"""Deaths and write faults of every command that saves: `python -m tests.faults --kills 300 --faults 100 --seed 1`.
+"""Deaths and write faults of every command that saves: `python -m tests.faults --kills 300 --faults
+100 --seed 1`.
 
-A command runs on a copy of a small session, in a forked child whose n-th change of the disk (opening a file to write,
-writing, syncing, renaming, making or removing) is its death, or fails. A death is a kill, or a loss of power, which
-takes what was not synced: files are emptied, and renames and replacements undone. Afterwards the session must open,
-hold every complete capture undamaged, and one calibration, wholly the old or wholly the new; and the same command must
-then complete.
+A command runs on a copy of a small session, in a forked child whose n-th change of the disk
+(opening a file to write, writing, syncing, renaming, making or removing) is its death, or fails. A
+death is a kill, or a loss of power, which takes what was not synced: files are emptied, and renames
+and replacements undone. Afterwards the session must open, hold every complete capture undamaged,
+and one calibration, wholly the old or wholly the new; and the same command must then complete.
 """
 
 import argparse
@@ -56,7 +57,8 @@ class Killed(BaseException):
 
 
 class Disk:
-    """Counts the calls that change the disk, and fails at one: once (EIO), from then on, or by the program's death."""
+    """Counts the calls that change the disk, and fails at one: once (EIO), from then on, or by the
+    program's death."""
 
     def __init__(self, at: int | None, code: int = KILL) -> None:
         self.calls: list[str] = []
@@ -73,7 +75,9 @@ class Disk:
         if self._at is None or number < self._at or self._code == KILL:
             return
         is_growing = name in ("open", "write", "mkdir", "fsync")
-        if (self._code == errno.EIO and number > self._at) or (self._code == errno.ENOSPC and not is_growing):
+        if (self._code == errno.EIO and number > self._at) or (
+            self._code == errno.ENOSPC and not is_growing
+        ):
             return
         raise OSError(self._code, os.strerror(self._code))
 
@@ -90,7 +94,11 @@ class Disk:
         try:
             self.call("write")
         except BaseException:
-            file.write(memoryview(data).cast("B")[: memoryview(data).nbytes // 2] if not isinstance(data, str) else "")
+            file.write(
+                memoryview(data).cast("B")[: memoryview(data).nbytes // 2]
+                if not isinstance(data, str)
+                else ""
+            )
             raise
         return int(file.write(data))
 
@@ -153,13 +161,18 @@ class Machine(Disk):
         super().__init__(at, code)
         self._loses_power, self._process = loses_power, os.getpid()
         self._unsynced: list[Path] = []
-        self._renamed: list[tuple[Path, Path, Path | None]] = []  # the last: a copy of what was replaced
+        self._renamed: list[
+            tuple[Path, Path, Path | None]
+        ] = []  # the last: a copy of what was replaced
         self._folder = Path.cwd()
         self._system = {name: getattr(os, name) for name in (*CHANGES, "truncate")}
 
     def concerns(self, path: Any) -> bool:
-        """Whether a path, or what is open under a number, is in the folder of the case: compiled code is elsewhere."""
-        place = Path(os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fsdecode(path))
+        """Whether a path, or what is open under a number, is in the folder of the case: compiled
+        code is elsewhere."""
+        place = Path(
+            os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fsdecode(path)
+        )
         return place.absolute().is_relative_to(self._folder)
 
     def call(self, name: str, *paths: Any) -> None:
@@ -174,7 +187,8 @@ class Machine(Disk):
         elif name in ("rename", "replace"):
             source, target = (Path(path).absolute() for path in paths)
             self._unsynced = [
-                target / path.relative_to(source) if path.is_relative_to(source) else path for path in self._unsynced
+                target / path.relative_to(source) if path.is_relative_to(source) else path
+                for path in self._unsynced
             ]
             old = None
             if self._loses_power and target.is_file():
@@ -198,18 +212,21 @@ class Machine(Disk):
 
 
 def make_seed(folder: Path, poses: int = 7) -> None:
-    """Make a small calibrated session S with a calibration in its trash, and the files that commands read beside it."""
+    """Make a small calibrated session S with a calibration in its trash, and the files that
+    commands read beside it."""
     from tests import fuzz
 
     fuzz.write_frames(folder)
     session = folder / "S"
-    (folder / "rig.toml").write_text('what = "small"\ndriver = "simulated"\npreset = "letter"\nscale = 0.1\nseed = 0\n')
+    (folder / "rig.toml").write_text(
+        'what = "small"\ndriver = "simulated"\npreset = "letter"\nscale = 0.1\nseed = 0\n'
+    )
     (folder / "sphere.toml").write_text(
-        'kind = "sphere"\nname = "sphere"\ncertificate = "none"\n'
-        "[calibrated]\ndiameter_mm = 196.0\ndiameter_U_mm = 0.01\nform_mm = 0.01\nform_U_mm = 0.01\n"
-        "temperature_C = 20.0\nexpansion_ppm_K = 0.0\nexpansion_U_ppm_K = 0.0\n"
-        '[measured]\ntemperature_C = 20.0\ntemperature_U_K = 0.1\ncaptures = ["sphere_*"]\n'
-        "[limits]\nform_mm = 5.0\nsize_mm = 5.0\n"
+        'kind = "sphere"\nname = "sphere"\ncertificate = "none"\n[calibrated]\ndiameter_mm ='
+        " 196.0\ndiameter_U_mm = 0.01\nform_mm = 0.01\nform_U_mm = 0.01\ntemperature_C ="
+        " 20.0\nexpansion_ppm_K = 0.0\nexpansion_U_ppm_K = 0.0\n[measured]\ntemperature_C ="
+        ' 20.0\ntemperature_U_K = 0.1\ncaptures = ["sphere_*"]\n[limits]\nform_mm = 5.0\nsize_mm ='
+        " 5.0\n"
     )
     calibrate = COMMANDS[3].replace(" S ", f" {session} ").split()
     run_sound(f"simulate {session} --scale 0.2 --poses {poses}".split())
@@ -220,7 +237,9 @@ def make_seed(folder: Path, poses: int = 7) -> None:
     shutil.rmtree(session / "trash")
     run_sound(calibrate)
     run_sound(["export", str(session), "calibration", "--out", str(folder / "calibration.yml")])
-    run_sound(["import", "opencv-calibration", str(folder / "calibration.yml"), str(session), "--force"])
+    run_sound(
+        ["import", "opencv-calibration", str(folder / "calibration.yml"), str(session), "--force"]
+    )
     with Session.open(session, write=True) as store:
         store.exclude(f"pose_{poses:02d}", "so that the next calibration is another")
     run_sound(calibrate)
@@ -237,7 +256,8 @@ def import_modules() -> None:
 
 
 def make_in_child(make: Callable[[], None]) -> None:
-    """Run a function in a forked child: threads of compiled code must not run where later children are forked."""
+    """Run a function in a forked child: threads of compiled code must not run where later children
+    are forked."""
     child = os.fork()
     if not child:
         status = 1
@@ -262,7 +282,8 @@ def run_sound(arguments: list[str]) -> None:
 
 
 def run_child(folder: Path, command: str, make: Callable[[], Machine]) -> tuple[int, str]:
-    """Run a command on a disk in a forked child; returns its status, -9 for killed, and what it wrote."""
+    """Run a command on a disk in a forked child; returns its status, -9 for killed, and what it
+    wrote."""
     out = folder / "output"
     child = os.fork()
     if not child:
@@ -285,7 +306,8 @@ def run_child(folder: Path, command: str, make: Callable[[], Machine]) -> tuple[
 
 
 def describe(session: Path) -> tuple[set[str], dict[str, str]]:
-    """Return the captures of a session and {result: hash} of its calibration; raises where anything is damaged."""
+    """Return the captures of a session and {result: hash} of its calibration; raises where anything
+    is damaged."""
     text = inspect(session, check=True)
     if "damaged" in text:
         raise AssertionError(text[text.index("damaged") :].splitlines()[0])
@@ -294,7 +316,9 @@ def describe(session: Path) -> tuple[set[str], dict[str, str]]:
         for name in names:
             if store.state_of(name) != "fresh":
                 raise AssertionError(f"{name} is {store.state_of(name)}")
-        return set(store.capture_names()), {name: store.load_result(name, only=())[0]["hash"] for name in names}
+        return set(store.capture_names()), {
+            name: store.load_result(name, only=())[0]["hash"] for name in names
+        }
 
 
 def examine(folder: Path, before: tuple[set[str], dict[str, str]], command: str) -> str:
@@ -308,8 +332,13 @@ def examine(folder: Path, before: tuple[set[str], dict[str, str]], command: str)
     if lost := before[0] - captures:
         return f"lost: {', '.join(sorted(lost))}"
     new = {name for name in calibration if calibration[name] != before[1].get(name)}
-    if calibration != before[1] and calibration.keys() - new - {"calibration/verdict"}:  # which names its calibration
-        return f"mixed calibration: {', '.join(sorted(new))} new, {', '.join(sorted(calibration.keys() - new))} old"
+    if calibration != before[1] and calibration.keys() - new - {
+        "calibration/verdict"
+    }:  # which names its calibration
+        return (
+            f"mixed calibration: {', '.join(sorted(new))} new,"
+            f" {', '.join(sorted(calibration.keys() - new))} old"
+        )
     again = f"{command} --force" if command.startswith("capture") else command
     status, text = run_child(folder, again, lambda: Machine(None))
     if status:
@@ -348,15 +377,21 @@ def run(kills: int, faults: int, seed: int, commands: tuple[str, ...]) -> Counte
             command = commands[number % len(commands)]
             at = rng.randrange(counts[command])
             shutil.copytree(sound, folder)
-            status, text = run_child(folder, command, lambda: Machine(at, code, loses_power=loses_power))  # noqa: B023
+            status, text = run_child(
+                folder, command, lambda: Machine(at, code, loses_power=loses_power)
+            )  # noqa: B023
             wrong = examine(folder, before, command)
             if "Traceback" in text:
                 wrong = wrong or f"traceback: {text.strip().splitlines()[-1]}"
-            outcome = "wrong" if wrong else "died" if status < 0 else "refused" if status else "completed"
+            outcome = (
+                "wrong" if wrong else "died" if status < 0 else "refused" if status else "completed"
+            )
             outcomes[outcome] += 1
             by_command[command][f"{kind}: {outcome}"] += 1
             if wrong:
-                print(f"{number}: {command}: {kind} at {at} of {counts[command]}: {wrong}", flush=True)
+                print(
+                    f"{number}: {command}: {kind} at {at} of {counts[command]}: {wrong}", flush=True
+                )
             shutil.rmtree(folder)
     for command, counted in by_command.items():
         print(f"{command}: " + ", ".join(f"{n} {what}" for what, n in sorted(counted.items())))
@@ -366,14 +401,23 @@ def run(kills: int, faults: int, seed: int, commands: tuple[str, ...]) -> Counte
 def main() -> int:
     """Run as many cases as were asked for, and print the number of each outcome."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=300, help="deaths, half of them by a loss of power")
-    parser.add_argument("--faults", type=int, default=100, help="full disks, I/O errors and read-only disks")
+    parser.add_argument(
+        "--kills", type=int, default=300, help="deaths, half of them by a loss of power"
+    )
+    parser.add_argument(
+        "--faults", type=int, default=100, help="full disks, I/O errors and read-only disks"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--commands", nargs="*", help="names of some of the commands")
     options = parser.parse_args()
-    commands = tuple(each for each in COMMANDS if not options.commands or each.split()[0] in options.commands)
+    commands = tuple(
+        each for each in COMMANDS if not options.commands or each.split()[0] in options.commands
+    )
     outcomes = run(options.kills, options.faults, options.seed, commands)
-    print(f"\n{sum(outcomes.values())} cases: " + ", ".join(f"{n} {kind}" for kind, n in outcomes.most_common()))
+    print(
+        f"\n{sum(outcomes.values())} cases: "
+        + ", ".join(f"{n} {kind}" for kind, n in outcomes.most_common())
+    )
     return int(bool(outcomes["wrong"]))
 
 

@@ -1,6 +1,7 @@
 """Devices that fail on purpose, to prove that a fault ends one capture and harms nothing else.
 
-`breakable(rig)` wraps any rig; `Faults.plan` says what goes wrong at which frame of the next capture.
+`breakable(rig)` wraps any rig; `Faults.plan` says what goes wrong at which frame of the next
+capture.
 """
 
 from collections.abc import Callable
@@ -15,8 +16,8 @@ from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.target.board import Board
 
 Fault = Literal["timeout", "unplugged", "projector", "turntable"]
-"""The camera gives no frame once; the camera is gone until it is closed and opened; the same for the projector; the
-turntable raises an alarm once."""
+"""The camera gives no frame once; the camera is gone until it is closed and opened; the same for
+the projector; the turntable raises an alarm once."""
 
 
 class Faults:
@@ -28,11 +29,13 @@ class Faults:
         self.shown: int | None = None
 
     def plan(self, fault: Fault, frame: int) -> None:
-        """Let `fault` happen once, when frame `frame` of a sequence is shown; previews do not set it off. That of the
-        turntable happens when it is to turn to `frame` degrees.
+        """Let `fault` happen once, when frame `frame` of a sequence is shown; previews do not set
+        it off. That of the turntable happens when it is to turn to `frame` degrees.
         """
         if fault not in get_args(Fault):
-            raise InputError(f"no fault is called {fault!r}: use one of {', '.join(get_args(Fault))}")
+            raise InputError(
+                f"no fault is called {fault!r}: use one of {', '.join(get_args(Fault))}"
+            )
         self._planned = (fault, frame)
 
     def strike(self, device: str) -> None:
@@ -42,14 +45,20 @@ class Faults:
             if (fault == "projector") == (device == "projector"):
                 self._planned = None
                 if fault == "timeout":
-                    raise DeviceError("the camera gave no frame within 2 s: check its cable and its trigger")
+                    raise DeviceError(
+                        "the camera gave no frame within 2 s: check its cable and its trigger"
+                    )
                 self._gone.add(device)
         if device in self._gone:
             raise DeviceError(f"the {device} does not answer: plug it in again and reconnect")
 
     def strike_turntable(self, deg: float) -> None:
         """Raise TurntableError if the turntable breaks at this angle."""
-        if self._planned is not None and self._planned[0] == "turntable" and deg >= self._planned[1]:
+        if (
+            self._planned is not None
+            and self._planned[0] == "turntable"
+            and deg >= self._planned[1]
+        ):
             self._planned = None
             raise TurntableError("the turntable raised alarm 1: see that the table turns freely")
 
@@ -130,7 +139,11 @@ class FaultyTurntable:
 
     def __init__(self, table: Turntable, faults: Faults) -> None:
         self._table, self._faults = table, faults
-        self.name, self.limits_deg, self.is_absolute = table.name, table.limits_deg, table.is_absolute
+        self.name, self.limits_deg, self.is_absolute = (
+            table.name,
+            table.limits_deg,
+            table.is_absolute,
+        )
 
     def open(self) -> None:
         """Open the wrapped turntable."""

@@ -1,9 +1,10 @@
 """Malformed input of every kind: `python -m tests.fuzz --minutes 10`, or `--count 2000 --seed 1`.
 
-Each case damages one file of a small session, or one that a command reads, or gives a command an impossible number,
-runs one command in a forked child within 2 GB and 10 s, beside twice what it takes without the damage, and is counted
-by kind of file, command and outcome. Right are: a refusal (exit status 1 to 3 and one printable message, the session
-unchanged but for what is computed once and saved, `DERIVED`), and success, where the damage does not matter.
+Each case damages one file of a small session, or one that a command reads, or gives a command an
+impossible number, runs one command in a forked child within 2 GB and 10 s, beside twice what it
+takes without the damage, and is counted by kind of file, command and outcome. Right are: a refusal
+(exit status 1 to 3 and one printable message, the session unchanged but for what is computed once
+and saved, `DERIVED`), and success, where the damage does not matter.
 """
 
 import argparse
@@ -40,7 +41,8 @@ from tests import faults
 
 SECONDS, MEGABYTES = 10.0, 2048
 ATTEMPTS = 2
-"""At what takes too long: beside other programs the same work takes more of the processor's time."""
+"""At what takes too long: beside other programs the same work takes more of the processor's
+time."""
 RIGHT = ("refused", "no effect")
 EVIL_TEXT = "a\x1b[2J\u202eb\x00c"
 VALUES: tuple[Any, ...] = (
@@ -91,11 +93,22 @@ COMMANDS = {
     ),
 }  # fmt: skip
 """The commands that read the files of a kind, S being the session; # is a number."""
-SLOW = ("align", "calibrate", "check", "inspect-parts", "merge", "mesh", "preflight", "report", "validate")
-"""Commands that take seconds where the damage does not concern them: a tenth as many cases as of each other command."""
+SLOW = (
+    "align",
+    "calibrate",
+    "check",
+    "inspect-parts",
+    "merge",
+    "mesh",
+    "preflight",
+    "report",
+    "validate",
+)
+"""Commands that take seconds where the damage does not concern them: a tenth as many cases as of
+each other command."""
 DERIVED = ("poses", "evidence", "trust", "compiled", "drift_reference")
-"""Results that a command computes on its way and saves, each whole and from sound inputs: they may be new when it ends
-with a refusal. Where a calibration is rejected, the attempt's verdict too."""
+"""Results that a command computes on its way and saves, each whole and from sound inputs: they may
+be new when it ends with a refusal. Where a calibration is rejected, the attempt's verdict too."""
 REJECTED = 3
 
 
@@ -108,7 +121,8 @@ class Outcome:
 
 
 def make_seed(folder: Path) -> None:
-    """Make a small session with a result of every kind, and the files that commands read beside it."""
+    """Make a small session with a result of every kind, and the files that commands read beside
+    it."""
     faults.make_seed(folder, poses=10)
     session = folder / "S"
     with pytest.MonkeyPatch.context() as patch:
@@ -153,7 +167,9 @@ def write_frames(folder: Path) -> None:
     (folder / "frames.toml").write_text('projector = "96x64"\nphase_sign = 1\n' + "\n".join(tables))
 
 
-def _render_frames(sequence: PatternSequence, size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+def _render_frames(
+    sequence: PatternSequence, size: tuple[int, int], rng: np.random.Generator
+) -> np.ndarray:
     """Return frames (n, h, w) uint8 of a plane that shows every pattern, with noise."""
     width, height = size
     v, u = np.mgrid[:height, :width]
@@ -183,7 +199,9 @@ def damage_text(text: str, rng: random.Random) -> bytes:
         lambda: b"a" + b".a" * 100_000 + b" = 1",
         lambda: (text + "9" * 5000).encode(),
         lambda: re.sub(r"\d+", lambda m: "9" * 5000 if rng.random() < 0.2 else m[0], text).encode(),
-        lambda: re.sub(r"\d+(\.\d+)?", lambda m: rng.choice(NUMBERS) if rng.random() < 0.1 else m[0], text).encode(),
+        lambda: re.sub(
+            r"\d+(\.\d+)?", lambda m: rng.choice(NUMBERS) if rng.random() < 0.1 else m[0], text
+        ).encode(),
         lambda: text.replace('"', "", 1).encode(),
         lambda: _flip(text.encode(), rng),
         lambda: ("\ufeff" + text).encode("utf-16"),
@@ -192,7 +210,20 @@ def damage_text(text: str, rng: random.Random) -> bytes:
     return rng.choice(choices)()
 
 
-NUMBERS = ("inf", "-inf", "nan", "1e400", "1e30", "-1", "0", "1000000000", "99999999999999999999", "[]", "{}", '"x"')
+NUMBERS = (
+    "inf",
+    "-inf",
+    "nan",
+    "1e400",
+    "1e30",
+    "-1",
+    "0",
+    "1000000000",
+    "99999999999999999999",
+    "[]",
+    "{}",
+    '"x"',
+)
 
 
 def damage_tree(data: Any, rng: random.Random) -> Any:
@@ -216,7 +247,9 @@ def damage_tree(data: Any, rng: random.Random) -> Any:
 
 def _walk(data: Any) -> Iterator[tuple[Any, Any]]:
     """Yield (container, key) of every value in plain values."""
-    for key in data if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else ():
+    for key in (
+        data if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else ()
+    ):
         yield data, key
         yield from _walk(data[key])
 
@@ -229,14 +262,19 @@ def damage_array(path: Path, rng: random.Random) -> None:
         np.float64(1),
         np.array(["x", "y"]), np.full(array.shape, 1e308), np.zeros(array.shape, bool),
     )  # fmt: skip
-    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (%s,), }" % rng.choice(
-        (b"99999999999", b"-1", b"1e9", b"9" * 40)
+    header = (
+        b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (%s,), }"
+        % rng.choice((b"99999999999", b"-1", b"1e9", b"9" * 40))
     )
     path.unlink()
     if rng.random() < 0.6:
         np.save(path, rng.choice(others))
     else:
-        path.write_bytes(rng.choice((header.ljust(127) + b"\n", b"", b"PK\x03\x04" + b"0" * 99, b"\x80\x04}\x94.")))
+        path.write_bytes(
+            rng.choice(
+                (header.ljust(127) + b"\n", b"", b"PK\x03\x04" + b"0" * 99, b"\x80\x04}\x94.")
+            )
+        )
 
 
 def damage_bytes(data: bytes, rng: random.Random) -> bytes:
@@ -254,7 +292,10 @@ def damage_bytes(data: bytes, rng: random.Random) -> bytes:
 
 def damage_mesh(path: Path, rng: random.Random) -> bytes:
     """Return a nominal model that is damaged, or larger than it seems."""
-    facet = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    facet = (
+        b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1"
+        b" 0\nendloop\nendfacet\n"
+    )
     record = np.zeros(50, np.uint8).tobytes()
     one = np.array([0, 0, 1, 0, 0, 0, 9, 0, 0, 0, 9, 0], "<f4").tobytes() + b"\0\0"
     count = rng.choice((20_000, 1_000_000))
@@ -270,14 +311,23 @@ def damage_mesh(path: Path, rng: random.Random) -> bytes:
             lambda: b"solid x\nfacet normal nan nan inf\nouter loop\nvertex 1e400 0 0\n",
         ),
         ".obj": (
-            lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"".join(b"g g%d\nf 1 2 3\n" % i for i in range(100_000)),
+            lambda: (
+                b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+                + b"".join(b"g g%d\nf 1 2 3\n" % i for i in range(100_000))
+            ),
             lambda: b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999\nf -1 -2 -9\n",
             lambda: b"v 0 0 0\nf " + b"1 " * 300_000,
             lambda: b"mtllib /etc/passwd\nusemtl x\nv 1e400 nan 0\nf 1 1 1\n",
         ),
         ".ply": (
-            lambda: b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n",
-            lambda: b"ply\nformat binary_little_endian 1.0\nelement face -1\nproperty list int int v\nend_header\n",
+            lambda: (
+                b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float"
+                b" x\nend_header\n"
+            ),
+            lambda: (
+                b"ply\nformat binary_little_endian 1.0\nelement face -1\nproperty list int int"
+                b" v\nend_header\n"
+            ),
             lambda: b"ply\nelement\nproperty\nend_header\n",
         ),
     }
@@ -289,8 +339,15 @@ def damage_image(path: Path, rng: random.Random) -> bytes:
     image = cv2.imread(str(path))
     if rng.random() < 0.5:
         return damage_bytes(path.read_bytes(), rng)
-    shape, suffix = rng.choice(((20000, 20000), (1, 1), (31, 40), (1, 60_000))), rng.choice((".png", ".jpg"))
-    kinds = (np.zeros(shape, np.uint8), np.dstack([image] * 2)[..., :4], image.astype(np.uint16) * 257)
+    shape, suffix = (
+        rng.choice(((20000, 20000), (1, 1), (31, 40), (1, 60_000))),
+        rng.choice((".png", ".jpg")),
+    )
+    kinds = (
+        np.zeros(shape, np.uint8),
+        np.dstack([image] * 2)[..., :4],
+        image.astype(np.uint16) * 257,
+    )
     drawn, data = cv2.imencode(suffix, rng.choice(kinds))
     return data.tobytes() if drawn else b""
 
@@ -304,25 +361,64 @@ def _flip(data: bytes, rng: random.Random) -> bytes:
 
 
 def damage(folder: Path, rng: random.Random) -> tuple[str, str, str]:
-    """Damage one file in a copy of the seed; returns the kind of file, what was done, and the command to run."""
-    kind = rng.choice(("session",) * 6 + ("rig", "frames", "image", "opencv", "artefact", "plan", "nominal", "number"))
-    (command,) = rng.choices(COMMANDS[kind], [0.1 if c.split()[0] in SLOW else 1.0 for c in COMMANDS[kind]])
+    """Damage one file in a copy of the seed; returns the kind of file, what was done, and the
+    command to run."""
+    kind = rng.choice(
+        ("session",) * 6
+        + ("rig", "frames", "image", "opencv", "artefact", "plan", "nominal", "number")
+    )
+    (command,) = rng.choices(
+        COMMANDS[kind], [0.1 if c.split()[0] in SLOW else 1.0 for c in COMMANDS[kind]]
+    )
     if kind == "number":
-        numbers = (*NUMBERS, "-0", "1e308", "-1e308", "1e-320", "0.5", "9" * 5000, "1_0", "٣", "0x10", "")
-        return "number", "the number", " ".join(re.sub("#", lambda _: rng.choice(numbers), w) for w in command.split())
-    names = {"rig": "rig.toml", "frames": "frames.toml", "artefact": "sphere.toml", "plan": "plan.toml"}
+        numbers = (
+            *NUMBERS,
+            "-0",
+            "1e308",
+            "-1e308",
+            "1e-320",
+            "0.5",
+            "9" * 5000,
+            "1_0",
+            "٣",
+            "0x10",
+            "",
+        )
+        return (
+            "number",
+            "the number",
+            " ".join(re.sub("#", lambda _: rng.choice(numbers), w) for w in command.split()),
+        )
+    names = {
+        "rig": "rig.toml",
+        "frames": "frames.toml",
+        "artefact": "sphere.toml",
+        "plan": "plan.toml",
+    }
     if kind == "session":
-        files = [path for path in (folder / "S").rglob("*") if path.is_file() and not path.name.startswith(".lock")]
+        files = [
+            path
+            for path in (folder / "S").rglob("*")
+            if path.is_file() and not path.name.startswith(".lock")
+        ]
         texts = [path for path in files if path.suffix == ".json"]
         path = rng.choice(texts if rng.random() < 0.7 else files)
     elif kind == "image":
         path = folder / ("board.png" if command.startswith("detect") else "images/00.png")
     else:
-        path = folder / (names.get(kind) or next(w for w in command.split() if w.startswith(("part", "calibration"))))
+        path = folder / (
+            names.get(kind)
+            or next(w for w in command.split() if w.startswith(("part", "calibration")))
+        )
     how = _damage_file(path, rng)
     if kind == "session":
         parts = path.relative_to(folder / "S").parts
-        kind = "/".join([*parts[: 1 + (parts[0] == "results")], "chunk" if path.name.startswith("c.") else path.name])
+        kind = "/".join(
+            [
+                *parts[: 1 + (parts[0] == "results")],
+                "chunk" if path.name.startswith("c.") else path.name,
+            ]
+        )
     return kind, f"{path.relative_to(folder)}: {how}", command
 
 
@@ -370,7 +466,8 @@ def _replace_by_node(path: Path, rng: random.Random) -> str:
 
 
 def run_case(folder: Path, command: str, seconds: float = SECONDS) -> Outcome:
-    """Run a command in a forked child within so many seconds of the processor, and return how it ended."""
+    """Run a command in a forked child within so many seconds of the processor, and return how it
+    ended."""
     before, out = describe_tree(folder / "S"), folder / "output"
     child = os.fork()
     if not child:
@@ -429,7 +526,8 @@ def _run_child(folder: Path, command: str, out: Path, seconds: float) -> None:
 
 
 def describe_tree(folder: Path) -> dict[str, tuple[int, ...]]:
-    """Return {file: what changes when it is written} of all files in a session but those of its lock."""
+    """Return {file: what changes when it is written} of all files in a session but those of its
+    lock."""
     described = {}
     for parent, _, files in os.walk(folder):
         for name in files:
@@ -449,7 +547,12 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=float("inf"))
     parser.add_argument("--count", type=int, default=None)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cases", type=int, nargs="+", help="only these, by the numbers that an earlier run printed")
+    parser.add_argument(
+        "--cases",
+        type=int,
+        nargs="+",
+        help="only these, by the numbers that an earlier run printed",
+    )
     options = parser.parse_args()
     count = options.count or (2000 if options.minutes == float("inf") else 10**9)
     outcomes: Counter[tuple[str, str, str]] = Counter()
@@ -459,7 +562,11 @@ def main() -> int:
         faults.make_in_child(lambda: make_seed(seed))
         faults.import_modules()
         lasts = _warm_up(seed, folder)
-        print("seconds of the processor: " + ", ".join(f"{name} {s:.1f}" for name, s in lasts.items()), flush=True)
+        print(
+            "seconds of the processor: "
+            + ", ".join(f"{name} {s:.1f}" for name, s in lasts.items()),
+            flush=True,
+        )
         end = time.monotonic() + 60 * options.minutes
         for number in options.cases or range(count):
             if time.monotonic() > end:
@@ -467,28 +574,37 @@ def main() -> int:
             for _ in range(ATTEMPTS):
                 shutil.copytree(seed, folder, copy_function=os.link)
                 kind, how, command = damage(folder, random.Random(f"{options.seed}-{number}"))
-                outcome = run_case(folder, command, SECONDS + 2 * lasts.get(command.split()[0], 0.0))
+                outcome = run_case(
+                    folder, command, SECONDS + 2 * lasts.get(command.split()[0], 0.0)
+                )
                 shutil.rmtree(folder)
                 if outcome.kind != "hang":
                     break
             outcomes[kind, command.split()[0], outcome.kind] += 1
             if outcome.kind not in RIGHT:
-                print(f"{number}: {outcome.kind}: {command[:200]} ({how}): {outcome.message[:300]}", flush=True)
+                print(
+                    f"{number}: {outcome.kind}: {command[:200]} ({how}): {outcome.message[:300]}",
+                    flush=True,
+                )
     bad = sum(n for (_, _, outcome), n in outcomes.items() if outcome not in RIGHT)
     for name, column in (("file", 0), ("command", 1), ("outcome", 2)):
         print(f"\nby {name}:")
         for each in sorted({key[column] for key in outcomes}):
             of_it = [(key, n) for key, n in outcomes.items() if key[column] == each]
             wrong = sum(n for key, n in of_it if key[2] not in RIGHT)
-            print(f"  {each:<28} {sum(n for _, n in of_it):5}" + (f", {wrong} bad" if wrong else ""))
+            print(
+                f"  {each:<28} {sum(n for _, n in of_it):5}" + (f", {wrong} bad" if wrong else "")
+            )
     print(f"\n{sum(outcomes.values())} malformed inputs, {bad} bad (seed {options.seed})")
     return int(bool(bad))
 
 
 def _warm_up(seed: Path, folder: Path) -> dict[str, float]:
-    """Run every command on the sound seed, and print those that fail; returns {command: seconds of the processor}.
+    """Run every command on the sound seed, and print those that fail; returns {command: seconds of
+    the processor}.
 
-    The first time compiles kernels; a command may take twice as long where the damage does not concern it.
+    The first time compiles kernels; a command may take twice as long where the damage does not
+    concern it.
     """
     for _ in range(2):
         lasts: dict[str, float] = {}

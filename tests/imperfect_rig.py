@@ -1,7 +1,9 @@
-"""Devices that work, and lie: late light, stale, lost and repeated frames, mains light, the wrong screen.
+"""Devices that work, and lie: late light, stale, lost and repeated frames, mains light, the wrong
+screen.
 
-`imperfect(rig)` wraps any rig, and what its `Imperfections` say may change at any time; `resampled_rig` is a simulated
-rig whose display scales what it is given. With them it is proved that the preflight names what is wrong.
+`imperfect(rig)` wraps any rig, and what its `Imperfections` say may change at any time;
+`resampled_rig` is a simulated rig whose display scales what it is given. With them it is proved
+that the preflight names what is wrong.
 """
 
 from collections import deque
@@ -22,11 +24,12 @@ from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock
 class Imperfections:
     """What is wrong.
 
-    ``latency_ms`` from "shown" to light. ``frame_ms``: the camera runs by its own clock, 0: it waits for nobody.
-    ``lag``: images that the camera is behind. ``elsewhere``: the projector's picture goes to another screen.
-    ``room`` grey levels of even light in the room, of which ``mains_depth`` swings at ``mains_hz``; ``lamp_depth`` of
-    the projector's own light does. Of every sequence's frames: those in ``late`` show the pattern before, those in
-    ``repeated`` come twice as one image, ``dropped`` is lost and all that follow come too early, ``swapped`` has
+    ``latency_ms`` from "shown" to light. ``frame_ms``: the camera runs by its own clock, 0: it
+    waits for nobody. ``lag``: images that the camera is behind. ``elsewhere``: the projector's
+    picture goes to another screen. ``room`` grey levels of even light in the room, of which
+    ``mains_depth`` swings at ``mains_hz``; ``lamp_depth`` of the projector's own light does. Of
+    every sequence's frames: those in ``late`` show the pattern before, those in ``repeated`` come
+    twice as one image, ``dropped`` is lost and all that follow come too early, ``swapped`` has
     changed places with the one after it.
     """
 
@@ -45,7 +48,8 @@ class Imperfections:
 
 
 class _Between:
-    """What the projector was told and the light has not done yet, and whether the next image repeats the last."""
+    """What the projector was told and the light has not done yet, and whether the next image
+    repeats the last."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
@@ -112,7 +116,9 @@ class ImperfectCamera:
         # A swing that is seen for a whole period of it, or several, adds nothing.
         middle = 2 * np.pi * wrong.mains_hz * (begin + exposure / 2)
         swing = float(np.sinc(wrong.mains_hz * exposure) * np.cos(middle))
-        illuminated = out * (1 + wrong.lamp_depth * swing) + wrong.room * (1 + wrong.mains_depth * swing)
+        illuminated = out * (1 + wrong.lamp_depth * swing) + wrong.room * (
+            1 + wrong.mains_depth * swing
+        )
         np.copyto(out, np.clip(illuminated + 0.5, 0, np.iinfo(out.dtype).max), casting="unsafe")
 
 
@@ -164,11 +170,14 @@ class ImperfectProjector:
             self._between.act(np.inf)
             action()
         else:
-            self._between.waiting.append((self._between.clock.now() + self._wrong.latency_ms / 1000, action))
+            self._between.waiting.append(
+                (self._between.clock.now() + self._wrong.latency_ms / 1000, action)
+            )
 
 
 class _ResamplingProjector(SimulatedProjector):
-    """Shows everything `zoom` times as large, by interpolation, as a display does that is not used pixel for pixel."""
+    """Shows everything `zoom` times as large, by interpolation, as a display does that is not used
+    pixel for pixel."""
 
     def __init__(self, world: SimulatedWorld, zoom: float) -> None:
         super().__init__(world)
@@ -184,10 +193,15 @@ class _ResamplingProjector(SimulatedProjector):
         return np.rint(np.interp(u / self._zoom, u, levels)).astype(np.uint8)
 
 
-def imperfect(rig: Rig, wrong: Imperfections | None = None, clock: Clock = SYSTEM_CLOCK) -> tuple[Rig, Imperfections]:
+def imperfect(
+    rig: Rig, wrong: Imperfections | None = None, clock: Clock = SYSTEM_CLOCK
+) -> tuple[Rig, Imperfections]:
     """`rig` with devices that lie, and what they lie about."""
     wrong, between = wrong or Imperfections(), _Between(clock)
-    camera, projector = ImperfectCamera(rig.camera, wrong, between), ImperfectProjector(rig.projector, wrong, between)
+    camera, projector = (
+        ImperfectCamera(rig.camera, wrong, between),
+        ImperfectProjector(rig.projector, wrong, between),
+    )
     return Rig(rig.name, camera, projector, rig.settle_ms), wrong
 
 

@@ -7,19 +7,29 @@ from typing import Any
 from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.operation import Job
-from slviewer.pipeline.reconstruct import ReconstructedCapture, ReconstructSettings, reconstruct_capture
+from slviewer.pipeline.reconstruct import (
+    ReconstructedCapture,
+    ReconstructSettings,
+    reconstruct_capture,
+)
 from slviewer.session.store import Session
 
 Warn = Callable[[str], None]
 
 
-def reconstructed(session: Path, capture: str, warn: Warn = ignore_warnings, **settings: Any) -> ReconstructedCapture:
+def reconstructed(
+    session: Path, capture: str, warn: Warn = ignore_warnings, **settings: Any
+) -> ReconstructedCapture:
     with Session.open(session) as store:
         return reconstruct_capture(Job(store, warn=warn), ReconstructSettings(capture, **settings))
 
 
 def merged(
-    session: Path, captures: Sequence[str], reference: str, warn: Warn = ignore_warnings, **settings: Any
+    session: Path,
+    captures: Sequence[str],
+    reference: str,
+    warn: Warn = ignore_warnings,
+    **settings: Any,
 ) -> MergedScans:
     with Session.open(session) as store:
         return merge_scans(Job(store, warn=warn), MergeSettings(captures, reference, **settings))

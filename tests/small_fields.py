@@ -10,7 +10,8 @@ from slviewer.calibration.splined import fields
 
 @contextmanager
 def fit_few_cells() -> Iterator[None]:
-    """Fit displacement fields of fewer cells: a hundredth of the time to solve, and as good for the simulated rigs."""
+    """Fit displacement fields of fewer cells: a hundredth of the time to solve, and as good for the
+    simulated rigs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fields, "CELLS_ACROSS", 12)
         yield

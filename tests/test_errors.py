@@ -15,7 +15,11 @@ from slviewer.errors import DeviceError, hide_passwords
     ],
 )
 def test_passwords_in_addresses_are_hidden(address: str) -> None:
-    for text in (f"{address} does not answer", f'{{"source": "{address}"}}', f"see {address}, then"):
+    for text in (
+        f"{address} does not answer",
+        f'{{"source": "{address}"}}',
+        f"see {address}, then",
+    ):
         for hidden in (hide_passwords(text), str(DeviceError(text))):
             assert "hun" not in hidden and "ter2" not in hidden and "camera" in hidden
 

@@ -51,12 +51,23 @@ FORBIDDEN = [
     ("session", "slviewer.devices"),
 ]
 NUMERIC = PACKAGES[1 : PACKAGES.index("simulation")]
-SOURCES = sorted(set((ROOT / "slviewer").rglob("*.py")) - {ROOT / "slviewer/_version.py"})  # a build writes that
+SOURCES = sorted(
+    set((ROOT / "slviewer").rglob("*.py")) - {ROOT / "slviewer/_version.py"}
+)  # a build writes that
 MOST_LINES = 500
 MANY_BRANCHES, MANY_PARAMETERS = 15, 8
 MOST_WITH_MANY_BRANCHES, MOST_WITH_MANY_PARAMETERS = 0, 17
 """Functions that are allowed more; lower these where some are simplified."""
-DECISIONS = (ast.If, ast.For, ast.While, ast.IfExp, ast.ExceptHandler, ast.comprehension, ast.Assert, ast.match_case)
+DECISIONS = (
+    ast.If,
+    ast.For,
+    ast.While,
+    ast.IfExp,
+    ast.ExceptHandler,
+    ast.comprehension,
+    ast.Assert,
+    ast.match_case,
+)
 MOST_SHARE = 0.15
 """Of the code in one package; a larger one holds more than one idea."""
 
@@ -91,7 +102,9 @@ def test_imports_run_one_way() -> None:
         for name in imports_of(path):
             package = package_of(name)
             upwards = package is not None and PACKAGES.index(package) > PACKAGES.index(layer)
-            if upwards or any(layer == importer and name.startswith(imported) for importer, imported in FORBIDDEN):
+            if upwards or any(
+                layer == importer and name.startswith(imported) for importer, imported in FORBIDDEN
+            ):
                 against.append(f"{path.relative_to(ROOT)} imports {name}")
     assert not against
 
@@ -134,17 +147,27 @@ def test_the_architecture_page_lists_the_packages_in_their_order() -> None:
 def test_numeric_packages_know_no_device_and_no_browser() -> None:
     banned = {"viser", "zarr", "tyro", "websockets", "jinja2", "matplotlib"}
     numeric = [path for path in SOURCES if layer_of(path) in NUMERIC]
-    assert not [path for path in numeric if banned & {name.split(".")[0] for name in imports_of(path)}]
+    assert not [
+        path for path in numeric if banned & {name.split(".")[0] for name in imports_of(path)}
+    ]
 
 
 def test_files_can_be_read_in_one_sitting() -> None:
-    long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > MOST_LINES}
+    long = {
+        str(p.relative_to(ROOT)): n
+        for p in SOURCES
+        if (n := len(p.read_text().splitlines())) > MOST_LINES
+    }
     assert not long
 
 
 def count_branches(function: ast.AST) -> int:
     """Decisions in a function, without those of functions inside it."""
-    inside = [n for n in ast.walk(function) if isinstance(n, ast.FunctionDef | ast.Lambda) and n is not function]
+    inside = [
+        n
+        for n in ast.walk(function)
+        if isinstance(n, ast.FunctionDef | ast.Lambda) and n is not function
+    ]
     hidden = {id(node) for each in inside for node in ast.walk(each)}
     own = [node for node in ast.walk(function) if id(node) not in hidden]
     chained = sum(len(node.values) - 1 for node in own if isinstance(node, ast.BoolOp))
@@ -182,11 +205,17 @@ def test_test_modules_have_names_of_their_own() -> None:
 
 def test_ci_checks_style_types_and_site_and_runs_the_readmes_test_command() -> None:
     ci = (ROOT / ".ci" / "run").read_text()
-    commands = [line for line in (ROOT / "README.md").read_text().splitlines() if "pytest" in line and ".venv" in line]
+    commands = [
+        line
+        for line in (ROOT / "README.md").read_text().splitlines()
+        if "pytest" in line and ".venv" in line
+    ]
     assert commands and commands[0] in map(str.strip, ci.splitlines())
     steps = ("mypy", "mypy --platform win32", "mypy --strict", "pytest -m slow", "sphinx -W")
     assert all(f".venv/bin/python -m {step}" in ci for step in steps)
-    assert all(f".venv/bin/{step}" in ci for step in ("ruff check .", "ruff format --check .", "hadolint"))
+    assert all(
+        f".venv/bin/{step}" in ci for step in ("ruff check .", "ruff format --check .", "hadolint")
+    )
 
 
 @pytest.mark.process

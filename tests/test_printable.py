@@ -23,7 +23,14 @@ def test_what_would_drive_a_terminal_is_escaped(text: str, shown: str) -> None:
 
 
 def test_a_table_is_read_back_and_runs_nothing() -> None:
-    rows = [["name", "value"], ["=1+1", -1.5], ["@sum", "-2.5"], ['a,"b"', "1e-3"], ["x\x1b[2J", "nan"], ["-a", None]]
+    rows = [
+        ["name", "value"],
+        ["=1+1", -1.5],
+        ["@sum", "-2.5"],
+        ['a,"b"', "1e-3"],
+        ["x\x1b[2J", "nan"],
+        ["-a", None],
+    ]
     read = list(csv.reader(io.StringIO(format_csv(rows))))
     assert read == [
         ["name", "value"], ["'=1+1", "-1.5"], ["'@sum", "-2.5"], ['a,"b"', "1e-3"], ["x\\x1b[2J", "nan"], ["'-a", ""],

@@ -69,7 +69,10 @@ def test_a_session_is_made_and_measured(images: Path, tmp_path: Path, run: Run) 
 
 def test_examples_need_nothing_below_slviewer() -> None:
     files = [path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".ipynb")]
-    below = {path.name: re.findall(r"(?:from|import) (slviewer\.[\w.]+)", path.read_text()) for path in files}
+    below = {
+        path.name: re.findall(r"(?:from|import) (slviewer\.[\w.]+)", path.read_text())
+        for path in files
+    }
     assert len(files) > 8 and not [name for name, modules in below.items() if modules]
 
 
@@ -78,8 +81,12 @@ def test_a_session_has_the_operations_as_methods(recorded: Path, tmp_path: Path)
     folder = copy_session(recorded / "session", tmp_path / "session")
     with sl.Session.open(folder, write=True) as session:
         found = session.verify(["plane_03"], "plane")
-        assert found["plane_03"].best == "splined" and session.state_of("verify/plane_03") == "fresh"
-        again = sl.verify(folder.as_posix(), ["plane_03"], "plane")  # read, as the session is open for writing
+        assert (
+            found["plane_03"].best == "splined" and session.state_of("verify/plane_03") == "fresh"
+        )
+        again = sl.verify(
+            folder.as_posix(), ["plane_03"], "plane"
+        )  # read, as the session is open for writing
         assert again["plane_03"].models == found["plane_03"].models
         assert session.load_arrays("verify/plane_03")["error_splined"].shape == (300, 400)
         assert session.reconstruct("object_r1").only.points > 10_000
@@ -88,7 +95,8 @@ def test_a_session_has_the_operations_as_methods(recorded: Path, tmp_path: Path)
 @pytest.mark.process
 def test_names_are_imported_when_they_are_first_used() -> None:
     code = (
-        "import sys, slviewer as sl; assert 'numpy' not in sys.modules; sl.decode; assert 'open3d' not in sys.modules"
+        "import sys, slviewer as sl; assert 'numpy' not in sys.modules; sl.decode; assert 'open3d'"
+        " not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     assert set(sl.__all__) == set(sl._EXPORTS) <= set(dir(sl))

@@ -43,7 +43,10 @@ PLAIN = {
 
 def test_a_record_comes_back_with_its_types() -> None:
     read = from_plain(json.loads(json.dumps(PLAIN)) | {"unknown": 1}, Outer)
-    assert np.array_equal(read.points, [[1.0, np.nan]], equal_nan=True) and read.points.dtype == np.float64
+    assert (
+        np.array_equal(read.points, [[1.0, np.nan]], equal_nan=True)
+        and read.points.dtype == np.float64
+    )
     weights = read.inner[0].weights
     assert weights is not None and weights.dtype == np.float32 and read.inner[1].weights is None
     assert json.dumps(to_plain(read)) == json.dumps(PLAIN)

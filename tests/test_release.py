@@ -1,4 +1,5 @@
-"""The release: what sdist and wheel hold, and whether an installed wheel works outside of the checkout."""
+"""The release: what sdist and wheel hold, and whether an installed wheel works outside of the
+checkout."""
 
 import os
 import re
@@ -21,9 +22,16 @@ ROOT = Path(__file__).parents[1]
 
 
 def run(*command: str | Path, cwd: Path) -> str:
-    """Return the standard output of a command that must succeed; it sees no checkout and no settings of ours."""
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
-    done = subprocess.run([str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True)
+    """Return the standard output of a command that must succeed; it sees no checkout and no
+    settings of ours."""
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "PYTHONHOME")
+    }
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, f"{command}: {done.stderr[-2000:]}"
     return done.stdout
 
@@ -48,7 +56,9 @@ def built(tmp_path_factory) -> tuple[Path, Path]:
 
 
 def test_the_version_without_git_is_the_same_in_the_build_and_in_the_package() -> None:
-    fallback = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["version"]
+    fallback = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"][
+        "version"
+    ]
     source = (ROOT / "slviewer" / "__init__.py").read_text("utf-8")
     assert re.findall(r'__version__ = "(.+)"', source) == [fallback["fallback-version"]]
     assert re.fullmatch(r"\d+\.\d+\.\d+[\w.+]*", slviewer.__version__)
@@ -59,9 +69,21 @@ def test_the_version_without_git_is_the_same_in_the_build_and_in_the_package() -
 def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> None:
     with tarfile.open(built[0]) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    wanted = "README.md LICENSE SECURITY.md CHANGELOG.md CITATION.cff pyproject.toml docs/architecture.md"
-    assert {*wanted.split(), "tests/test_release.py", "assets/rigs/webcam.toml", "slviewer/py.typed"} <= names
-    assert not [name for name in names if re.search(r"__pycache__|\.venv|\.git/|\.\w+_cache/|^dist/|\.zarr", name)]
+    wanted = (
+        "README.md LICENSE SECURITY.md CHANGELOG.md CITATION.cff pyproject.toml"
+        " docs/architecture.md"
+    )
+    assert {
+        *wanted.split(),
+        "tests/test_release.py",
+        "assets/rigs/webcam.toml",
+        "slviewer/py.typed",
+    } <= names
+    assert not [
+        name
+        for name in names
+        if re.search(r"__pycache__|\.venv|\.git/|\.\w+_cache/|^dist/|\.zarr", name)
+    ]
 
 
 @pytest.mark.slow
@@ -69,23 +91,45 @@ def test_an_sdist_holds_sources_docs_tests_and_assets_and_no_caches(built) -> No
 def test_a_wheel_works_without_the_checkout(built, tmp_path) -> None:
     with zipfile.ZipFile(built[1]) as archive:
         names = set(archive.namelist())
-    pages = {f"server/{name}" for name in ("login.html", "projector.html", "camera.html", "device_page.js")}
-    data = {"report/page.html.j2", "report/page.css", "py.typed", "assets/rigs/webcam.toml", "_version.py", *pages}
+    pages = {
+        f"server/{name}"
+        for name in ("login.html", "projector.html", "camera.html", "device_page.js")
+    }
+    data = {
+        "report/page.html.j2",
+        "report/page.css",
+        "py.typed",
+        "assets/rigs/webcam.toml",
+        "_version.py",
+        *pages,
+    }
     assert {f"slviewer/{name}" for name in data} <= names
     assert not [name for name in names if not name.startswith(("slviewer/", "slviewer-"))]
 
-    # The wheel in an environment of its own; its dependencies are those of this environment, which need no network.
+    # The wheel in an environment of its own; its dependencies are those of this environment, which
+    # need no network.
     venv.create(tmp_path / "venv", with_pip=False)
-    site = run(_python(tmp_path), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=tmp_path).strip()
+    site = run(
+        _python(tmp_path),
+        "-c",
+        "import sysconfig; print(sysconfig.get_path('purelib'))",
+        cwd=tmp_path,
+    ).strip()
     with zipfile.ZipFile(built[1]) as archive:
         archive.extractall(site)
     Path(site, "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", "utf-8")
     version = built[1].name.split("-")[1]
-    show = "import slviewer as s, importlib.metadata as m; print(s.__file__, s.__version__, m.version('slviewer'))"
+    show = (
+        "import slviewer as s, importlib.metadata as m; print(s.__file__, s.__version__,"
+        " m.version('slviewer'))"
+    )
     where, *versions = run(_python(tmp_path), "-c", show, cwd=tmp_path).split()
     assert Path(where).is_relative_to(site) and versions == [version, version]
 
-    assert run(_python(tmp_path), "-m", "slviewer.cli", "--version", cwd=tmp_path).split() == ["slviewer", version]
+    assert run(_python(tmp_path), "-m", "slviewer.cli", "--version", cwd=tmp_path).split() == [
+        "slviewer",
+        version,
+    ]
     for line in _quick_start():
         run(_python(tmp_path), "-m", "slviewer.cli", *shlex.split(line)[1:], cwd=tmp_path)
     ply, mesh = tmp_path / "object.ply", trimesh.load(tmp_path / "object.stl")

@@ -11,11 +11,17 @@ import slviewer as sl
 folder, board, picture = sys.argv[1:]
 poses = sl.read_captures(f"{folder}/poses")
 frames = {pose.name: pose.frames for pose in poses}
-calibration = sl.calibrate_frames(poses[0].sequence, frames, board, models=["stereo"])  # without models: all of them
+calibration = sl.calibrate_frames(
+    poses[0].sequence, frames, board, models=["stereo"]
+)  # without models: all of them
 (scan,) = sl.read_captures(f"{folder}/scan")
 phases = {axis: sl.decode(scan.sequence, scan.frames, axis) for axis in scan.sequence.axes}
 cloud = sl.reconstruct_cloud(calibration.best, phases)
 plane = sl.evaluate_plane(cloud.points, None, cloud.sigma_z)
-drawing = sl.draw_error_maps("Plane", {cloud.model: plane.error_map}, {cloud.model: plane.rms_mm}, plane.noise_floor_mm)
+drawing = sl.draw_error_maps(
+    "Plane", {cloud.model: plane.error_map}, {cloud.model: plane.rms_mm}, plane.noise_floor_mm
+)
 Path(picture).write_bytes(drawing.png)
-print(f"RMS {plane.rms_mm:.3f} mm, noise floor {plane.noise_floor_mm:.3f} mm, {plane.points} points")
+print(
+    f"RMS {plane.rms_mm:.3f} mm, noise floor {plane.noise_floor_mm:.3f} mm, {plane.points} points"
+)

@@ -22,7 +22,10 @@ clouds = {
 planes = {}
 for name, cloud in clouds.items():
     planes[name] = sl.evaluate_plane(cloud.points, None, cloud.sigma_z)
-    print(f"{name}: RMS {planes[name].rms_mm:.3f} mm, noise floor {planes[name].noise_floor_mm:.3f} mm")
+    print(
+        f"{name}: RMS {planes[name].rms_mm:.3f} mm, noise floor"
+        f" {planes[name].noise_floor_mm:.3f} mm"
+    )
 maps = {name: plane.error_map for name, plane in planes.items()}
 rms = {name: plane.rms_mm for name, plane in planes.items()}
 drawing = sl.draw_error_maps("Plane", maps, rms, planes["stereo"].noise_floor_mm)

@@ -10,7 +10,10 @@ import slviewer as sl
 folder = sl.datasets.fetch("sample")
 (scan,) = sl.read_captures(folder / "object")
 phase = sl.decode(scan.sequence, scan.frames, "x")
-print(f"{phase.mask.mean():.0%} of the pixels decoded, at a period of {phase.period_px:g} projector columns")
+print(
+    f"{phase.mask.mean():.0%} of the pixels decoded, at a period of {phase.period_px:g} projector"
+    " columns"
+)
 print(f"noise of the phase: median {np.nanmedian(phase.sigma_px):.3f} projector columns")
 
 reasons = [int(code) for code in np.unique(phase.reason) if code]

@@ -25,5 +25,10 @@ x, y = surface.points[::2, 0], -surface.points[::2, 1]
 shade = surface.normals[::2] @ [-0.4, -0.5, -0.77]  # lit from the upper left, behind the camera
 figure, axis = plt.subplots(figsize=(5, 4.2), layout="constrained")
 axis.scatter(x, y, s=1.5, c=shade, cmap="gray", vmin=0, vmax=1)
-axis.set(xlabel="x, mm", ylabel="-y, mm", title=f"{len(surface.points)} points of {len(scans)} scans", aspect="equal")
+axis.set(
+    xlabel="x, mm",
+    ylabel="-y, mm",
+    title=f"{len(surface.points)} points of {len(scans)} scans",
+    aspect="equal",
+)
 figure.savefig(Path(sys.argv[1]), dpi=100)

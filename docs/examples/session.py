@@ -1,4 +1,5 @@
-"""Calibrate and measure in a session, which stores the captures and every result: session.py FOLDER BOARD SESSION."""
+"""Calibrate and measure in a session, which stores the captures and every result: session.py FOLDER
+BOARD SESSION."""
 
 import sys
 

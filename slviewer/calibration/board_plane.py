@@ -1,4 +1,5 @@
-"""The board plane's projector coordinates for every camera pixel; a mask of the pixels that agree with it."""
+"""The board plane's projector coordinates for every camera pixel; a mask of the pixels that agree
+with it."""
 
 from dataclasses import dataclass, replace
 
@@ -13,16 +14,17 @@ OUTLIER_SIGMAS = 6.0
 """Features with a larger residual, in robust sigma, are outliers."""
 MIN_TOLERANCE_PX = 1.0
 TOLERANCE_RATIO = 4.0
-"""Tolerance of a pixel's coordinate: 1 px plus four times the largest residual of a feature. Beyond the outermost
-features, lens distortion is several times as large as between them."""
+"""Tolerance of a pixel's coordinate: 1 px plus four times the largest residual of a feature. Beyond
+the outermost features, lens distortion is several times as large as between them."""
 
 
 @dataclass(frozen=True)
 class BoardPlane:
-    """A homography from camera to projector, with the division model x / (1 + bend r^2) of the camera's distortion.
+    """A homography from camera to projector, with the division model x / (1 + bend r^2) of the
+    camera's distortion.
 
-    ``centre`` px and ``radius`` px normalise camera pixels; ``reach`` (2,) px: tolerance of the projector's x and y
-    coordinate at a pixel of the board.
+    ``centre`` px and ``radius`` px normalise camera pixels; ``reach`` (2,) px: tolerance of the
+    projector's x and y coordinate at a pixel of the board.
     """
 
     H: np.ndarray
@@ -32,10 +34,14 @@ class BoardPlane:
     reach: np.ndarray
 
     @classmethod
-    def fit(cls, camera: np.ndarray, projector: np.ndarray, size: tuple[int, int]) -> "BoardPlane | None":
-        """Fit the plane robustly to features at ``camera`` and ``projector`` pixels (n, 2), NaN where unknown.
+    def fit(
+        cls, camera: np.ndarray, projector: np.ndarray, size: tuple[int, int]
+    ) -> "BoardPlane | None":
+        """Fit the plane robustly to features at ``camera`` and ``projector`` pixels (n, 2), NaN
+        where unknown.
 
-        ``size``: (width, height) px of the camera. None where fewer than MIN_FEATURES inliers remain.
+        ``size``: (width, height) px of the camera. None where fewer than MIN_FEATURES inliers
+        remain.
         """
         centre, radius = (np.array(size) - 1) / 2, float(np.hypot(*size)) / 2
         inlier = finite_rows(projector, camera)
@@ -48,7 +54,9 @@ class BoardPlane:
                 return None
             residual = lengths(plane.predict(camera[:, 0], camera[:, 1]) - projector)
             before = inlier
-            inlier = residual < np.maximum(OUTLIER_SIGMAS * np.median(residual[inlier]) / 1.1774, 0.5)
+            inlier = residual < np.maximum(
+                OUTLIER_SIGMAS * np.median(residual[inlier]) / 1.1774, 0.5
+            )
             if np.array_equal(inlier, before):
                 break
         return plane
@@ -57,12 +65,15 @@ class BoardPlane:
     def _fit_inliers(
         cls, camera: np.ndarray, projector: np.ndarray, centre: np.ndarray, radius: float
     ) -> "BoardPlane | None":
-        """Fit the homography for a range of distortions, refined twice, and return the plane with the smallest RMS."""
+        """Fit the homography for a range of distortions, refined twice, and return the plane with
+        the smallest RMS."""
         bends, step = np.linspace(-0.5, 0.3, 9), 0.1
         best: tuple[float, BoardPlane] | None = None
         for _ in range(3):
             for bend in bends:
-                H, _ = cv2.findHomography(_undistort_division((camera - centre) / radius, bend), projector)
+                H, _ = cv2.findHomography(
+                    _undistort_division((camera - centre) / radius, bend), projector
+                )
                 if H is None:
                     continue
                 plane = cls(H, float(bend), centre, radius, np.zeros(2))
@@ -78,7 +89,8 @@ class BoardPlane:
         return best[1] if best else None
 
     def predict(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the plane's projector coordinates (..., 2) px at camera pixels (u, v), which broadcast."""
+        """Return the plane's projector coordinates (..., 2) px at camera pixels (u, v), which
+        broadcast."""
         x, y = (u - self.centre[0]) / self.radius, (v - self.centre[1]) / self.radius
         scale = 1 + self.bend * (x * x + y * y)
         a, b, w = (h[0] * x + h[1] * y + h[2] * scale for h in self.H)
@@ -86,12 +98,16 @@ class BoardPlane:
             return np.stack([a / w, b / w], axis=-1)
 
     def contains(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> np.ndarray:
-        """(h', w') bool: projector coordinates (h', w') px within the tolerance of the plane; False for NaN.
+        """(h', w') bool: projector coordinates (h', w') px within the tolerance of the plane; False
+        for NaN.
 
-        ``along``: 0 for columns, 1 for rows; ``origin``: camera pixel (u0, v0) of the first coordinate.
+        ``along``: 0 for columns, 1 for rows; ``origin``: camera pixel (u0, v0) of the first
+        coordinate.
         """
         height, width = coordinate.shape
-        expected = self.predict(np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1])
+        expected = self.predict(
+            np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1]
+        )
         with np.errstate(invalid="ignore"):
             return np.abs(coordinate - expected[..., along]) < self.reach[along]
 

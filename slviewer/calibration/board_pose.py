@@ -14,14 +14,21 @@ CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
 
 
 def solve_pose(
-    points: np.ndarray, pixels: np.ndarray, K: np.ndarray, D: np.ndarray, flags: int = cv2.SOLVEPNP_ITERATIVE
+    points: np.ndarray,
+    pixels: np.ndarray,
+    K: np.ndarray,
+    D: np.ndarray,
+    flags: int = cv2.SOLVEPNP_ITERATIVE,
 ) -> Floats | None:
-    """Solve T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None without a finite solution.
+    """Solve T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None without a finite
+    solution.
 
     ``K`` and ``D``: of the lens, as OpenCV has them; ``flags``: OpenCV's method.
     """
     try:
-        success, rvec, tvec = cv2.solvePnP(np.asarray(points, float), np.asarray(pixels, float), K, D, flags=flags)
+        success, rvec, tvec = cv2.solvePnP(
+            np.asarray(points, float), np.asarray(pixels, float), K, D, flags=flags
+        )
     except cv2.error:
         return None
     T = transform_from_rvec(rvec, tvec) if success else np.full((4, 4), np.nan)
@@ -33,8 +40,9 @@ def solve_device(
 ) -> tuple[np.ndarray, np.ndarray, list[Floats], tuple[float, float]]:
     """Solve a pinhole and Brown lens from points (n, 3) mm and pixels (n, 2) of each pose, float32.
 
-    Returns K (3, 3), D (5,), T_device_board (4, 4) mm of each pose, and the standard deviations of fx and fy in px.
-    ``device``: for the message of CalibrationRejected, which is raised where OpenCV finds no solution.
+    Returns K (3, 3), D (5,), T_device_board (4, 4) mm of each pose, and the standard deviations of
+    fx and fy in px. ``device``: for the message of CalibrationRejected, which is raised where
+    OpenCV finds no solution.
     """
     try:
         _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(

@@ -9,7 +9,11 @@ import numpy as np
 from slviewer.calibration.board_pose import solve_device
 from slviewer.calibration.centres import centroid_shifts
 from slviewer.calibration.diagnosis.poses import FEW_POSES
-from slviewer.calibration.diagnosis.rules import HIGH_REPROJECTION_PX, MAX_FOCAL_UNCERTAINTY, MIN_TILT_DEG
+from slviewer.calibration.diagnosis.rules import (
+    HIGH_REPROJECTION_PX,
+    MAX_FOCAL_UNCERTAINTY,
+    MIN_TILT_DEG,
+)
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.soundness import check_pose_count
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
@@ -20,15 +24,17 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection
 
 MAX_ERROR_RATIO = 3.0
-"""Times the usual reprojection error, from which a picture is named: it was blurred, or its board bent or moved."""
+"""Times the usual reprojection error, from which a picture is named: it was blurred, or its board
+bent or moved."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
     """A calibrated camera, its reprojection errors, and a verdict on it.
 
-    ``rms_px``: reprojection error of all pictures together, ``picture_rms_px`` of each one (RMS length of the
-    residuals). ``focal_sigma_px``: standard deviations of fx and fy. ``excluded``: pictures not used, with the reason.
+    ``rms_px``: reprojection error of all pictures together, ``picture_rms_px`` of each one (RMS
+    length of the residuals). ``focal_sigma_px``: standard deviations of fx and fy. ``excluded``:
+    pictures not used, with the reason.
     """
 
     lens: Lens
@@ -61,8 +67,11 @@ class CameraCalibration:
                 f"pictures: {len(self.picture_rms_px)} of {total} used, {width}x{height} px",
                 *(f"  excluded: {name}: {why}" for name, why in self.excluded.items()),
                 f"camera: reprojection RMS {self.rms_px:.3f} px",
-                f"  focal length {K[0, 0]:.1f} +- {self.focal_sigma_px[0]:.1f}, {K[1, 1]:.1f} +- "
-                f"{self.focal_sigma_px[1]:.1f} px; principal point {K[0, 2]:.1f}, {K[1, 2]:.1f} px",
+                (
+                    f"  focal length {K[0, 0]:.1f} +- {self.focal_sigma_px[0]:.1f}, {K[1, 1]:.1f}"
+                    f" +- {self.focal_sigma_px[1]:.1f} px; principal point {K[0, 2]:.1f},"
+                    f" {K[1, 2]:.1f} px"
+                ),
                 "  distortion k1 k2 p1 p2 k3: " + ", ".join(f"{d:.5f}" for d in D),
                 self.verdict.text(),
             ]
@@ -77,9 +86,10 @@ def calibrate_camera(
 ) -> CameraCalibration:
     """Calibrate a pinhole camera with Brown distortion (k1 k2 p1 p2 k3) from pictures of a board.
 
-    ``detections``: the board's features by picture name; ``size``: (width, height) px of every picture. The images of
-    circles are corrected from centroid to centre by a first calibration. ``excluded``: pictures without a board, with
-    the reason. Raises CalibrationRejected for fewer than three pictures.
+    ``detections``: the board's features by picture name; ``size``: (width, height) px of every
+    picture. The images of circles are corrected from centroid to centre by a first calibration.
+    ``excluded``: pictures without a board, with the reason. Raises CalibrationRejected for fewer
+    than three pictures.
     """
     names = list(detections)
     check_pose_count(len(names), excluded or {})
@@ -94,20 +104,25 @@ def calibrate_camera(
         ]
         lens, poses, sigma = _solve_camera(points, pixels, size)
     residuals = [
-        lens.project(move_points(T, X)) - measured for X, T, measured in zip(points, poses, pixels, strict=True)
+        lens.project(move_points(T, X)) - measured
+        for X, T, measured in zip(points, poses, pixels, strict=True)
     ]
     picture_rms = {name: rms_length(r) for name, r in zip(names, residuals, strict=True)}
     total_rms = rms_length(np.concatenate(residuals))
     verdict = _judge_camera(picture_rms, total_rms, lens, poses, sigma)
-    return CameraCalibration(lens, str(board), total_rms, picture_rms, sigma, dict(excluded or {}), verdict)
+    return CameraCalibration(
+        lens, str(board), total_rms, picture_rms, sigma, dict(excluded or {}), verdict
+    )
 
 
 def _solve_camera(
     points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]
 ) -> tuple[Lens, list[np.ndarray], tuple[float, float]]:
-    """Solve the camera's lens from points (n, 3) mm and pixels (n, 2) by picture, as ``solve_device`` does.
+    """Solve the camera's lens from points (n, 3) mm and pixels (n, 2) by picture, as
+    ``solve_device`` does.
 
-    Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx and fy in px.
+    Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx
+    and fy in px.
     """
     objects, images = [p.astype(np.float32) for p in points], [p.astype(np.float32) for p in pixels]
     K, D, poses, sigma = solve_device("camera", objects, images, size)
@@ -121,7 +136,8 @@ def _judge_camera(
     poses: list[np.ndarray],
     focal_sigma: tuple[float, float],
 ) -> Verdict:
-    """Judge a camera calibration by its number of pictures, their tilts, and the reprojection errors in px."""
+    """Judge a camera calibration by its number of pictures, their tilts, and the reprojection
+    errors in px."""
     findings = []
     if len(picture_rms) < FEW_POSES:
         findings.append(
@@ -158,18 +174,21 @@ def _judge_camera(
                 "residuals",
                 "doubtful",
                 f"the reprojection error is {total_rms:.1f} px",
-                "see that the board is flat, in focus and held still, and that its notation is right",
+                "see that the board is flat, in focus and held still, and that its notation is"
+                " right",
             )
         )
     median_rms = float(np.median(list(picture_rms.values())))
-    outliers = tuple(name for name, px in picture_rms.items() if px > max(MAX_ERROR_RATIO * median_rms, 0.1))
+    outliers = tuple(
+        name for name, px in picture_rms.items() if px > max(MAX_ERROR_RATIO * median_rms, 0.1)
+    )
     if outliers:
         findings.append(
             Finding(
                 "outlier",
                 "doubtful",
-                f"in {', '.join(outliers)} the reprojection error is more than {MAX_ERROR_RATIO:g} times the usual "
-                f"{median_rms:.2f} px",
+                f"in {', '.join(outliers)} the reprojection error is more than {MAX_ERROR_RATIO:g}"
+                f" times the usual {median_rms:.2f} px",
                 "check these pictures, and calibrate again with --exclude",
                 outliers,
             )

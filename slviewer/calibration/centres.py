@@ -1,8 +1,8 @@
 """Correction of circle centroids to the images of the circles' centres.
 
-Perspective and distortion separate the two by some hundredths of a pixel on a tilted board. The shift follows from the
-lens and the board's pose; those of a first calibration from the centroids are accurate enough, as their error changes
-the correction by 1 % only.
+Perspective and distortion separate the two by some hundredths of a pixel on a tilted board. The
+shift follows from the lens and the board's pose; those of a first calibration from the centroids
+are accurate enough, as their error changes the correction by 1 % only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,10 +28,11 @@ def calibrate_centres(
     *,
     strict: bool = True,
 ) -> tuple[StereoModel, list[Observation]]:
-    """Run ``calibrate_stereo`` on the circles' centroids, correct these to centres, and run it again.
+    """Run ``calibrate_stereo`` on the circles' centroids, correct these to centres, and run it
+    again.
 
-    Parameters and errors are those of ``calibrate_stereo``. Returns the model and the corrected observations of the
-    poses that it used.
+    Parameters and errors are those of ``calibrate_stereo``. Returns the model and the corrected
+    observations of the poses that it used.
     """
     stereo = calibrate_stereo(observations, projector_size, board, excluded, strict=strict)
     used = [o for o in observations if o.name in stereo.poses]
@@ -43,15 +44,18 @@ def calibrate_centres(
 
 
 def centroid_shifts(lens: Lens, T_camera_board: Floats, points: Floats, radius_mm: float) -> Floats:
-    """Return the shift (n, 2) px from the image of each circle's centre to the area centroid of the circle's image.
+    """Return the shift (n, 2) px from the image of each circle's centre to the area centroid of the
+    circle's image.
 
-    Circles of ``radius_mm`` have their centres at ``points`` (n, 3) mm in the board's plane; ``T_camera_board`` (4, 4)
-    mm. NaN where a circle is not in the lens's field of view. Raises InputError for a negative radius.
+    Circles of ``radius_mm`` have their centres at ``points`` (n, 3) mm in the board's plane;
+    ``T_camera_board`` (4, 4) mm. NaN where a circle is not in the lens's field of view. Raises
+    InputError for a negative radius.
     """
     if not radius_mm >= 0:
         raise InputError(f"circles of radius {radius_mm:g} mm were given: the radius is 0 or more")
     angles = 2 * np.pi * np.arange(CORNERS) / CORNERS
-    # a regular polygon of a circle's area shares its second moments, which the shift comes from, to 1e-5
+    # a regular polygon of a circle's area shares its second moments, which the shift comes from, to
+    # 1e-5
     reach = radius_mm * np.sqrt(2 * np.pi / (CORNERS * np.sin(2 * np.pi / CORNERS)))
     rim = reach * np.stack([np.cos(angles), np.sin(angles), np.zeros(CORNERS)], axis=1)
     centre = lens.project(move_points(T_camera_board, points))
@@ -66,19 +70,32 @@ def centroid_shifts(lens: Lens, T_camera_board: Floats, points: Floats, radius_m
 
 
 def move_to_centres(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
-    """Return the observations with circle centroids corrected to centres, and projector coordinates moved alike.
+    """Return the observations with circle centroids corrected to centres, and projector coordinates
+    moved alike.
 
-    Poses that ``stereo`` did not use, corners, and circles that are corrected already are returned unchanged.
+    Poses that ``stereo`` did not use, corners, and circles that are corrected already are returned
+    unchanged.
     """
     radii = [o.radius_mm for o in observations if o.radius_mm]
-    radius = float(np.median(radii)) if radii else 0.0  # one board: what differs between poses is noise
-    return [_move_to_centres(o, stereo, radius) if o.radius_mm and o.name in stereo.poses else o for o in observations]
+    radius = (
+        float(np.median(radii)) if radii else 0.0
+    )  # one board: what differs between poses is noise
+    return [
+        _move_to_centres(o, stereo, radius) if o.radius_mm and o.name in stereo.poses else o
+        for o in observations
+    ]
 
 
-def _move_to_centres(observation: Observation, stereo: StereoModel, radius_mm: float) -> Observation:
+def _move_to_centres(
+    observation: Observation, stereo: StereoModel, radius_mm: float
+) -> Observation:
     """Return one observation with its circles of ``radius_mm`` at their centres."""
-    shift = centroid_shifts(stereo.rig.camera, stereo.poses[observation.name], observation.points, radius_mm)
+    shift = centroid_shifts(
+        stereo.rig.camera, stereo.poses[observation.name], observation.points, radius_mm
+    )
     projector = observation.projector
     if observation.slopes is not None:
         projector = projector - np.einsum("nij,nj->ni", observation.slopes, shift)
-    return replace(observation, camera=observation.camera - shift, projector=projector, radius_mm=0.0)
+    return replace(
+        observation, camera=observation.camera - shift, projector=projector, radius_mm=0.0
+    )

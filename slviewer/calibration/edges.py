@@ -1,10 +1,11 @@
 """Mask of a board's pixels with undisturbed phase: bright ones, clear of the contrast edges.
 
-The camera's lens and pixels mix bright and dark across an edge, and the phase of a bright pixel there is that of a
-point farther inside the bright part: by half a blur's sigma at the edge, a tenth at 1.3 sigma, a fortieth at 2 and a
-hundredth at 2.5, whatever the blur (measured on rendered boards of known truth). The errors
-of opposite sides of a circle cancel, so that the error of a feature or a smoothed surface is smallest where 2 sigma are
-excluded; with more, the loss of pixels adds more noise.
+The camera's lens and pixels mix bright and dark across an edge, and the phase of a bright pixel
+there is that of a point farther inside the bright part: by half a blur's sigma at the edge, a tenth
+at 1.3 sigma, a fortieth at 2 and a hundredth at 2.5, whatever the blur (measured on rendered boards
+of known truth). The errors of opposite sides of a circle cancel, so that the error of a feature or
+a smoothed surface is smallest where 2 sigma are excluded; with more, the loss of pixels adds more
+noise.
 """
 
 from collections.abc import Callable
@@ -15,24 +16,27 @@ import numpy as np
 from slviewer.fringe.phase import PhaseMap
 
 CLEARANCE_SIGMAS = 2.0
-"""Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is undisturbed."""
+"""Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is
+undisturbed."""
 MIN_CLEARANCE_PX = 1.0
 """Smallest clearance: the uncertainty of a mask's edge."""
 MIN_CLEAR_SHARE = 0.25
-"""Share of the bright pixels within half a pitch that must be clear of edges; otherwise the clearance is reduced."""
+"""Share of the bright pixels within half a pitch that must be clear of edges; otherwise the
+clearance is reduced."""
 SHARPEST_PX = 12**-0.5
 """Blur of an edge by the pixel area alone."""
 EDGE_BAND = 0.25
-"""Pixels whose brightness differs by this share of the contrast from dark and from bright belong to an edge; with a
-Gaussian blur they are within 0.6745 sigma of it."""
+"""Pixels whose brightness differs by this share of the contrast from dark and from bright belong to
+an edge; with a Gaussian blur they are within 0.6745 sigma of it."""
 
 
 def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarray:
-    """Select the valid pixels (h, w) bool of the board's bright parts at a distance from contrast edges.
+    """Select the valid pixels (h, w) bool of the board's bright parts at a distance from contrast
+    edges.
 
-    ``inside`` (h, w) bool: the board's pixels; ``pitch``: px. Bright pixels have more than half of the largest
-    modulation within a pitch. The distance is 2 sigma of the edges' blur, less where few pixels would remain, as
-    between the squares and markers of a ChArUco board.
+    ``inside`` (h, w) bool: the board's pixels; ``pitch``: px. Bright pixels have more than half of
+    the largest modulation within a pitch. The distance is 2 sigma of the edges' blur, less where
+    few pixels would remain, as between the squares and markers of a ChArUco board.
     """
     modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
     crest = _local_extreme(cv2.dilate, modulation, pitch)
@@ -60,7 +64,9 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     modulation = np.asarray(phase.modulation, np.float32)
     crest, trough = (_local_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
     contrast = crest - trough
-    edged = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # the board's outline is no edge
+    edged = (
+        cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    )  # the board's outline is no edge
     edged &= contrast > 0.4 * crest
     level = np.clip((modulation - trough) / np.maximum(contrast, 1e-6), 0, 1)
     area = np.count_nonzero(edged & (level > EDGE_BAND) & (level < 1 - EDGE_BAND))
@@ -70,14 +76,19 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     # an edge of length L with its normal at (n_u, n_v) crosses L n_u rows and L n_v columns
     rows = (high[:, 1:] != high[:, :-1]) & edged[:, 1:] & edged[:, :-1]
     columns = (high[1:] != high[:-1]) & edged[1:] & edged[:-1]
-    length = float((np.abs(across) / steep)[:, 1:][rows].sum() + (np.abs(down) / steep)[1:][columns].sum())
+    length = float(
+        (np.abs(across) / steep)[:, 1:][rows].sum() + (np.abs(down) / steep)[1:][columns].sum()
+    )
     if length < pitch:
         return SHARPEST_PX
     return float(np.clip(area / length / (2 * 0.6745), SHARPEST_PX, pitch / 8))
 
 
-def _local_extreme(of: Callable[..., np.ndarray], modulation: np.ndarray, pitch: float) -> np.ndarray:
-    """(h, w): the largest or smallest modulation within a pitch, by ``cv2.dilate`` or ``cv2.erode``."""
+def _local_extreme(
+    of: Callable[..., np.ndarray], modulation: np.ndarray, pitch: float
+) -> np.ndarray:
+    """(h, w): the largest or smallest modulation within a pitch, by ``cv2.dilate`` or
+    ``cv2.erode``."""
     shrink = max(1, int(pitch // 12))
     small = cv2.blur(modulation, (shrink, shrink))[::shrink, ::shrink] if shrink > 1 else modulation
     reach = 2 * int(np.ceil(0.7 * pitch / shrink)) + 1

@@ -1,4 +1,5 @@
-"""The projector coordinate at a board feature, and its slopes there, read from the phase around it."""
+"""The projector coordinate at a board feature, and its slopes there, read from the phase around
+it."""
 
 import numpy as np
 
@@ -8,16 +9,21 @@ from slviewer.geometry.rigid import Floats
 MAX_SAMPLES = 1024
 """Samples that a window may have; they are not more than 31 along either side."""
 MAX_OFF_CENTRE = 0.35
-"""Largest distance, in half widths, between the centroid of a window's samples and its centre; beyond it, the fit would
-extrapolate. At a chessboard's corner two opposite squares are bright, and their centroid is the corner."""
+"""Largest distance, in half widths, between the centroid of a window's samples and its centre;
+beyond it, the fit would extrapolate. At a chessboard's corner two opposite squares are bright, and
+their centroid is the corner."""
 
 
-def fit_local_values(field: np.ndarray, weight: np.ndarray, pixels: Floats, radius: Floats) -> tuple[Floats, Floats]:
-    """Fit value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust quadratic around each.
+def fit_local_values(
+    field: np.ndarray, weight: np.ndarray, pixels: Floats, radius: Floats
+) -> tuple[Floats, Floats]:
+    """Fit value and slopes of ``field`` (h, w) at sub-pixel ``pixels`` (n, 2), by a robust
+    quadratic around each.
 
-    ``radius`` (n,) px: half the width of each window; ``weight`` (h, w): 0 where the field is not used, so that the
-    value at a dark circle's centre comes from its bright surroundings alone. Returns values (n,) float64 and slopes
-    (n, 2) per px along u and v; NaN with fewer than 30 samples in the window, or samples on one side only.
+    ``radius`` (n,) px: half the width of each window; ``weight`` (h, w): 0 where the field is not
+    used, so that the value at a dark circle's centre comes from its bright surroundings alone.
+    Returns values (n,) float64 and slopes (n, 2) per px along u and v; NaN with fewer than 30
+    samples in the window, or samples on one side only.
     """
     out = np.full((len(pixels), 3), np.nan)
     run_rows(
@@ -62,7 +68,8 @@ def _solve_spd(A, b, x):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (n, 3) with value and slopes of a robust quadratic fit around pixels ``first`` to ``last``.
+    """Fill ``out`` (n, 3) with value and slopes of a robust quadratic fit around pixels ``first``
+    to ``last``.
 
     Where a fit is not possible, ``out`` stays as it is.
     """
@@ -81,7 +88,8 @@ def _fit_windows(first, last, field, weight, pixels, radius, out):  # type: igno
 
 @kernel()
 def _collect_samples(field, weight, cu, cv, r, basis, value, base):  # type: ignore[no-untyped-def]
-    """Fill in the quadratic's terms, the values and the weights of a window's samples around pixel (cu, cv).
+    """Fill in the quadratic's terms, the values and the weights of a window's samples around pixel
+    (cu, cv).
 
     Returns their number; 0 where they are on one side only, or the window is not in the image.
     """
@@ -98,7 +106,14 @@ def _collect_samples(field, weight, cu, cv, r, basis, value, base):  # type: ign
             if weight[v, u] > 0 and count < MAX_SAMPLES:
                 x, y = (u - cu) / r, (v - cv) / r
                 terms = basis[count]
-                terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = 1.0, x, y, x * x, x * y, y * y
+                terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = (
+                    1.0,
+                    x,
+                    y,
+                    x * x,
+                    x * y,
+                    y * y,
+                )
                 value[count], base[count] = field[v, u], weight[v, u]
                 mean_x += x
                 mean_y += y
@@ -108,10 +123,11 @@ def _collect_samples(field, weight, cu, cv, r, basis, value, base):  # type: ign
 
 @kernel()
 def _fit_quadratic(count, middle, basis, value, base, robust, solution):  # type: ignore[no-untyped-def]
-    """Fit ``solution`` (6,) to the first ``count`` values (k,) less ``middle``, with Tukey's weights.
+    """Fit ``solution`` (6,) to the first ``count`` values (k,) less ``middle``, with Tukey's
+    weights.
 
-    ``basis`` (k, 6): the terms; ``base`` (k,): the weights. Fills ``robust`` (k,) with Tukey's, and returns the number
-    of inliers.
+    ``basis`` (k, 6): the terms; ``base`` (k,): the weights. Fills ``robust`` (k,) with Tukey's, and
+    returns the number of inliers.
     """
     residual = np.empty(count)
     robust[:count] = 1.0

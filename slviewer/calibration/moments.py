@@ -1,7 +1,9 @@
-"""Fit ``z = (c0 + c1 phi)/(1 + c2 phi)`` at each pixel from moments in float64, some image rows at a time.
+"""Fit ``z = (c0 + c1 phi)/(1 + c2 phi)`` at each pixel from moments in float64, some image rows at
+a time.
 
-Depth and phase are relative to a reference point of each pixel (``zeta = z - z_ref``, ``s = phi - phi_ref``), which
-leaves the rational family as it is, ``zeta = (a0 + a1 s)/(1 + a2 s)``, and keeps the sums well conditioned.
+Depth and phase are relative to a reference point of each pixel (``zeta = z - z_ref``, ``s = phi -
+phi_ref``), which leaves the rational family as it is, ``zeta = (a0 + a1 s)/(1 + a2 s)``, and keeps
+the sums well conditioned.
 """
 
 import numba
@@ -11,13 +13,16 @@ from slviewer.geometry.jit import kernel
 
 
 @kernel(parallel=True)
-def fit_rational(phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses, phase_min, phase_max, condition):
-    """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN where invalid.
+def fit_rational(
+    phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses, phase_min, phase_max, condition
+):
+    """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN
+    where invalid.
 
-    Fills ``coefficients`` (3, h', w) a0 ... a2 and ``rms`` mm, NaN at pixels of fewer than ``min_poses`` poses;
-    ``poses``, the range of valid ``phase``, and the fit's ``condition``, (h', w) each. First the equation's own
-    residual is minimised, which is linear, ``zeta = a0 + a1 s - a2 zeta s``; then one Gauss-Newton step minimises the
-    residual in depth.
+    Fills ``coefficients`` (3, h', w) a0 ... a2 and ``rms`` mm, NaN at pixels of fewer than
+    ``min_poses`` poses; ``poses``, the range of valid ``phase``, and the fit's ``condition``, (h',
+    w) each. First the equation's own residual is minimised, which is linear, ``zeta = a0 + a1 s -
+    a2 zeta s``; then one Gauss-Newton step minimises the residual in depth.
     """
     for v in numba.prange(phase.shape[1]):
         a = np.empty(10)
@@ -39,8 +44,8 @@ def fit_rational(phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses
 
 @numba.njit
 def _sum_linear_moments(phase, z, v, u, phase_ref, z_ref, a):
-    """Fill the sums ``a``: upper triangle of the normal matrix (6) and right-hand side (3). Returns the number of valid
-    poses and the range of their phases."""
+    """Fill the sums ``a``: upper triangle of the normal matrix (6) and right-hand side (3). Returns
+    the number of valid poses and the range of their phases."""
     a[:] = 0.0
     count, low, high = 0, np.inf, -np.inf
     for i in range(phase.shape[0]):
@@ -65,10 +70,11 @@ def _sum_linear_moments(phase, z, v, u, phase_ref, z_ref, a):
 
 @numba.njit
 def _sum_gauss_newton_moments(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
-    """Fill ``a`` (10,) with one pixel's Gauss-Newton sums for z = (a0 + a1 s) / (1 + a2 s) over the poses.
+    """Fill ``a`` (10,) with one pixel's Gauss-Newton sums for z = (a0 + a1 s) / (1 + a2 s) over the
+    poses.
 
-    ``s`` is the phase less ``phase_ref``, z less ``z_ref``. a[:6]: upper triangle of the normal matrix, a[6:9]: its
-    right side, a[9]: sum of the squared residuals; poses with NaN are skipped.
+    ``s`` is the phase less ``phase_ref``, z less ``z_ref``. a[:6]: upper triangle of the normal
+    matrix, a[6:9]: its right side, a[9]: sum of the squared residuals; poses with NaN are skipped.
     """
     a[:] = 0.0
     for i in range(phase.shape[0]):
@@ -95,7 +101,8 @@ def _sum_gauss_newton_moments(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
 def _solve_moments(a):
     """Solve the normal equations ``a`` by Cholesky of the normalised matrix.
 
-    Returns the three unknowns, the sum of squares that they explain, and the condition; NaN without a solution.
+    Returns the three unknowns, the sum of squares that they explain, and the condition; NaN without
+    a solution.
     """
     none = np.nan
     if a[0] <= 0 or a[3] <= 0 or a[5] <= 0:

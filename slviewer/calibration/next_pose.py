@@ -1,7 +1,8 @@
 """Coverage of the image, depths and tilts by target poses, and the next pose that improves it most.
 
-A calibration needs the target in every part of the image, near and far, and tilted in several directions. Poses are
-T_camera_board (4, 4) mm; before a calibration they are approximate, from a nominal lens, which is good enough here.
+A calibration needs the target in every part of the image, near and far, and tilted in several
+directions. Poses are T_camera_board (4, 4) mm; before a calibration they are approximate, from a
+nominal lens, which is good enough here.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +33,8 @@ GOAL_POSES = 2
 CELL_GOAL = 4
 """Poses that each cell should have: a pixel-wise fit takes four at least."""
 NOMINAL_FOCAL = 1.5
-"""In widths of the image, where nothing is known of the lens: between a phone's and a machine lens's."""
+"""In widths of the image, where nothing is known of the lens: between a phone's and a machine
+lens's."""
 
 _NEAR_FILL, _DEPTH_RATIO = (
     0.9,
@@ -50,7 +52,8 @@ Illumination = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Number of poses that cover each cell of the image (3, 4), each third of the depths (3,), and each tilt (5,).
+    """Number of poses that cover each cell of the image (3, 4), each third of the depths (3,), and
+    each tilt (5,).
 
     ``range_mm``: nearest and farthest recommended depth.
     """
@@ -69,7 +72,8 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """A recommended pose, T_camera_board (4, 4) mm, its outline (4, 2) in camera px, and an instruction in words."""
+    """A recommended pose, T_camera_board (4, 4) mm, its outline (4, 2) in camera px, and an
+    instruction in words."""
 
     T_camera_board: np.ndarray
     outline_px: np.ndarray
@@ -83,13 +87,18 @@ def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
     return Lens.from_parameters((f, f, (width - 1) / 2, (height - 1) / 2), size)
 
 
-def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]) -> Lens:
-    """Estimate a lens of one focal length, undistorted, from points (n, 3) mm and pixels (n, 2) of several boards.
+def estimated_lens(
+    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
+) -> Lens:
+    """Estimate a lens of one focal length, undistorted, from points (n, 3) mm and pixels (n, 2) of
+    several boards.
 
     Returns the nominal lens for fewer than two boards, and where the estimate is not plausible.
     """
     if len(points) >= 2:
-        objects, images = ([np.asarray(a, np.float32) for a in arrays] for arrays in (points, pixels))
+        objects, images = (
+            [np.asarray(a, np.float32) for a in arrays] for arrays in (points, pixels)
+        )
         f = float(cv2.initCameraMatrix2D(objects, images, size, aspectRatio=1.0)[0, 0])
         if np.isfinite(f) and 0.5 < f / size[0] < 8:
             return nominal_lens(size, f)
@@ -97,7 +106,8 @@ def estimated_lens(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], s
 
 
 def approximate_pose(points: np.ndarray, pixels: np.ndarray, lens: Lens) -> np.ndarray | None:
-    """Estimate T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None where there is no solution."""
+    """Estimate T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None where there
+    is no solution."""
     if len(points) < 4:
         return None
     T = solve_pose(points, pixels, lens.K, lens.D, cv2.SOLVEPNP_IPPE)
@@ -105,7 +115,8 @@ def approximate_pose(points: np.ndarray, pixels: np.ndarray, lens: Lens) -> np.n
 
 
 def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
-    """Return the nearest and farthest recommended depth of the board in mm; at the nearest it fills the image."""
+    """Return the nearest and farthest recommended depth of the board in mm; at the nearest it fills
+    the image."""
     sides = np.ptp(board.outline()[:, :2], axis=0)
     near = float(np.max(sides * lens.K[[0, 1], [0, 1]] / (_NEAR_FILL * np.array(lens.size))))
     return near, _DEPTH_RATIO * near
@@ -120,7 +131,8 @@ def count_coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Cov
 
 
 def outline_px(board: Board, lens: Lens, T: np.ndarray) -> np.ndarray:
-    """(..., 4, 2) px: the board's outline in the image at poses T (..., 4, 4), NaN behind the camera."""
+    """(..., 4, 2) px: the board's outline in the image at poses T (..., 4, 4), NaN behind the
+    camera."""
     return lens.project(move_points(T, board.outline()))
 
 
@@ -134,24 +146,30 @@ def suggest(
 ) -> Suggestion:
     """Suggest the pose that improves the coverage by `poses` most, with the whole board in view.
 
-    `illuminated(points (n, 3) mm) -> (n,) bool`: whether the projector reaches points in the camera's frame, where that
-    is known (see `projector_reach`). `skip`: number of better suggestions to skip, which were refused before. Raises
-    InputError where no pose shows the whole board.
+    `illuminated(points (n, 3) mm) -> (n,) bool`: whether the projector reaches points in the
+    camera's frame, where that is known (see `projector_reach`). `skip`: number of better
+    suggestions to skip, which were refused before. Raises InputError where no pose shows the whole
+    board.
     """
     current = count_coverage(board, lens, poses)
     candidates = _list_candidates(board, lens, current.range_mm, len(poses), illuminated)
     if not len(candidates):
-        raise InputError(f"the board {board} cannot be held so that the camera sees all of it: take a smaller board")
+        raise InputError(
+            f"the board {board} cannot be held so that the camera sees all of it: take a smaller"
+            " board"
+        )
     covered, thirds, tilts = _classify(board, lens, candidates, current.range_mm)
     gain = (
-        (covered * np.maximum(CELL_GOAL - current.cells, 0)).sum(axis=(1, 2)) / (CELL_GOAL * current.cells.size)
+        (covered * np.maximum(CELL_GOAL - current.cells, 0)).sum(axis=(1, 2))
+        / (CELL_GOAL * current.cells.size)
         + np.maximum(GOAL_POSES - current.depths[thirds], 0) / GOAL_POSES
         + np.maximum(GOAL_POSES - current.tilts[tilts], 0) / GOAL_POSES
     )
     distance = 1.0
     if len(poses):
         new, existing = (
-            _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm) for each in (candidates, poses)
+            _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm)
+            for each in (candidates, poses)
         )
         distance = lengths(new[:, None] - existing).min(axis=1)
     order = np.argsort(-(gain + 0.2 * distance), kind="stable")
@@ -162,14 +180,19 @@ def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) ->
     """Return a suggestion for a given pose, with its outline and instruction."""
     corners = outline_px(board, lens, T_camera_board)
     _, thirds, tilts = _classify(board, lens, T_camera_board[None], depth_range(board, lens))
-    return Suggestion(T_camera_board, corners, _describe_pose(thirds[0], tilts[0], corners.mean(0), lens.size))
+    return Suggestion(
+        T_camera_board, corners, _describe_pose(thirds[0], tilts[0], corners.mean(0), lens.size)
+    )
 
 
-def projector_reach(points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]) -> Illumination | None:
-    """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and pixels (n, 2).
+def projector_reach(
+    points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]
+) -> Illumination | None:
+    """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and
+    pixels (n, 2).
 
-    Points are in the camera's frame. Returns a function points (k, 3) mm -> (k,) bool, or None where the points do not
-    determine the projection, as on a single plane.
+    Points are in the camera's frame. Returns a function points (k, 3) mm -> (k,) bool, or None
+    where the points do not determine the projection, as on a single plane.
     """
     known = finite_rows(pixels, points)
     points, pixels = points[known], pixels[known]
@@ -180,7 +203,9 @@ def projector_reach(points: np.ndarray, pixels: np.ndarray, size: tuple[int, int
     X = np.column_stack([(points - middle) / scale, np.ones(len(points))])
     u = pixels / unit - 0.5
     none = np.zeros_like(X)
-    rows = np.concatenate([np.hstack([X, none, -u[:, :1] * X]), np.hstack([none, X, -u[:, 1:] * X])])
+    rows = np.concatenate(
+        [np.hstack([X, none, -u[:, :1] * X]), np.hstack([none, X, -u[:, 1:] * X])]
+    )
     _, singular, basis = np.linalg.svd(rows, full_matrices=False)
     if singular[-2] < 1e-3 * singular[0]:  # a plane leaves several solutions
         return None
@@ -201,22 +226,30 @@ def _list_candidates(
     count: int,
     illuminated: Illumination | None,
 ) -> np.ndarray:
-    """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the whole board is visible.
+    """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the
+    whole board is visible.
 
     `span`: (near, far) mm; `count`: number of poses so far, which selects the tilt angle.
     """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
     near, far = span
     middle = box_middle(board.points)
-    # Before two poses have shown the projector's field of view, the middle of the image is most likely inside it.
+    # Before two poses have shown the projector's field of view, the middle of the image is most
+    # likely inside it.
     places = np.array(list(product((-1, 0, 1), repeat=2)) if illuminated is not None else [(0, 0)])
     shares = np.linspace(1, 0, 11)  # of the way from the image's middle to its border
-    pixels = (np.array(lens.size) - 1) / 2 + shares[:, None] * (places * np.array(lens.size) / 2)[:, None]
-    rays = np.concatenate([(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:2], 1))], axis=-1)
+    pixels = (np.array(lens.size) - 1) / 2 + shares[:, None] * (places * np.array(lens.size) / 2)[
+        :, None
+    ]
+    rays = np.concatenate(
+        [(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:2], 1))], axis=-1
+    )
     depths = near + (far - near) * (np.arange(3) + 0.5) / 3
     R = Rotation.from_rotvec([(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]).as_matrix()
     t = depths[:, None, None, None, None] * rays - (R @ middle)[:, None, None]
-    T = rigid_transform(np.broadcast_to(R[:, None, None], (*t.shape, 3)), t)  # by depth, tilt, place and share
+    T = rigid_transform(
+        np.broadcast_to(R[:, None, None], (*t.shape, 3)), t
+    )  # by depth, tilt, place and share
     visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(t.shape[:-1])
     farthest = visible.argmax(axis=-1)
     far_enough = (shares[farthest] > 0.15) | (places == 0).all(axis=1)
@@ -224,20 +257,30 @@ def _list_candidates(
     return chosen[visible.any(axis=-1) & far_enough]
 
 
-def _is_visible(board: Board, lens: Lens, T: np.ndarray, illuminated: Illumination | None) -> np.ndarray:
-    """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin, and illuminated."""
+def _is_visible(
+    board: Board, lens: Lens, T: np.ndarray, illuminated: Illumination | None
+) -> np.ndarray:
+    """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin,
+    and illuminated."""
     corners = move_points(T, board.outline())
-    inside = np.asarray(lens.contains(lens.project(corners), _FREE * lens.size[0] + 0.5).all(axis=1))
+    inside = np.asarray(
+        lens.contains(lens.project(corners), _FREE * lens.size[0] + 0.5).all(axis=1)
+    )
     if illuminated is not None:
-        inside[inside] = illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
+        inside[inside] = (
+            illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
+        )
     return inside
 
 
 def _classify(
     board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of poses (n, 4, 4)."""
-    samples = grid_points(*((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS))) * np.array(lens.size)
+    """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of
+    poses (n, 4, 4)."""
+    samples = grid_points(
+        *((np.arange(n * _FINE) + 0.5) / (n * _FINE) for n in (COLUMNS, ROWS))
+    ) * np.array(lens.size)
     corners = outline_px(board, lens, T)[:, None]
     sides = np.roll(corners, -1, -2) - corners
     away = samples[:, None] - corners
@@ -252,15 +295,19 @@ def _classify(
 def _classify_tilt(T: np.ndarray) -> np.ndarray:
     """Return the index in `TILTS` of poses (n, 4, 4)."""
     normal = T[:, :3, 2] * np.where(T[:, 2, 2] >= 0, 1, -1)[:, None]
-    # the side towards which depth grows: dz/dx = -n_x/n_z, dz/dy = -n_y/n_z, and up in the image is -y
+    # the side towards which depth grows: dz/dx = -n_x/n_z, dz/dy = -n_y/n_z, and up in the image is
+    # -y
     right, top = -normal[:, 0], normal[:, 1]
-    tilted = np.where(np.abs(top) >= np.abs(right), np.where(top > 0, 1, 3), np.where(right > 0, 2, 4))
+    tilted = np.where(
+        np.abs(top) >= np.abs(right), np.where(top > 0, 1, 3), np.where(right > 0, 2, 4)
+    )
     facing = np.degrees(np.arccos(np.clip(normal[:, 2], -1, 1))) < FACING_DEG
     return np.where(facing, 0, tilted)
 
 
 def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
-    """Return descriptors (n, 5) of poses (n, 4, 4), to compare them: position, depth and tilt in units of about 1."""
+    """Return descriptors (n, 5) of poses (n, 4, 4), to compare them: position, depth and tilt in
+    units of about 1."""
     middle = _board_middle(T, board)
     reach = np.ptp(board.points[:, 0]) / 2
     depth = (middle[:, 2:] - span[0]) / (span[1] - span[0])
@@ -268,14 +315,24 @@ def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]
 
 
 def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
-    """Return the middle (n, 3) mm of the board's features at poses (n, 4, 4), in the camera's frame."""
+    """Return the middle (n, 3) mm of the board's features at poses (n, 4, 4), in the camera's
+    frame."""
     return move_points(T, box_middle(board.points)[None])[:, 0]
 
 
 def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
     """Return the instruction for a pose: its tilt, depth and position in the image in words."""
     across, down = middle_px / np.array(size) - 0.5
-    words = {"top": down < -0.06, "bottom": down > 0.06, "left": across < -0.06, "right": across > 0.06}
+    words = {
+        "top": down < -0.06,
+        "bottom": down > 0.06,
+        "left": across < -0.06,
+        "right": across > 0.06,
+    }
     where = " ".join(word for word, here in words.items() if here)
-    attitude = "Face the camera squarely" if tilt == 0 else f"Tilt the {TILTS[tilt].removesuffix(' away')} away"
+    attitude = (
+        "Face the camera squarely"
+        if tilt == 0
+        else f"Tilt the {TILTS[tilt].removesuffix(' away')} away"
+    )
     return f"{attitude}, {THIRDS[third]}, {f'to the {where}' if where else 'in the middle'}"

@@ -1,7 +1,8 @@
-"""Observation of one board pose: features in both devices, and the smoothed phase over the board (Letter step 2).
+"""Observation of one board pose: features in both devices, and the smoothed phase over the board
+(Letter step 2).
 
-An observation is small whatever the image size, so any number of poses fits in memory; frames and phase maps are
-released.
+An observation is small whatever the image size, so any number of poses fits in memory; frames and
+phase maps are released.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,8 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
 READING_VERSION = 4
-"""Version of ``observe``; observations that a session saved with another version are computed again."""
+"""Version of ``observe``; observations that a session saved with another version are computed
+again."""
 SAMPLES = 30_000
 """Largest number of pixels in one smoothing fit; more change the result by less than the noise."""
 AXES: tuple[Axis, ...] = ("x", "y")
@@ -35,7 +37,8 @@ CELLS_PER_WIDTH = 14
 
 
 COUNT = 4000
-"""Number of blocks sampled from one pose; more resolve no finer distortion and slow the joint adjustment down."""
+"""Number of blocks sampled from one pose; more resolve no finer distortion and slow the joint
+adjustment down."""
 MAX_BLOCK_PX = 5
 """Largest side of a block; over more pixels, the phase of a tilted board is not linear."""
 MIN_FILL_SHARE = 0.5
@@ -46,8 +49,9 @@ MIN_FILL_SHARE = 0.5
 class Samples:
     """Projector coordinates averaged over blocks of camera pixels.
 
-    ``camera`` (n, 2) px: mean pixel of each block; ``projector`` (n, 2) px: mean projector coordinates; ``sigma``
-    (n, 2) px: their standard deviations predicted from the capture's noise. An axis that was not captured is NaN.
+    ``camera`` (n, 2) px: mean pixel of each block; ``projector`` (n, 2) px: mean projector
+    coordinates; ``sigma`` (n, 2) px: their standard deviations predicted from the capture's noise.
+    An axis that was not captured is NaN.
     """
 
     camera: Floats
@@ -57,13 +61,19 @@ class Samples:
     def __post_init__(self) -> None:
         shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
         if len(shapes) != 1 or self.camera.ndim != 2 or self.camera.shape[1] != 2:
-            raise InputError(f"samples of shapes {sorted(shapes)} do not match: give three arrays (n, 2)")
+            raise InputError(
+                f"samples of shapes {sorted(shapes)} do not match: give three arrays (n, 2)"
+            )
 
 
 def block_samples(
-    phases: Mapping[Axis, PhaseMap], bright: Mapping[Axis, np.ndarray], axes: Sequence[Axis], count: int = COUNT
+    phases: Mapping[Axis, PhaseMap],
+    bright: Mapping[Axis, np.ndarray],
+    axes: Sequence[Axis],
+    count: int = COUNT,
 ) -> Samples:
-    """Average the projector coordinates over at most ``count`` blocks of the pixels that are ``bright`` in every axis.
+    """Average the projector coordinates over at most ``count`` blocks of the pixels that are
+    ``bright`` in every axis.
 
     ``bright``: (h, w) bool by axis; ``axes``: the columns of the result.
     """
@@ -87,7 +97,9 @@ def block_samples(
     for axis, phase in phases.items():
         column, px = axes.index(axis), phase.period_px / (2 * np.pi)
         projector[:, column] = mean(phase.phase[v, u].astype(float) * px)
-        sigma[:, column] = np.sqrt(mean((phase.sigma_phase[v, u].astype(float) * px) ** 2) * inverse)
+        sigma[:, column] = np.sqrt(
+            mean((phase.sigma_phase[v, u].astype(float) * px) ** 2) * inverse
+        )
     return Samples(camera, projector, sigma)
 
 
@@ -95,8 +107,8 @@ def block_samples(
 class Smoothing:
     """How step 2 smooths a board's phase.
 
-    ``spline`` (default) keeps the local distortion that the model should learn; ``polynomial`` of degree 5 is
-    close to the Letter's own, and removes part of it.
+    ``spline`` (default) keeps the local distortion that the model should learn; ``polynomial`` of
+    degree 5 is close to the Letter's own, and removes part of it.
     """
 
     kind: str = "spline"
@@ -106,19 +118,23 @@ class Smoothing:
         if self.kind not in ("spline", "polynomial"):
             raise InputError(f"smoothing '{self.kind}' is unknown: use 'spline' or 'polynomial'")
         if not 1 <= self.degree <= 20:
-            raise InputError(f"a polynomial of degree {self.degree} cannot be fitted reliably: use 1 to 20")
+            raise InputError(
+                f"a polynomial of degree {self.degree} cannot be fitted reliably: use 1 to 20"
+            )
 
 
 @dataclass(frozen=True)
 class Observation:
     """Features and phase of one pose of the board.
 
-    ``camera`` and ``projector`` (n, 2) px correspond to ``points`` (n, 3) mm on the board; unknown projector
-    coordinates are NaN. ``surfaces``: the smoothed absolute phase (rad) over the board by captured axis, valid in
-    ``region``, the part of the board with measured phase close by. ``slopes`` (n, 2, 2): Jacobian of the projector
-    coordinates by camera pixels at each feature. ``radius_mm``: of circles, whose pixels are the centroids of their
-    images (see ``calibration.centres``); 0 where they are centres. ``marked``: whether the board's mark was detected,
-    so that the numbering is unambiguous. ``samples``: unsmoothed phase at bright blocks; None in older observations.
+    ``camera`` and ``projector`` (n, 2) px correspond to ``points`` (n, 3) mm on the board; unknown
+    projector coordinates are NaN. ``surfaces``: the smoothed absolute phase (rad) over the board by
+    captured axis, valid in ``region``, the part of the board with measured phase close by.
+    ``slopes`` (n, 2, 2): Jacobian of the projector coordinates by camera pixels at each feature.
+    ``radius_mm``: of circles, whose pixels are the centroids of their images (see
+    ``calibration.centres``); 0 where they are centres. ``marked``: whether the board's mark was
+    detected, so that the numbering is unambiguous. ``samples``: unsmoothed phase at bright blocks;
+    None in older observations.
     """
 
     name: str
@@ -140,12 +156,17 @@ class Observation:
         """(v1 - v0, u1 - u0) bool over ``box`` = (u0, v0, u1, v1)."""
         u0, v0, u1, v1 = self.box
         shape = (v1 - v0, u1 - u0)
-        return np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
+        return (
+            np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
+        )
 
     def smoothed_phase(self, axis: Axis) -> Floats:
-        """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the region."""
+        """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the
+        region."""
         u0, v0, u1, v1 = self.box
-        return np.where(self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan)
+        return np.where(
+            self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan
+        )
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return named arrays for saving."""
@@ -199,9 +220,11 @@ class Observation:
             arrays.get("slopes"),
             float(arrays.get("radius_mm", 0.0)),
             bool(arrays.get("marked", False)),
-            Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
-            if "samples_camera" in arrays
-            else None,
+            (
+                Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
+                if "samples_camera" in arrays
+                else None
+            ),
         )
 
 
@@ -212,7 +235,8 @@ def observe(
     phases: Mapping[Axis, PhaseMap],
     smoothing: Smoothing | None = None,
 ) -> Observation:
-    """Compute the observation of one pose from its detected board and its decoded phase maps by axis.
+    """Compute the observation of one pose from its detected board and its decoded phase maps by
+    axis.
 
     Raises DetectionError where too few pixels of the board carry a usable pattern.
     """
@@ -224,7 +248,9 @@ def observe(
     typical_pitch = float(np.median(pitch))
     box = _bounding_box(inside)
     with ThreadPoolExecutor(max(1, len(phases))) as threads:
-        each = threads.map(lambda phase: bright_pixels(phase, inside, typical_pitch), phases.values())
+        each = threads.map(
+            lambda phase: bright_pixels(phase, inside, typical_pitch), phases.values()
+        )
         bright = dict(zip(phases, each, strict=True))
     projector, _ = _projector_pixels(detection, phases, bright, pitch)
     plane = BoardPlane.fit(detection.pixels, projector, (width, height))
@@ -235,8 +261,8 @@ def observe(
             bright[axis][v0:v1, u0:u1] &= plane.contains(coordinate, AXES.index(axis), (u0, v0))
         if np.count_nonzero(bright[axis]) < 400:
             raise DetectionError(
-                f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis} pattern: "
-                "illuminate the whole board with the projector, and raise the exposure"
+                f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis}"
+                " pattern: illuminate the whole board with the projector, and raise the exposure"
             )
     projector, slopes = _projector_pixels(detection, phases, bright, pitch)
     u0, v0, u1, v1 = box
@@ -276,9 +302,13 @@ def pitch_px(board: Board, detection: Detection) -> Floats:
 
 
 def _projector_pixels(
-    detection: Detection, phases: Mapping[Axis, PhaseMap], bright: Mapping[Axis, np.ndarray], pitch: np.ndarray
+    detection: Detection,
+    phases: Mapping[Axis, PhaseMap],
+    bright: Mapping[Axis, np.ndarray],
+    pitch: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the projector coordinates (n, 2) px of the features, and their Jacobians (n, 2, 2) by camera pixels.
+    """Fit the projector coordinates (n, 2) px of the features, and their Jacobians (n, 2, 2) by
+    camera pixels.
 
     NaN where too few bright pixels surround a feature.
     """
@@ -293,7 +323,8 @@ def _projector_pixels(
 
 
 def _phase_weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
-    """Return weights (h, w): the inverse variance of the phase of bright pixels over its maximum, else 0."""
+    """Return weights (h, w): the inverse variance of the phase of bright pixels over its maximum,
+    else 0."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
     return weight / max(float(weight.max()), 1e-30)
 
@@ -305,10 +336,12 @@ def smooth_axes(
     pitch: float,
     smoothing: Smoothing,
 ) -> dict[Axis, SplineSurface | Polynomial2D]:
-    """Run ``smooth_phase`` on each axis' (phase, weight) in parallel threads; see there for the parameters."""
+    """Run ``smooth_phase`` on each axis' (phase, weight) in parallel threads; see there for the
+    parameters."""
     with ThreadPoolExecutor(max(1, len(weighted))) as threads:
         surfaces = threads.map(
-            lambda pair: smooth_phase(pair[0], pair[1], box, width, pitch, smoothing), weighted.values()
+            lambda pair: smooth_phase(pair[0], pair[1], box, width, pitch, smoothing),
+            weighted.values(),
         )
         return dict(zip(weighted, surfaces, strict=True))
 
@@ -323,8 +356,8 @@ def smooth_phase(
 ) -> SplineSurface | Polynomial2D:
     """Fit a smooth surface to a board's absolute phase (step 2).
 
-    ``phase`` (v1 - v0, u1 - u0) rad and its ``weight`` over the ``box`` (u0, v0, u1, v1); ``width`` of the image and
-    ``pitch`` of the board in px.
+    ``phase`` (v1 - v0, u1 - u0) rad and its ``weight`` over the ``box`` (u0, v0, u1, v1); ``width``
+    of the image and ``pitch`` of the board in px.
     """
     u0, v0, u1, v1 = box
     v, u = np.nonzero(weight)
@@ -345,9 +378,15 @@ def _is_near_bright(bright: np.ndarray, reach: float) -> np.ndarray:
     """(h, w) bool: pixels that have bright ones within ``reach`` px on every side of a closing."""
     step = max(1, int(reach // 8))
     height, width = bright.shape
-    small = cv2.resize(bright.astype(np.uint8), (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        bright.astype(np.uint8),
+        (-(-width // step), -(-height // step)),
+        interpolation=cv2.INTER_AREA,
+    )
     size = 2 * int(np.ceil(reach / step)) + 1
-    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    closed = cv2.morphologyEx(
+        small, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    )
     grown = cv2.dilate(closed, np.ones((3, 3), np.uint8))
     return cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 

@@ -1,4 +1,5 @@
-"""Approximation of a calibrated device by a pinhole with Brown's distortion, for export to other programs."""
+"""Approximation of a calibrated device by a pinhole with Brown's distortion, for export to other
+programs."""
 
 from dataclasses import dataclass
 
@@ -22,8 +23,8 @@ MIN_PIXELS = 50
 
 @dataclass(frozen=True, eq=False)
 class PinholeFit:
-    """The fitted ``lens``; ``rms_px`` and ``max_px`` of its residuals over the ``share`` of the image that target poses
-    support."""
+    """The fitted ``lens``; ``rms_px`` and ``max_px`` of its residuals over the ``share`` of the
+    image that target poses support."""
 
     lens: Lens
     rms_px: float
@@ -32,17 +33,22 @@ class PinholeFit:
 
 
 def fit_splined(model: SplinedModel) -> tuple[PinholeFit, PinholeFit]:
-    """Fit lenses to a splined model's camera and projector, over the cells that target poses illuminated."""
+    """Fit lenses to a splined model's camera and projector, over the cells that target poses
+    illuminated."""
     bundle = model.bundle
     camera, projector = (
         _fit_device(device, poses > 0)
-        for device, poses in ((model.rig.camera, bundle.camera_poses), (model.rig.projector, bundle.projector_poses))
+        for device, poses in (
+            (model.rig.camera, bundle.camera_poses),
+            (model.rig.projector, bundle.projector_poses),
+        )
     )
     return camera, projector
 
 
 def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
-    """Measure the residuals of a ``lens`` on the pixelwise model's rays (c3, c4) of the camera pixels."""
+    """Measure the residuals of a ``lens`` on the pixelwise model's rays (c3, c4) of the camera
+    pixels."""
     coefficients = model.fits[model.depth_axis].coefficients
     step = max(1, coefficients.shape[2] // GRID)
     pixels = grid_points(*(np.arange(0, n, step) for n in coefficients.shape[:0:-1]))
@@ -50,18 +56,24 @@ def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
 
 
 def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
-    """Fit a lens that projects undistorted normalised ``rays`` (n, 2) to ``pixels`` (n, 2) px, by least squares.
+    """Fit a lens that projects undistorted normalised ``rays`` (n, 2) to ``pixels`` (n, 2) px, by
+    least squares.
 
-    ``start``: initial lens. Rows with NaN are ignored; raises InputError where fewer than 50 remain.
+    ``start``: initial lens. Rows with NaN are ignored; raises InputError where fewer than 50
+    remain.
     """
     known = finite_rows(rays, pixels)
     if np.count_nonzero(known) < MIN_PIXELS:
-        raise InputError(f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}")
+        raise InputError(
+            f"{np.count_nonzero(known)} pixels are calibrated: a lens needs at least {MIN_PIXELS}"
+        )
     observed, directions = pixels[known], rays[known]
 
     def residuals(numbers: np.ndarray) -> np.ndarray:
         """Return the residuals (2 n,) px of a lens with these nine parameters."""
-        return np.nan_to_num(Lens.from_parameters(numbers, start.size).distort(directions) - observed, nan=1e3).ravel()
+        return np.nan_to_num(
+            Lens.from_parameters(numbers, start.size).distort(directions) - observed, nan=1e3
+        ).ravel()
 
     K = start.K
     first = start.parameters[:9]
@@ -71,7 +83,8 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
 
 
 def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
-    """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN are ignored."""
+    """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN are
+    ignored."""
     length = lengths(lens.distort(rays) - pixels)
     known = np.isfinite(length)
     if not known.any():
@@ -80,10 +93,15 @@ def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> Pinh
 
 
 def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
-    """Fit a pinhole and Brown lens to a device over the cells (rows, columns) bool that target poses illuminated."""
+    """Fit a pinhole and Brown lens to a device over the cells (rows, columns) bool that target
+    poses illuminated."""
     width, height = device.size
     across = np.linspace(0, width - 1, GRID)
     down = np.linspace(0, height - 1, max(2, round(GRID * height / width)))
     pixels = grid_points(across, down)
-    rays = np.where(in_illuminated_cells(device, pixels, illuminated)[:, None], undistort(device, pixels), np.nan)
+    rays = np.where(
+        in_illuminated_cells(device, pixels, illuminated)[:, None],
+        undistort(device, pixels),
+        np.nan,
+    )
     return fit_lens(pixels, rays, pinhole_lens(device))

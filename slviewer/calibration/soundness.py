@@ -1,4 +1,5 @@
-"""Checks of target poses before a stereo calibration; each raises CalibrationRejected with its own message."""
+"""Checks of target poses before a stereo calibration; each raises CalibrationRejected with its own
+message."""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,7 +18,8 @@ MIN_TILT_SPREAD_DEG = 4.0
 
 
 def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
-    """Raise CalibrationRejected for fewer than MIN_POSES poses; the message lists the ``excluded`` ones."""
+    """Raise CalibrationRejected for fewer than MIN_POSES poses; the message lists the ``excluded``
+    ones."""
     if count < MIN_POSES:
         why = "".join(f"; {name}: {reason}" for name, reason in excluded.items())
         raise CalibrationRejected(
@@ -40,7 +42,8 @@ def check_tilts(used: Sequence[Observation]) -> None:
 
 
 def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
-    """Estimate the largest angle in degrees between two boards with a nominal lens; 0 for fewer than two boards."""
+    """Estimate the largest angle in degrees between two boards with a nominal lens; 0 for fewer
+    than two boards."""
     normals = []
     for o in used:
         H, _ = cv2.findHomography(o.points[:, :2], o.camera)
@@ -51,15 +54,20 @@ def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
 
 
 def check_handedness(used: Sequence[Observation]) -> None:
-    """Raise CalibrationRejected where projector coordinates are a mirror image of the camera's in most poses."""
-    mirrored = sum(_handedness(o.points, o.camera) * _handedness(o.points, o.projector) < 0 for o in used)
+    """Raise CalibrationRejected where projector coordinates are a mirror image of the camera's in
+    most poses."""
+    mirrored = sum(
+        _handedness(o.points, o.camera) * _handedness(o.points, o.projector) < 0 for o in used
+    )
     if mirrored > len(used) / 2:
         raise CalibrationRejected(
-            f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of what the camera "
-            "sees: switch off the projector's rear or mirror mode, or exchange the x and y (V and H) patterns"
+            f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of"
+            " what the camera sees: switch off the projector's rear or mirror mode, or exchange"
+            " the x and y (V and H) patterns"
         )
 
 
 def _handedness(points: np.ndarray, pixels: np.ndarray) -> float:
-    """Return the determinant of the affine map from board points (n, 3) mm to pixels (n, 2): negative if mirrored."""
+    """Return the determinant of the affine map from board points (n, 3) mm to pixels (n, 2):
+    negative if mirrored."""
     return float(np.linalg.det(fit_slopes(points[:, :2], pixels)))

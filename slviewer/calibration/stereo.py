@@ -35,12 +35,13 @@ _SAVED_KEYS = {"excluded": "left_out", "features_excluded": "features_set_aside"
 class StereoModel:
     """A calibrated camera and projector with the target poses they were calibrated from.
 
-    ``poses``: T_camera_board (4, 4) mm by pose name. ``reprojection_rms_px``: RMS length of the residuals of "camera",
-    "projector" and "stereo" (both together); ``pose_rms_px``: (camera, projector) of each pose. ``excluded``: poses not
-    used, with the reason. ``depth_range_mm``: nearest and farthest feature; None for a calibration made elsewhere.
-    ``focal_sigma_px``: standard deviation of the focal length by device. ``features_excluded``: number of outliers
-    among the features. ``residuals_px`` (n, 4): camera and projector residuals of each pose's features, NaN where
-    excluded or not measured.
+    ``poses``: T_camera_board (4, 4) mm by pose name. ``reprojection_rms_px``: RMS length of the
+    residuals of "camera", "projector" and "stereo" (both together); ``pose_rms_px``: (camera,
+    projector) of each pose. ``excluded``: poses not used, with the reason. ``depth_range_mm``:
+    nearest and farthest feature; None for a calibration made elsewhere. ``focal_sigma_px``:
+    standard deviation of the focal length by device. ``features_excluded``: number of outliers
+    among the features. ``residuals_px`` (n, 4): camera and projector residuals of each pose's
+    features, NaN where excluded or not measured.
     """
 
     rig: StereoRig
@@ -71,23 +72,32 @@ class StereoModel:
     def residual_px(self) -> float:
         """Standard deviation in projector px of the features' distances from their epipolar lines.
 
-        It holds noise and the lens distortion that Brown's polynomial lacks; 0 for a calibration made elsewhere.
+        It holds noise and the lens distortion that Brown's polynomial lacks; 0 for a calibration
+        made elsewhere.
         """
         rms = self.reprojection_rms_px
         if not rms:
             return 0.0
         magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
-        return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))  # of one coordinate
+        return float(
+            np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2)
+        )  # of one coordinate
 
-    def undistort_pairs(self, camera_pixels: Floats, projector_pixels: Floats) -> tuple[Floats, Floats]:
-        """Return the undistorted normalised coordinates (n, 2) of camera pixels (n, 2) and of projector pixels (n, 2).
+    def undistort_pairs(
+        self, camera_pixels: Floats, projector_pixels: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the undistorted normalised coordinates (n, 2) of camera pixels (n, 2) and of
+        projector pixels (n, 2).
 
         NaN where the inversion of the distortion fails.
         """
-        return self.rig.camera.undistort(camera_pixels), self.rig.projector.undistort(projector_pixels)
+        return self.rig.camera.undistort(camera_pixels), self.rig.projector.undistort(
+            projector_pixels
+        )
 
     def points(self, phase: PhaseMap) -> NDArray[np.float32]:
-        """Triangulate the absolute phase of one axis (eq. 6-8, with exact inversion of the projector's distortion).
+        """Triangulate the absolute phase of one axis (eq. 6-8, with exact inversion of the
+        projector's distortion).
 
         Returns points (h, w, 3) float32 mm in the camera's frame; NaN where the phase is invalid.
         """
@@ -95,7 +105,8 @@ class StereoModel:
         return points_from_depth(self.rig.camera.rays(), z)
 
     def sigma_z(self, phase: PhaseMap, points: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Predict the standard deviation of depth (h, w) mm from the phase noise, ``|dz/dphi| sigma_phi``."""
+        """Predict the standard deviation of depth (h, w) mm from the phase noise, ``|dz/dphi|
+        sigma_phi``."""
         z = points[..., 2].astype(float)
         per_rad = depth_per_px(self.rig, phase.axis, z) * phase.period_px / (2 * np.pi)
         return (per_rad * phase.sigma_phase).astype(np.float32)
@@ -108,13 +119,15 @@ class StereoModel:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":
-        """Return the model that ``to_dict`` saved. Raises InputError that names an invalid field."""
+        """Return the model that ``to_dict`` saved. Raises InputError that names an invalid
+        field."""
         names = {key: name for name, key in _SAVED_KEYS.items()}
         return from_plain({names.get(key, key): value for key, value in data.items()}, cls)
 
     @classmethod
     def from_rig(cls, rig: StereoRig) -> "StereoModel":
-        """Return a model of a rig that was calibrated elsewhere: no poses, no residuals, no calibrated depths."""
+        """Return a model of a rig that was calibrated elsewhere: no poses, no residuals, no
+        calibrated depths."""
         return cls(rig, "", ("x", "y"), {}, {}, {}, {}, None, {})
 
 
@@ -126,13 +139,15 @@ def calibrate_stereo(
     *,
     strict: bool = True,
 ) -> StereoModel:
-    """Calibrate camera and projector, pinhole and Brown (k1 k2 p1 p2 k3) each, and their relative pose (step 1).
+    """Calibrate camera and projector, pinhole and Brown (k1 k2 p1 p2 k3) each, and their relative
+    pose (step 1).
 
-    ``board``: its notation, stored with the model. ``excluded``: poses that were excluded before, with the reason.
-    Features beyond 6 robust sigma are excluded, and so is a pose most of whose features are. Raises CalibrationRejected
-    where the poses cannot determine the devices: too few, all parallel, or features that contradict the model.
-    ``strict=False`` skips these checks and the exclusion of outliers, for diagnosis only; it raises
-    CalibrationRejected only where OpenCV finds no solution.
+    ``board``: its notation, stored with the model. ``excluded``: poses that were excluded before,
+    with the reason. Features beyond 6 robust sigma are excluded, and so is a pose most of whose
+    features are. Raises CalibrationRejected where the poses cannot determine the devices: too few,
+    all parallel, or features that contradict the model. ``strict=False`` skips these checks and the
+    exclusion of outliers, for diagnosis only; it raises CalibrationRejected only where OpenCV finds
+    no solution.
     """
     excluded = dict(excluded or {})
     inliers: dict[str, NDArray[np.bool_]] = {}
@@ -140,7 +155,9 @@ def calibrate_stereo(
         measured = finite_rows(observation.projector, observation.camera)
         if len(observation.surfaces) < 2:
             only = ", ".join(observation.surfaces)
-            excluded[observation.name] = f"holds the {only} axis alone: a calibration pose needs both x and y"
+            excluded[observation.name] = (
+                f"holds the {only} axis alone: a calibration pose needs both x and y"
+            )
         elif measured.sum() < MIN_FEATURES:
             excluded[observation.name] = (
                 f"{measured.sum()} of {len(measured)} features carry both projector coordinates: "
@@ -163,8 +180,8 @@ def calibrate_stereo(
             inliers[name] = inliers[name] & ~is_outlier
             if inliers[name].sum() < max(MIN_FEATURES, 0.5 * len(is_outlier)):
                 excluded[name] = (
-                    f"{is_outlier.sum()} of {len(is_outlier)} features disagree with the other poses: "
-                    "was the board moved during the capture, or its grid shifted?"
+                    f"{is_outlier.sum()} of {len(is_outlier)} features disagree with the other"
+                    " poses: was the board moved during the capture, or its grid shifted?"
                 )
                 used = [o for o in used if o.name != name]
         check_pose_count(len(used), excluded)
@@ -178,7 +195,8 @@ def calibrate_stereo(
 
 @dataclass(frozen=True)
 class _Solution:
-    """Result of ``cv2.stereoCalibrate``: the rig, T_camera_board (4, 4) mm of each pose, focal sigmas by device."""
+    """Result of ``cv2.stereoCalibrate``: the rig, T_camera_board (4, 4) mm of each pose, focal
+    sigmas by device."""
 
     rig: StereoRig
     poses: dict[str, Floats]
@@ -192,10 +210,11 @@ class _Solution:
         projector_size: tuple[int, int],
         strict: bool,
     ) -> "_Solution":
-        """Solve each device by itself, then both together with their relative pose, from the inlier features.
+        """Solve each device by itself, then both together with their relative pose, from the inlier
+        features.
 
-        Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive, and if ``strict``
-        where one is too uncertain.
+        Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive,
+        and if ``strict`` where one is too uncertain.
         """
         objects, cameras, projectors = (
             [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
@@ -203,14 +222,18 @@ class _Solution:
         )
         sigma: dict[str, float] = {}
         intrinsics = []
-        for device, images, size in (("camera", cameras, used[0].size), ("projector", projectors, projector_size)):
+        for device, images, size in (
+            ("camera", cameras, used[0].size),
+            ("projector", projectors, projector_size),
+        ):
             K, D, _, sigmas = solve_device(device, objects, images, size)
             sigma[device] = max(sigmas)
             relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
             if strict and not relative < MAX_FOCAL_SIGMA:
                 raise CalibrationRejected(
-                    f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f} %: "
-                    "tilt the board by 15 to 30 degrees in different directions, and vary its distance"
+                    f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f}"
+                    " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
+                    " distance"
                 )
             intrinsics.append((K, D))
         (K_c, D_c), (K_p, D_p) = intrinsics
@@ -231,13 +254,15 @@ class _Solution:
         for device, K in (("camera", K_c), ("projector", K_p)):
             if not min(K[0, 0], K[1, 1]) > 0:
                 raise CalibrationRejected(
-                    f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px, as no lens has: "
-                    "check the target's notation, the projector's size, the fringe period, and that x and y are not "
-                    "exchanged"
+                    f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px,"
+                    " as no lens has: check the target's notation, the projector's size, the"
+                    " fringe period, and that x and y are not exchanged"
                 )
         camera = Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size)
         projector = Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size)
-        poses = {o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)}
+        poses = {
+            o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)
+        }
         return cls(StereoRig(camera, projector, np.array(R), np.array(T)), poses, sigma)
 
     def residuals(self, observation: Observation) -> Floats:
@@ -254,10 +279,15 @@ class _Solution:
         excluded: Mapping[str, str],
     ) -> StereoModel:
         """Return the calibrated model with the reprojection errors of the inlier features."""
-        residuals = {o.name: np.where(inliers[o.name][:, None], self.residuals(o), np.nan) for o in used}
+        residuals = {
+            o.name: np.where(inliers[o.name][:, None], self.residuals(o), np.nan) for o in used
+        }
         z = np.concatenate([move_points(self.poses[o.name], o.points)[:, 2] for o in used])
         all_residuals = np.concatenate(list(residuals.values()))
-        rms = {"camera": rms_length(all_residuals[:, :2]), "projector": rms_length(all_residuals[:, 2:])}
+        rms = {
+            "camera": rms_length(all_residuals[:, :2]),
+            "projector": rms_length(all_residuals[:, 2:]),
+        }
         rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
         return StereoModel(
             rig=self.rig,
@@ -265,7 +295,9 @@ class _Solution:
             axes=("x", "y"),
             reprojection_rms_px=rms,
             poses=self.poses,
-            pose_rms_px={name: (rms_length(r[:, :2]), rms_length(r[:, 2:])) for name, r in residuals.items()},
+            pose_rms_px={
+                name: (rms_length(r[:, :2]), rms_length(r[:, 2:])) for name, r in residuals.items()
+            },
             excluded=excluded,
             depth_range_mm=(float(z.min()), float(z.max())),
             focal_sigma_px=self.focal_sigma_px,
@@ -275,16 +307,20 @@ class _Solution:
 
 
 def _check_agreement(model: StereoModel) -> None:
-    """Raise CalibrationRejected where the reprojection error is too large or a board is behind the camera."""
+    """Raise CalibrationRejected where the reprojection error is too large or a board is behind the
+    camera."""
     rms = model.reprojection_rms_px
     if rms["stereo"] > MAX_REPROJECTION_PX:
         raise CalibrationRejected(
-            f"the reprojection error is {rms['stereo']:.1f} px (camera {rms['camera']:.1f}, projector "
-            f"{rms['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the target's notation, the projector's "
-            "size, the fringe period, and that x and y are not exchanged"
+            f"the reprojection error is {rms['stereo']:.1f} px (camera {rms['camera']:.1f},"
+            f" projector {rms['projector']:.1f}), above {MAX_REPROJECTION_PX:g}: check the target's"
+            " notation, the projector's size, the fringe period, and that x and y are not"
+            " exchanged"
         )
     if model.depth_range_mm is not None and model.depth_range_mm[0] <= 0:
-        raise CalibrationRejected("the solution puts the board behind the camera: check the target's notation")
+        raise CalibrationRejected(
+            "the solution puts the board behind the camera: check the target's notation"
+        )
 
 
 def _detect_outliers(
@@ -292,10 +328,15 @@ def _detect_outliers(
 ) -> dict[str, NDArray[np.bool_]]:
     """Return the outliers (n,) bool among the inliers so far, of each pose that has some.
 
-    An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either device.
+    An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either
+    device.
     """
-    errors = {o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used}  # in the camera and projector
-    sigma = np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774  # Rayleigh
+    errors = {
+        o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used
+    }  # in the camera and projector
+    sigma = (
+        np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774
+    )  # Rayleigh
     limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
     outliers = {o.name: inliers[o.name] & (errors[o.name] > limit).any(1) for o in used}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}

@@ -13,22 +13,30 @@ CALIBRATED = (
         "validate",
         bool,
         False,
-        "Also compare the models on poses that they were not made from, as `slviewer validate` does.",
+        "Also compare the models on poses that they were not made from, as `slviewer validate`"
+        " does.",
     ),
     Option(
         "camera_only",
         bool,
         False,
-        "Calibrate the camera's lens alone, from pictures of the board; the session stays as it is.",
+        "Calibrate the camera's lens alone, from pictures of the board; the session stays as"
+        " it is.",
     ),
-    Option("out", Path | None, None, "With --camera-only: write the lens to this .yml, .xml or .json, for OpenCV."),
+    Option(
+        "out",
+        Path | None,
+        None,
+        "With --camera-only: write the lens to this .yml, .xml or .json, for OpenCV.",
+    ),
     *JSON,
 )
 """What `calibrate` takes beside the parameters of the pipeline's `calibrate`."""
 
 
 def run_calibrate(calibrate: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Calibrate the rig, or the camera alone with --camera-only; compare the models with --validate."""
+    """Calibrate the rig, or the camera alone with --camera-only; compare the models with
+    --validate."""
     validated, camera_only, out, json_file = (arguments.pop(option.name) for option in CALIBRATED)
     if camera_only:
         from slviewer.pipeline.calibrate_camera import calibrate_camera_alone
@@ -36,7 +44,10 @@ def run_calibrate(calibrate: Callable[..., Any], arguments: dict[str, Any]) -> N
         chosen = {name: arguments[name] for name in ("target", "poses", "exclude")}
         result = call(calibrate_camera_alone, source=arguments["session"], out=out, **chosen)
     elif out is not None:
-        raise UsageError("--out belongs to --camera-only: `slviewer export calibration` writes the rig's calibration")
+        raise UsageError(
+            "--out belongs to --camera-only: `slviewer export calibration` writes the rig's"
+            " calibration"
+        )
     else:
         result = call(calibrate, **arguments)
     data = result.to_json()

@@ -1,8 +1,9 @@
-"""Makes a command of the terminal from the signature and the docstring of a function of the program.
+"""Makes a command of the terminal from the signature and the docstring of a function of the
+program.
 
-Both are read from the function's source, so that arguments are parsed and `--help` is shown before anything heavy, such
-as NumPy, is imported. The parameters that `Args:` of the docstring describes are the command's arguments; the others,
-and the text behind `Args:`, are for Python alone.
+Both are read from the function's source, so that arguments are parsed and `--help` is shown before
+anything heavy, such as NumPy, is imported. The parameters that `Args:` of the docstring describes
+are the command's arguments; the others, and the text behind `Args:`, are for Python alone.
 """
 
 import ast
@@ -29,7 +30,8 @@ ModelName = Literal["stereo", "pixelwise", "splined"]
 
 @runtime_checkable
 class Operational(Protocol):
-    """An operation of `slviewer.pipeline.operation`, which is not imported here: it brings NumPy."""
+    """An operation of `slviewer.pipeline.operation`, which is not imported here: it brings
+    NumPy."""
 
     settings: Callable[..., Any]
 
@@ -39,7 +41,8 @@ class Operational(Protocol):
 
 Run = Callable[[Callable[..., Any], dict[str, Any]], None]
 TYPES: dict[str, Any] = {"SessionLike": Path, "ModelName": ModelName, "Size": str}
-"""What the terminal takes for types that are wider in Python; all others are looked up in the function's module."""
+"""What the terminal takes for types that are wider in Python; all others are looked up in the
+function's module."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +86,15 @@ def read_command(
     description: str = "",
     run: Run | None = None,
 ) -> Callable[..., Callable[[], None]]:
-    """Return the command of the function ``module:function`` of slviewer, or of a module in use, for tyro.
+    """Return the command of the function ``module:function`` of slviewer, or of a module in use,
+    for tyro.
 
     The command's value is the work to do once all arguments are parsed.
 
-    ``positional``: the parameters that are given without a name, ``options``: arguments that the function does not
-    have, ``names``: {parameter: option} where these differ, ``defaults`` and ``description``: in place of the
-    function's own, ``run``: what to do with the function and its arguments, by default `show_result`.
+    ``positional``: the parameters that are given without a name, ``options``: arguments that the
+    function does not have, ``names``: {parameter: option} where these differ, ``defaults`` and
+    ``description``: in place of the function's own, ``run``: what to do with the function and its
+    arguments, by default `show_result`.
     """
     module, _, name = source.partition(":")
     module = module if module in sys.modules else f"slviewer.{module}"
@@ -119,11 +124,14 @@ def read_command(
         parameters.append(_make_parameter(each.name, kind, each.default))
 
     def parse(**arguments: Any) -> Callable[[], None]:
-        """Return the work to do: the function, imported only when it is called, with the parsed arguments."""
+        """Return the work to do: the function, imported only when it is called, with the parsed
+        arguments."""
 
         def work() -> None:
             """Check the numbers among the arguments, and run the function."""
-            _check_numbers({names.get(option, option): value for option, value in arguments.items()})
+            _check_numbers(
+                {names.get(option, option): value for option, value in arguments.items()}
+            )
             (run or show_result)(getattr(import_module(module), name), arguments)
 
         return work
@@ -135,17 +143,20 @@ def read_command(
 
 
 def join_lines(doc: str) -> str:
-    """Return a docstring with each argument on one line: tyro would break the help where the source is broken."""
+    """Return a docstring with each argument on one line: tyro would break the help where the source
+    is broken."""
     return re.sub(r"\n {8,}(?=\S)", " ", doc)
 
 
 def show_result(
-    function: Callable[..., Any], arguments: dict[str, Any], describe: Callable[..., str] | None = None
+    function: Callable[..., Any],
+    arguments: dict[str, Any],
+    describe: Callable[..., str] | None = None,
 ) -> None:
     """Call the function, write what it returns as JSON where that is requested, and print it.
 
-    ``describe``: the text to print, from the result and the arguments; by default the result's own ``text()``. Raises
-    SlviewerError with the result's ``failure``, where it has one.
+    ``describe``: the text to print, from the result and the arguments; by default the result's own
+    ``text()``. Raises SlviewerError with the result's ``failure``, where it has one.
     """
     json_file = arguments.pop("json", None)
     result = call(function, **arguments)
@@ -163,14 +174,21 @@ def call(function: Callable[..., Any], **arguments: Any) -> Any:
     """Call the function and return its result; its progress and warnings go to standard error."""
     if isinstance(function, Operational):
         session = arguments.pop("session")
-        return function.run(session, function.settings(**arguments), terminal.progress, terminal.warn)
+        return function.run(
+            session, function.settings(**arguments), terminal.progress, terminal.warn
+        )
     callbacks = {"progress": terminal.progress, "warn": terminal.warn}
-    heard = {name: callbacks[name] for name in callbacks if name in inspect.signature(function).parameters}
+    heard = {
+        name: callbacks[name]
+        for name in callbacks
+        if name in inspect.signature(function).parameters
+    }
     return function(**arguments, **heard)
 
 
 def write_json(path: Path | None, result: object) -> None:
-    """Write a result, plain values or dataclasses, to the file of ``--json``; nothing without one."""
+    """Write a result, plain values or dataclasses, to the file of ``--json``; nothing without
+    one."""
     if path is not None:
         from slviewer.records.plain import to_plain  # lazily: it brings NumPy
 
@@ -180,18 +198,25 @@ def write_json(path: Path | None, result: object) -> None:
 
 def union(commands: Mapping[str, Callable[..., Any]]) -> Any:
     """Return the type whose value is one of the commands, for tyro."""
-    choices = [Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)] for name, f in commands.items()]
+    choices = [
+        Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)]
+        for name, f in commands.items()
+    ]
     return Union[tuple(choices)]  # noqa: UP007 (built at run time)
 
 
 def _check_numbers(arguments: Mapping[str, Any]) -> None:
-    """Raise UsageError for numbers outside of their range in `RANGES`, and for any that is infinite or not a number."""
+    """Raise UsageError for numbers outside of their range in `RANGES`, and for any that is infinite
+    or not a number."""
     for name, value in arguments.items():
         low, high = RANGES.get(name, (-LARGEST, LARGEST))
         for number in value if isinstance(value, tuple | list) else (value,):
             if isinstance(number, float | int) and not low <= number <= high:
                 stated = f"{number:g}" if abs(number) < LARGEST else str(number)[:20]
-                raise UsageError(f"--{name.replace('_', '-')} is {stated}: give a number from {low:g} to {high:g}")
+                raise UsageError(
+                    f"--{name.replace('_', '-')} is {stated}: give a number from {low:g} to"
+                    f" {high:g}"
+                )
 
 
 def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
@@ -199,8 +224,11 @@ def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
 
 
-def _read_arguments(definition: ast.FunctionDef, module: str) -> tuple[str, list[tuple[ast.arg, ast.expr | None]]]:
-    """Return the docstring of a function and its parameters; of an operation both are those of its settings."""
+def _read_arguments(
+    definition: ast.FunctionDef, module: str
+) -> tuple[str, list[tuple[ast.arg, ast.expr | None]]]:
+    """Return the docstring of a function and its parameters; of an operation both are those of its
+    settings."""
     doc, settings = ast.get_docstring(definition) or "", _find_settings(definition, module)
     if settings is None:
         return doc, _list_arguments(definition)
@@ -210,7 +238,8 @@ def _read_arguments(definition: ast.FunctionDef, module: str) -> tuple[str, list
 
 
 def _find_settings(definition: ast.FunctionDef, module: str) -> ast.ClassDef | None:
-    """Return the class of the settings of an operation, as its decorator names it; None for other functions."""
+    """Return the class of the settings of an operation, as its decorator names it; None for other
+    functions."""
     for decorator in definition.decorator_list:
         if (
             isinstance(decorator, ast.Call)
@@ -227,7 +256,11 @@ def _find_settings(definition: ast.FunctionDef, module: str) -> ast.ClassDef | N
 
 def _list_fields(settings: ast.ClassDef) -> list[tuple[ast.arg, ast.expr | None]]:
     """List the fields of a dataclass with their defaults, None where they have none."""
-    fields = [node for node in settings.body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)]
+    fields = [
+        node
+        for node in settings.body
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    ]
     return [(ast.arg(node.target.id, node.annotation), node.value) for node in fields]  # type: ignore[union-attr]
 
 
@@ -241,7 +274,8 @@ def _list_arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr
 
 @cache
 def _read_definitions(module: str) -> dict[str, ast.stmt]:
-    """Return {name: node that defines or imports it} of a module's functions, types, constants and imports."""
+    """Return {name: node that defines or imports it} of a module's functions, types, constants and
+    imports."""
     spec = find_spec(module)
     assert spec is not None and spec.origin is not None
     definitions: dict[str, ast.stmt] = {}
@@ -258,7 +292,8 @@ def _read_definitions(module: str) -> dict[str, ast.stmt]:
 
 
 class _Names(dict[str, Any]):
-    """Mapping of a module's names to their types and constants; those of slviewer are read from their source."""
+    """Mapping of a module's names to their types and constants; those of slviewer are read from
+    their source."""
 
     def __init__(self, module: str) -> None:
         super().__init__(TYPES)
@@ -271,7 +306,9 @@ class _Names(dict[str, Any]):
             return _evaluate(node.value, self._module)
         if isinstance(node, ast.ImportFrom) and node.module is not None:
             inside = node.module.startswith("slviewer.")
-            return _Names(node.module)[name] if inside else getattr(import_module(node.module), name)
+            return (
+                _Names(node.module)[name] if inside else getattr(import_module(node.module), name)
+            )
         raise KeyError(name)
 
 
@@ -281,7 +318,8 @@ def _evaluate(expression: ast.expr, module: str) -> Any:
 
 
 def _terminal_type(kind: Any) -> Any:
-    """Return the type for the terminal: `str | Path` becomes the first of both, sequences become tuples."""
+    """Return the type for the terminal: `str | Path` becomes the first of both, sequences become
+    tuples."""
     choices = get_args(kind)
     if Path in choices and str in choices:
         first = next(choice for choice in choices if choice in (Path, str))

@@ -18,15 +18,38 @@ if TYPE_CHECKING:
 PAGE_PATIENCE_S = 600.0
 """How long somebody may take to walk to the projector and open its page."""
 PAGES = (
-    Option("port", int, 8080, "Port of the pages, where projector or camera is one; 0 takes any free one."),
-    Option("host", str, "127.0.0.1", "Address to serve the pages at: 0.0.0.0 for other computers and phones."),
-    Option("tls", bool, False, "Encrypt the pages, as the browser of another device demands for its camera."),
-    Option("wait_s", float, PAGE_PATIENCE_S, "How long to wait until each page is opened and ready, in s."),
+    Option(
+        "port",
+        int,
+        8080,
+        "Port of the pages, where projector or camera is one; 0 takes any free one.",
+    ),
+    Option(
+        "host",
+        str,
+        "127.0.0.1",
+        "Address to serve the pages at: 0.0.0.0 for other computers and phones.",
+    ),
+    Option(
+        "tls",
+        bool,
+        False,
+        "Encrypt the pages, as the browser of another device demands for its camera.",
+    ),
+    Option(
+        "wait_s",
+        float,
+        PAGE_PATIENCE_S,
+        "How long to wait until each page is opened and ready, in s.",
+    ),
 )
 """How the pages of a rig's devices are served."""
 CHECKED = (
     Option(
-        "rig", str | None, None, "A TOML file that describes the rig, or the name of one that `slviewer devices` lists."
+        "rig",
+        str | None,
+        None,
+        "A TOML file that describes the rig, or the name of one that `slviewer devices` lists.",
     ),
     Option(
         "capture",
@@ -56,12 +79,15 @@ def run_turn(turn: Callable[..., Any], arguments: dict[str, Any]) -> None:
 
 
 def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Check a rig, or a recorded capture where --capture names one, and raise an error where something is bad."""
+    """Check a rig, or a recorded capture where --capture names one, and raise an error where
+    something is bad."""
     from slviewer.preflight.check_rig import check_recorded_rig
 
     recorded, json_file = arguments.pop("capture"), arguments.pop("json")
     if (arguments["rig"] is None) == (recorded is None):
-        raise UsageError("give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture")
+        raise UsageError(
+            "give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture"
+        )
     if recorded is not None:
         checked = call(check_recorded_rig, session=recorded[0], capture=recorded[1])
     else:
@@ -71,20 +97,27 @@ def run_preflight(check_rig: Callable[..., Any], arguments: dict[str, Any]) -> N
     terminal.print_result(checked.text())
     if checked.verdict == "bad":
         if recorded is not None:
-            raise InputError("the capture is not fit to measure with: correct what is marked bad, then capture again")
-        raise DeviceError("the rig is not fit to capture with: correct what is marked bad, then check it again")
+            raise InputError(
+                "the capture is not fit to measure with: correct what is marked bad, then capture"
+                " again"
+            )
+        raise DeviceError(
+            "the rig is not fit to capture with: correct what is marked bad, then check it again"
+        )
 
 
 @contextmanager
 def _serve_pages(arguments: dict[str, Any]) -> Iterator["SetUp"]:
-    """Take `PAGES` out of the arguments; yield the function that sets up rigs, which serves the pages that a rig needs
-    until the block ends."""
+    """Take `PAGES` out of the arguments; yield the function that sets up rigs, which serves the
+    pages that a rig needs until the block ends."""
     from slviewer.devices.browser import PageChannels
     from slviewer.pipeline.rig_choice import Board, Choice, RigSetup, list_needed_pages, set_up
     from slviewer.server.secure import Serving
 
     wait_s = arguments.pop("wait_s")
-    serving = Serving(**{option.name: arguments.pop(option.name) for option in PAGES if option.name in arguments})
+    serving = Serving(
+        **{option.name: arguments.pop(option.name) for option in PAGES if option.name in arguments}
+    )
     with ExitStack() as ended:
 
         def make(choice: Choice, board: Board | None) -> RigSetup:
@@ -92,8 +125,11 @@ def _serve_pages(arguments: dict[str, Any]) -> Iterator["SetUp"]:
             needed = list_needed_pages(choice)
             if not needed:
                 return set_up(choice, board)
-            # with assumed sizes and without pages, so that what is impossible is refused before somebody walks there
-            devices: dict[str, Any] = {role: {"size": [912, 1140], **choice[role]} for role in needed}
+            # with assumed sizes and without pages, so that what is impossible is refused before
+            # somebody walks there
+            devices: dict[str, Any] = {
+                role: {"size": [912, 1140], **choice[role]} for role in needed
+            }
             set_up({**choice, **devices}, board, pages=PageChannels())
             return set_up(choice, board, pages=_connect_pages(serving, needed, ended, wait_s))
 
@@ -103,7 +139,8 @@ def _serve_pages(arguments: dict[str, Any]) -> Iterator["SetUp"]:
 def _connect_pages(
     serving: "Serving", needed: tuple["PageRole", ...], ended: ExitStack, wait_s: float
 ) -> "PageChannels":
-    """Serve the pages and return the channels to them, once those needed are ready. Raises DeviceError on timeout."""
+    """Serve the pages and return the channels to them, once those needed are ready. Raises
+    DeviceError on timeout."""
     from slviewer.devices.browser import PageChannels
     from slviewer.server.device_pages import serve_device_pages
     from slviewer.server.secure import serve
@@ -112,11 +149,17 @@ def _connect_pages(
     ended.callback(server.stop)
     serve_device_pages(server, pages)
     if server.certificate is not None and server.certificate.self_made:
-        terminal.print_message(f"Fingerprint of the pages' certificate (SHA-256): {server.certificate.fingerprint}")
+        terminal.print_message(
+            f"Fingerprint of the pages' certificate (SHA-256): {server.certificate.fingerprint}"
+        )
     if "projector" in needed:
-        terminal.print_message(f"Open this on the projector's screen, full screen: {server.link('project')}")
+        terminal.print_message(
+            f"Open this on the projector's screen, full screen: {server.link('project')}"
+        )
     if "camera" in needed:
-        terminal.print_message(f"Open this on the phone or laptop that is the camera: {server.link('camera')}")
+        terminal.print_message(
+            f"Open this on the phone or laptop that is the camera: {server.link('camera')}"
+        )
     reported = dict.fromkeys(needed, "")
     for _ in range(math.ceil(wait_s)):
         states = {role: getattr(pages, role).page_state() for role in needed}
@@ -126,6 +169,12 @@ def _connect_pages(
             if state.words != reported[role]:
                 reported[role] = state.words
                 terminal.print_message(f"{role} page: {state.words}")
-        getattr(pages, next(role for role in needed if states[role].state != "ready")).wait_ready(1.0)
-    reasons = "; ".join(f"the {role} page: {state.words}" for role, state in states.items() if state.state != "ready")
+        getattr(pages, next(role for role in needed if states[role].state != "ready")).wait_ready(
+            1.0
+        )
+    reasons = "; ".join(
+        f"the {role} page: {state.words}"
+        for role, state in states.items()
+        if state.state != "ready"
+    )
     raise DeviceError(f"not ready within {wait_s:g} s: {reasons}")

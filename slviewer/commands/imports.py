@@ -18,7 +18,10 @@ CODEC = Option(
 )
 AXIS = Option("axis", Literal["x", "y"], "x", "Of a codec along a single axis.")
 FILES = Option(
-    "files", str | None, None, 'Pattern of the names to use, such as "pattern_cam1_*"; * and ? are wildcards.'
+    "files",
+    str | None,
+    None,
+    'Pattern of the names to use, such as "pattern_cam1_*"; * and ? are wildcards.',
 )
 DESCRIBED = (
     Option(
@@ -32,8 +35,8 @@ DESCRIBED = (
         "guess",
         Path | None,
         None,
-        "A capture folder, whose TOML is proposed from its images; nothing is imported. Exit status 1 where a part of "
-        "it is unsure.",
+        "A capture folder, whose TOML is proposed from its images; nothing is imported. Exit status"
+        " 1 where a part of it is unsure.",
     ),
     Option("out", Path | None, None, "File for the proposed TOML, by default standard output."),
 )
@@ -56,24 +59,32 @@ def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -
     source, session, sequence = (arguments[name] for name in ("source", "session", "sequence"))
     if folder is not None:
         if source is not None or sequence is not None:
-            raise UsageError("--guess proposes a TOML and imports nothing: give it without SOURCE, SESSION, --sequence")
+            raise UsageError(
+                "--guess proposes a TOML and imports nothing: give it without SOURCE, SESSION,"
+                " --sequence"
+            )
         _propose_description(folder, out, arguments["projector"], arguments["channel"])
         return
     if source is None or session is None:
         raise UsageError("SOURCE or SESSION is missing: give both, or --guess FOLDER for a TOML")
     if out is not None:
-        raise UsageError("--out is the file for the TOML of --guess: give --guess FOLDER, or omit --out")
+        raise UsageError(
+            "--out is the file for the TOML of --guess: give --guess FOLDER, or omit --out"
+        )
     run_import("frames", import_captures, arguments)
 
 
-def run_import_calibration(import_calibration: Callable[..., Any], arguments: dict[str, Any]) -> None:
+def run_import_calibration(
+    import_calibration: Callable[..., Any], arguments: dict[str, Any]
+) -> None:
     """Import a calibration, and print what was read from its file."""
     from slviewer.pipeline.import_calibration import identify_calibration_keys
 
     if arguments["keys"] is None:
         identified = identify_calibration_keys(arguments["file"])
         terminal.print_result(
-            "read from the file: " + ", ".join(f"{entry} = {key}" for entry, key in identified.items())
+            "read from the file: "
+            + ", ".join(f"{entry} = {key}" for entry, key in identified.items())
         )
     model = call(import_calibration, **arguments)
     if model is None:
@@ -81,12 +92,16 @@ def run_import_calibration(import_calibration: Callable[..., Any], arguments: di
         return
     (cw, ch), (pw, ph) = model.rig.camera.size, model.rig.projector.size
     terminal.print_result(
-        f"stereo calibration imported: camera {cw}x{ch}, projector {pw}x{ph}, baseline {model.baseline_mm:.1f} mm"
+        f"stereo calibration imported: camera {cw}x{ch}, projector {pw}x{ph}, baseline"
+        f" {model.baseline_mm:.1f} mm"
     )
 
 
-def _propose_description(folder: Path, out: Path | None, projector: str | None, channel: str | None) -> None:
-    """Write the proposed TOML of a capture folder to `out` or standard output. Raises InputError for doubts."""
+def _propose_description(
+    folder: Path, out: Path | None, projector: str | None, channel: str | None
+) -> None:
+    """Write the proposed TOML of a capture folder to `out` or standard output. Raises InputError
+    for doubts."""
     from slviewer.pipeline.import_captures import guess_description
 
     guessed = guess_description(folder, projector=projector, channel=channel)  # type: ignore[arg-type]
@@ -97,7 +112,9 @@ def _propose_description(folder: Path, out: Path | None, projector: str | None, 
         out.write_text(guessed.toml, encoding="utf-8")
         terminal.print_result(f"written to {out}")
     if guessed.doubts:
-        raise InputError(f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML")
+        raise InputError(
+            f"unsure: {'; '.join(guessed.doubts)}. Correct the entries marked UNSURE in the TOML"
+        )
 
 
 def _make_captures_command(
@@ -119,45 +136,54 @@ def make_import_command() -> Callable[..., Callable[[], None]]:
     """Return the command with one subcommand a layout."""
     layouts = {
         "auto": _make_captures_command(
-            "detect", "Import folders whose layout is known by their file names, or by a TOML that lies in the folder."
+            "detect",
+            "Import folders whose layout is known by their file names, or by a TOML that lies in"
+            " the folder.",
         ),
         "p18": _make_captures_command(
             "p18",
-            "Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray bits an axis.",
+            "Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray"
+            " bits an axis.",
             projector="912x1140",
         ),
         "procam-calibration": _make_captures_command(
             "procam-calibration",
-            "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code with "
-            "inverses, white, black.",
+            "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code"
+            " with inverses, white, black.",
             projector="1024x768",
         ),
         "opencv-graycode": _make_captures_command(
             "opencv-graycode",
-            "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows, each bit with its "
-            "inverse.\n\nImages are read in natural order of their names.",
+            "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows,"
+            " each bit with its inverse.\n\nImages are read in natural order of their names.",
             FILES,
         ),
         "sltk": _make_captures_command(
-            "sltk", "Import folders of the sltk layout: TIME_[AA-BB-CC_NN]_img.jpg, Gray code with inverses."
+            "sltk",
+            "Import folders of the sltk layout: TIME_[AA-BB-CC_NN]_img.jpg, Gray code with"
+            " inverses.",
         ),
         "slstudio": _make_captures_command(
             "slstudio",
-            "Import the frames that SLStudio writes: frameSeq_NN.bmp.\n\nWith the diamond pattern, the projector's "
-            "size has twice its columns.",
+            "Import the frames that SLStudio writes: frameSeq_NN.bmp.\n\nWith the diamond pattern,"
+            " the projector's size has twice its columns.",
             CODEC,
             AXIS,
         ),
         "frames": _make_captures_command(
             "frames",
-            "Import any folder of images with a TOML that describes them, or propose that TOML with --guess FOLDER.",
+            "Import any folder of images with a TOML that describes them, or propose that TOML with"
+            " --guess FOLDER.",
             *DESCRIBED,
             run=run_frames,
             source=None,
             session=None,
         ),
         "opencv-calibration": read_command(
-            "pipeline.import_calibration:import_opencv_calibration", "file", "session", run=run_import_calibration
+            "pipeline.import_calibration:import_opencv_calibration",
+            "file",
+            "session",
+            run=run_import_calibration,
         ),
     }
 
@@ -167,6 +193,8 @@ def make_import_command() -> Callable[..., Callable[[], None]]:
         return run
 
     for name in sorted(set(list_names(IMPORTERS)) - layouts.keys()):
-        layouts[name] = _make_captures_command(name, f"Import folders of the layout {name}, which a plugin reads.")
+        layouts[name] = _make_captures_command(
+            name, f"Import folders of the layout {name}, which a plugin reads."
+        )
     import_command.__annotations__["command"] = union(layouts)
     return import_command

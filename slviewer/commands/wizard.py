@@ -17,17 +17,21 @@ def wizard(
     token_file: Path | None = None,
     no_browser: bool = False,
 ) -> Callable[[], None]:
-    """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does the same.
+    """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does
+    the same.
 
     Args:
         session: Session folder, made if it does not exist; by default slviewer-session, here.
-        rig: simulated (half resolution), simulated:0.25 or a driver; by default that of the session, else simulated.
+        rig: simulated (half resolution), simulated:0.25 or a driver; by default that of the
+            session, else simulated.
         host: Address to serve at; any other than the default lets others on the network try.
         port: Port to serve at; 0 takes any free one.
-        name: Further host names under which browsers reach this server, such as scanner.lab, behind a proxy.
+        name: Further host names under which browsers reach this server, such as scanner.lab, behind
+            a proxy.
         tls: Encrypt, with a certificate that slviewer makes; its fingerprint is printed.
         tls_files: Encrypt, with this certificate and this key (PEM files).
-        token_file: TOML file with the tokens of the links, which so stay the same; made if it does not exist.
+        token_file: TOML file with the tokens of the links, which so stay the same; made if it does
+            not exist.
         no_browser: Print the address, and open no browser.
     """
 

@@ -1,4 +1,5 @@
-"""Devices that any computer or phone has: a screen as the projector, a camera, each through a page in a browser."""
+"""Devices that any computer or phone has: a screen as the projector, a camera, each through a page
+in a browser."""
 
 from dataclasses import dataclass, field
 from typing import Literal, get_args
@@ -23,7 +24,10 @@ class PageChannels:
 DRIVER = Driver(
     "browser",
     "a page on a screen, phone or laptop",
-    needs="the projector page, open in a browser on the projector's screen; the camera page, on the phone or laptop",
+    needs=(
+        "the projector page, open in a browser on the projector's screen; the camera page, on the"
+        " phone or laptop"
+    ),
     camera=BrowserCamera,
     projector=browser_projector,
     page=True,

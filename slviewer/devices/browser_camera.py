@@ -1,8 +1,10 @@
-"""A camera that anybody has: a page, open on a phone or laptop, that sends its camera's pictures without loss.
+"""A camera that anybody has: a page, open on a phone or laptop, that sends its camera's pictures
+without loss.
 
-The page waits for a picture that the camera took after the request, takes it from a canvas, and sends one channel of it
-uncompressed (1 byte a pixel), or three. While the camera is in use, the page locks exposure, focus and white balance as
-far as the browser lets it; what stays automatic is reported in `notes`.
+The page waits for a picture that the camera took after the request, takes it from a canvas, and
+sends one channel of it uncompressed (1 byte a pixel), or three. While the camera is in use, the
+page locks exposure, focus and white balance as far as the browser lets it; what stays automatic is
+reported in `notes`.
 """
 
 import struct
@@ -13,7 +15,14 @@ import msgspec
 import numpy as np
 
 from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
-from slviewer.devices.protocols import CameraSettings, Channel, Openable, check_channel, check_frame, check_image_size
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Channel,
+    Openable,
+    check_channel,
+    check_frame,
+    check_image_size,
+)
 from slviewer.errors import DeviceError
 
 FRAME_S = 10.0
@@ -28,22 +37,29 @@ _Text = Annotated[str, msgspec.Meta(max_length=200)]
 _Side = Annotated[int, msgspec.Meta(ge=1, le=_MAX_SIDE_PX)]
 _Milliseconds = Annotated[float, msgspec.Meta(gt=0, le=600_000)]
 _PROBLEMS = {
-    "insecure": "the browser gives its camera to encrypted pages alone: start slviewer with --tls, and open the "
-    "camera page's new link",
-    "NotAllowedError": "the browser refused the camera page its camera: allow it beside the page's address, then "
-    "reload the page",
+    "insecure": (
+        "the browser gives its camera to encrypted pages alone: start slviewer with --tls, and open"
+        " the camera page's new link"
+    ),
+    "NotAllowedError": (
+        "the browser refused the camera page its camera: allow it beside the page's address, then "
+        "reload the page"
+    ),
     "NotFoundError": "the camera page's device has no camera: open the page on another one",
-    "NotReadableError": "the camera page cannot read its camera: close other programs that use it, then reload it",
+    "NotReadableError": (
+        "the camera page cannot read its camera: close other programs that use it, then reload it"
+    ),
 }
 
 
 class Video(msgspec.Struct, frozen=True):
     """The camera of the page, as it reports it.
 
-    `size`: (width, height) px of its pictures; None while there are none, and then `problem` is the name of the
-    browser's error, "insecure" where the page is not encrypted, or "" while it starts. `label`: the browser's name for
-    it. `automatic`: what the browser does not lock. `exposure_ms`: None where the browser does not report it.
-    `visible`: whether the page is in front; hidden ones get no pictures.
+    `size`: (width, height) px of its pictures; None while there are none, and then `problem` is the
+    name of the browser's error, "insecure" where the page is not encrypted, or "" while it starts.
+    `label`: the browser's name for it. `automatic`: what the browser does not lock. `exposure_ms`:
+    None where the browser does not report it. `visible`: whether the page is in front; hidden ones
+    get no pictures.
     """
 
     size: tuple[_Side, _Side] | None
@@ -81,7 +97,8 @@ class CameraChannel(PageChannel[Video]):
         self._frame_size: tuple[int, int] | None = None
 
     def set_use(self, size: tuple[int, int] | None) -> None:
-        """Judge pages by pictures of this size (width, height) from now on; None: no camera is open."""
+        """Judge pages by pictures of this size (width, height) from now on; None: no camera is
+        open."""
         with self._condition:
             self._frame_size = size
             self._publish_state()
@@ -94,15 +111,19 @@ class CameraChannel(PageChannel[Video]):
 
     def _refuse(self, facts: Video) -> str:
         if facts.size is None:
-            failed = f"the camera page has no pictures ({facts.problem or 'its camera is starting'})"
+            failed = (
+                f"the camera page has no pictures ({facts.problem or 'its camera is starting'})"
+            )
             return _PROBLEMS.get(facts.problem, f"{failed}: wait a moment, else reload the page")
         if not facts.visible:
             return "the camera page is hidden: bring it to the front, and keep its screen on"
         if self._frame_size not in (None, facts.size):
-            size, expected = ("{} x {}".format(*each) for each in (facts.size, self._frame_size or facts.size))
+            size, expected = (
+                "{} x {}".format(*each) for each in (facts.size, self._frame_size or facts.size)
+            )
             return (
-                f"the camera page's pictures have {size} px and no longer {expected}: turn the phone back and fix it, "
-                "or choose the rig again"
+                f"the camera page's pictures have {size} px and no longer {expected}: turn the"
+                " phone back and fix it, or choose the rig again"
             )
         return ""
 
@@ -117,8 +138,8 @@ class CameraChannel(PageChannel[Video]):
 class BrowserCamera(Openable):
     """One `channel` of the pictures of the camera on a page.
 
-    A capture that loses its page, or whose pictures change their size, ends with a DeviceError. A gain is not set:
-    browsers offer none that is a factor on the grey levels.
+    A capture that loses its page, or whose pictures change their size, ends with a DeviceError. A
+    gain is not set: browsers offer none that is a factor on the grey levels.
     """
 
     dtype = np.dtype(np.uint8)
@@ -130,15 +151,17 @@ class BrowserCamera(Openable):
         channel: Channel = "green",
         page: CameraChannel | None = None,
     ) -> None:
-        """A camera of `size` (width, height) px, by default that of the connected page's camera; `channel` is what is
-        decoded, `page` leads to the page. `exposure_ms` is set when it is opened, where the browser lets it.
+        """A camera of `size` (width, height) px, by default that of the connected page's camera;
+        `channel` is what is decoded, `page` leads to the page. `exposure_ms` is set when it is
+        opened, where the browser lets it.
 
         Raises DeviceError without a `page`, and where `size` is None and no page is ready.
         """
         check_channel(channel)
         if page is None:
             raise DeviceError(
-                "the browser camera's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
+                "the browser camera's page is served by `slviewer wizard` and `slviewer capture`:"
+                " use one of them"
             )
         super().__init__("the browser camera")
         self._channel: Channel = channel
@@ -146,9 +169,15 @@ class BrowserCamera(Openable):
         self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
         self._page: PageConnection[Video] | None = None
         self._note = ""
-        known = page.page_state().size if size is None else check_image_size("camera", size, _MAX_SIDE_PX)
+        known = (
+            page.page_state().size
+            if size is None
+            else check_image_size("camera", size, _MAX_SIDE_PX)
+        )
         if known is None:
-            raise DeviceError("the camera's size is unknown: open the camera page first, or give the size")
+            raise DeviceError(
+                "the camera's size is unknown: open the camera page first, or give the size"
+            )
         self.size: tuple[int, int] = known
 
     @property
@@ -157,13 +186,14 @@ class BrowserCamera(Openable):
         page, unlocked = self._page, ""
         if page is not None and page.facts.automatic:
             unlocked = (
-                f"its browser does not lock {' and '.join(page.facts.automatic)}: nothing may move or change its "
-                "brightness during a capture; Chrome on Android locks most"
+                f"its browser does not lock {' and '.join(page.facts.automatic)}: nothing may move"
+                " or change its brightness during a capture; Chrome on Android locks most"
             )
         return tuple(f"{self.name}: {sentence}" for sentence in (unlocked, self._note) if sentence)
 
     def _start(self) -> None:
-        """Lock what is automatic. Raises DeviceError with a remedy where the page has no pictures of this size."""
+        """Lock what is automatic. Raises DeviceError with a remedy where the page has no pictures
+        of this size."""
         self._pages.set_use(self.size)
         page = self._pages.page()
         self._lock(page, self._exposure_ms)
@@ -195,28 +225,37 @@ class BrowserCamera(Openable):
         if settings.exposure_ms is not None:
             self._lock(page, settings.exposure_ms)
             if page.facts.exposure_ms is None:
-                self._note = "its browser sets no exposure: change the light or the projector's brightness instead"
+                self._note = (
+                    "its browser sets no exposure: change the light or the projector's brightness"
+                    " instead"
+                )
         if settings.gain is not None:
             self._note = "browsers set no gain: change the exposure instead"
         return self.settings()
 
     def _lock(self, page: PageConnection[Video], exposure_ms: float | None) -> None:
-        """Lock what is automatic, at an exposure where one is given, and wait until the camera has settled."""
-        page.request("lock", timeout_s=_LOCK_S, exposure_ms=exposure_ms, settling_ms=self._pages.settling_ms)
+        """Lock what is automatic, at an exposure where one is given, and wait until the camera has
+        settled."""
+        page.request(
+            "lock", timeout_s=_LOCK_S, exposure_ms=exposure_ms, settling_ms=self._pages.settling_ms
+        )
 
     def _request_picture(self, channel: Channel | Literal["rgb"], depth: int) -> np.ndarray:
         """Request a picture taken from now on, and return it, (h, w, depth) uint8."""
         width, height = self.size
-        content = self._require_page().request("grab", timeout_s=FRAME_S, channel=channel, size=self.size)
+        content = self._require_page().request(
+            "grab", timeout_s=FRAME_S, channel=channel, size=self.size
+        )
         if len(content) != width * height * depth:
             raise DeviceError(
-                f"the camera page sent {len(content):,} bytes and not the {width * height * depth:,} of a picture: "
-                "reload it"
+                f"the camera page sent {len(content):,} bytes and not the"
+                f" {width * height * depth:,} of a picture: reload it"
             )
         return np.frombuffer(content, np.uint8).reshape(height, width, depth)
 
     def _require_page(self) -> PageConnection[Video]:
-        """Return the page that was locked when the camera was opened. Raises DeviceError where it was reloaded."""
+        """Return the page that was locked when the camera was opened. Raises DeviceError where it
+        was reloaded."""
         self.check_open()
         assert self._page is not None
         self._page.check()

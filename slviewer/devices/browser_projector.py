@@ -1,8 +1,10 @@
-"""A projector that any computer has: a page, full screen on the projector's output, that shows patterns pixel by pixel.
+"""A projector that any computer has: a page, full screen on the projector's output, that shows
+patterns pixel by pixel.
 
-A pattern varies along one axis, so that its profile alone is sent; the page keeps the profiles of one sequence, and
-repeats one over its canvas when it is shown. "Shown" is reported two animation frames later: the picture is composited
-by then, not yet emitted, and what the display adds is measured and waited for as the rig's `settle_ms`.
+A pattern varies along one axis, so that its profile alone is sent; the page keeps the profiles of
+one sequence, and repeats one over its canvas when it is shown. "Shown" is reported two animation
+frames later: the picture is composited by then, not yet emitted, and what the display adds is
+measured and waited for as the rig's `settle_ms`.
 """
 
 from collections.abc import Sequence
@@ -11,7 +13,13 @@ from typing import Any
 import msgspec
 
 from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection
-from slviewer.devices.protocols import Openable, check_image_size, check_index, check_level, check_sequence
+from slviewer.devices.protocols import (
+    Openable,
+    check_image_size,
+    check_index,
+    check_level,
+    check_sequence,
+)
 from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError
 from slviewer.fringe.patterns import profile
@@ -53,7 +61,8 @@ class ProjectorChannel(PageChannel[Screen]):
             self._publish_state()
 
     def set_light(self, grey: int | None) -> None:
-        """Set the light that a page shows after a reload; None: no projector is open, it shows its marker."""
+        """Set the light that a page shows after a reload; None: no projector is open, it shows its
+        marker."""
         with self._condition:
             self._light = grey
             self._publish_state()
@@ -66,14 +75,19 @@ class ProjectorChannel(PageChannel[Screen]):
 
     def _describe_state(self, facts: Screen) -> tuple[Any, dict[str, Any]]:
         size = self._pattern_size or facts.pixels
-        return (size, self._light is None), {"full": facts.full_screen, "size": size, "light": self._light}
+        return (size, self._light is None), {
+            "full": facts.full_screen,
+            "size": size,
+            "light": self._light,
+        }
 
 
 class BrowserProjector(Openable):
-    """A projector of `size` (width, height) px that shows its patterns on the page connected to `channel`.
+    """A projector of `size` (width, height) px that shows its patterns on the page connected to
+    `channel`.
 
-    A capture that loses its page, or during which the page's window changes, ends with a DeviceError; `load` then sends
-    the patterns again, to whatever page is ready by then.
+    A capture that loses its page, or during which the page's window changes, ends with a
+    DeviceError; `load` then sends the patterns again, to whatever page is ready by then.
     """
 
     def __init__(self, channel: ProjectorChannel, size: tuple[int, int]) -> None:
@@ -86,7 +100,8 @@ class BrowserProjector(Openable):
         self._changes = 0
 
     def _start(self) -> None:
-        """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by pixel."""
+        """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by
+        pixel."""
         self._forget_loaded()
         self._channel.set_pattern_size(self.size)
         self._channel.page()
@@ -100,7 +115,8 @@ class BrowserProjector(Openable):
         super().close()
 
     def load(self, sequence: PatternSequence) -> None:
-        """Send all patterns of the sequence, unless the page has them already. Raises InputError or DeviceError."""
+        """Send all patterns of the sequence, unless the page has them already. Raises InputError or
+        DeviceError."""
         self.check_open()
         check_sequence(self, sequence)
         page = self._channel.page()
@@ -113,7 +129,8 @@ class BrowserProjector(Openable):
         self._sequence, self._sent, self._page, self._changes = sequence, sent, page, page.changes
 
     def show(self, index: int) -> None:
-        """Show frame `index`. Raises DeviceError where the page or its size changed since the patterns were sent."""
+        """Show frame `index`. Raises DeviceError where the page or its size changed since the
+        patterns were sent."""
         self.check_open()
         check_index(self, self._sequence, index)
         page = self._page
@@ -121,7 +138,9 @@ class BrowserProjector(Openable):
             assert page is not None
             page.request("show", index=index)
             if page.changes != self._changes:
-                raise DeviceError("the projector page's window changed while patterns were shown: capture again")
+                raise DeviceError(
+                    "the projector page's window changed while patterns were shown: capture again"
+                )
         except BaseException:
             self._forget_loaded()
             raise
@@ -139,16 +158,26 @@ class BrowserProjector(Openable):
         self._sequence = self._sent = self._page = None
 
 
-def browser_projector(size: Sequence[int] | None = None, page: ProjectorChannel | None = None) -> BrowserProjector:
-    """Create a projector of `size` (width, height) px, by default the size of the connected page's screen.
+def browser_projector(
+    size: Sequence[int] | None = None, page: ProjectorChannel | None = None
+) -> BrowserProjector:
+    """Create a projector of `size` (width, height) px, by default the size of the connected page's
+    screen.
 
     Raises DeviceError without a `page`, and where `size` is None and no page is connected.
     """
     if page is None:
         raise DeviceError(
-            "the browser projector's page is served by `slviewer wizard` and `slviewer capture`: use one of them"
+            "the browser projector's page is served by `slviewer wizard` and `slviewer capture`:"
+            " use one of them"
         )
-    known = page.page_state().size if size is None else check_image_size("projector", size, _MAX_SIZE_PX)
+    known = (
+        page.page_state().size
+        if size is None
+        else check_image_size("projector", size, _MAX_SIZE_PX)
+    )
     if known is None:
-        raise DeviceError("the projector's size is unknown: open the projector page first, or give the size")
+        raise DeviceError(
+            "the projector's size is unknown: open the projector page first, or give the size"
+        )
     return BrowserProjector(page, known)

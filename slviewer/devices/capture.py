@@ -1,4 +1,5 @@
-"""One capture: every frame of a pattern sequence shown and grabbed, in one exposure or in several."""
+"""One capture: every frame of a pattern sequence shown and grabbed, in one exposure or in
+several."""
 
 import contextlib
 import time
@@ -24,10 +25,10 @@ def capture_frames(
 ) -> np.ndarray:
     """Capture the frames (n, h, w) of `sequence` with the open rig, into `out` if it is given.
 
-    `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled) to stop.
-    `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at which it happened; whatever is
-    raised, `out` then holds no capture and the rig can be used again once its device answers. The projector is left
-    showing the last frame.
+    `progress(done, n)` is called before the first frame and after each, and may raise (Cancelled)
+    to stop. `sleep(seconds)` waits for the light to settle. Raises DeviceError, with the frame at
+    which it happened; whatever is raised, `out` then holds no capture and the rig can be used again
+    once its device answers. The projector is left showing the last frame.
     """
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)
@@ -37,7 +38,8 @@ def capture_frames(
 
 
 def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
-    """Return `out` if `n` frames of the rig's camera fit it, or a new array (n, h, w). Raises InputError."""
+    """Return `out` if `n` frames of the rig's camera fit it, or a new array (n, h, w). Raises
+    InputError."""
     width, height = rig.camera.size
     if out is None:
         return np.empty((n, height, width), rig.camera.dtype)
@@ -68,7 +70,9 @@ def _capture_loaded(
                 rig.camera.grab(out[k])
             if k == n - 1:
                 with report_driver_faults(rig.projector):
-                    rig.projector.show(k)  # a change during this exposure is reported by the next request only
+                    rig.projector.show(
+                        k
+                    )  # a change during this exposure is reported by the next request only
         except DeviceError as error:
             raise DeviceError(
                 f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: {error}"
@@ -79,9 +83,9 @@ def _capture_loaded(
 
 @dataclass(frozen=True, eq=False)
 class CapturedFrames:
-    """Result of `capture_with_texture`: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the whole sequence in
-    one after the other; the camera's settings; the sequence and the name of the rig; and a colour texture (h, w, 3),
-    None with a monochrome camera.
+    """Result of `capture_with_texture`: frames (n, h, w), or (k n, h, w) of k `exposures_ms`, the
+    whole sequence in one after the other; the camera's settings; the sequence and the name of the
+    rig; and a colour texture (h, w, 3), None with a monochrome camera.
     """
 
     frames: np.ndarray
@@ -99,48 +103,64 @@ def capture_with_texture(
     out: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CapturedFrames:
-    """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and then a colour texture.
+    """Capture `sequence`, in each of two or more `exposures_ms` if they are given, and then a
+    colour texture.
 
-    `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture_frames`. The camera's settings are
-    as before when this returns or raises. Raises InputError for invalid exposures, DeviceError for a camera that
-    cannot be set to them, and whatever `capture_frames` raises.
+    `out` is (k n, h, w) where it is given, and `progress(done, k n)` as in `capture_frames`. The
+    camera's settings are as before when this returns or raises. Raises InputError for invalid
+    exposures, DeviceError for a camera that cannot be set to them, and whatever `capture_frames`
+    raises.
     """
     if not exposures_ms:
         frames = capture_frames(rig, sequence, out, progress)
-        return CapturedFrames(frames, _read_settings(rig), sequence, rig.name, (), _try_capture_colour(rig))
+        return CapturedFrames(
+            frames, _read_settings(rig), sequence, rig.name, (), _try_capture_colour(rig)
+        )
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
     with report_driver_faults(rig.projector):
-        rig.projector.load(sequence)  # once: a projector reconnected between two exposures must not go unnoticed
+        rig.projector.load(
+            sequence
+        )  # once: a projector reconnected between two exposures must not go unnoticed
     before, applied_ms = _read_settings(rig), []
     try:
         for e, exposure in enumerate(wanted):
             applied_ms.append(_set_exposure(rig, exposure))
             if e and applied_ms[e] <= applied_ms[e - 1]:
                 raise DeviceError(
-                    f"{rig.camera.name} set {applied_ms[e]:g} ms instead of the requested {exposure:g} ms: "
-                    "choose exposures that it can tell apart, or a single one"
+                    f"{rig.camera.name} set {applied_ms[e]:g} ms instead of the requested"
+                    f" {exposure:g} ms: choose exposures that it can tell apart, or a single one"
                 )
-            _capture_loaded(rig, n, out[e * n : (e + 1) * n], _offset_progress(progress, e * n, len(out)))
+            _capture_loaded(
+                rig, n, out[e * n : (e + 1) * n], _offset_progress(progress, e * n, len(out))
+            )
     finally:
-        with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):  # a lost device raises its own error
+        with (
+            contextlib.suppress(DeviceError),
+            report_driver_faults(rig.camera),
+        ):  # a lost device raises its own error
             rig.camera.apply(before)
-    return CapturedFrames(out, _read_settings(rig), sequence, rig.name, tuple(applied_ms), _try_capture_colour(rig))
+    return CapturedFrames(
+        out, _read_settings(rig), sequence, rig.name, tuple(applied_ms), _try_capture_colour(rig)
+    )
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
-    """Return two or more exposures, ms, ascending. Raises InputError for too few, too many or repeated ones."""
+    """Return two or more exposures, ms, ascending. Raises InputError for too few, too many or
+    repeated ones."""
     wanted = sorted(CameraSettings(exposure).exposure_ms or 0.0 for exposure in exposures_ms)
     if len(set(wanted)) < max(2, len(exposures_ms)) or len(wanted) > MAX_EXPOSURES:
         raise InputError(
-            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to {MAX_EXPOSURES}, each once"
+            f"exposures of {', '.join(f'{e:g}' for e in exposures_ms)} ms: give 2 to"
+            f" {MAX_EXPOSURES}, each once"
         )
     return wanted
 
 
 def _try_capture_colour(rig: Rig) -> np.ndarray | None:
-    """Capture the colour texture (h, w, 3); None also on a DeviceError: the frames are complete without it."""
+    """Capture the colour texture (h, w, 3); None also on a DeviceError: the frames are complete
+    without it."""
     with report_driver_faults(rig.camera), contextlib.suppress(DeviceError):
         return capture_colour(rig)
     return None
@@ -153,23 +173,28 @@ def _read_settings(rig: Rig) -> CameraSettings:
 
 
 def _set_exposure(rig: Rig, exposure_ms: float) -> float:
-    """Set the exposure; returns the value, ms, that the camera applied. Raises DeviceError where it is unknown."""
+    """Set the exposure; returns the value, ms, that the camera applied. Raises DeviceError where it
+    is unknown."""
     with report_driver_faults(rig.camera):
         applied_ms = rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
     if applied_ms is None:
-        raise DeviceError(f"{rig.camera.name} does not report its exposure: capture in a single one")
+        raise DeviceError(
+            f"{rig.camera.name} does not report its exposure: capture in a single one"
+        )
     return applied_ms
 
 
 def _offset_progress(
     progress: Callable[[int, int], None] | None, before: int, frames: int
 ) -> Callable[[int, int], None] | None:
-    """Return progress over all `frames`, for one exposure whose frames come after `before` others."""
+    """Return progress over all `frames`, for one exposure whose frames come after `before`
+    others."""
     return None if progress is None else lambda done, _: progress(before + done, frames)
 
 
 def capture_colour(rig: Rig) -> np.ndarray | None:
-    """Capture (h, w, 3) RGB of the scene under white light; None where the rig's camera sees no colour."""
+    """Capture (h, w, 3) RGB of the scene under white light; None where the rig's camera sees no
+    colour."""
     if not isinstance(rig.camera, ColourCamera):
         return None
     rig.projector.show_level(255)
@@ -178,6 +203,7 @@ def capture_colour(rig: Rig) -> np.ndarray | None:
 
 
 def settle(rig: Rig, sleep: Callable[[float], None] = time.sleep) -> None:
-    """Wait for the delay between the projector's report and the light on the scene (`settle_ms`)."""
+    """Wait for the delay between the projector's report and the light on the scene
+    (`settle_ms`)."""
     if rig.settle_ms > 0:
         sleep(rig.settle_ms / 1000)

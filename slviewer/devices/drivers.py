@@ -1,4 +1,5 @@
-"""Drivers by name: every file of this folder that holds a `DRIVER` is one, and plugins add others."""
+"""Drivers by name: every file of this folder that holds a `DRIVER` is one, and plugins add
+others."""
 
 import importlib
 import pkgutil
@@ -15,12 +16,14 @@ from slviewer.errors import DeviceError, InputError
 
 @dataclass(frozen=True)
 class Driver:
-    """A driver of devices; its factories take the driver's options, and import vendor packages when called.
+    """A driver of devices; its factories take the driver's options, and import vendor packages when
+    called.
 
-    `what`: in a few words, what it drives. `packages`: how to install each package that must be importable, such as
-    ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers cameras, projectors, turntables, whole rigs
-    (where both devices share something), or several of these. `page`: camera and projector are pages in a browser, and
-    take the keyword `page`, the channel to it. `list_connected` returns a line per connected device.
+    `what`: in a few words, what it drives. `packages`: how to install each package that must be
+    importable, such as ``{"harvesters": "pip install 'slviewer[genicam]'"}``. A driver offers
+    cameras, projectors, turntables, whole rigs (where both devices share something), or several of
+    these. `page`: camera and projector are pages in a browser, and take the keyword `page`, the
+    channel to it. `list_connected` returns a line per connected device.
     """
 
     name: str
@@ -36,7 +39,8 @@ class Driver:
 
     @property
     def missing(self) -> str:
-        """What is missing on this machine and how to install it, in words; empty if the driver can be used."""
+        """What is missing on this machine and how to install it, in words; empty if the driver can
+        be used."""
         return "; ".join(
             f"the package {package} is missing: {remedy}"
             for package, remedy in self.packages.items()
@@ -54,7 +58,10 @@ def drivers() -> dict[str, Driver]:
 def builtin_drivers() -> dict[str, Driver]:
     """Return the drivers of this folder by name."""
     modules = (module.name for module in pkgutil.iter_modules(slviewer.devices.__path__))
-    candidates = (getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None) for name in modules)
+    candidates = (
+        getattr(importlib.import_module(f"slviewer.devices.{name}"), "DRIVER", None)
+        for name in modules
+    )
     return {driver.name: driver for driver in candidates if isinstance(driver, Driver)}
 
 
@@ -62,15 +69,19 @@ DRIVER_PLUGINS = PluginGroup("slviewer.drivers", Driver, builtin_drivers)
 
 
 def available() -> list[Driver]:
-    """List all drivers, those that can be used here first; `needs` and `missing` name what the others require."""
+    """List all drivers, those that can be used here first; `needs` and `missing` name what the
+    others require."""
     return sorted(drivers().values(), key=lambda driver: (bool(driver.missing), driver.name))
 
 
 def driver(name: str) -> Driver:
-    """Return the driver called `name`. Raises InputError if there is none, DeviceError if it lacks a package."""
+    """Return the driver called `name`. Raises InputError if there is none, DeviceError if it lacks
+    a package."""
     if name not in drivers():
         why = DRIVER_PLUGINS.explain_missing(name)
-        raise InputError(f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}{why}")
+        raise InputError(
+            f"no driver is called {name!r}: use one of {', '.join(sorted(drivers()))}{why}"
+        )
     selected = drivers()[name]
     if selected.missing:
         raise DeviceError(f"the driver {name} cannot be used here, {selected.missing}")

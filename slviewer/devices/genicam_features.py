@@ -1,6 +1,8 @@
-"""GenICam features for a structured-light rig: exposure in ms, gain as a factor, a trigger, no automatics.
+"""GenICam features for a structured-light rig: exposure in ms, gain as a factor, a trigger, no
+automatics.
 
-A node map is any object with a camera's nodes as attributes; its nodes are those of `genicam.genapi`.
+A node map is any object with a camera's nodes as attributes; its nodes are those of
+`genicam.genapi`.
 """
 
 import math
@@ -13,7 +15,11 @@ from slviewer.errors import DeviceError, InputError
 
 Trigger = Literal["software", "hardware", "free"]
 
-_IMPLEMENTED, _READABLE, _WRITABLE = (1, 2, 3, 4), (3, 4), (2, 4)  # EAccessMode: 1 not now, 2 write, 3 read, 4 both
+_IMPLEMENTED, _READABLE, _WRITABLE = (
+    (1, 2, 3, 4),
+    (3, 4),
+    (2, 4),
+)  # EAccessMode: 1 not now, 2 write, 3 read, 4 both
 _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")  # the second is older GigE cameras'
 _MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "s": 1e3}
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "BlackLevelAuto")
@@ -28,13 +34,15 @@ _FRAME_TRIGGERS = ("FrameStart", "ExposureStart")
 
 
 class Features:
-    """The GenICam features of a camera called `name`. Every method raises DeviceError if it does not answer."""
+    """The GenICam features of a camera called `name`. Every method raises DeviceError if it does
+    not answer."""
 
     def __init__(self, node_map: Any, name: str) -> None:
         self._nodes, self._name = node_map, name
 
     def size(self) -> tuple[int, int]:
-        """Return the (width, height) px of its images: the whole sensor, or the region that is set in it."""
+        """Return the (width, height) px of its images: the whole sensor, or the region that is set
+        in it."""
         width, height = self._get_node("Width"), self._get_node("Height")
         if width is None or height is None:
             raise DeviceError(f"{self._name} does not report its image size: use another camera")
@@ -42,38 +50,53 @@ class Features:
             return int(width.value), int(height.value)
 
     def choose_format(self, wanted: str | None = None) -> PixelFormat:
-        """Choose the pixel format, `wanted` or the best. Raises InputError for one that is not offered or not
-        supported.
+        """Choose the pixel format, `wanted` or the best. Raises InputError for one that is not
+        offered or not supported.
         """
         offered = self._list_choices("PixelFormat")
         usable = [name for name in offered if pixel_format(name) is not None]
-        chosen = best_format(usable) if wanted is None else pixel_format(wanted) if wanted in offered else None
+        chosen = (
+            best_format(usable)
+            if wanted is None
+            else pixel_format(wanted)
+            if wanted in offered
+            else None
+        )
         if chosen is None:
             missing = "none that can be read" if wanted is None else f"no {wanted} that can be read"
             raise InputError(
-                f"{self._name} offers {missing}: use one of {', '.join(usable) or 'another camera'} as pixel_format"
+                f"{self._name} offers {missing}: use one of {', '.join(usable) or 'another camera'}"
+                " as pixel_format"
             )
         return chosen
 
     def choose_trigger(self, wanted: Trigger | None, line: str | None) -> Trigger:
-        """Choose what starts an exposure: `wanted`, else software where supported, else free running.
+        """Choose what starts an exposure: `wanted`, else software where supported, else free
+        running.
 
         Raises InputError for a trigger or a line that the camera lacks.
         """
         if wanted is not None and wanted not in get_args(Trigger):
-            raise InputError(f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}")
+            raise InputError(
+                f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}"
+            )
         has_mode = "On" in self._list_choices("TriggerMode")
         sources = self._list_choices("TriggerSource") if has_mode else []
-        software = "Software" in sources and self._get_node("TriggerSoftware", _IMPLEMENTED) is not None
+        software = (
+            "Software" in sources and self._get_node("TriggerSoftware", _IMPLEMENTED) is not None
+        )
         if wanted is None:
             return "software" if software else "free"
         if wanted == "software" and not software:
-            raise InputError(f"{self._name} has no software trigger: leave `trigger` out, and it runs free")
+            raise InputError(
+                f"{self._name} has no software trigger: leave `trigger` out, and it runs free"
+            )
         lines = [source for source in sources if source not in ("Software", "Off")]
         if wanted == "hardware" and (line is None or line not in lines):
             raise InputError(
-                f"{self._name} has {f'no trigger line {line!r}' if line else 'a trigger line to be named'}: use one of "
-                f"{', '.join(lines)} as `line`"
+                f"{self._name} has"
+                f" {f'no trigger line {line!r}' if line else 'a trigger line to be named'}: use one"
+                f" of {', '.join(lines)} as `line`"
                 if lines
                 else f"{self._name} has no trigger lines: leave `trigger` out"
             )
@@ -82,14 +105,19 @@ class Features:
     def check_settings(self, wanted: CameraSettings) -> None:
         """Raise InputError for settings that the camera has no feature for."""
         if wanted.exposure_ms is not None and self._get_exposure_node() is None:
-            raise InputError(f"{self._name} has no exposure time that can be set: leave exposure_ms out")
+            raise InputError(
+                f"{self._name} has no exposure time that can be set: leave exposure_ms out"
+            )
         if wanted.gain is not None and self._get_gain_node() is None:
             gain = self._get_node("Gain")
             why = "no gain" if gain is None else "a gain in device-specific steps of unknown factor"
-            raise InputError(f"{self._name} has {why}: leave `gain` out, and set it with its maker's software")
+            raise InputError(
+                f"{self._name} has {why}: leave `gain` out, and set it with its maker's software"
+            )
 
     def prepare(self, chosen: PixelFormat, trigger: Trigger, line: str | None) -> None:
-        """Configure comparable frames: no automatics, grey levels proportional to light, this format and trigger."""
+        """Configure comparable frames: no automatics, grey levels proportional to light, this
+        format and trigger."""
         with as_device_error(self._name):
             self._choose("PixelFormat", chosen.name)
             self._choose("AcquisitionMode", "Continuous")
@@ -105,7 +133,10 @@ class Features:
             self._set_trigger(trigger, line)
             current = self._get_node("PixelFormat")
             if current is None or current.value != chosen.name:
-                raise DeviceError(f"{self._name} did not accept the pixel format {chosen.name}: choose another one")
+                raise DeviceError(
+                    f"{self._name} did not accept the pixel format {chosen.name}: choose"
+                    " another one"
+                )
 
     def release(self) -> None:
         """Restore free running, which other programs expect."""
@@ -118,7 +149,8 @@ class Features:
             self._nodes.TriggerSoftware.execute()
 
     def settings(self) -> CameraSettings:
-        """Read the current settings; None for those that the camera lacks, and for a gain of unknown factor."""
+        """Read the current settings; None for those that the camera lacks, and for a gain of
+        unknown factor."""
         with as_device_error(self._name):
             exposure, gain = self._get_exposure_node(), self._get_gain_node()
             return CameraSettings(
@@ -137,12 +169,18 @@ class Features:
 
     def _get_exposure_node(self) -> Any:
         """Return the readable node of the exposure time; None where there is none."""
-        return next((node for name in _EXPOSURES if (node := self._get_node(name)) is not None), None)
+        return next(
+            (node for name in _EXPOSURES if (node := self._get_node(name)) is not None), None
+        )
 
     def _get_gain_node(self) -> Any:
         """Return the readable node of the gain, if its unit is dB; else None."""
         gain = self._get_node("Gain")
-        return gain if gain is not None and str(getattr(gain, "unit", "")).strip().lower() == "db" else None
+        return (
+            gain
+            if gain is not None and str(getattr(gain, "unit", "")).strip().lower() == "db"
+            else None
+        )
 
     def _set_trigger(self, trigger: Trigger, line: str | None) -> None:
         """Switch every trigger off but the one that starts each frame."""
@@ -152,10 +190,14 @@ class Features:
             self._choose("TriggerMode", "Off")
         if trigger == "free":
             return
-        self._choose("TriggerSelector", next((name for name in _FRAME_TRIGGERS if name in selectors), ""))
+        self._choose(
+            "TriggerSelector", next((name for name in _FRAME_TRIGGERS if name in selectors), "")
+        )
         source = "Software" if trigger == "software" else line
         if not (self._choose("TriggerSource", source or "") and self._choose("TriggerMode", "On")):
-            raise DeviceError(f"{self._name} did not accept the trigger {source}: choose another one")
+            raise DeviceError(
+                f"{self._name} did not accept the trigger {source}: choose another one"
+            )
 
     def _list_choices(self, name: str) -> list[str]:
         """List the readable entries of the enumeration `name`."""
@@ -163,7 +205,9 @@ class Features:
         if node is None:
             return []
         with as_device_error(self._name):
-            return [entry.symbolic for entry in node.entries if entry.get_access_mode() in _READABLE]
+            return [
+                entry.symbolic for entry in node.entries if entry.get_access_mode() in _READABLE
+            ]
 
     def _choose(self, name: str, choice: str) -> bool:
         """Set the enumeration `name` to `choice`; False where the camera does not offer it."""
@@ -187,7 +231,8 @@ def _is_settable(node: Any) -> bool:
 
 
 def _ms_per_unit(exposure: Any) -> float:
-    """Return the length of the exposure node's unit in ms; microseconds, as in the standard, where it names none."""
+    """Return the length of the exposure node's unit in ms; microseconds, as in the standard, where
+    it names none."""
     return _MS.get(str(getattr(exposure, "unit", "")).strip(), 1e-3)
 
 

@@ -1,7 +1,7 @@
 """Lists the cameras of the installed GenTL producers.
 
-A producer (`.cti`) comes with the camera maker's software and can be loaded once in a process, so that everything that
-requests the same file here shares it.
+A producer (`.cti`) comes with the camera maker's software and can be loaded once in a process, so
+that everything that requests the same file here shares it.
 """
 
 import contextlib
@@ -24,7 +24,9 @@ LOCK = threading.RLock()
 _PRODUCERS: dict[str, "_Producer"] = {}
 
 _LOG = logging.getLogger("slviewer.gentl")
-_LOG.addHandler(logging.NullHandler())  # harvesters prints every failure with its stack; errors are raised as sentences
+_LOG.addHandler(
+    logging.NullHandler()
+)  # harvesters prints every failure with its stack; errors are raised as sentences
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,15 @@ class ListedCamera:
 
 @contextlib.contextmanager
 def as_device_error(name: str) -> Iterator[None]:
-    """Convert exceptions of the GenICam libraries, raised in the block, to a DeviceError about `name`."""
+    """Convert exceptions of the GenICam libraries, raised in the block, to a DeviceError about
+    `name`."""
     try:
         yield
     except _list_library_errors() as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DeviceError(
-            f"{name} does not answer: check its cable, and close other programs that use it ({reason})"
+            f"{name} does not answer: check its cable, and close other programs that use it"
+            f" ({reason})"
         ) from error
 
 
@@ -60,24 +64,33 @@ def producer_files(producer: str | None = None) -> list[str]:
     """
     if producer is not None:
         if not (producer.endswith(".cti") and Path(producer).is_file()):
-            raise InputError(f"{producer} is no GenTL producer: give the path of a .cti file of your camera's software")
+            raise InputError(
+                f"{producer} is no GenTL producer: give the path of a .cti file of your camera's"
+                " software"
+            )
         return [str(Path(producer).resolve())]
-    folders = [folder for folder in os.environ.get(PRODUCERS_VARIABLE, "").split(os.pathsep) if folder]
-    files = [str(file.resolve()) for folder in folders for file in sorted(Path(folder).glob("*.cti"))]
+    folders = [
+        folder for folder in os.environ.get(PRODUCERS_VARIABLE, "").split(os.pathsep) if folder
+    ]
+    files = [
+        str(file.resolve()) for folder in folders for file in sorted(Path(folder).glob("*.cti"))
+    ]
     if not files:
         raise DeviceError(
-            f"no GenTL producer is installed ({PRODUCERS_VARIABLE} names no folder with a .cti file): install the "
-            "software of your camera's maker, such as Spinnaker (FLIR), pylon (Basler) or IDS peak, and start again, "
-            "or give the path of its .cti file as `producer`"
+            f"no GenTL producer is installed ({PRODUCERS_VARIABLE} names no folder with a .cti"
+            " file): install the software of your camera's maker, such as Spinnaker (FLIR), pylon"
+            " (Basler) or IDS peak, and start again, or give the path of its .cti file as"
+            " `producer`"
         )
     return list(dict.fromkeys(files))
 
 
 def list_cameras(producer: str | None = None) -> list[ListedCamera]:
-    """List the cameras of all producers; one that cannot be loaded is an error only if it is the only one.
+    """List the cameras of all producers; one that cannot be loaded is an error only if it is the
+    only one.
 
-    While a camera of a producer is claimed in this process, its list is that of when it was claimed: to look again
-    would take the camera away.
+    While a camera of a producer is claimed in this process, its list is that of when it was
+    claimed: to look again would take the camera away.
     """
     files, cameras, problems = producer_files(producer), [], []
     for file in files:
@@ -101,7 +114,8 @@ class _Producer:
 
 @contextlib.contextmanager
 def open_producer(file: str) -> Iterator[Any]:
-    """Yield the shared harvester of a producer, updated for its first user and closed after its last."""
+    """Yield the shared harvester of a producer, updated for its first user and closed after its
+    last."""
     with LOCK:
         if file not in _PRODUCERS:
             _PRODUCERS[file] = _Producer(_load_producer(file))
@@ -125,12 +139,18 @@ def _load_producer(file: str) -> Any:
     try:
         harvester.add_file(file, check_existence=True, check_validity=True)
         harvester.update()
-        if not harvester.has_revised_device_info_list:  # harvesters logs why, and goes on without cameras
-            raise DeviceError(f"the GenTL producer {file} cannot list cameras: close other programs that use them")
+        if (
+            not harvester.has_revised_device_info_list
+        ):  # harvesters logs why, and goes on without cameras
+            raise DeviceError(
+                f"the GenTL producer {file} cannot list cameras: close other programs that use them"
+            )
     except BaseException as error:
         ignore_errors(harvester.reset)
         if isinstance(error, (OSError, *_list_library_errors())):
-            raise DeviceError(f"the GenTL producer {file} cannot be loaded: install it again ({error})") from error
+            raise DeviceError(
+                f"the GenTL producer {file} cannot be loaded: install it again ({error})"
+            ) from error
         raise
     return harvester
 

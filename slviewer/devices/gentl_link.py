@@ -30,7 +30,8 @@ _LINKS: dict[ListedCamera, "Link"] = {}
 
 @dataclass(frozen=True)
 class Image:
-    """The bytes of one image where they arrived: valid until the buffer is handed back, never copied."""
+    """The bytes of one image where they arrived: valid until the buffer is handed back, never
+    copied."""
 
     data: np.ndarray
     size: tuple[int, int]
@@ -39,7 +40,8 @@ class Image:
 
 @contextlib.contextmanager
 def open_node_map(camera: ListedCamera) -> Iterator[Any]:
-    """Yield the node map of `camera`, for reading; claims the camera meanwhile unless this process has already."""
+    """Yield the node map of `camera`, for reading; claims the camera meanwhile unless this process
+    has already."""
     with LOCK:
         link = _LINKS.get(camera)
     if link is not None:
@@ -53,10 +55,12 @@ def open_node_map(camera: ListedCamera) -> Iterator[Any]:
 
 
 class Link:
-    """A claimed camera. Belongs to one thread; `close` never raises, and the camera can be claimed again after it."""
+    """A claimed camera. Belongs to one thread; `close` never raises, and the camera can be claimed
+    again after it."""
 
     def __init__(self, camera: ListedCamera) -> None:
-        """Claim the camera. Raises DeviceError where it is not connected or in use by another program."""
+        """Claim the camera. Raises DeviceError where it is not connected or in use by another
+        program."""
         self.name = f"the camera {camera}"
         self._camera = camera
         self._acquirer: Any = None
@@ -68,16 +72,27 @@ class Link:
             try:
                 self._harvester = self._producer.enter_context(open_producer(camera.file))
                 listed = [
-                    info for info in self._harvester.device_info_list if read_listed_camera(info, camera.file) == camera
+                    info
+                    for info in self._harvester.device_info_list
+                    if read_listed_camera(info, camera.file) == camera
                 ]
                 if not listed:
-                    raise DeviceError(f"{self.name} is not connected: plug it in, and wait until it has started")
+                    raise DeviceError(
+                        f"{self.name} is not connected: plug it in, and wait until it has started"
+                    )
                 with as_device_error(self.name), _preserve_sigint_handler():
-                    self._acquirer = self._harvester.create(listed[0], config=_make_acquirer_options())
+                    self._acquirer = self._harvester.create(
+                        listed[0], config=_make_acquirer_options()
+                    )
                 if len(self._acquirer.data_streams) != 1:
-                    raise DeviceError(f"{self.name} sends {len(self._acquirer.data_streams)} streams: use one with one")
+                    raise DeviceError(
+                        f"{self.name} sends {len(self._acquirer.data_streams)} streams: use one"
+                        " with one"
+                    )
                 self._acquirer.timeout_period_on_update_event_data_call = 0
-                self._acquirer.add_callback(self._acquirer.Events.INCOMPLETE_BUFFER, self._incomplete)
+                self._acquirer.add_callback(
+                    self._acquirer.Events.INCOMPLETE_BUFFER, self._incomplete
+                )
                 self.node_map = self._acquirer.remote_device.node_map
             except BaseException:
                 self.close()
@@ -91,7 +106,9 @@ class Link:
                 del _LINKS[self._camera]
             acquirer, self._acquirer, self.streaming = self._acquirer, None, False
             if acquirer is not None:
-                ignore_errors(lambda: acquirer.__exit__(None, None, None))  # unlike destroy(), lets go of its memory
+                ignore_errors(
+                    lambda: acquirer.__exit__(None, None, None)
+                )  # unlike destroy(), lets go of its memory
                 if acquirer.is_valid():  # it failed halfway: the second time skips what failed
                     ignore_errors(acquirer.destroy)
                 ignore_errors(lambda: self._harvester.image_acquirers.remove(acquirer))
@@ -129,8 +146,11 @@ class Link:
                 _return_buffer(buffer)
 
     @contextlib.contextmanager
-    def next(self, timeout_s: float, nbytes: Callable[[tuple[int, int], int], int]) -> Iterator[Image]:
-        """Yield the next image; `nbytes(size, padding)`: bytes required. Raises DeviceError for an incomplete one."""
+    def next(
+        self, timeout_s: float, nbytes: Callable[[tuple[int, int], int], int]
+    ) -> Iterator[Image]:
+        """Yield the next image; `nbytes(size, padding)`: bytes required. Raises DeviceError for an
+        incomplete one."""
         buffer = self._wait_buffer(timeout_s)
         if buffer is None:
             raise DeviceError(_describe_incomplete_frame(self.name))
@@ -144,8 +164,8 @@ class Link:
     def _wait_buffer(self, timeout_s: float) -> Any:
         """Wait for the next buffer; None for one that is incomplete.
 
-        Polled, with pauses of our own: the binding keeps all Python threads waiting while it waits, and
-        `fetch` restarts its timeout after each incomplete buffer, and returns none of them.
+        Polled, with pauses of our own: the binding keeps all Python threads waiting while it waits,
+        and `fetch` restarts its timeout after each incomplete buffer, and returns none of them.
         """
         until = time.monotonic() + timeout_s
         before = self._incomplete.count
@@ -156,17 +176,27 @@ class Link:
                 return buffer
             if time.monotonic() > until:
                 raise DeviceError(
-                    f"{self.name} gave no frame within {timeout_s:.1f} s: check its cable, its trigger and its exposure"
+                    f"{self.name} gave no frame within {timeout_s:.1f} s: check its cable, its"
+                    " trigger and its exposure"
                 )
             time.sleep(_POLL_S)
 
     def _read_image(self, buffer: Any, nbytes: Callable[[tuple[int, int], int], int]) -> Image:
-        """Read from the raw buffer: harvesters' own components unpack into copies, and keep the rows' padding."""
+        """Read from the raw buffer: harvesters' own components unpack into copies, and keep the
+        rows' padding."""
         nodes = self.node_map
-        size = (read_info(buffer, "width") or nodes.Width.value, read_info(buffer, "height") or nodes.Height.value)
-        padding, offset = read_info(buffer, "padding_x") or 0, read_info(buffer, "image_offset") or 0
+        size = (
+            read_info(buffer, "width") or nodes.Width.value,
+            read_info(buffer, "height") or nodes.Height.value,
+        )
+        padding, offset = (
+            read_info(buffer, "padding_x") or 0,
+            read_info(buffer, "image_offset") or 0,
+        )
         if (read_info(buffer, "pixel_format") or self._format) != self._format:
-            raise DeviceError(f"{self.name} sends another pixel format than was set: choose another one")
+            raise DeviceError(
+                f"{self.name} sends another pixel format than was set: choose another one"
+            )
         data = np.frombuffer(buffer.raw_buffer, np.uint8)[offset:]
         needed = nbytes(size, padding)
         filled = read_info(buffer, "size_filled")
@@ -195,13 +225,15 @@ def _make_acquirer_options() -> Any:
     """Return the options of harvesters' acquirers: chunk data is not parsed."""
     from harvesters.core import ParameterKey, ParameterSet
 
-    # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which costs the buffer.
+    # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which costs the
+    # buffer.
     return ParameterSet({ParameterKey.ENABLE_AUTO_CHUNK_DATA_UPDATE: False})
 
 
 @contextlib.contextmanager
 def _preserve_sigint_handler() -> Iterator[None]:
-    """Restore the handler of Ctrl+C: harvesters' own closes the camera instead of ending the program."""
+    """Restore the handler of Ctrl+C: harvesters' own closes the camera instead of ending the
+    program."""
     before = signal.getsignal(signal.SIGINT)
     try:
         yield
@@ -218,6 +250,6 @@ def _return_buffer(buffer: Any) -> None:
 def _describe_incomplete_frame(name: str) -> str:
     """Return the message for an incomplete frame, with remedies."""
     return (
-        f"{name} sent an incomplete frame: use a faster port or a shorter cable, and for GigE cameras jumbo packets or "
-        "a longer packet delay"
+        f"{name} sent an incomplete frame: use a faster port or a shorter cable, and for GigE"
+        " cameras jumbo packets or a longer packet delay"
     )

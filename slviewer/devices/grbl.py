@@ -1,7 +1,9 @@
-"""A turntable whose motor is driven by G-code over a serial port: GRBL 1.1 and its descendants, or Marlin.
+"""A turntable whose motor is driven by G-code over a serial port: GRBL 1.1 and its descendants, or
+Marlin.
 
-GRBL: https://github.com/gnea/grbl/wiki/Grbl-v1.1-Interface and -Jogging. Marlin: https://marlinfw.org/meta/gcode.
-An alarm is never unlocked by itself: only who looks at the table knows that it may turn.
+GRBL: https://github.com/gnea/grbl/wiki/Grbl-v1.1-Interface and -Jogging. Marlin:
+https://marlinfw.org/meta/gcode. An alarm is never unlocked by itself: only who looks at the table
+knows that it may turn.
 """
 
 import re
@@ -21,7 +23,8 @@ Dialect = Literal["auto", "grbl", "marlin"]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e4)]
 
 BOOT_S = 6.0
-"""An Arduino restarts when its port is opened, and its boot loader then listens for about two seconds."""
+"""An Arduino restarts when its port is opened, and its boot loader then listens for about two
+seconds."""
 REPLY_S = 5.0
 """How long a command may take to be accepted."""
 _ANSWER_S = 1.0  # to a question while it boots
@@ -32,15 +35,24 @@ _SPARE_S = 10.0  # that a motion may take longer than planned, beside twice the 
 _CHECK_TABLE = "see that the table turns freely"
 _UNLOCK = "then unlock it with $X (or home it with $H) in a G-code sender"
 ALARMS = {
-    1: f"a limit switch was hit, and the position is lost: {_CHECK_TABLE}, set $21=0 if it has no switches, {_UNLOCK}",
+    1: (
+        f"a limit switch was hit, and the position is lost: {_CHECK_TABLE}, set $21=0 if it has no"
+        f" switches, {_UNLOCK}"
+    ),
     2: f"the angle is outside its soft limits: set $20=0, as a turntable has no end, {_UNLOCK}",
     3: f"it was reset while it turned, and the position is lost: {_CHECK_TABLE}, {_UNLOCK}",
     4: f"a probe was in the wrong state: remove it, {_UNLOCK}",
     5: f"a probe made no contact: remove it, {_UNLOCK}",
     6: f"homing was reset: {_CHECK_TABLE}, {_UNLOCK}",
     7: f"a door was opened during homing: close it, {_UNLOCK}",
-    8: f"homing did not leave the limit switch: check the switch, or set $22=0 if there is none, {_UNLOCK}",
-    9: f"homing did not reach a limit switch: check the switch, or set $22=0 if there is none, {_UNLOCK}",
+    8: (
+        "homing did not leave the limit switch: check the switch, or set $22=0 if there is none,"
+        f" {_UNLOCK}"
+    ),
+    9: (
+        "homing did not reach a limit switch: check the switch, or set $22=0 if there is none,"
+        f" {_UNLOCK}"
+    ),
 }
 """What the alarms of GRBL 1.1 mean, and what to do."""
 
@@ -53,7 +65,9 @@ ERRORS = {
     8: "it is not idle: wait until it stands still, and end other programs that use it",
     9: "it is locked by an alarm: look at the table, then unlock it with $X in a G-code sender",
     10: "soft limits need homing: set $20=0, as a turntable has no end",
-    11: "the line is too long: it received something else too; end other programs that use the port",
+    11: (
+        "the line is too long: it received something else too; end other programs that use the port"
+    ),
     12: "the step rate is too high: lower speed_deg_s",
     13: "its safety door is open: close it",
     15: "the angle is outside its soft limits: set $20=0, as a turntable has no end",
@@ -75,8 +89,8 @@ _BLOCKED = {
 
 @dataclass(frozen=True)
 class ControllerTiming:
-    """How a controller is waited for: how often it is asked for its state, how long it must be silent until everything
-    that it had to say has been read, in s, and the clock.
+    """How a controller is waited for: how often it is asked for its state, how long it must be
+    silent until everything that it had to say has been read, in s, and the clock.
     """
 
     poll_s: float = 0.1
@@ -90,13 +104,13 @@ TIMING = ControllerTiming()
 
 @dataclass(eq=False)
 class GcodeTurntable(Openable):
-    """A turntable on one axis of a GRBL or Marlin controller at a serial port, such as /dev/ttyUSB0 or COM3. It is open
-    while its port is.
+    """A turntable on one axis of a GRBL or Marlin controller at a serial port, such as /dev/ttyUSB0
+    or COM3. It is open while its port is.
 
-    `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the controller's steps per
-    mm were set to steps per degree; negative to reverse it. `settle_ms` passes after it stands still. `boot_s`,
-    `reply_s`: how long it may take to start, and to accept a command, in seconds of the clock of `timing`. Raises
-    InputError.
+    `degrees_per_unit`: degrees that the table turns for one unit (mm) of the axis, 1 where the
+    controller's steps per mm were set to steps per degree; negative to reverse it. `settle_ms`
+    passes after it stands still. `boot_s`, `reply_s`: how long it may take to start, and to accept
+    a command, in seconds of the clock of `timing`. Raises InputError.
     """
 
     port: str
@@ -115,10 +129,14 @@ class GcodeTurntable(Openable):
 
     def __post_init__(self) -> None:
         if self.degrees_per_unit == 0:
-            raise InputError("degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis")
+            raise InputError(
+                "degrees_per_unit = 0 turns nothing: give the degrees per unit of the axis"
+            )
         if (limits := self.limits_deg) is not None:
             if not (len(limits) == 2 and limits[0] < limits[1]):
-                raise InputError(f"limits_deg = {list(limits)} are no limits: give two, the lower one first")
+                raise InputError(
+                    f"limits_deg = {list(limits)} are no limits: give two, the lower one first"
+                )
             self.limits_deg = float(limits[0]), float(limits[1])
         super().__init__(f"the turntable at {self.port}")
         self._clock = self.timing.clock
@@ -128,7 +146,8 @@ class GcodeTurntable(Openable):
         self._is_marlin = False
 
     def _start(self) -> None:
-        """Open the port, and wait for the controller. Raises TurntableError where it does not answer or is locked."""
+        """Open the port, and wait for the controller. Raises TurntableError where it does not
+        answer or is locked."""
         import serial  # lazily: an optional package
 
         try:
@@ -141,8 +160,8 @@ class GcodeTurntable(Openable):
             )
         except (OSError, ValueError) as error:
             raise TurntableError(
-                f"{self.name} cannot be opened ({error}): plug it in, end other programs that use it, and check "
-                "the port; `slviewer devices` lists those that are connected"
+                f"{self.name} cannot be opened ({error}): plug it in, end other programs that use"
+                " it, and check the port; `slviewer devices` lists those that are connected"
             ) from error
         self._buffer, self._unreadable = b"", 0
         self._is_marlin = self._probe() == "marlin"
@@ -159,7 +178,9 @@ class GcodeTurntable(Openable):
     def position_deg(self) -> float:
         """Ask the controller for the angle that it counts."""
         self.check_open()
-        return (self._read_marlin() if self._is_marlin else self._read_grbl()[1]) * self.degrees_per_unit
+        return (
+            self._read_marlin() if self._is_marlin else self._read_grbl()[1]
+        ) * self.degrees_per_unit
 
     def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
         """Turn to an angle, wait until it stands still, and `settle_ms` more."""
@@ -168,8 +189,13 @@ class GcodeTurntable(Openable):
         change_deg = deg - self.position_deg()
         units = change_deg / self.degrees_per_unit
         feed = 60.0 * self.speed_deg_s / abs(self.degrees_per_unit)  # units a minute
-        end = self._clock() + 2.0 * abs(change_deg) / self.speed_deg_s + _SPARE_S * self.reply_s / REPLY_S
-        # Relative to what it counts now: the reported and the commanded angle may have different origins (G92, G54).
+        end = (
+            self._clock()
+            + 2.0 * abs(change_deg) / self.speed_deg_s
+            + _SPARE_S * self.reply_s / REPLY_S
+        )
+        # Relative to what it counts now: the reported and the commanded angle may have different
+        # origins (G92, G54).
         move = f"{self.axis}{units:.4f} F{feed:.2f}"
         try:
             check()
@@ -183,13 +209,15 @@ class GcodeTurntable(Openable):
                 while self._read_grbl()[0] != "Idle":
                     check()
                     if self._clock() > end:
-                        raise TurntableError(f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}")
+                        raise TurntableError(
+                            f"{self.name} did not reach {deg:g} degrees in time: {_CHECK_TABLE}"
+                        )
                     time.sleep(self.timing.poll_s)
             reached_deg = self.position_deg()
             if abs(reached_deg - deg) > max(_TOLERANCE_DEG, 0.01 * abs(self.degrees_per_unit)):
                 raise TurntableError(
-                    f"{self.name} stopped at {reached_deg:.2f} instead of {deg:g} degrees: {_CHECK_TABLE}, and end "
-                    "other programs that use it"
+                    f"{self.name} stopped at {reached_deg:.2f} instead of {deg:g} degrees:"
+                    f" {_CHECK_TABLE}, and end other programs that use it"
                 )
         except BaseException:
             self._stop()
@@ -197,34 +225,46 @@ class GcodeTurntable(Openable):
         time.sleep(self.settle_ms / 1000)
 
     def _probe(self) -> Dialect:
-        """Ask who is there until the controller answers. Raises TurntableError where it does not, or not readably."""
+        """Ask who is there until the controller answers. Raises TurntableError where it does not,
+        or not readably."""
         end = self._clock() + self.boot_s
         while self._clock() < end:
-            for question, dialect, answer in (("$I", "grbl", "[VER:"), ("M115", "marlin", "FIRMWARE_NAME")):
+            for question, dialect, answer in (
+                ("$I", "grbl", "[VER:"),
+                ("M115", "marlin", "FIRMWARE_NAME"),
+            ):
                 if self.dialect not in ("auto", dialect):
                     continue
                 self._write(f"{question}\n".encode())
                 until = min(end, self._clock() + _ANSWER_S * self.boot_s / BOOT_S)
                 while (line := self._read_line(until)) is not None:
-                    refused = dialect == "grbl" and line.startswith("error:")  # it is GRBL, but paused
+                    refused = dialect == "grbl" and line.startswith(
+                        "error:"
+                    )  # it is GRBL, but paused
                     if answer in line or refused:
                         self._drain()
                         return "grbl" if dialect == "grbl" else "marlin"
                     if line.startswith(("ok", "error:")):
                         break
         if self._unreadable:
-            raise TurntableError(f"{self.name} sends unreadable characters at {self.baud} baud: set its own `baud`")
+            raise TurntableError(
+                f"{self.name} sends unreadable characters at {self.baud} baud: set its own `baud`"
+            )
         raise TurntableError(
-            f"{self.name} does not answer as {'GRBL or Marlin' if self.dialect == 'auto' else self.dialect} within "
-            f"{self.boot_s:g} s: switch it on, and check `port`, `baud` and `dialect`"
+            f"{self.name} does not answer as"
+            f" {'GRBL or Marlin' if self.dialect == 'auto' else self.dialect} within"
+            f" {self.boot_s:g} s: switch it on, and check `port`, `baud` and `dialect`"
         )
 
     def _drain(self) -> None:
-        """Discard lines until none comes: late answers to earlier questions must not confirm a command."""
+        """Discard lines until none comes: late answers to earlier questions must not confirm a
+        command."""
         while self._read_line(self._clock() + self.timing.quiet_s) is not None:
             pass
 
-    def _command(self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None) -> None:
+    def _command(
+        self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None
+    ) -> None:
         """Send a line, and wait until it is accepted; `check()` is called meanwhile."""
         self._write(f"{command}\n".encode())
         end = self._clock() + self.reply_s if end is None else end
@@ -236,21 +276,27 @@ class GcodeTurntable(Openable):
             self._check_line(line, command)
             if line.startswith("ok"):
                 return
-            if line.startswith("echo:busy") and command != "M400":  # it says every two seconds that it is alive
+            if (
+                line.startswith("echo:busy") and command != "M400"
+            ):  # it says every two seconds that it is alive
                 end = self._clock() + self.reply_s
         raise TurntableError(
-            f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its cable"
+            f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its"
+            " cable"
         )
 
     def _read_grbl(self) -> tuple[str, float]:
-        """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which it cannot turn."""
+        """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which
+        it cannot turn."""
         self._write(b"?")
         end = self._clock() + self.reply_s
         while (line := self._read_line(end)) is not None:
             if match := re.fullmatch(r"<(\w+)[^|]*\|[MW]Pos:([-\d.,]+)(\|.*)?>", line):
                 state, positions = match[1], match[2].split(",")
                 if state == "Alarm":
-                    raise TurntableError(f"{self.name} is locked by an alarm: {_CHECK_TABLE}, {_UNLOCK}")
+                    raise TurntableError(
+                        f"{self.name} is locked by an alarm: {_CHECK_TABLE}, {_UNLOCK}"
+                    )
                 if state in _BLOCKED:
                     raise TurntableError(f"{self.name} {_BLOCKED[state]}")
                 index = "XYZABC".find(self.axis)
@@ -258,10 +304,14 @@ class GcodeTurntable(Openable):
                     return state, float(positions[index] if index >= 0 else "")
                 except (IndexError, ValueError):
                     raise TurntableError(
-                        f"{self.name} has no axis {self.axis}, it has {'XYZABC'[: len(positions)]}: set `axis`"
+                        f"{self.name} has no axis {self.axis}, it has {'XYZABC'[: len(positions)]}:"
+                        " set `axis`"
                     ) from None
             self._check_line(line, "?")
-        raise TurntableError(f"{self.name} did not report its state in time: switch it off and on, and check its cable")
+        raise TurntableError(
+            f"{self.name} did not report its state in time: switch it off and on, and check its"
+            " cable"
+        )
 
     def _read_marlin(self) -> float:
         """Ask Marlin for the position of the axis, in units."""
@@ -275,22 +325,30 @@ class GcodeTurntable(Openable):
                 if position is None:
                     raise TurntableError(f"{self.name} has no axis {self.axis}: set `axis`")
                 return position
-        raise TurntableError(f"{self.name} did not report its angle in time: switch it off and on, and check its cable")
+        raise TurntableError(
+            f"{self.name} did not report its angle in time: switch it off and on, and check its"
+            " cable"
+        )
 
     def _check_line(self, line: str, command: str) -> None:
         """Raise TurntableError for a line that reports an alarm, an error or a restart."""
         if match := re.match(r"(ALARM|error):(\d+)", line):
             kind, number = match[1], int(match[2])
             if kind == "ALARM":
-                meaning = ALARMS.get(number, f"see the alarms of its firmware; {_CHECK_TABLE}, {_UNLOCK}")
+                meaning = ALARMS.get(
+                    number, f"see the alarms of its firmware; {_CHECK_TABLE}, {_UNLOCK}"
+                )
                 raise TurntableError(f"{self.name} raised alarm {number}: {meaning}")
             meaning = ERRORS.get(number, "see the errors of its firmware")
             raise TurntableError(f"{self.name} refused {command!r} with error {number}: {meaning}")
         if line.startswith(("Error:", "!!")):
-            raise TurntableError(f"{self.name} reports {line!r}: correct that, and switch it off and on")
+            raise TurntableError(
+                f"{self.name} reports {line!r}: correct that, and switch it off and on"
+            )
         if line.startswith("Grbl ") or line == "start":
             raise TurntableError(
-                f"{self.name} restarted: check its power supply and its cable; its count of the angle is lost"
+                f"{self.name} restarted: check its power supply and its cable; its count of the"
+                " angle is lost"
             )
 
     def _stop(self) -> None:
@@ -312,7 +370,8 @@ class GcodeTurntable(Openable):
             raise self._describe_loss(error) from error
 
     def _read_line(self, end: float) -> str | None:
-        """Return the next line without its end; None where none is complete at `end`, s of the clock."""
+        """Return the next line without its end; None where none is complete at `end`, s of the
+        clock."""
         while True:
             line, newline, rest = self._buffer.partition(b"\n")
             if newline:

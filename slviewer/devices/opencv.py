@@ -1,7 +1,8 @@
-"""A camera for everything that OpenCV can open: a webcam, a video file, an MJPEG (http://…) or RTSP address.
+"""A camera for everything that OpenCV can open: a webcam, a video file, an MJPEG (http://…) or RTSP
+address.
 
-Frames have 8 bits: OpenCV gives no more of any of these. A webcam's exposure, white balance and focus stay where they
-are when it is opened, as nothing may change by itself during a capture.
+Frames have 8 bits: OpenCV gives no more of any of these. A webcam's exposure, white balance and
+focus stay where they are when it is opened, as nothing may change by itself during a capture.
 """
 
 import math
@@ -37,18 +38,20 @@ SETTLING = 3
 """Pictures that a webcam takes until an exposure that was set is the one that they have."""
 
 _IN_USE: dict[int | str, "OpenCVCamera"] = {}
-"""Who has which source open in this process: most cannot be opened a second time to query their size."""
+"""Who has which source open in this process: most cannot be opened a second time to query their
+size."""
 
 
 @dataclass(eq=False)
 class OpenCVCamera(Openable):
-    """One `channel` of the webcam with the number `source`, or of the video at a path or an address. `notes` lists, in
-    sentences, settings that were refused or changed since it was opened.
+    """One `channel` of the webcam with the number `source`, or of the video at a path or an
+    address. `notes` lists, in sentences, settings that were refused or changed since it was opened.
 
-    `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use, or the source must
-    answer now. The settings are made when it is opened, None leaves one as it is: exposure in ms, gain and focus in the
-    camera's own units, white balance in K. `timing`: how long pictures are waited for. A gain in the camera's own units
-    is no factor on the grey levels: `settings` does not report it and `apply` does not set it.
+    `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use,
+    or the source must answer now. The settings are made when it is opened, None leaves one as it
+    is: exposure in ms, gain and focus in the camera's own units, white balance in K. `timing`: how
+    long pictures are waited for. A gain in the camera's own units is no factor on the grey levels:
+    `settings` does not report it and `apply` does not set it.
 
     Raises InputError for invalid options, DeviceError for a source that does not answer.
     """
@@ -69,8 +72,13 @@ class OpenCVCamera(Openable):
         wanted = None if self.size is None else check_image_size("camera", self.size)
         check_channel(self.channel)
         CameraSettings(self.exposure_ms)
-        if not all(value is None or math.isfinite(value) for value in (self.gain, self.focus, self.white_balance)):
-            raise InputError("a gain, a focus or a white balance that is no number cannot be set: give one")
+        if not all(
+            value is None or math.isfinite(value)
+            for value in (self.gain, self.focus, self.white_balance)
+        ):
+            raise InputError(
+                "a gain, a focus or a white balance that is no number cannot be set: give one"
+            )
         super().__init__(describe_source(source))
         if wanted is None and source in _IN_USE:
             wanted = _IN_USE[source].size
@@ -88,9 +96,12 @@ class OpenCVCamera(Openable):
         return tuple(f"{self.name}: {sentence}" for sentence in self._notices.values() if sentence)
 
     def _start(self) -> None:
-        """Start reading. Raises DeviceError where the source does not answer, or its frames have another size."""
+        """Start reading. Raises DeviceError where the source does not answer, or its frames have
+        another size."""
         if self._reader is not None:
-            self._reader.join(self.timing.opening_s)  # it may hang in a call, the device still in its hands
+            self._reader.join(
+                self.timing.opening_s
+            )  # it may hang in a call, the device still in its hands
         self._reader = Reader(self.name, self._connect, self.timing)
         self._next, self._read = self._check_size(self._reader.first()), 0
         self._notices = {}
@@ -106,7 +117,8 @@ class OpenCVCamera(Openable):
         super().close()
 
     def grab(self, out: np.ndarray) -> None:
-        """Grab a picture whose exposure started after this call; of a video file, the next picture."""
+        """Grab a picture whose exposure started after this call; of a video file, the next
+        picture."""
         check_frame(self, out)
         image = self._read_picture()
         if image.ndim == 2:
@@ -123,17 +135,23 @@ class OpenCVCamera(Openable):
         """Read the exposure; None where the camera does not report it."""
         dialect = self._dialect
         reader = self._require_reader()
-        return CameraSettings(None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect)))
+        return CameraSettings(
+            None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect))
+        )
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set the exposure; what could not be set is in `notes`."""
         dialect, ms = self._dialect, settings.exposure_ms
         reader = self._require_reader()
         if dialect is not None and ms is not None:
-            self._notices["exposure"] = reader.do(lambda capture: set_exposure(capture, dialect, ms))
+            self._notices["exposure"] = reader.do(
+                lambda capture: set_exposure(capture, dialect, ms)
+            )
             self._unsettled = SETTLING
         if dialect is not None and settings.gain is not None:
-            self._notices["gain"] = "its gain has units of its own: set it in the rig's file, as the camera's gain"
+            self._notices["gain"] = (
+                "its gain has units of its own: set it in the rig's file, as the camera's gain"
+            )
         return self.settings()
 
     def _require_reader(self) -> Reader:
@@ -149,15 +167,17 @@ class OpenCVCamera(Openable):
         if dialect is None:
             if self._require_reader().live or (self.exposure_ms, *controls) != (None,) * 4:
                 self._notices["controls"] = (
-                    "its exposure, gain, focus and white balance cannot be set from here: set them at the camera "
-                    "itself, and switch off everything automatic"
+                    "its exposure, gain, focus and white balance cannot be set from here: set them"
+                    " at the camera itself, and switch off everything automatic"
                 )
             return
         self._notices |= disable_automatics(capture, dialect)
         if self.exposure_ms is not None:
             self._notices["exposure"] = set_exposure(capture, dialect, self.exposure_ms)
         properties = (cv2.CAP_PROP_GAIN, cv2.CAP_PROP_FOCUS, dialect.white_balance)
-        for control, value, what in zip(properties, controls, ("gain", "focus", "white balance"), strict=True):
+        for control, value, what in zip(
+            properties, controls, ("gain", "focus", "white balance"), strict=True
+        ):
             if value is not None:
                 self._notices[what] = set_value(capture, control, value, what)
         self._unsettled = SETTLING
@@ -174,21 +194,25 @@ class OpenCVCamera(Openable):
             read, following = reader.do(lambda capture: capture.read())
             if not read:
                 raise DeviceError(
-                    f"{self.name} has ended after {self._read} pictures: close it and open it again to start over"
+                    f"{self.name} has ended after {self._read} pictures: close it and open it again"
+                    " to start over"
                 )
         self._read += 1
         return self._check_size(following)
 
     def _check_size(self, image: np.ndarray) -> np.ndarray:
-        """Return the image (h, w) or (h, w, 3) if it has the camera's size and 8 bits. Raises DeviceError otherwise."""
+        """Return the image (h, w) or (h, w, 3) if it has the camera's size and 8 bits. Raises
+        DeviceError otherwise."""
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise DeviceError(
-                f"{self.name} gives pictures of {width} x {height} px instead of {self.size[0]} x {self.size[1]}: "
-                f"choose {width} x {height} as its size, or another that it has"
+                f"{self.name} gives pictures of {width} x {height} px instead of {self.size[0]} x"
+                f" {self.size[1]}: choose {width} x {height} as its size, or another that it has"
             )
         if image.dtype != np.uint8:
-            raise DeviceError(f"{self.name} gives {image.dtype} and not 8 bits: switch it to an 8-bit format")
+            raise DeviceError(
+                f"{self.name} gives {image.dtype} and not 8 bits: switch it to an 8-bit format"
+            )
         return image
 
     def _probe_size(self) -> tuple[int, int]:
@@ -205,8 +229,14 @@ def _check_source(source: int | str) -> int | str:
     """Return a webcam's number, a path or an address. Raises InputError for anything else."""
     if isinstance(source, str) and source.isdecimal():
         source = int(source)
-    if not isinstance(source, int | str) or isinstance(source, bool) or (isinstance(source, int) and source < 0):
-        raise InputError(f"{source!r} is no camera: give a webcam's number, a video file, or an address")
+    if (
+        not isinstance(source, int | str)
+        or isinstance(source, bool)
+        or (isinstance(source, int) and source < 0)
+    ):
+        raise InputError(
+            f"{source!r} is no camera: give a webcam's number, a video file, or an address"
+        )
     return source
 
 

@@ -1,6 +1,8 @@
-"""What OpenCV's ways to a webcam call its exposure, gain, focus and white balance, and in which units.
+"""What OpenCV's ways to a webcam call its exposure, gain, focus and white balance, and in which
+units.
 
-A camera may refuse a value, round it or ignore it: what counts is the value that it reports afterwards.
+A camera may refuse a value, round it or ignore it: what counts is the value that it reports
+afterwards.
 """
 
 import math
@@ -15,8 +17,8 @@ UNKNOWN = -1.0
 
 @dataclass(frozen=True)
 class Dialect:
-    """The control conventions of one backend. `automatics`: each automatic control, and the value that switches it off;
-    empty where a value that is set switches its own automatic off.
+    """The control conventions of one backend. `automatics`: each automatic control, and the value
+    that switches it off; empty where a value that is set switches its own automatic off.
     """
 
     to_ms: Callable[[float], float]
@@ -25,9 +27,10 @@ class Dialect:
     automatics: tuple[tuple[str, int, float], ...] = ()
 
 
-# V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us; V4L2_EXPOSURE_MANUAL is 1 (docs.kernel.org, "Camera Control Reference").
-# OpenCV 4 and later hands both on as they are (modules/videoio/src/cap_v4l.cpp; the 0.25 and 0.75 of older advice are
-# those of its normalised ranges, which `CAP_PROP_MODE` 0 switches off).
+# V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us; V4L2_EXPOSURE_MANUAL is 1 (docs.kernel.org, "Camera
+# Control Reference"). OpenCV 4 and later hands both on as they are
+# (modules/videoio/src/cap_v4l.cpp; the 0.25 and 0.75 of older advice are those of its normalised
+# ranges, which `CAP_PROP_MODE` 0 switches off).
 _V4L2 = Dialect(
     to_ms=lambda value: value / 10,
     from_ms=lambda ms: max(1.0, round(ms * 10)),
@@ -40,11 +43,17 @@ _V4L2 = Dialect(
 )
 
 
-# Windows counts in powers of two of a second (learn.microsoft.com, "ICameraControl::put_Exposure"); OpenCV cuts the
-# fraction off, and sets each value with the flag that says "manual" (cap_dshow.cpp, cap_msmf.cpp: setProperty).
+# Windows counts in powers of two of a second (learn.microsoft.com, "ICameraControl::put_Exposure");
+# OpenCV cuts the fraction off, and sets each value with the flag that says "manual" (cap_dshow.cpp,
+# cap_msmf.cpp: setProperty).
 def _make_windows_dialect(white_balance: int) -> Dialect:
-    """Return the conventions of Windows' backends: exposures are powers of two in s, set by their exponent."""
-    return Dialect(lambda value: 1000 * 2.0**value, lambda ms: float(round(math.log2(ms / 1000))), white_balance)
+    """Return the conventions of Windows' backends: exposures are powers of two in s, set by their
+    exponent."""
+    return Dialect(
+        lambda value: 1000 * 2.0**value,
+        lambda ms: float(round(math.log2(ms / 1000))),
+        white_balance,
+    )
 
 
 _DIALECTS = {
@@ -55,8 +64,9 @@ _DIALECTS = {
 
 
 def dialect_of(capture: cv2.VideoCapture) -> Dialect | None:
-    """Return the control conventions of the open `capture`'s backend; None where controls are not accessible: those of
-    a stream, and on macOS those of any camera (cap_avfoundation_mac.mm sets a size and a frame rate only).
+    """Return the control conventions of the open `capture`'s backend; None where controls are not
+    accessible: those of a stream, and on macOS those of any camera (cap_avfoundation_mac.mm sets a
+    size and a frame rate only).
     """
     dialect = _DIALECTS.get(capture.getBackendName())
     if dialect is _V4L2:
@@ -65,8 +75,8 @@ def dialect_of(capture: cv2.VideoCapture) -> Dialect | None:
 
 
 def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, str]:
-    """Fix exposure, white balance and focus at their current values; returns {control: warning} for those that stay
-    automatic.
+    """Fix exposure, white balance and focus at their current values; returns {control: warning} for
+    those that stay automatic.
 
     A pattern sequence means nothing when its frames are exposed differently.
     """
@@ -75,7 +85,8 @@ def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, s
         automatic = [
             what
             for what, control, off in words.automatics
-            if capture.get(control) != UNKNOWN and not (capture.set(control, off) and capture.get(control) == off)
+            if capture.get(control) != UNKNOWN
+            and not (capture.set(control, off) and capture.get(control) == off)
         ]
     else:
         remedy = "do it in the system's camera settings"
@@ -85,8 +96,15 @@ def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, s
             "focus": cv2.CAP_PROP_FOCUS,
         }
         current = {what: capture.get(control) for what, control in controls.items()}
-        automatic = [what for what, now in current.items() if now != UNKNOWN and not capture.set(controls[what], now)]
-    return {f"automatic {what}": f"its automatic {what} cannot be switched off: {remedy}" for what in automatic}
+        automatic = [
+            what
+            for what, now in current.items()
+            if now != UNKNOWN and not capture.set(controls[what], now)
+        ]
+    return {
+        f"automatic {what}": f"its automatic {what} cannot be switched off: {remedy}"
+        for what in automatic
+    }
 
 
 def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:
@@ -97,7 +115,8 @@ def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:
 
 
 def set_exposure(capture: cv2.VideoCapture, words: Dialect, ms: float) -> str:
-    """Set the exposure to the nearest supported value; returns a warning if that differs or failed, else ""."""
+    """Set the exposure to the nearest supported value; returns a warning if that differs or failed,
+    else ""."""
     value = words.from_ms(ms)
     capture.set(cv2.CAP_PROP_EXPOSURE, value)
     applied = exposure_ms(capture, words)
@@ -109,9 +128,12 @@ def set_exposure(capture: cv2.VideoCapture, words: Dialect, ms: float) -> str:
 
 
 def set_value(capture: cv2.VideoCapture, control: int, value: float, what: str) -> str:
-    """Set a control, in the camera's units; returns a warning if the value differs or was not set, else ""."""
+    """Set a control, in the camera's units; returns a warning if the value differs or was not set,
+    else ""."""
     capture.set(control, value)
     applied = capture.get(control)
     if applied == UNKNOWN != value:
         return f"its {what} cannot be set: set it at the camera itself"
-    return "" if abs(applied - value) < 0.5 else f"its {what} is {applied:g}, {value:g} was requested"
+    return (
+        "" if abs(applied - value) < 0.5 else f"its {what} is {applied:g}, {value:g} was requested"
+    )

@@ -1,8 +1,9 @@
 """One video capture on a thread of its own, which alone knows which of its pictures are new.
 
-Calls into a capture may block for as long as a driver or a network likes, so that callers who need a picture wait here,
-and not longer than `StreamTiming.patience_s`. A live source is read without a break, wanted or not: unread pictures
-accumulate in the buffers of the driver, of the network and of the sender, and arrive later as if they were new.
+Calls into a capture may block for as long as a driver or a network likes, so that callers who need
+a picture wait here, and not longer than `StreamTiming.patience_s`. A live source is read without a
+break, wanted or not: unread pictures accumulate in the buffers of the driver, of the network and of
+the sender, and arrive later as if they were new.
 """
 
 import threading
@@ -19,8 +20,9 @@ import numpy as np
 from slviewer.errors import DeviceError
 
 FRAMES = 3
-"""The exposure of the first picture that arrives after a request started before it. So may the second have been, by a
-sensor that exposes its next picture while it reads out the previous one; that of the third started after it.
+"""The exposure of the first picture that arrives after a request started before it. So may the
+second have been, by a sensor that exposes its next picture while it reads out the previous one;
+that of the third started after it.
 """
 
 _WINDOW_S = 4.0
@@ -33,9 +35,10 @@ T = TypeVar("T")
 class StreamTiming:
     """How long a reader waits, in s of `clock`.
 
-    `patience_s`: without a picture for so long, a source is lost. `opening_s`: a webcam's driver may take seconds to
-    start it. `warm_up_s`: a live source's first pictures, which may be dark, are discarded for so long. `ended_s`: a
-    source that refuses its next picture for so long gives no more.
+    `patience_s`: without a picture for so long, a source is lost. `opening_s`: a webcam's driver
+    may take seconds to start it. `warm_up_s`: a live source's first pictures, which may be dark,
+    are discarded for so long. `ended_s`: a source that refuses its next picture for so long gives
+    no more.
     """
 
     patience_s: float = 2.5
@@ -51,8 +54,8 @@ TIMING = StreamTiming()
 
 @dataclass(frozen=True)
 class Connected:
-    """An open capture. One that is not `live` gives its next picture on request; where not even `grab_waits` for a
-    picture of a live one, `read` does.
+    """An open capture. One that is not `live` gives its next picture on request; where not even
+    `grab_waits` for a picture of a live one, `read` does.
     """
 
     capture: cv2.VideoCapture
@@ -69,8 +72,9 @@ class Pace:
     def add(self, now: float, busy: float) -> float | None:
         """Add a picture that arrived at `now` s, when the reader had computed for `busy` s in all.
 
-        Returns the time since the previous one in mean frame periods; None before three have arrived. The mean is over
-        seconds, so that pictures which come in clumps, or in a flood after a pause, do not shorten it.
+        Returns the time since the previous one in mean frame periods; None before three have
+        arrived. The mean is over seconds, so that pictures which come in clumps, or in a flood
+        after a pause, do not shorten it.
         """
         arrivals = self._arrivals
         periods = None
@@ -78,13 +82,16 @@ class Pace:
             mean = (arrivals[-1][0] - arrivals[0][0]) / (len(arrivals) - 1)
             periods = (now - arrivals[-1][0]) / max(mean, 1e-6)
         arrivals.append((now, busy))
-        while len(arrivals) > 3 and arrivals[1][0] < now - _WINDOW_S:  # a pause stays until its flood has gone by
+        while (
+            len(arrivals) > 3 and arrivals[1][0] < now - _WINDOW_S
+        ):  # a pause stays until its flood has gone by
             arrivals.popleft()
         return periods
 
     @property
     def saturated(self) -> bool:
-        """Whether the reader never waits: it is slower than the source, and what it reads is always late."""
+        """Whether the reader never waits: it is slower than the source, and what it reads is always
+        late."""
         (start, idle), (end, busy) = self._arrivals[0], self._arrivals[-1]
         return end - start > _WINDOW_S / 2 and busy - idle > _SATURATED * (end - start)
 
@@ -99,12 +106,16 @@ class _Wanted:
 
 
 class Reader:
-    """Reads the capture that `connect` opens, until `close`. Its methods are called from one other thread.
+    """Reads the capture that `connect` opens, until `close`. Its methods are called from one other
+    thread.
 
-    `connect` may raise DeviceError. So does every method once the source is lost: make another reader then.
+    `connect` may raise DeviceError. So does every method once the source is lost: make another
+    reader then.
     """
 
-    def __init__(self, name: str, connect: Callable[[], Connected], timing: StreamTiming = TIMING) -> None:
+    def __init__(
+        self, name: str, connect: Callable[[], Connected], timing: StreamTiming = TIMING
+    ) -> None:
         self._name, self._connect, self._timing = name, connect, timing
         self._condition = threading.Condition()
         self._jobs: deque[tuple[Callable[[cv2.VideoCapture], Any], Future[Any]]] = deque()
@@ -124,7 +135,8 @@ class Reader:
         return self._live
 
     def first(self) -> np.ndarray:
-        """Wait for the first valid picture, (h, w, 3) BGR or (h, w), once the source is open. Raises DeviceError."""
+        """Wait for the first valid picture, (h, w, 3) BGR or (h, w), once the source is open.
+        Raises DeviceError."""
         with self._condition:
             self._wait_until(lambda: self._first is not None, self._timing.opening_s)
             assert self._first is not None
@@ -140,16 +152,21 @@ class Reader:
         return job.result()
 
     def picture(self, later: int = 0) -> np.ndarray:
-        """Wait for a live source's first picture (h, w, 3) BGR exposed after this call, or `later` pictures after it.
+        """Wait for a live source's first picture (h, w, 3) BGR exposed after this call, or `later`
+        pictures after it.
 
-        The delay within an encoder and a network cannot be measured here: the rig measures it and waits for it.
+        The delay within an encoder and a network cannot be measured here: the rig measures it and
+        waits for it.
         """
         wanted, patience_s = _Wanted(FRAMES + later), self._timing.patience_s
         with self._condition:
             self._wanted = wanted
             try:
-                # some sources may be slow and others may come in clumps: the end is when nothing counts for too long
-                self._wait_until(lambda: wanted.image is not None, patience_s, patience_s * wanted.remaining)
+                # some sources may be slow and others may come in clumps: the end is when nothing
+                # counts for too long
+                self._wait_until(
+                    lambda: wanted.image is not None, patience_s, patience_s * wanted.remaining
+                )
             finally:
                 self._wanted = None
         assert wanted.image is not None
@@ -166,8 +183,11 @@ class Reader:
         """Wait until the capture is released."""
         self._thread.join(timeout_s)
 
-    def _wait_until(self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0) -> None:
-        """Wait for `ready()` on the condition. Raises DeviceError once no picture has come for `patience_s`."""
+    def _wait_until(
+        self, ready: Callable[[], bool], patience_s: float, longest_s: float = 0.0
+    ) -> None:
+        """Wait for `ready()` on the condition. Raises DeviceError once no picture has come for
+        `patience_s`."""
         requested_s = self._timing.clock()
         while not ready():
             if self._lost:
@@ -176,20 +196,21 @@ class Reader:
             silent = now - max(self._arrived, requested_s) if longest_s else now - requested_s
             if silent > patience_s:
                 raise DeviceError(
-                    f"{self._name} gave no picture within {patience_s:g} s: check its cable and whether another "
-                    "program uses it"
+                    f"{self._name} gave no picture within {patience_s:g} s: check its cable and"
+                    " whether another program uses it"
                 )
             if longest_s and now - requested_s > longest_s:
                 raise DeviceError(
-                    f"the pictures of {self._name} arrive too irregularly to separate new from buffered ones: "
-                    "use a cable instead of a radio link, or a lower frame rate"
+                    f"the pictures of {self._name} arrive too irregularly to separate new from"
+                    " buffered ones: use a cable instead of a radio link, or a lower frame rate"
                 )
             self._condition.wait(0.1)
 
     # on its own thread
 
     def _serve(self) -> None:
-        """Open the source, run jobs and read pictures until closing; store why the source was lost."""
+        """Open the source, run jobs and read pictures until closing; store why the source was
+        lost."""
         capture = None
         try:
             connected = self._connect()
@@ -220,14 +241,17 @@ class Reader:
                 capture.release()
 
     def _read_first(self, connected: Connected) -> None:
-        """Read the first valid picture; the earliest may be dark, or from buffers filled while opening."""
+        """Read the first valid picture; the earliest may be dark, or from buffers filled while
+        opening."""
         timing = self._timing
         start_s = timing.clock()
         read, image = connected.capture.read()
         frames = 1
         while connected.live and not self._closing:
             late = timing.clock() - start_s
-            if (read and frames > 2 and late > timing.warm_up_s) or (not read and late > timing.patience_s):
+            if (read and frames > 2 and late > timing.warm_up_s) or (
+                not read and late > timing.patience_s
+            ):
                 break
             if not read:
                 time.sleep(0.02)
@@ -235,8 +259,8 @@ class Reader:
             frames += read
         if not read:
             raise DeviceError(
-                f"{self._name} was detected and gives no picture: check whether another program uses it, or choose "
-                "another size"
+                f"{self._name} was detected and gives no picture: check whether another program"
+                " uses it, or choose another size"
             )
         with self._condition:
             self._first, self._live, self._arrived = image, connected.live, timing.clock()
@@ -252,15 +276,22 @@ class Reader:
         now = self._timing.clock()
         if not read:
             if now - self._arrived > self._timing.ended_s:
-                raise DeviceError(f"{self._name} gives no more pictures: plug it in or start it again, and reconnect")
+                raise DeviceError(
+                    f"{self._name} gives no more pictures: plug it in or start it again, and"
+                    " reconnect"
+                )
             time.sleep(0.01)
             return
         self._arrived = now
         periods = self._pace.add(now, time.thread_time())
         wanted = self._wanted
-        if wanted is None or periods is None or periods < 0.5:  # None, or hard on the one before: out of a buffer
+        if (
+            wanted is None or periods is None or periods < 0.5
+        ):  # None, or hard on the one before: out of a buffer
             return
-        if periods > 2 and not wanted.paused:  # after a pause of the reader's own, the first of those that waited
+        if (
+            periods > 2 and not wanted.paused
+        ):  # after a pause of the reader's own, the first of those that waited
             wanted.paused = True
             return
         wanted.remaining -= 1
@@ -268,8 +299,8 @@ class Reader:
             return
         if self._pace.saturated:
             raise DeviceError(
-                f"{self._name} sends pictures faster than this computer can unpack them, so that they grow old: "
-                "lower their size or their rate"
+                f"{self._name} sends pictures faster than this computer can unpack them, so that"
+                " they grow old: lower their size or their rate"
             )
         if image is None:
             read, image = connected.capture.retrieve()

@@ -29,7 +29,9 @@ def describe_source(source: int | str) -> str:
     return f"the camera {source}" if _is_device(source) else f"the video {Path(source).name}"
 
 
-def connect_source(source: int | str, size: tuple[int, int] | None, timing: StreamTiming = TIMING) -> Connected:
+def connect_source(
+    source: int | str, size: tuple[int, int] | None, timing: StreamTiming = TIMING
+) -> Connected:
     """Open a source, a webcam at `size` (width, height) px where supported. Raises DeviceError.
 
     An address may take `patience_s` of the timing to answer, and later to send more.
@@ -40,24 +42,29 @@ def connect_source(source: int | str, size: tuple[int, int] | None, timing: Stre
     name = describe_source(source)
     if _is_address(source):
         limit = int(1000 * timing.patience_s)
-        # one thread: a decoder that works on several pictures at once keeps as many of them back. A stream that changes
-        # its size is scaled to the previous one, without notice
+        # one thread: a decoder that works on several pictures at once keeps as many of them back. A
+        # stream that changes its size is scaled to the previous one, without notice
         options = {
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: limit,
             cv2.CAP_PROP_READ_TIMEOUT_MSEC: limit,
             cv2.CAP_PROP_N_THREADS: 1,
         }
-        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [part for option in options.items() for part in option])
+        capture = cv2.VideoCapture(
+            source, cv2.CAP_FFMPEG, [part for option in options.items() for part in option]
+        )
         if not capture.isOpened():
             raise DeviceError(
-                f"{name} does not answer, or not with a video: check that its camera is switched on, and its address"
+                f"{name} does not answer, or not with a video: check that its camera is switched"
+                " on, and its address"
             )
         return Connected(capture, live=capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0)
     if not Path(source).is_file():
         raise DeviceError(f"{name} does not exist: check its path, {source}")
     capture = cv2.VideoCapture(source)
     if not capture.isOpened():
-        raise DeviceError(f"{name} cannot be read as a video: convert it, to MJPEG in an AVI file for instance")
+        raise DeviceError(
+            f"{name} cannot be read as a video: convert it, to MJPEG in an AVI file for instance"
+        )
     return Connected(capture, live=False)
 
 
@@ -76,14 +83,22 @@ def list_webcams() -> list[str]:
 
 
 def list_sysfs_webcams(sysfs: Path) -> list[str]:
-    """As `list_webcams`, from Linux's sysfs, with missing permissions. A camera's further nodes carry no pictures."""
+    """As `list_webcams`, from Linux's sysfs, with missing permissions. A camera's further nodes
+    carry no pictures."""
     lines = []
     for node in sorted(sysfs.glob("video*"), key=lambda node: (len(node.name), node.name)):
         with contextlib.suppress(OSError):
             if int((node / "index").read_text()) == 0:
                 device = Path("/dev") / node.name
-                locked = "" if os.access(device, os.R_OK | os.W_OK) else f", no permission to use {device}"
-                lines.append(f"source {node.name.removeprefix('video')}: {(node / 'name').read_text().strip()}{locked}")
+                locked = (
+                    ""
+                    if os.access(device, os.R_OK | os.W_OK)
+                    else f", no permission to use {device}"
+                )
+                lines.append(
+                    f"source {node.name.removeprefix('video')}:"
+                    f" {(node / 'name').read_text().strip()}{locked}"
+                )
     return lines
 
 
@@ -95,8 +110,8 @@ def _open_webcam(source: int | str, size: tuple[int, int] | None) -> Connected:
             break
     else:
         raise DeviceError(
-            f"{describe_source(source)} does not answer: check its cable, whether another program uses it, and what "
-            "`slviewer devices` finds"
+            f"{describe_source(source)} does not answer: check its cable, whether another program"
+            " uses it, and what `slviewer devices` finds"
         )
     if size is not None and not _set_size(capture, size):
         # many webcams have their larger sizes compressed only, and OpenCV tries that last
@@ -127,6 +142,8 @@ def _is_device(source: str) -> bool:
 def _silence_libraries() -> None:
     """Silence the libraries' terminal output, unless a log level is set: errors are raised."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
-    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s until a webcam without pictures is given up
+    os.environ.setdefault(
+        "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2"
+    )  # s until a webcam without pictures is given up
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

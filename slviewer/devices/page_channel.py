@@ -1,9 +1,11 @@
-"""The message channel between a device that is a browser's page, and the page, on a server's event loop.
+"""The message channel between a device that is a browser's page, and the page, on a server's event
+loop.
 
-The device's side, on the thread that owns it, sends requests and waits; the server's side connects and disconnects
-pages and passes messages on. One window at a time is the device: it stays so when it is reloaded, and another one takes
-over only when the user requests that in it. What the page reports of itself is judged here whether or not the device is
-open, and the page shows the same message as the operator's panel.
+The device's side, on the thread that owns it, sends requests and waits; the server's side connects
+and disconnects pages and passes messages on. One window at a time is the device: it stays so when
+it is reloaded, and another one takes over only when the user requests that in it. What the page
+reports of itself is judged here whether or not the device is open, and the page shows the same
+message as the operator's panel.
 """
 
 import struct
@@ -19,10 +21,12 @@ import msgspec
 from slviewer.errors import DeviceError, InputError
 
 ANSWER_S = 1.8
-"""A page that is alive answers within two animation frames; a request ends within two seconds unless it says more."""
+"""A page that is alive answers within two animation frames; a request ends within two seconds
+unless it says more."""
 
 Send = Callable[[bytes | None], None]
-"""Queue a message for the page, from any thread, and return at once; None: end it, another window took over."""
+"""Queue a message for the page, from any thread, and return at once; None: end it, another window
+took over."""
 Facts = TypeVar("Facts")
 """What a kind of page reports of itself."""
 
@@ -36,7 +40,8 @@ class Done(msgspec.Struct, tag_field="op", tag="done"):
 
 @dataclass(frozen=True)
 class PageState:
-    """State of a page: "waiting" for one to be opened, "refused" or "ready", and a message in `words`.
+    """State of a page: "waiting" for one to be opened, "refused" or "ready", and a message in
+    `words`.
 
     `size` is the (width, height) px of the page's screen or camera, None while there is none.
     """
@@ -48,9 +53,11 @@ class PageState:
 
 @dataclass(eq=False)
 class PageConnection(Generic[Facts]):
-    """One connection of a page. The device's thread sends requests, the server's stores the answers.
+    """One connection of a page. The device's thread sends requests, the server's stores the
+    answers.
 
-    ``changes`` of what it reported since it connected; ``refused``, ``gone``: why it cannot be the device, or is lost.
+    ``changes`` of what it reported since it connected; ``refused``, ``gone``: why it cannot be the
+    device, or is lost.
     """
 
     condition: threading.Condition
@@ -66,8 +73,11 @@ class PageConnection(Generic[Facts]):
     _number: int = 0
     _answer: tuple[Done, bytes] | None = None
 
-    def request(self, op: str, payload: bytes = b"", timeout_s: float | None = None, **fields: Any) -> bytes:
-        """Send a request, wait until the page reports it done, and return what came with the answer.
+    def request(
+        self, op: str, payload: bytes = b"", timeout_s: float | None = None, **fields: Any
+    ) -> bytes:
+        """Send a request, wait until the page reports it done, and return what came with the
+        answer.
 
         Raises DeviceError within `timeout_s`, None: within `answer_s`.
         """
@@ -82,8 +92,8 @@ class PageConnection(Generic[Facts]):
                 remaining_s = end - time.monotonic()
                 if remaining_s <= 0:
                     raise DeviceError(
-                        f"{self.name} did not answer within {timeout_s:g} s: look whether its window is covered, "
-                        "its computer asleep, or the network down"
+                        f"{self.name} did not answer within {timeout_s:g} s: look whether its"
+                        " window is covered, its computer asleep, or the network down"
                     )
                 self.condition.wait(remaining_s)
             done, content = self._answer
@@ -103,11 +113,12 @@ class PageConnection(Generic[Facts]):
 
 
 class PageChannel(ABC, Generic[Facts]):
-    """Connects a device to its page. Every method may be called from any thread; only `wait_ready` waits."""
+    """Connects a device to its page. Every method may be called from any thread; only `wait_ready`
+    waits."""
 
     hello: type
-    """The page's first message, a struct of `window`, `take` and `facts`; `window` is the same after a reload, `take`:
-    it requests to be the device."""
+    """The page's first message, a struct of `window`, `take` and `facts`; `window` is the same
+    after a reload, `take`: it requests to be the device."""
     report: type
     """Message of the page that its `facts` have changed."""
     name: str
@@ -124,7 +135,8 @@ class PageChannel(ABC, Generic[Facts]):
 
     @abstractmethod
     def _refuse(self, facts: Facts) -> str:
-        """Return why a page that reports this cannot be the device, with a remedy; "" where it can."""
+        """Return why a page that reports this cannot be the device, with a remedy; "" where it
+        can."""
 
     @abstractmethod
     def _size(self, facts: Facts) -> tuple[int, int] | None:
@@ -132,7 +144,8 @@ class PageChannel(ABC, Generic[Facts]):
 
     @abstractmethod
     def _describe_state(self, facts: Facts) -> tuple[Any, dict[str, Any]]:
-        """Return a value that differs when the page has to learn its state anew, and the fields that describe it."""
+        """Return a value that differs when the page has to learn its state anew, and the fields
+        that describe it."""
 
     # for panels that show the state
 
@@ -159,15 +172,17 @@ class PageChannel(ABC, Generic[Facts]):
         """Return the connected page, able to be the device. Raises DeviceError with a remedy."""
         with self._condition:
             if self._page is None:
-                raise DeviceError(f"no {self.name.removeprefix('the ')} is connected: {self.remedy}")
+                raise DeviceError(
+                    f"no {self.name.removeprefix('the ')} is connected: {self.remedy}"
+                )
             self._page.check()
             return self._page
 
     # the server's side
 
     def connect(self, hello: str | bytes, send: Send) -> PageConnection[Facts] | None:
-        """Connect the page that sent `hello`; None where another window is the device. Raises InputError for an
-        invalid message.
+        """Connect the page that sent `hello`; None where another window is the device. Raises
+        InputError for an invalid message.
         """
         first = self._decode(hello, self.hello)
         with self._condition:
@@ -238,6 +253,7 @@ class PageChannel(ABC, Generic[Facts]):
 
 
 def encode_message(header: dict[str, Any], payload: bytes = b"") -> bytes:
-    """Encode a message: the header's length as 4 bytes, little endian, the header as JSON, then the payload."""
+    """Encode a message: the header's length as 4 bytes, little endian, the header as JSON, then the
+    payload."""
     text = msgspec.json.encode(header)
     return struct.pack("<I", len(text)) + text + payload

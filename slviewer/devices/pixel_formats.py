@@ -1,8 +1,10 @@
-"""GenICam's pixel formats: which bits of a buffer are which pixel, by the names of the Pixel Format Naming Convention.
+"""GenICam's pixel formats: which bits of a buffer are which pixel, by the names of the Pixel Format
+Naming Convention.
 
-Grey levels stay as the camera gives them: 10 and 12 bits become uint16 of 0 ... 1023 and 0 ... 4095, whose full scale
-`fringe.layout.clip_level` knows. "p" formats are one stream of bits, the lowest first; GigE Vision's older "Packed"
-ones keep the upper eight bits of two pixels around a byte with the rest of both.
+Grey levels stay as the camera gives them: 10 and 12 bits become uint16 of 0 ... 1023 and 0 ...
+4095, whose full scale `fringe.layout.clip_level` knows. "p" formats are one stream of bits, the
+lowest first; GigE Vision's older "Packed" ones keep the upper eight bits of two pixels around a
+byte with the rest of both.
 """
 
 import re
@@ -43,7 +45,8 @@ _GROUPS: dict[tuple[int, str], tuple[int, tuple[tuple[_Bits, _Bits], ...]]] = {
 
 @dataclass(frozen=True)
 class PixelFormat:
-    """A pixel format of GenICam. `kind`: Mono, BayerRG ..., RGB, RGBa, BGR or BGRa; `packing`: "p", "Packed" or ""."""
+    """A pixel format of GenICam. `kind`: Mono, BayerRG ..., RGB, RGBa, BGR or BGRa; `packing`: "p",
+    "Packed" or ""."""
 
     name: str
     kind: str
@@ -66,9 +69,14 @@ class PixelFormat:
         return len(self.kind) if self.kind in _ORDERS else 1
 
     def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
-        """Return the bytes of an image (width, height) px whose rows end with `padding` bytes; seamless lines at 0."""
+        """Return the bytes of an image (width, height) px whose rows end with `padding` bytes;
+        seamless lines at 0."""
         width, height = size
-        return self._count_bytes(width * height) if padding == 0 else height * (self._count_bytes(width) + padding)
+        return (
+            self._count_bytes(width * height)
+            if padding == 0
+            else height * (self._count_bytes(width) + padding)
+        )
 
     def _count_bytes(self, pixels: int) -> int:
         """Return the number of bytes of so many consecutive pixels."""
@@ -78,11 +86,14 @@ class PixelFormat:
         return (pixels * self.samples * stored + 7) // 8
 
     def unpack(self, data: np.ndarray, out: np.ndarray, padding: int = 0) -> None:
-        """Fill `out`, contiguous (h, w), or (h, w, samples), of `dtype`, from the bytes of a buffer."""
+        """Fill `out`, contiguous (h, w), or (h, w, samples), of `dtype`, from the bytes of a
+        buffer."""
         height, width = out.shape[:2]
         rows, pixels = (1, width * height) if padding == 0 else (height, width)
         used = self._count_bytes(pixels)
-        lines = data[: self.nbytes((width, height), padding)].reshape(rows, used + padding)[:, :used]
+        lines = data[: self.nbytes((width, height), padding)].reshape(rows, used + padding)[
+            :, :used
+        ]
         if self.packing:
             _unpack_groups(lines, out.reshape(rows, pixels), *_GROUPS[self.bits, self.packing])
         elif self.bits == 8:
@@ -91,7 +102,8 @@ class PixelFormat:
             np.copyto(out.reshape(rows, used // 2), np.ascontiguousarray(lines).view("<u2"))
 
     def view_samples(self, data: np.ndarray, size: tuple[int, int], padding: int = 0) -> np.ndarray:
-        """Return a buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need no unpacking."""
+        """Return a buffer's samples (h, w), or (h, w, samples), of `dtype`: a view where they need
+        no unpacking."""
         width, height = size
         shape = (height, width) if self.samples == 1 else (height, width, self.samples)
         if self.bits == 8 and padding == 0:
@@ -101,7 +113,8 @@ class PixelFormat:
         return out
 
     def rgb(self, samples: np.ndarray) -> np.ndarray:
-        """Convert the result of `view_samples` to (h, w, 3) RGB; a Bayer mosaic is interpolated linearly."""
+        """Convert the result of `view_samples` to (h, w, 3) RGB; a Bayer mosaic is interpolated
+        linearly."""
         if self.kind in _ORDERS:
             reverse = _ORDERS[self.kind] == (2, 1, 0)
             return samples[..., 2::-1] if reverse else samples[..., :3]
@@ -127,15 +140,26 @@ def pixel_format(name: str) -> PixelFormat | None:
 def best_format(names: Sequence[str]) -> PixelFormat | None:
     """Return the best of the formats `names` that a camera offers; None if none is supported.
 
-    Unpacked and up to 12 bits deep where there is such a one; a camera that offers colours is a colour camera, and
-    its mosaic comes before colours that it would fill in itself and send as three.
+    Unpacked and up to 12 bits deep where there is such a one; a camera that offers colours is a
+    colour camera, and its mosaic comes before colours that it would fill in itself and send as
+    three.
     """
-    formats = [candidate for name in names if (candidate := pixel_format(name)) is not None and candidate.bits <= 12]
+    formats = [
+        candidate
+        for name in names
+        if (candidate := pixel_format(name)) is not None and candidate.bits <= 12
+    ]
     colours = [candidate for candidate in formats if candidate.colour]
-    return max(colours or formats, key=lambda f: (not f.packing, f.samples == 1, f.bits, -f.samples), default=None)
+    return max(
+        colours or formats,
+        key=lambda f: (not f.packing, f.samples == 1, f.bits, -f.samples),
+        default=None,
+    )
 
 
-def _unpack_groups(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[_Bits, _Bits], ...]) -> None:
+def _unpack_groups(
+    lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[_Bits, _Bits], ...]
+) -> None:
     """Fill `out` (rows, n) uint16 from (rows, bytes) in groups, of which the last may be short."""
     count = len(pixels)
     groups = -(-out.shape[1] // count)
@@ -145,7 +169,10 @@ def _unpack_groups(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple
     if groups * count != out.shape[1]:
         whole = np.empty((len(out), groups * count), np.uint16)
     for k, parts in enumerate(pixels):
-        first, second = (_shift_bits(lines[:, byte::group] & np.uint8(bits), shift) for byte, bits, shift in parts)
+        first, second = (
+            _shift_bits(lines[:, byte::group] & np.uint8(bits), shift)
+            for byte, bits, shift in parts
+        )
         np.bitwise_or(first, second, out=whole[:, k::count])
     if whole is not out:
         out[:] = whole[:, : out.shape[1]]
@@ -153,4 +180,8 @@ def _unpack_groups(lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple
 
 def _shift_bits(bits: np.ndarray, shift: int) -> np.ndarray:
     """Shift bits to the left as uint16; to the right where `shift` is negative."""
-    return np.left_shift(bits, shift, dtype=np.uint16) if shift > 0 else np.right_shift(bits, -shift, dtype=np.uint16)
+    return (
+        np.left_shift(bits, shift, dtype=np.uint16)
+        if shift > 0
+        else np.right_shift(bits, -shift, dtype=np.uint16)
+    )

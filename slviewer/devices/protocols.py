@@ -1,7 +1,8 @@
 """Protocols of cameras, projectors and turntables: as little as a structured-light rig needs.
 
-A device belongs to the thread that opened it. Every method raises `DeviceError` when the device does not answer, is not
-open or was unplugged; after that, `close` and `open` are the way back, and `close` never raises.
+A device belongs to the thread that opened it. Every method raises `DeviceError` when the device
+does not answer, is not open or was unplugged; after that, `close` and `open` are the way back, and
+`close` never raises.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,17 +29,23 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         if self.exposure_ms is not None and not 0 < self.exposure_ms <= 600_000:
-            raise InputError(f"an exposure of {self.exposure_ms:g} ms is impossible: give one above 0, up to 600,000")
+            raise InputError(
+                f"an exposure of {self.exposure_ms:g} ms is impossible: give one above 0, up to"
+                " 600,000"
+            )
         if self.gain is not None and not 0 < self.gain <= 1e6:
-            raise InputError(f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none")
+            raise InputError(
+                f"a gain of {self.gain:g} is impossible: give a factor above 0, 1 for none"
+            )
 
 
 class Camera(Protocol):
     """Grabs single frames on request; `name`, `size` and `dtype` can be read before it is open.
 
-    One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as 4095. It can be read
-    before the camera is open, and is stored with its captures; without it the bit depth is taken from the brightest
-    pixel, and a dark image may pass for a bright one of fewer bits.
+    One of more than 8 bits may also have a `full_scale`, the grey level at which it clips, such as
+    4095. It can be read before the camera is open, and is stored with its captures; without it the
+    bit depth is taken from the brightest pixel, and a dark image may pass for a bright one of fewer
+    bits.
     """
 
     @property
@@ -60,7 +67,8 @@ class Camera(Protocol):
         """Release the device; nothing happens when it is not open."""
 
     def grab(self, out: np.ndarray) -> None:
-        """Fill `out` (h, w) of `dtype` with a frame exposed after the projector last reported "shown"."""
+        """Fill `out` (h, w) of `dtype` with a frame exposed after the projector last reported
+        "shown"."""
 
     def settings(self) -> CameraSettings:
         """Read the current settings from the device."""
@@ -78,22 +86,31 @@ class ColourCamera(Camera, Protocol):
 
 
 _SETTING_TOLERANCE = 0.1
-"""Share by which an applied setting may differ from the requested one: cameras round to their steps."""
+"""Share by which an applied setting may differ from the requested one: cameras round to their
+steps."""
 
 
 def list_notes(camera: Camera) -> tuple[str, ...]:
-    """Return a camera's own `notes`, one for each setting that it refused, where its driver has them."""
+    """Return a camera's own `notes`, one for each setting that it refused, where its driver has
+    them."""
     return tuple(getattr(camera, "notes", ()))
 
 
-def list_changed_settings(camera: Camera, wanted: CameraSettings, applied: CameraSettings) -> tuple[str, ...]:
-    """Return a sentence for each setting that the camera changed noticeably, unless its own `notes` report it."""
+def list_changed_settings(
+    camera: Camera, wanted: CameraSettings, applied: CameraSettings
+) -> tuple[str, ...]:
+    """Return a sentence for each setting that the camera changed noticeably, unless its own `notes`
+    report it."""
     sentences = []
     for what, unit, value, in_effect in (
         ("an exposure", " ms", wanted.exposure_ms, applied.exposure_ms),
         ("a gain", "", wanted.gain, applied.gain),
     ):
-        if value is None or in_effect is None or abs(in_effect - value) <= _SETTING_TOLERANCE * value:
+        if (
+            value is None
+            or in_effect is None
+            or abs(in_effect - value) <= _SETTING_TOLERANCE * value
+        ):
             continue
         if not any(f"{value:g}{unit}" in note for note in list_notes(camera)):
             sentences.append(
@@ -104,7 +121,8 @@ def list_changed_settings(camera: Camera, wanted: CameraSettings, applied: Camer
 
 
 def find_full_scale(camera: Camera, largest: int) -> float:
-    """Return the grey level at which a camera clips: its own statement, else by the largest level of an image."""
+    """Return the grey level at which a camera clips: its own statement, else by the largest level
+    of an image."""
     return clip_level(camera.dtype, largest, stated_full_scale(camera))
 
 
@@ -118,19 +136,26 @@ _MAX_ANGLE_DEG = 1e5
 """What the controllers of turntables count exactly."""
 
 Channel = Literal["red", "green", "blue", "grey"]
-"""What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light of most lamps."""
+"""What a colour camera decodes; green has the most pixels under a Bayer mosaic, and the most light
+of most lamps."""
 
 
 def check_channel(channel: str) -> None:
     """Raise InputError unless `channel` is one of `Channel`."""
     if channel not in get_args(Channel):
-        raise InputError(f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}")
+        raise InputError(
+            f"no channel is called {channel!r}: use one of {', '.join(get_args(Channel))}"
+        )
 
 
 def check_image_size(what: str, size: Sequence[int], most_px: int = 2**16) -> tuple[int, int]:
-    """Return the (width, height) px of `what`, a camera or a projector. Raises InputError for anything else."""
+    """Return the (width, height) px of `what`, a camera or a projector. Raises InputError for
+    anything else."""
     if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= most_px for side in size):
-        raise InputError(f"{size!r} is not the size of a {what}: give its width and height in px, such as [1280, 720]")
+        raise InputError(
+            f"{size!r} is not the size of a {what}: give its width and height in px, such as [1280,"
+            " 720]"
+        )
     return size[0], size[1]
 
 
@@ -143,7 +168,8 @@ def extract_channel(rgb: np.ndarray, channel: Channel, out: np.ndarray) -> None:
 
 
 class Projector(Protocol):
-    """Shows one image until another is requested; `name` and `size` can be read before it is open."""
+    """Shows one image until another is requested; `name` and `size` can be read before it is
+    open."""
 
     @property
     def name(self) -> str:
@@ -160,7 +186,8 @@ class Projector(Protocol):
         """Release the device; nothing happens when it is not open."""
 
     def load(self, sequence: PatternSequence) -> None:
-        """Load `sequence`, so that `show` is immediate; replaces the previous sequence, and shows nothing yet.
+        """Load `sequence`, so that `show` is immediate; replaces the previous sequence, and shows
+        nothing yet.
 
         Raises InputError for patterns that are not of the projector's size.
         """
@@ -169,11 +196,13 @@ class Projector(Protocol):
         """Show frame `index` of the loaded sequence; returns when its light reaches the scene."""
 
     def show_level(self, grey: int | None) -> None:
-        """Show even light of grey level 0 ... 255, None for dark; returns when shown. The sequence stays loaded."""
+        """Show even light of grey level 0 ... 255, None for dark; returns when shown. The sequence
+        stays loaded."""
 
 
 class Turntable(Protocol):
-    """Turns what stands before the rig about an axis; `name` and `limits_deg` can be read before it is open.
+    """Turns what stands before the rig about an axis; `name` and `limits_deg` can be read before it
+    is open.
 
     Its errors are `TurntableError`: the rig can capture without it.
     """
@@ -191,7 +220,8 @@ class Turntable(Protocol):
         """Whether it still knows its angle after it was switched off."""
 
     def open(self) -> None:
-        """Claim the device, without turning it. It keeps the angle that it stands at where it knows it, else 0."""
+        """Claim the device, without turning it. It keeps the angle that it stands at where it knows
+        it, else 0."""
 
     def close(self) -> None:
         """Stop, and release the device; nothing happens when it is not open."""
@@ -200,11 +230,12 @@ class Turntable(Protocol):
         """Read the angle that it stands at, as far as the device knows it."""
 
     def turn_to(self, deg: float, check: Callable[[], None] = lambda: None) -> None:
-        """Turn to an angle by the way in between, of several turns too, and return when it stands still.
+        """Turn to an angle by the way in between, of several turns too, and return when it stands
+        still.
 
-        `check()` is called while it turns, and may raise (Cancelled), which stops it. Raises InputError for an angle
-        outside its limits, TurntableError where it raises an alarm, stops before the angle, takes too long or was
-        unplugged; it is then told to stop.
+        `check()` is called while it turns, and may raise (Cancelled), which stops it. Raises
+        InputError for an angle outside its limits, TurntableError where it raises an alarm, stops
+        before the angle, takes too long or was unplugged; it is then told to stop.
         """
 
 
@@ -216,7 +247,8 @@ class Openable:
         self._open = False
 
     def open(self) -> None:
-        """Open the device. Raises DeviceError if it is open already, or does not start; it is closed then."""
+        """Open the device. Raises DeviceError if it is open already, or does not start; it is
+        closed then."""
         if self._open:
             raise DeviceError(f"{self.name} is open already: close it first")
         self._open = True
@@ -243,8 +275,8 @@ class Openable:
 class Rig:
     """A camera and a projector that view the same scene, under the name that the operator chose.
 
-    `settle_ms` passes between "shown" and the grab: the measured delay of the light after the projector's report.
-    A `turntable` is opened by what uses it: captures do not need it.
+    `settle_ms` passes between "shown" and the grab: the measured delay of the light after the
+    projector's report. A `turntable` is opened by what uses it: captures do not need it.
     """
 
     name: str
@@ -281,27 +313,32 @@ class Rig:
 
 @contextmanager
 def report_driver_faults(device: Camera | Projector | Turntable) -> Iterator[None]:
-    """Raise DeviceError, which names the device, for what its driver may not raise: anything but our own errors."""
+    """Raise DeviceError, which names the device, for what its driver may not raise: anything but
+    our own errors."""
     try:
         yield
     except SlviewerError:
         raise
     except Exception as error:  # a driver's own fault, as of a plugin
         raise DeviceError(
-            f"the driver of {device.name} failed with {type(error).__name__}: {error}; report it to the driver's maker"
+            f"the driver of {device.name} failed with {type(error).__name__}: {error}; report it to"
+            " the driver's maker"
         ) from error
 
 
 def check_frame(camera: Camera, out: np.ndarray) -> None:
-    """Raise InputError unless `out` is a contiguous, writable (h, w) array that `camera.grab` can fill in place."""
+    """Raise InputError unless `out` is a contiguous, writable (h, w) array that `camera.grab` can
+    fill in place."""
     width, height = camera.size
     if out.shape != (height, width) or out.dtype != camera.dtype:
         raise InputError(
-            f"{camera.name} fills frames of shape {(height, width)} {camera.dtype}, got {out.shape} {out.dtype}: "
-            "make the array by its size"
+            f"{camera.name} fills frames of shape {(height, width)} {camera.dtype}, got {out.shape}"
+            f" {out.dtype}: make the array by its size"
         )
     if not (out.flags.c_contiguous and out.flags.writeable):
-        raise InputError(f"{camera.name} fills frames row by row: give a contiguous array that can be written")
+        raise InputError(
+            f"{camera.name} fills frames row by row: give a contiguous array that can be written"
+        )
 
 
 def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
@@ -311,7 +348,8 @@ def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
     if tuple(sequence.projector) != tuple(projector.size):
         (w, h), (columns, rows) = sequence.projector, projector.size
         raise InputError(
-            f"the patterns are {w}x{h} px and {projector.name} has {columns}x{rows}: make them for this projector"
+            f"the patterns are {w}x{h} px and {projector.name} has {columns}x{rows}: make them for"
+            " this projector"
         )
 
 
@@ -319,13 +357,21 @@ def check_angle(turntable: Turntable, deg: float) -> None:
     """Raise InputError unless the turntable can turn to the angle."""
     low, high = turntable.limits_deg or (-_MAX_ANGLE_DEG, _MAX_ANGLE_DEG)
     if not low <= deg <= high:
-        raise InputError(f"{turntable.name} turns from {low:g} to {high:g} degrees, not to {deg:g}: choose others")
+        raise InputError(
+            f"{turntable.name} turns from {low:g} to {high:g} degrees, not to {deg:g}: choose"
+            " others"
+        )
 
 
-def check_index(projector: Projector, sequence: PatternSequence | None, index: int) -> PatternSequence:
-    """Return the loaded sequence if it has frame `index`. Raises DeviceError if none is loaded, else InputError."""
+def check_index(
+    projector: Projector, sequence: PatternSequence | None, index: int
+) -> PatternSequence:
+    """Return the loaded sequence if it has frame `index`. Raises DeviceError if none is loaded,
+    else InputError."""
     if sequence is None:
-        raise DeviceError(f"{projector.name} has no patterns: load a sequence before showing a frame")
+        raise DeviceError(
+            f"{projector.name} has no patterns: load a sequence before showing a frame"
+        )
     if not 0 <= index < len(sequence.frames):
         raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
     return sequence
@@ -336,5 +382,7 @@ def check_level(grey: int | None) -> int:
     if grey is None:
         return 0
     if not 0 <= grey <= 255:
-        raise InputError(f"a grey level of {grey} cannot be projected: give 0 to 255, or None for dark")
+        raise InputError(
+            f"a grey level of {grey} cannot be projected: give 0 to 255, or None for dark"
+        )
     return grey

@@ -1,30 +1,47 @@
-"""A recorded capture as camera and projector: the frame that is shown is the frame that was recorded."""
+"""A recorded capture as camera and projector: the frame that is shown is the frame that was
+recorded."""
 
 import numpy as np
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.protocols import CameraSettings, Openable, Rig, check_frame, check_index, check_level
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Openable,
+    Rig,
+    check_frame,
+    check_index,
+    check_level,
+)
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.decode import texture
 from slviewer.fringe.sequence import PatternSequence
 
 
 class Recording:
-    """Recorded frames (n, h, w), uint8 or uint16, and the sequence that was projected; `play` replaces both."""
+    """Recorded frames (n, h, w), uint8 or uint16, and the sequence that was projected; `play`
+    replaces both."""
 
     def __init__(self, frames: np.ndarray, sequence: PatternSequence) -> None:
         _check_recording(frames, sequence)
         self.played = (frames, sequence)
-        self.visible_frame: np.ndarray | None = None  # (h, w) of the pattern shown; None: not recorded
+        self.visible_frame: np.ndarray | None = (
+            None  # (h, w) of the pattern shown; None: not recorded
+        )
 
     def play(self, frames: np.ndarray, sequence: PatternSequence) -> None:
-        """Play another capture of the same rig; a running capture then ends with the old one. For any thread."""
+        """Play another capture of the same rig; a running capture then ends with the old one. For
+        any thread."""
         _check_recording(frames, sequence)
         before, projector = self.played[0], self.played[1].projector
-        if frames.shape[1:] != before.shape[1:] or frames.dtype != before.dtype or sequence.projector != projector:
+        if (
+            frames.shape[1:] != before.shape[1:]
+            or frames.dtype != before.dtype
+            or sequence.projector != projector
+        ):
             raise InputError(
-                f"the recording holds frames of {before.shape[1:]} {before.dtype} for a projector of {projector}, got "
-                f"{frames.shape[1:]} {frames.dtype} and {sequence.projector}: replay captures of one rig together"
+                f"the recording holds frames of {before.shape[1:]} {before.dtype} for a projector"
+                f" of {projector}, got {frames.shape[1:]} {frames.dtype} and {sequence.projector}:"
+                " replay captures of one rig together"
             )
         self.played = (frames, sequence)
 
@@ -44,7 +61,8 @@ class ReplayCamera(Openable):
         return self._recording.played[1].full_scale
 
     def grab(self, out: np.ndarray) -> None:
-        """Copy the recorded frame of the pattern shown; under even light of any level, the recorded texture."""
+        """Copy the recorded frame of the pattern shown; under even light of any level, the recorded
+        texture."""
         self.check_open()
         check_frame(self, out)
         if self._recording.visible_frame is None:
@@ -81,8 +99,9 @@ class ReplayProjector(Openable):
         played = self._recording.played
         if sequence != played[1]:
             raise DeviceError(
-                f"the recording answers only to the patterns it was made with, {_describe_sequence(played[1])}, "
-                f"and was asked for {_describe_sequence(sequence)}: capture with its own sequence"
+                "the recording answers only to the patterns it was made with,"
+                f" {_describe_sequence(played[1])}, and was asked for"
+                f" {_describe_sequence(sequence)}: capture with its own sequence"
             )
         self._loaded = played
 
@@ -106,7 +125,8 @@ class ReplayProjector(Openable):
 
 
 def replay(frames: np.ndarray, sequence: PatternSequence) -> Rig:
-    """Return a rig that replays `frames` (n, h, w) of `sequence`, not copied. Raises InputError if they do not fit."""
+    """Return a rig that replays `frames` (n, h, w) of `sequence`, not copied. Raises InputError if
+    they do not fit."""
     return recording_rig(Recording(frames, sequence))
 
 
@@ -115,15 +135,24 @@ def recording_rig(recording: Recording) -> Rig:
     return Rig("replay", ReplayCamera(recording), ReplayProjector(recording))
 
 
-DRIVER = Driver("replay", "a recorded capture, played back", needs="frames and their pattern sequence", rig=replay)
+DRIVER = Driver(
+    "replay",
+    "a recorded capture, played back",
+    needs="frames and their pattern sequence",
+    rig=replay,
+)
 
 
 def _check_recording(frames: np.ndarray, sequence: PatternSequence) -> None:
     """Raise InputError unless frames are (n, h, w) uint8 or uint16, one for each pattern."""
-    if frames.ndim != 3 or frames.dtype not in (np.uint8, np.uint16) or len(frames) != len(sequence.frames):
+    if (
+        frames.ndim != 3
+        or frames.dtype not in (np.uint8, np.uint16)
+        or len(frames) != len(sequence.frames)
+    ):
         raise InputError(
-            f"{len(sequence.frames)} frames (n, h, w) of uint8 or uint16 are needed for this sequence, "
-            f"got {frames.shape} {frames.dtype}: give one image a pattern"
+            f"{len(sequence.frames)} frames (n, h, w) of uint8 or uint16 are needed for this"
+            f" sequence, got {frames.shape} {frames.dtype}: give one image a pattern"
         )
 
 

@@ -1,4 +1,5 @@
-"""A browser window as a projector: whether each pixel of a pattern becomes one pixel of the screen."""
+"""A browser window as a projector: whether each pixel of a pattern becomes one pixel of the
+screen."""
 
 from typing import Annotated
 
@@ -7,16 +8,18 @@ import msgspec
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**16)]
 _Ratio = Annotated[float, msgspec.Meta(gt=0, le=64)]
 
-_EXACT_PX = 0.01  # browsers round the ratio to single precision; a window that is cut off is 0.25 px or more away
+# browsers round the ratio to single precision; a window that is cut off is 0.25 px or more away
+_EXACT_PX = 0.01
 
 
 class Screen(msgspec.Struct, frozen=True):
     """Screen and window of the projector page, as it reports them.
 
-    `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside and of its screen in
-    page pixels. `box`: the inside in device pixels as the browser laid it out, None where a browser does not report it.
-    `full`: shown full screen on request. `settled`: the browser no longer shows over the page that Esc leaves full
-    screen. `pinched`: magnification by touch.
+    `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside
+    and of its screen in page pixels. `box`: the inside in device pixels as the browser laid it out,
+    None where a browser does not report it. `full`: shown full screen on request. `settled`: the
+    browser no longer shows over the page that Esc leaves full screen. `pinched`: magnification by
+    touch.
     """
 
     dpr: _Ratio
@@ -30,7 +33,8 @@ class Screen(msgspec.Struct, frozen=True):
 
     @property
     def full_screen(self) -> bool:
-        """Whether the window is full screen, on request or because it was opened so (kiosk, F11)."""
+        """Whether the window is full screen, on request or because it was opened so (kiosk,
+        F11)."""
         return self.full or self.inner == self.whole
 
     @property
@@ -50,39 +54,45 @@ class Screen(msgspec.Struct, frozen=True):
 
 
 def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
-    """Return why patterns of `size` (width, height; None: unknown) cannot be shown there, with a remedy; else ""."""
+    """Return why patterns of `size` (width, height; None: unknown) cannot be shown there, with a
+    remedy; else ""."""
     if not screen.visible:
         return (
-            "the projector page is hidden: bring its window to the front of the projector's screen, and leave nothing "
-            "on top of it"
+            "the projector page is hidden: bring its window to the front of the projector's screen,"
+            " and leave nothing on top of it"
         )
     if not screen.full_screen:
         return (
-            "the projector page does not fill its screen: put its window on the projector's screen and click into it "
-            "(or press F11)"
+            "the projector page does not fill its screen: put its window on the projector's screen"
+            " and click into it (or press F11)"
         )
     if abs(screen.pinched - 1) > 1e-3:
-        return "the projector page is magnified by touch: pinch it back to its normal size, or reload it"
+        return (
+            "the projector page is magnified by touch: pinch it back to its normal size, or"
+            " reload it"
+        )
     if not screen.is_pixel_exact:
         width, height = (screen.dpr * side for side in screen.inner)
         return (
-            f"the projector page would resample the patterns, its window is {width:g} x {height:g} px at "
-            f"{screen.dpr:g} px per page pixel: set the scaling of the projector's display to 100 % in the system's "
-            "display settings, and the page's zoom to 100 % (Ctrl+0)"
+            f"the projector page would resample the patterns, its window is {width:g} x {height:g}"
+            f" px at {screen.dpr:g} px per page pixel: set the scaling of the projector's display"
+            " to 100 % in the system's display settings, and the page's zoom to 100 % (Ctrl+0)"
         )
-    if screen.inner != screen.whole:  # zoomed, next to a bar, or full screen inside a tab that is recorded
+    if (
+        screen.inner != screen.whole
+    ):  # zoomed, next to a bar, or full screen inside a tab that is recorded
         (width, height), (columns, rows) = screen.inner, screen.whole
         return (
-            f"the projector page is full screen and {width} x {height} page pixels large where its screen has "
-            f"{columns} x {rows}: set the page's zoom to 100 % (Ctrl+0), close any bar that the browser shows above "
-            "it, and let nothing share or record this tab"
+            f"the projector page is full screen and {width} x {height} page pixels large where its"
+            f" screen has {columns} x {rows}: set the page's zoom to 100 % (Ctrl+0), close any bar"
+            " that the browser shows above it, and let nothing share or record this tab"
         )
     if size is not None and screen.pixels != size:
         (columns, rows), (width, height) = screen.pixels, size
         return (
-            f"the projector page fills {columns} x {rows} px and the patterns have {width} x {height}, which must fill "
-            f"it exactly: set the resolution of that display to {width} x {height}, or choose {columns} x {rows} as "
-            "the projector's size"
+            f"the projector page fills {columns} x {rows} px and the patterns have {width} x"
+            f" {height}, which must fill it exactly: set the resolution of that display to {width}"
+            f" x {height}, or choose {columns} x {rows} as the projector's size"
         )
     if not screen.settled:
         return "the browser still shows a notice over the projector page: wait a few seconds"

@@ -1,4 +1,5 @@
-"""Simulated camera, projector and turntable: drivers that capture the content of a `SimulatedWorld`."""
+"""Simulated camera, projector and turntable: drivers that capture the content of a
+`SimulatedWorld`."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -27,17 +28,20 @@ from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
 AUTO = CameraSettings(exposure_ms=1.0, gain=1.0)
-"""At 1 ms the brightest half percent of the illuminated scene reach the sensor's `peak_level` in white light, near or
-far.
+"""At 1 ms the brightest half percent of the illuminated scene reach the sensor's `peak_level` in
+white light, near or far.
 """
 
 _EXPOSURES_MS = (0.01, 100.0)
 _GAINS = (1.0, 16.0)
-_WHITE = 0.85  # albedo of the plate for which the camera is exposed while the projector lights nothing
+_WHITE = (
+    0.85  # albedo of the plate for which the camera is exposed while the projector lights nothing
+)
 
 
 class SimulatedCamera(Openable):
-    """Simulated 8-bit camera with the rig's noise; light grows with the exposure, and saturates at 255."""
+    """Simulated 8-bit camera with the rig's noise; light grows with the exposure, and saturates at
+    255."""
 
     dtype = np.dtype(np.uint8)
 
@@ -61,7 +65,9 @@ class SimulatedCamera(Openable):
         frame = out if (width, height) == self.size else np.empty((height, width), np.uint8)
         assert self._settings.exposure_ms is not None and self._settings.gain is not None
         exposure = _estimate_white_level(renderer) * self._settings.exposure_ms
-        renderer.frame(shown.pattern, keys, frame, lamp=shown.lamp, exposure=exposure, gain=self._settings.gain)
+        renderer.frame(
+            shown.pattern, keys, frame, lamp=shown.lamp, exposure=exposure, gain=self._settings.gain
+        )
         if frame is not out:
             cv2.resize(frame, self.size, dst=out, interpolation=cv2.INTER_LINEAR)
 
@@ -85,7 +91,8 @@ class SimulatedCamera(Openable):
 
 
 class SimulatedProjector(Openable):
-    """Projects patterns into the world. The same captures in the same order have the same noise, previews or not."""
+    """Projects patterns into the world. The same captures in the same order have the same noise,
+    previews or not."""
 
     def __init__(self, world: SimulatedWorld) -> None:
         super().__init__("the simulated projector")
@@ -107,7 +114,8 @@ class SimulatedProjector(Openable):
         super().close()
 
     def load(self, sequence: PatternSequence) -> None:
-        """Compute all patterns of a sequence. Raises InputError for an invalid one, or one for another projector."""
+        """Compute all patterns of a sequence. Raises InputError for an invalid one, or one for
+        another projector."""
         self.check_open()
         check_sequence(self, sequence)
         self._profiles = [profile(sequence, k) for k in range(len(sequence.frames))]
@@ -135,13 +143,16 @@ class SimulatedProjector(Openable):
 
 
 class SimulatedTurntable(Openable):
-    """Turns what stands before the simulated rig; each stop is off by a normal error of `repeatability_deg`."""
+    """Turns what stands before the simulated rig; each stop is off by a normal error of
+    `repeatability_deg`."""
 
     limits_deg = None
     is_absolute = True
 
     def __init__(
-        self, world: SimulatedWorld, repeatability_deg: Annotated[float, msgspec.Meta(ge=0, le=10)] = 0.02
+        self,
+        world: SimulatedWorld,
+        repeatability_deg: Annotated[float, msgspec.Meta(ge=0, le=10)] = 0.02,
     ) -> None:
         super().__init__("the simulated turntable")
         self.world, self._repeatability_deg = world, repeatability_deg
@@ -167,8 +178,11 @@ def simulated_rig(world: SimulatedWorld) -> Rig:
     return Rig("simulated", SimulatedCamera(world), SimulatedProjector(world))
 
 
-def preset_rig(preset: str = "letter", scale: float = 1.0, seed: int = 0, board: str = "circles:21x16:9") -> Rig:
-    """Return a preset's rig with a board, such as "circles:21x16:9"; `scale` multiplies the camera's size."""
+def preset_rig(
+    preset: str = "letter", scale: float = 1.0, seed: int = 0, board: str = "circles:21x16:9"
+) -> Rig:
+    """Return a preset's rig with a board, such as "circles:21x16:9"; `scale` multiplies the
+    camera's size."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     return simulated_rig(SimulatedWorld(letter(scale, seed), Board.parse(board)))
@@ -183,7 +197,8 @@ DRIVER = Driver(
 
 
 def _estimate_white_level(renderer: Renderer) -> float:
-    """Return the grey level of full white light on an albedo of 1, from the brightness of the scene."""
+    """Return the grey level of full white light on an albedo of 1, from the brightness of the
+    scene."""
     if renderer.truth().mask.any():
         return renderer.exposure
     sensor, light = renderer.rig.sensor, renderer.rig.light

@@ -10,7 +10,14 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
+from slviewer.simulation.boards import (
+    FLAT,
+    BoardScene,
+    BoardShape,
+    Pose,
+    blank_board,
+    printed_board,
+)
 from slviewer.simulation.concave import CONCAVE
 from slviewer.simulation.decals import MarkedScene, marked_plate
 from slviewer.simulation.mesh import MeshScene, demo_object
@@ -20,20 +27,41 @@ from slviewer.simulation.scenes import Scene, Spheres, sphere
 from slviewer.simulation.turning import stone_on_table, turn_pose, turning
 from slviewer.target.board import Board
 
-Thing = Literal["board", "plane", "sphere", "object", "stone", "stone on a table", "marked", "groove", "bowl", "wax"]
-"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone of the turntable, alone and on
-a table, a plate with coded markers, and three surfaces that light themselves."""
+Thing = Literal[
+    "board",
+    "plane",
+    "sphere",
+    "object",
+    "stone",
+    "stone on a table",
+    "marked",
+    "groove",
+    "bowl",
+    "wax",
+]
+"""The printed target, the blank plate, the Letter's sphere, the demo object, the stone of the
+turntable, alone and on a table, a plate with coded markers, and three surfaces that light
+themselves."""
 
-_INITIAL_DEPTHS_MM = {"board": 600.0, "plane": 600.0, "sphere": 690.0, "object": 600.0, "marked": 600.0}
+_INITIAL_DEPTHS_MM = {
+    "board": 600.0,
+    "plane": 600.0,
+    "sphere": 690.0,
+    "object": 600.0,
+    "marked": 600.0,
+}
 _INITIAL_DEPTHS_MM |= dict.fromkeys(CONCAVE, 640.0)
 SETTLED_S = 0.3
 """A thing that has not been moved for so long is rendered in full by a preview too."""
-_DRAFT_SCALE = 0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
+_DRAFT_SCALE = (
+    0.25  # of a preview while things move: the geometry of 400x300 rays instead of 1600x1200
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the projector shows: pattern as `fringe.profile` returns it, the lamp's relative light, the noise's seed.
+    """What the projector shows: pattern as `fringe.profile` returns it, the lamp's relative light,
+    the noise's seed.
 
     Under even light, `preview`, a moving scene may be drawn as a draft.
     """
@@ -45,10 +73,12 @@ class Shown:
 
 
 class SimulatedWorld:
-    """The scene of a simulated rig, shared by its camera and projector. Things may be moved from any thread.
+    """The scene of a simulated rig, shared by its camera and projector. Things may be moved from
+    any thread.
 
-    One thing is in view at a time; the others keep their poses for later. A pose is T_camera_thing: the board's
-    origin is its first feature, the plane's its middle, the sphere's its centre, the object's its own.
+    One thing is in view at a time; the others keep their poses for later. A pose is T_camera_thing:
+    the board's origin is its first feature, the plane's its middle, the sphere's its centre, the
+    object's its own.
     """
 
     def __init__(
@@ -59,8 +89,12 @@ class SimulatedWorld:
     ) -> None:
         self.rig = rig
         self._clock = clock
-        self.shown = Shown((None, np.zeros(rig.projector.size[0], np.uint8)), 1.0, (rig.seed,), True)
-        self._draft_rig = replace(rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE)))
+        self.shown = Shown(
+            (None, np.zeros(rig.projector.size[0], np.uint8)), 1.0, (rig.seed,), True
+        )
+        self._draft_rig = replace(
+            rig, camera=replace(rig.camera, scale=min(rig.camera.scale, _DRAFT_SCALE))
+        )
         self._lock = threading.RLock()
         self._things: dict[Thing, Scene] = {
             "plane": blank_board(_make_initial_pose("plane")),
@@ -107,7 +141,8 @@ class SimulatedWorld:
         return float(np.degrees(np.arctan2(R[0, 2], R[2, 2])))
 
     def print_board(self, board: Board, shape: BoardShape = FLAT) -> None:
-        """Replace the board by another, centred on the camera's axis; the thing in view stays the same.
+        """Replace the board by another, centred on the camera's axis; the thing in view stays the
+        same.
 
         Raises InputError for ChArUco boards, which the simulation does not print.
         """
@@ -116,11 +151,16 @@ class SimulatedWorld:
         self._store_scene("board", printed_board(board, pose, shape, self.rig.seed))
 
     def place(self, thing: Thing, pose: Pose | None = None) -> None:
-        """Place `thing` in view at T_camera_thing, in place of the current one; None: at its last pose."""
+        """Place `thing` in view at T_camera_thing, in place of the current one; None: at its last
+        pose."""
         if thing not in get_args(Thing):
-            raise InputError(f"the simulated world has no {thing!r}: use one of {', '.join(get_args(Thing))}")
+            raise InputError(
+                f"the simulated world has no {thing!r}: use one of {', '.join(get_args(Thing))}"
+            )
         if pose is not None and not (np.isfinite(pose.R).all() and np.isfinite(pose.t).all()):
-            raise InputError("a pose with numbers that are not finite places nothing: give a turn and mm")
+            raise InputError(
+                "a pose with numbers that are not finite places nothing: give a turn and mm"
+            )
         with self._lock:
             scene = self._things[thing] if thing in self._things else _make_scene(thing)
             if pose is not None:
@@ -129,7 +169,8 @@ class SimulatedWorld:
             self._store_scene(thing, scene)
 
     def move(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
-        """Move the thing in view along its camera ray to depth `distance_mm`, and turn it about the vertical.
+        """Move the thing in view along its camera ray to depth `distance_mm`, and turn it about the
+        vertical.
 
         `turn_deg` is the new rotation; None: unchanged.
         """
@@ -137,7 +178,9 @@ class SimulatedWorld:
             pose = self.pose
             t = pose.t if distance_mm is None else pose.t * distance_mm / pose.t[2]
             more = 0.0 if turn_deg is None else np.radians(turn_deg - self.turn_deg)
-            R = np.array([[np.cos(more), 0, np.sin(more)], [0, 1, 0], [-np.sin(more), 0, np.cos(more)]])
+            R = np.array(
+                [[np.cos(more), 0, np.sin(more)], [0, 1, 0], [-np.sin(more), 0, np.cos(more)]]
+            )
             self.place(self._standing, Pose(R @ pose.R, t))
 
     @property
@@ -146,18 +189,22 @@ class SimulatedWorld:
         return self._table_deg
 
     def turn_table(self, deg: float) -> None:
-        """Turn the table to an angle, and with it the thing in view, about the axis of `simulation.turning`."""
+        """Turn the table to an angle, and with it the thing in view, about the axis of
+        `simulation.turning`."""
         with self._lock:
             self._table_deg, change_deg = deg, deg - self._table_deg
             self.place(self._standing, turn_pose(self.pose, change_deg))
 
     def renderer(self, preview: bool) -> Renderer:
-        """Return a renderer of the scene; for previews soon after a motion, one of a smaller camera scale."""
+        """Return a renderer of the scene; for previews soon after a motion, one of a smaller camera
+        scale."""
         with self._lock:
             draft = preview and self._clock() - self._moved < SETTLED_S
             draft = draft and self._draft_rig.camera.scale < self.rig.camera.scale
             if draft not in self._renderers:
-                self._renderers[draft] = Renderer(self._draft_rig if draft else self.rig, self._things[self._standing])
+                self._renderers[draft] = Renderer(
+                    self._draft_rig if draft else self.rig, self._things[self._standing]
+                )
             return self._renderers[draft]
 
     def _store_scene(self, thing: Thing, scene: Scene) -> None:
@@ -206,5 +253,6 @@ def _make_scene(thing: Thing) -> Scene:
 
 
 def _make_initial_pose(thing: Thing) -> Pose:
-    """Return the pose at which a thing is first placed: in front of the camera at its default depth."""
+    """Return the pose at which a thing is first placed: in front of the camera at its default
+    depth."""
     return Pose(np.eye(3), np.array([0.0, 0.0, _INITIAL_DEPTHS_MM[thing]]))

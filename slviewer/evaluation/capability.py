@@ -1,4 +1,5 @@
-"""Capability of a process: Cp and Cpk of a sample against limits, with their confidence intervals."""
+"""Capability of a process: Cp and Cpk of a sample against limits, with their confidence
+intervals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ MIN_PARTS = 3
 
 @dataclass(frozen=True)
 class Capability:
-    """Of ``parts`` values of this ``mean`` and standard deviation ``sigma``: ``cp`` (None for a single limit) and
-    ``cpk``, each with the ends of its 95 % confidence interval."""
+    """Of ``parts`` values of this ``mean`` and standard deviation ``sigma``: ``cp`` (None for a
+    single limit) and ``cpk``, each with the ends of its 95 % confidence interval."""
 
     parts: int
     mean: float
@@ -22,15 +23,22 @@ class Capability:
     cpk: tuple[float, float, float]
 
 
-def process_capability(values: Sequence[float], lower: float | None, upper: float | None) -> Capability | None:
-    """Estimate the capability of a process; None for fewer than 3 values, without a limit, or where they do not vary.
+def process_capability(
+    values: Sequence[float], lower: float | None, upper: float | None
+) -> Capability | None:
+    """Estimate the capability of a process; None for fewer than 3 values, without a limit, or where
+    they do not vary.
 
-    Cp's interval is exact for normal values (chi squared), Cpk's is Bissell's approximation (Applied Statistics 39,
-    1990). The spread of the values includes that of the measurement.
+    Cp's interval is exact for normal values (chi squared), Cpk's is Bissell's approximation
+    (Applied Statistics 39, 1990). The spread of the values includes that of the measurement.
     """
     x = np.asarray(values, np.float64)
     n = len(x)
-    if n < MIN_PARTS or (lower is None and upper is None) or not (sigma := float(x.std(ddof=1))) > 0:
+    if (
+        n < MIN_PARTS
+        or (lower is None and upper is None)
+        or not (sigma := float(x.std(ddof=1))) > 0
+    ):
         return None
     mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
     cp = None

@@ -27,19 +27,20 @@ from slviewer.records.verification import ModelFit, Shape, Verification
 LEAST_SHARE = 0.5
 """Of the scene's measured pixels, that a plane must hold to be what was captured."""
 MOST_OVER_FLOOR = 4.0
-"""Times the noise floor, up to which the best model's RMS may be the calibration's own error; beyond, the shape is
-doubtful too."""
+"""Times the noise floor, up to which the best model's RMS may be the calibration's own error;
+beyond, the shape is doubtful too."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """One capture of a plane or a sphere, measured with several models.
 
-    ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of ``region`` ``(h, w)`` bool
-    that every model measures. ``coverage`` by model: share of the region's illuminated pixels that it measures, NaN
-    where these are not known. ``incidence``: percent of the measured region in R1, R2, R3, or None without a depth
-    range. ``share``: of the pixels that all models measure, those in the region; ``is_searched``: the region was not
-    given, it is the largest patch of the shape.
+    ``results`` by model name, each over the pixels of ``common`` ``(h, w)`` bool: those of
+    ``region`` ``(h, w)`` bool that every model measures. ``coverage`` by model: share of the
+    region's illuminated pixels that it measures, NaN where these are not known. ``incidence``:
+    percent of the measured region in R1, R2, R3, or None without a depth range. ``share``: of the
+    pixels that all models measure, those in the region; ``is_searched``: the region was not given,
+    it is the largest patch of the shape.
     """
 
     shape: Shape
@@ -53,37 +54,52 @@ class Comparison:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings where more than 2 % of the points were excluded, where a plane is a minor part of the scene, and
-        where the RMS is far above the noise floor by every model."""
-        messages = [f"{model}: {result.warning}" for model, result in self.results.items() if result.warning]
+        """Warnings where more than 2 % of the points were excluded, where a plane is a minor part
+        of the scene, and where the RMS is far above the noise floor by every model."""
+        messages = [
+            f"{model}: {result.warning}" for model, result in self.results.items() if result.warning
+        ]
         if self.is_searched and self.shape == "plane" and self.share < LEAST_SHARE:
             messages.append(
-                f"the largest plane holds {100 * self.share:.0f} % of the measured pixels "
-                f"({self.region_text()}), and the figures are of it alone: is this a capture of a plane?"
+                f"the largest plane holds {100 * self.share:.0f} % of the measured pixels"
+                f" ({self.region_text()}), and the figures are of it alone: is this a capture of a"
+                " plane?"
             )
-        ratios = {model: result.rms_mm / result.noise_floor_mm for model, result in self.results.items()}
+        ratios = {
+            model: result.rms_mm / result.noise_floor_mm for model, result in self.results.items()
+        }
         known = {model: ratio for model, ratio in ratios.items() if np.isfinite(ratio)}
         best = min(known, key=lambda model: known[model], default="")
         if best and known[best] > MOST_OVER_FLOOR:
             messages.append(
-                f"the RMS is {known[best]:.1f} times the noise floor at best ({best}): this is no {self.shape}, the "
-                "frames are disturbed, or the calibration is off by that much"
+                f"the RMS is {known[best]:.1f} times the noise floor at best ({best}): this is no"
+                f" {self.shape}, the frames are disturbed, or the calibration is off by that much"
             )
         return messages
 
     def region_text(self) -> str:
-        """Describe the position of the measured region in the image; empty where its map is not available."""
-        rows, columns = np.flatnonzero(self.region.any(axis=1)), np.flatnonzero(self.region.any(axis=0))
+        """Describe the position of the measured region in the image; empty where its map is not
+        available."""
+        rows, columns = (
+            np.flatnonzero(self.region.any(axis=1)),
+            np.flatnonzero(self.region.any(axis=0)),
+        )
         if not len(rows):
             return ""
         return f"columns {columns[0]}-{columns[-1]}, rows {rows[0]}-{rows[-1]}"
 
-    def record(self, masked: Mapping[str, float] = MappingProxyType({}), **origin: Any) -> Verification:
+    def record(
+        self, masked: Mapping[str, float] = MappingProxyType({}), **origin: Any
+    ) -> Verification:
         """Return the figures without the maps.
 
-        ``masked``: {model: share that it masks}, of models that do; ``origin``: the record's inputs and scales.
+        ``masked``: {model: share that it masks}, of models that do; ``origin``: the record's inputs
+        and scales.
         """
-        rows, columns = np.flatnonzero(self.region.any(axis=1)), np.flatnonzero(self.region.any(axis=0))
+        rows, columns = (
+            np.flatnonzero(self.region.any(axis=1)),
+            np.flatnonzero(self.region.any(axis=0)),
+        )
         return Verification(
             shape=self.shape,
             models={
@@ -94,9 +110,17 @@ class Comparison:
                     noise_floor_mm=_known(result.noise_floor_mm),
                     coverage=_known(self.coverage[model]),
                     radius_mm=result.radius_mm if isinstance(result, SphereResult) else None,
-                    centre_mm=to_vector(result.sphere.centre) if isinstance(result, SphereResult) else None,
-                    normal=to_vector(result.plane.normal) if isinstance(result, PlaneResult) else None,
-                    offset_mm=float(result.plane.offset) if isinstance(result, PlaneResult) else None,
+                    centre_mm=(
+                        to_vector(result.sphere.centre)
+                        if isinstance(result, SphereResult)
+                        else None
+                    ),
+                    normal=(
+                        to_vector(result.plane.normal) if isinstance(result, PlaneResult) else None
+                    ),
+                    offset_mm=(
+                        float(result.plane.offset) if isinstance(result, PlaneResult) else None
+                    ),
                     masked=masked.get(model),
                 )
                 for model, result in self.results.items()
@@ -117,14 +141,17 @@ def fit_clouds(
     depth_range: tuple[float, float] | None = None,
     radius: float | None = None,
 ) -> Comparison:
-    """Fit the shape to every model's cloud of one capture, over the pixels that all of them measure.
+    """Fit the shape to every model's cloud of one capture, over the pixels that all of them
+    measure.
 
-    ``illuminated`` ``(h, w)`` bool: what a perfect decoder could measure. ``region`` ``(h, w)`` bool: the
-    pixels that show the shape, such as a board's outline; None: the shape is looked for where every model measures, and
-    its region grown in the first model's cloud, completed by the others'. ``depth_range`` in mm bounds R2. ``radius``
-    in mm, roughly, helps to find a sphere; the fitted one is free all the same.
+    ``illuminated`` ``(h, w)`` bool: what a perfect decoder could measure. ``region`` ``(h, w)``
+    bool: the pixels that show the shape, such as a board's outline; None: the shape is looked for
+    where every model measures, and its region grown in the first model's cloud, completed by the
+    others'. ``depth_range`` in mm bounds R2. ``radius`` in mm, roughly, helps to find a sphere; the
+    fitted one is free all the same.
 
-    Raises ``InputError`` where clouds differ in size, the shape is not found, or the models share too few pixels.
+    Raises ``InputError`` where clouds differ in size, the shape is not found, or the models share
+    too few pixels.
     """
     if not clouds:
         raise InputError("No cloud was given to evaluate: name at least one model.")
@@ -132,8 +159,8 @@ def fit_clouds(
     shared = np.logical_and.reduce([cloud.mask for cloud in clouds.values()])
     if len(clouds) > 1 and region is None and np.count_nonzero(shared) < LEAST_PIXELS:
         raise InputError(
-            f"{' and '.join(clouds)} share {np.count_nonzero(shared)} measured pixels: name one model, or place the "
-            "shape where the board poses were."
+            f"{' and '.join(clouds)} share {np.count_nonzero(shared)} measured pixels: name one"
+            " model, or place the shape where the board poses were."
         )
     # A wall behind the shape may hold more pixels, in a model that measures everywhere.
     searched = region if region is not None else shared
@@ -164,7 +191,9 @@ def fit_clouds(
         results=results,
         region=region,
         common=common,
-        coverage={model: _coverage_share(cloud, region, illuminated) for model, cloud in clouds.items()},
+        coverage={
+            model: _coverage_share(cloud, region, illuminated) for model, cloud in clouds.items()
+        },
         incidence=None if depth_range is None else incidence(every, region, depth_range),
         share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
         is_searched=is_searched,
@@ -172,11 +201,14 @@ def fit_clouds(
 
 
 def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first cloud's points and their noise, and the next cloud's where it has none. InputError where they
-    differ in size."""
+    """Return the first cloud's points and their noise, and the next cloud's where it has none.
+    InputError where they differ in size."""
     sizes = {cloud.points.shape[:2] for cloud in clouds.values()}
     if len(sizes) > 1:
-        raise InputError(f"The models' clouds have different sizes, {sizes}: reconstruct them from the same capture.")
+        raise InputError(
+            f"The models' clouds have different sizes, {sizes}: reconstruct them from the same"
+            " capture."
+        )
     first, *others = clouds.values()
     points, sigma_z = first.points.copy(), first.sigma_z.copy()
     for cloud in others:
@@ -186,7 +218,8 @@ def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _coverage_share(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
-    """Return the share of the region's illuminated pixels that the cloud measures; NaN where unknown."""
+    """Return the share of the region's illuminated pixels that the cloud measures; NaN where
+    unknown."""
     measurable = 0 if illuminated is None else np.count_nonzero(region & illuminated)
     if illuminated is None or measurable == 0:
         return float("nan")

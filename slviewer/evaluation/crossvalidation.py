@@ -1,8 +1,9 @@
 """How well each calibration measures target poses that it was not made from.
 
-A pose that is held out is measured from its smoothed phase, so that what remains is the calibration's error and hardly
-any camera noise. The board itself is the standard: how flat it comes out, how long, and how near its features lie to
-where they are on it when it is laid over them without stretching.
+A pose that is held out is measured from its smoothed phase, so that what remains is the
+calibration's error and hardly any camera noise. The board itself is the standard: how flat it comes
+out, how long, and how near its features lie to where they are on it when it is laid over them
+without stretching.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,9 +37,10 @@ BETTER = 0.98
 class HeldOutPose:
     """Errors of one model on one pose that was not used to fit it.
 
-    ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of the features from
-    the board laid over them, flatness, shape and scale included. ``scale_ppm``: how much too long the board's own
-    spacings come out. ``camera_px``, ``projector_px``: what ``board_mm`` amounts to in the images, RMS.
+    ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of
+    the features from the board laid over them, flatness, shape and scale included. ``scale_ppm``:
+    how much too long the board's own spacings come out. ``camera_px``, ``projector_px``: what
+    ``board_mm`` amounts to in the images, RMS.
     """
 
     plane_mm: float
@@ -52,8 +54,8 @@ class HeldOutPose:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """``poses``: {model: {pose: its errors}}, every model over the same pixels. ``folds``: poses held out together.
-    ``failed``: {model: why it could not be fitted to some fold}."""
+    """``poses``: {model: {pose: its errors}}, every model over the same pixels. ``folds``: poses
+    held out together. ``failed``: {model: why it could not be fitted to some fold}."""
 
     poses: Mapping[str, Mapping[str, HeldOutPose]]
     folds: tuple[tuple[str, ...], ...]
@@ -70,7 +72,8 @@ class CrossValidation:
 
     @property
     def recommended(self) -> str:
-        """The model with the least error on boards that it was not made from, of nearly equal ones the simpler."""
+        """The model with the least error on boards that it was not made from, of nearly equal ones
+        the simpler."""
         chosen = self.models[0]
         for model in self.models[1:]:
             if self.rms(model, "board_mm") < BETTER * self.rms(chosen, "board_mm"):
@@ -92,28 +95,36 @@ class CrossValidation:
         ]
         count = len(next(iter(self.poses.values())))
         lines = [
-            f"{count} poses, each measured by calibrations made from the others ({len(self.folds)} folds):",
+            (
+                f"{count} poses, each measured by calibrations made from the others"
+                f" ({len(self.folds)} folds):"
+            ),
             render(table),
             f"recommended: {self.recommended}",
         ]
-        return "\n".join([*lines, *(f"{model} is not judged: {why}" for model, why in self.failed.items())])
+        return "\n".join(
+            [*lines, *(f"{model} is not judged: {why}" for model, why in self.failed.items())]
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The fields, the recommended model and each model's figures over all poses."""
         figures = ("plane_mm", "board_mm", "scale_ppm", "camera_px", "projector_px")
-        models = {model: {figure: self.rms(model, figure) for figure in figures} for model in self.models}
+        models = {
+            model: {figure: self.rms(model, figure) for figure in figures} for model in self.models
+        }
         return {"recommended": self.recommended, "models": models, **to_plain(self)}
 
 
 def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
-    """Deal the poses into folds in the order of their depths, so that each fold holds near and far ones.
+    """Deal the poses into folds in the order of their depths, so that each fold holds near and far
+    ones.
 
     Raises InputError for fewer than ``LEAST_POSES`` poses.
     """
     if len(depths_mm) < LEAST_POSES:
         raise InputError(
-            f"{len(depths_mm)} target poses, and none can be spared of fewer than {LEAST_POSES}: capture more poses to "
-            "compare the models on poses that they were not made from"
+            f"{len(depths_mm)} target poses, and none can be spared of fewer than {LEAST_POSES}:"
+            " capture more poses to compare the models on poses that they were not made from"
         )
     if folds < 2:
         raise InputError(f"{folds} folds leave no pose out of any calibration: use 2 or more")
@@ -149,8 +160,10 @@ def smoothed_phases(observation: Observation) -> dict[Axis, PhaseMap]:
 def measure_held_out(
     models: Mapping[str, Model], observation: Observation, axis: Axis, rig: StereoRig
 ) -> dict[str, HeldOutPose]:
-    """Measure the errors of each model on a pose, all from the same axis and over the pixels and features that all of
-    them measure; empty where these are too few, or the pose lacks the axis. ``rig`` converts millimetres to pixels."""
+    """Measure the errors of each model on a pose, all from the same axis and over the pixels and
+    features that all of them measure; empty where these are too few, or the pose lacks the axis.
+    ``rig`` converts millimetres to pixels.
+    """
     phase = smoothed_phases(observation).get(axis)
     if phase is None:
         return {}
@@ -192,24 +205,35 @@ def gather_results(
     """
     poses: dict[str, dict[str, HeldOutPose]] = {}
     for model in (name for name in names if name not in failed):
-        by_pose = {pose: by_model[model] for fold in measured for pose, by_model in fold.items() if model in by_model}
+        by_pose = {
+            pose: by_model[model]
+            for fold in measured
+            for pose, by_model in fold.items()
+            if model in by_model
+        }
         if by_pose:
             poses[model] = by_pose
     if not poses:
         why = "; ".join(f"{model}: {reason}" for model, reason in failed.items())
-        raise InputError(f"no model could be made without some of the poses ({why}): capture more poses")
+        raise InputError(
+            f"no model could be made without some of the poses ({why}): capture more poses"
+        )
     return CrossValidation(poses, folds, dict(failed))
 
 
 def _interpolate(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """(n, 3): an organised cloud (h, w, 3) at pixels (n, 2), linear between its own; NaN beside invalid ones."""
+    """(n, 3): an organised cloud (h, w, 3) at pixels (n, 2), linear between its own; NaN beside
+    invalid ones."""
     v_u = pixels[:, ::-1].T
-    maps = (map_coordinates(points[..., k].astype(float), v_u, order=1, cval=np.nan) for k in range(3))
+    maps = (
+        map_coordinates(points[..., k].astype(float), v_u, order=1, cval=np.nan) for k in range(3)
+    )
     return np.stack(list(maps), axis=1)
 
 
 def _align_board(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, float]:
-    """The board's points (n, 3) after the rigid best fit to the measured ones, and the scale of the measured ones."""
+    """The board's points (n, 3) after the rigid best fit to the measured ones, and the scale of the
+    measured ones."""
     laid, middle = move_points(fit_rigid(board, measured), board), measured.mean(0)
     scale = float(np.sum((laid - middle) * (measured - middle)) / np.sum((laid - middle) ** 2))
     return laid, scale

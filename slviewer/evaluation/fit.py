@@ -22,11 +22,12 @@ LEAST_POINTS = 100
 class ShapeResult:
     """Distances of a cloud from its own best plane or sphere.
 
-    ``points`` pixels were evaluated; of these ``excluded`` lie beyond 5 robust sigma and count neither in the fit nor
-    in ``rms_mm``, the root mean square of the perpendicular (radial) distances. ``noise_floor_mm`` is what that would
-    be from the cloud's expected noise alone, over the same pixels; NaN where none is known. ``error_map`` ``(h, w)``
-    float32, mm, NaN where nothing was evaluated, holds every distance, those excluded too: positive towards the
-    camera for a plane, outwards for a sphere. ``inliers`` ``(h, w)`` bool says which pixels counted.
+    ``points`` pixels were evaluated; of these ``excluded`` lie beyond 5 robust sigma and count
+    neither in the fit nor in ``rms_mm``, the root mean square of the perpendicular (radial)
+    distances. ``noise_floor_mm`` is what that would be from the cloud's expected noise alone, over
+    the same pixels; NaN where none is known. ``error_map`` ``(h, w)`` float32, mm, NaN where
+    nothing was evaluated, holds every distance, those excluded too: positive towards the camera for
+    a plane, outwards for a sphere. ``inliers`` ``(h, w)`` bool says which pixels counted.
     """
 
     rms_mm: float
@@ -43,12 +44,14 @@ class ShapeResult:
 
     @property
     def warning(self) -> str | None:
-        """A warning if so many points were excluded that the RMS is not representative of the shape."""
+        """A warning if so many points were excluded that the RMS is not representative of the
+        shape."""
         if self.excluded_share <= MAX_EXCLUDED:
             return None
         return (
-            f"{100 * self.excluded_share:.1f} % of the points are outliers, beyond {MAX_SIGMA:g} robust "
-            "standard deviations, and not part of the RMS: look at the error map before you trust it."
+            f"{100 * self.excluded_share:.1f} % of the points are outliers, beyond {MAX_SIGMA:g}"
+            " robust standard deviations, and not part of the RMS: look at the error map before"
+            " you trust it."
         )
 
 
@@ -65,10 +68,11 @@ AnyShape = TypeVar("AnyShape", bound=Shape)
 def fit_settled(
     fit: Callable[[np.ndarray, AnyShape], AnyShape], points: np.ndarray, start: AnyShape
 ) -> tuple[AnyShape, np.ndarray]:
-    """Fit a shape to points (n, 3) mm, those beyond 5 robust sigma excluded, repeated until the set is stable.
+    """Fit a shape to points (n, 3) mm, those beyond 5 robust sigma excluded, repeated until the set
+    is stable.
 
-    ``fit(points, shape)`` is a least-squares fit that may start from a shape. Returns the shape and which points were
-    used, (n,) bool.
+    ``fit(points, shape)`` is a least-squares fit that may start from a shape. Returns the shape and
+    which points were used, (n,) bool.
     """
     shape, inliers = start, np.zeros(len(points), dtype=bool)
     for _ in range(30):
@@ -82,8 +86,8 @@ def fit_settled(
 def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(n,) bool: the residuals (n,) mm within 5 robust sigma of their median.
 
-    Sigma is that of *all* residuals, so that it does not shrink from round to round until only the best are left; of
-    exact points it is nothing but rounding, which excludes none of them.
+    Sigma is that of *all* residuals, so that it does not shrink from round to round until only the
+    best are left; of exact points it is nothing but rounding, which excludes none of them.
     """
     reach = max(MAX_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
     return np.abs(residuals - np.median(residuals)) <= reach
@@ -96,11 +100,14 @@ def fit_shape(
     start: Fitted,
     fit: Callable[[np.ndarray], Fitted],
 ) -> tuple[Fitted, ShapeResult]:
-    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate the residuals."""
+    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate
+    the residuals."""
     evaluated = mask & finite_rows(points)
     chosen = points[evaluated].astype(np.float64)
     if len(chosen) < LEAST_POINTS:
-        raise InputError(f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed.")
+        raise InputError(
+            f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed."
+        )
     shape, is_inlier = fit_settled(lambda some, _: fit(some), chosen, start)
     residuals = shape.distance(chosen)
 
@@ -108,15 +115,21 @@ def fit_shape(
     error_map[evaluated] = residuals
     inliers = np.zeros(points.shape[:2], dtype=bool)
     inliers[evaluated] = is_inlier
-    floor = float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
+    floor = (
+        float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
+    )
     error = rms(residuals[is_inlier])
-    return shape, ShapeResult(error, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers)
+    return shape, ShapeResult(
+        error, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers
+    )
 
 
 def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:
-    """Root mean square of ``sigma_z |n . r|`` over points (n, 3), r = (x/z, y/z, 1), n the shape's normal there; mm.
+    """Root mean square of ``sigma_z |n . r|`` over points (n, 3), r = (x/z, y/z, 1), n the shape's
+    normal there; mm.
 
-    ``sigma_z`` (n,) is the expected noise of each depth; an error of z moves the point along its ray r.
+    ``sigma_z`` (n,) is the expected noise of each depth; an error of z moves the point along its
+    ray r.
     """
     known = np.isfinite(sigma_z)
     if not known.any():

@@ -17,12 +17,17 @@ class PlaneResult(ShapeResult):
 
 
 def evaluate_plane(
-    points: np.ndarray, mask: np.ndarray | None, sigma_z: np.ndarray | None = None, start: Plane | None = None
+    points: np.ndarray,
+    mask: np.ndarray | None,
+    sigma_z: np.ndarray | None = None,
+    start: Plane | None = None,
 ) -> PlaneResult:
-    """Fit a plane to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the distances from it.
+    """Fit a plane to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the distances from
+    it.
 
-    ``mask`` ``(h, w)``: the pixels that show the plane; None: the largest flat patch is found. ``sigma_z`` ``(h, w)``
-    mm: the expected noise of z, for the noise floor. ``start``: about where the plane lies, if that is known.
+    ``mask`` ``(h, w)``: the pixels that show the plane; None: the largest flat patch is found.
+    ``sigma_z`` ``(h, w)`` mm: the expected noise of z, for the noise floor. ``start``: about where
+    the plane lies, if that is known.
     """
     if mask is None:
         start, mask = find_plane(points, sigma_z=sigma_z)

@@ -6,11 +6,13 @@ from typing import Any
 from slviewer.records.table import align_columns
 
 Row = dict[str, Any]
-"""Column titles and cells; a title that ends in % or radius, or holds ratio, sets its column's decimals."""
+"""Column titles and cells; a title that ends in % or radius, or holds ratio, sets its column's
+decimals."""
 
 
 def render(table: Sequence[Row]) -> str:
-    """Format rows as text with aligned columns: names to the left, figures to the right, ``-`` for unknown values.
+    """Format rows as text with aligned columns: names to the left, figures to the right, ``-`` for
+    unknown values.
 
     Titles stand above their columns one word a line, so that wide tables stay narrow.
     """

@@ -16,9 +16,10 @@ LEAST_CAPTURES = 3
 class Repeatability:
     """The spread of depth at each pixel over captures of a still object, mm.
 
-    ``sigma_map`` (h, w) float32, NaN where not every capture measured; ``sigma_mm`` its median, ``sigma_95_mm`` what 95
-    % of the pixels stay below; ``predicted_mm`` the median of what the captures' noise predicts; ``wandering_mm`` how
-    far the mean depth moved from the lowest to the highest capture: warming up, not noise.
+    ``sigma_map`` (h, w) float32, NaN where not every capture measured; ``sigma_mm`` its median,
+    ``sigma_95_mm`` what 95 % of the pixels stay below; ``predicted_mm`` the median of what the
+    captures' noise predicts; ``wandering_mm`` how far the mean depth moved from the lowest to the
+    highest capture: warming up, not noise.
     """
 
     captures: int
@@ -37,20 +38,27 @@ class Repeatability:
 def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatability:
     """Repeatability of captures given as (z, sigma_z), each (h, w) mm, NaN where invalid.
 
-    Raises InputError for fewer than three captures, captures of different size, and for no pixel that all measured.
+    Raises InputError for fewer than three captures, captures of different size, and for no pixel
+    that all measured.
     """
     pairs = [(np.asarray(z, np.float32), np.asarray(sigma, np.float32)) for z, sigma in measured]
     count, shapes = len(pairs), {z.shape for z, _ in pairs}
     if len(shapes) > 1:
-        raise InputError(f"captures of {' and '.join(map(str, shapes))} pixels are no repetition of one another")
+        raise InputError(
+            f"captures of {' and '.join(map(str, shapes))} pixels are no repetition of one another"
+        )
     if count < LEAST_CAPTURES:
-        raise InputError(f"{count} captures show no repeatability: take {CAPTURES} of the same still object")
+        raise InputError(
+            f"{count} captures show no repeatability: take {CAPTURES} of the same still object"
+        )
     depths, noise = (np.stack(maps) for maps in zip(*pairs, strict=True))
     depths -= depths[0].copy()  # small, so that squares keep their digits
     sigma = depths.std(axis=0, ddof=1)
     always = np.isfinite(sigma)
     if not always.any():
-        raise InputError("no pixel was measured in every capture: leave the object where it is, and in view")
+        raise InputError(
+            "no pixel was measured in every capture: leave the object where it is, and in view"
+        )
     levels = depths[:, always].mean(axis=1, dtype=np.float64)
     return Repeatability(
         count,

@@ -1,7 +1,9 @@
-"""What a camera and a projector can measure, predicted from their data sheets before they are bought or mounted.
+"""What a camera and a projector can measure, predicted from their data sheets before they are
+bought or mounted.
 
-Noise is propagated as decoding and the stereo model do it (`PhaseMap.sigma_phase`, `depth_per_px`); what is assumed of
-devices is blur, noise and light. Errors of a calibration are not part of the prediction.
+Noise is propagated as decoding and the stereo model do it (`PhaseMap.sigma_phase`, `depth_per_px`);
+what is assumed of devices is blur, noise and light. Errors of a calibration are not part of the
+prediction.
 """
 
 from collections.abc import Sequence
@@ -17,23 +19,26 @@ from slviewer.geometry.triangulation import depth_per_px
 from slviewer.geometry.vectors import lengths, unit_vectors
 
 PEAK_LEVEL, DARK_LEVEL, FULL_LEVEL = 215.0, 3.0, 255.0
-"""Grey levels of a white surface, as the rig check sets the exposure; without light; and the highest."""
+"""Grey levels of a white surface, as the rig check sets the exposure; without light; and the
+highest."""
 _GRID = 64
 """Columns of camera pixels that are computed."""
 _MIN_PERIOD_PX, _MIN_CAMERA_PX = 6.0, 6.0
-"""Shortest fringe in projector columns, which grey levels still shape well, and in camera pixels."""
+"""Shortest fringe in projector columns, which grey levels still shape well, and in camera
+pixels."""
 _BRIGHT_QUANTILE = 0.995
 """The brightest half percent of what is illuminated decides the exposure."""
 _DEPTHS = np.linspace(0.5, 2.0, 151)
 """Distances that are examined, as shares of the working distance."""
 _USABLE_COVERAGE, _USABLE_SIGMA = 0.6, 2.0
-"""Of the depth range: share of the view that the projector must illuminate, and noise over that at the distance."""
+"""Of the depth range: share of the view that the projector must illuminate, and noise over that at
+the distance."""
 
 
 @dataclass(frozen=True)
 class PlannedCamera:
-    """A camera: ``focal_px``; ``aperture_mm``, diameter of its pupil; ``blur_px``, Gaussian sigma in focus;
-    ``full_well`` and ``read_noise`` in electrons."""
+    """A camera: ``focal_px``; ``aperture_mm``, diameter of its pupil; ``blur_px``, Gaussian sigma
+    in focus; ``full_well`` and ``read_noise`` in electrons."""
 
     size: tuple[int, int]
     focal_px: float
@@ -55,8 +60,9 @@ class PlannedCamera:
 
 @dataclass(frozen=True)
 class PlannedProjector:
-    """A projector: ``focal_px`` of columns and of rows; ``offset``: its picture's middle above its axis, as a share of
-    its height; ``aperture_mm``; ``blur_px``, Gaussian sigma in focus in columns; ``black``: light of black over white.
+    """A projector: ``focal_px`` of columns and of rows; ``offset``: its picture's middle above its
+    axis, as a share of its height; ``aperture_mm``; ``blur_px``, Gaussian sigma in focus in
+    columns; ``black``: light of black over white.
     """
 
     size: tuple[int, int]
@@ -71,11 +77,12 @@ class PlannedProjector:
 class RigPlan:
     """What a rig is predicted to measure at its working distance, lengths in mm.
 
-    ``camera_field``, ``projector_field``: width and height of what each covers; ``camera_px``, ``projector_px``: size
-    of a pixel (a column) on the object; ``coverage``: share of the camera's view that the projector illuminates;
-    ``depth_range``: nearest and furthest distance at which it is usable. ``period_px``: recommended fringe period in
-    projector columns; ``modulation``: its amplitude in grey levels. ``sigma_middle``, ``sigma_corner``: standard
-    deviation of the depth of one point due to noise, in the middle and the median of the corners of what is covered;
+    ``camera_field``, ``projector_field``: width and height of what each covers; ``camera_px``,
+    ``projector_px``: size of a pixel (a column) on the object; ``coverage``: share of the camera's
+    view that the projector illuminates; ``depth_range``: nearest and furthest distance at which it
+    is usable. ``period_px``: recommended fringe period in projector columns; ``modulation``: its
+    amplitude in grey levels. ``sigma_middle``, ``sigma_corner``: standard deviation of the depth of
+    one point due to noise, in the middle and the median of the corners of what is covered;
     ``sigma_rms``: over all of it.
     """
 
@@ -98,27 +105,33 @@ class RigPlan:
 
 @dataclass(frozen=True)
 class PlannedLight:
-    """``steps`` of the phase shift; ``reflectance`` of the object, 1 for white paper; ``ambient`` room light over the
-    projector's."""
+    """``steps`` of the phase shift; ``reflectance`` of the object, 1 for white paper; ``ambient``
+    room light over the projector's."""
 
     steps: int = 8
     reflectance: float = 1.0
     ambient: float = 0.06
 
 
-def place(camera: PlannedCamera, projector: PlannedProjector, distance: float, baseline: float) -> StereoRig:
-    """Return the rig whose projector stands ``baseline`` mm to the right of the camera, its picture's middle on the
-    camera's axis at ``distance`` mm."""
+def place(
+    camera: PlannedCamera, projector: PlannedProjector, distance: float, baseline: float
+) -> StereoRig:
+    """Return the rig whose projector stands ``baseline`` mm to the right of the camera, its
+    picture's middle on the camera's axis at ``distance`` mm."""
     columns, rows = projector.size
     fx, fy = projector.focal_px
     # rows count downwards: the axis meets the picture's plane below its middle
-    lens = Lens.from_parameters((fx, fy, (columns - 1) / 2, (rows - 1) / 2 + projector.offset * rows), projector.size)
+    lens = Lens.from_parameters(
+        (fx, fy, (columns - 1) / 2, (rows - 1) / 2 + projector.offset * rows), projector.size
+    )
     centre = np.array([baseline, 0.0, 0.0])
     aim = np.array([0.0, 0.0, distance]) - centre
     z = unit_vectors(aim)
     x = unit_vectors(np.cross([0.0, 1.0, 0.0], z))
     R = np.stack([x, np.cross(z, x), z])
-    tilt = np.arctan(projector.offset * rows / fy)  # so that the picture's middle, not the axis, is aimed
+    tilt = np.arctan(
+        projector.offset * rows / fy
+    )  # so that the picture's middle, not the axis, is aimed
     R = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]) @ R
     return StereoRig(nominal_lens(camera.size, camera.focal_px), lens, R, -R @ centre)
 
@@ -134,8 +147,8 @@ def predict_rig(
 ) -> RigPlan:
     """Predict what a rig measures at a distance, mm.
 
-    ``period_px``: of the fringes, by default the best. ``depth_factors``, ascending: the depths, as multiples of the
-    distance, among which the usable range is found.
+    ``period_px``: of the fringes, by default the best. ``depth_factors``, ascending: the depths, as
+    multiples of the distance, among which the usable range is found.
 
     Raises InputError where the projector does not illuminate what the camera sees there.
     """
@@ -146,13 +159,15 @@ def predict_rig(
     coverage = float(is_lit.mean())
     if coverage < 0.02:
         raise InputError(
-            f"at {distance:g} mm the projector illuminates {100 * coverage:.0f} % of what the camera sees: choose "
-            "another distance, lens or baseline"
+            f"at {distance:g} mm the projector illuminates {100 * coverage:.0f} % of what the"
+            " camera sees: choose another distance, lens or baseline"
         )
     away = float(np.hypot(distance, baseline))
     camera_px, projector_px = distance / camera.focal_px, away / projector.focal_px[0]
     optics = _Optics(view, camera, projector, light, distance)
-    period = period_px or _best_period(float(np.median(optics.blur_px(distance)[is_lit])), camera_px / projector_px)
+    period = period_px or _best_period(
+        float(np.median(optics.blur_px(distance)[is_lit])), camera_px / projector_px
+    )
     sigmas, modulation = optics.predict_sigma(distance, period, is_lit)
     middle, corner = _middle_and_corner(sigmas)
     depths = distance * np.asarray(depth_factors, float)
@@ -202,7 +217,8 @@ def _is_illuminated(rig: StereoRig, z: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Optics:
-    """Light, blur and noise of a rig with few camera pixels (h, w), whose lenses are focused at ``focus`` mm."""
+    """Light, blur and noise of a rig with few camera pixels (h, w), whose lenses are focused at
+    ``focus`` mm."""
 
     rig: StereoRig
     camera: PlannedCamera
@@ -211,23 +227,28 @@ class _Optics:
     focus: float
 
     def blur_px(self, z: float) -> np.ndarray:
-        """Return the Gaussian sigma (h, w) of a fringe on the plane at depth z, in projector columns.
+        """Return the Gaussian sigma (h, w) of a fringe on the plane at depth z, in projector
+        columns.
 
-        A disc of defocus of diameter d has the sigma d / 4; a pixel of the projector or the camera counts as
-        1 / sqrt(12).
+        A disc of defocus of diameter d has the sigma d / 4; a pixel of the projector or the camera
+        counts as 1 / sqrt(12).
         """
         depths = self.rig.to_projector(_plane_points(self.rig, z))[..., 2]
         focused = self.rig.to_projector(np.array([0.0, 0.0, self.focus]))[2]
         camera, projector = self.camera, self.projector
-        of_projector = projector.focal_px[0] * projector.aperture_mm / 4 * (1 / depths - 1 / focused)
+        of_projector = (
+            projector.focal_px[0] * projector.aperture_mm / 4 * (1 / depths - 1 / focused)
+        )
         of_camera = camera.focal_px * camera.aperture_mm / 4 * (1 / z - 1 / self.focus)
         columns_per_px = (z / camera.focal_px) / (depths / projector.focal_px[0])
         camera_sigma = np.sqrt(camera.blur_px**2 + of_camera**2 + 1 / 12) * columns_per_px
         return np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
 
     def light_on(self, z: float, is_lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the projector's light (h, w) that returns from a white plane at depth z, and the room's, as shares of
-        the brightest white: cosine of the incidence, square of the distance, cos^4 of the camera's lens."""
+        """Return the projector's light (h, w) that returns from a white plane at depth z, and the
+        room's, as shares of the brightest white: cosine of the incidence, square of the distance,
+        cos^4 of the camera's lens.
+        """
         points = _plane_points(self.rig, z)
         centre = -self.rig.R.T @ self.rig.t
         to_projector = centre - points
@@ -237,26 +258,41 @@ class _Optics:
         brightest = np.quantile((lit + self.light.ambient * even)[is_lit], _BRIGHT_QUANTILE)
         return lit / brightest, self.light.ambient * even / brightest
 
-    def predict_sigma(self, z: float, period: float, is_lit: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the standard deviation (h, w) mm of depth on the plane at depth z, NaN where not ``is_lit`` (h, w),
-        and the median modulation in grey levels. The exposure is chosen for a white surface at that depth."""
-        lit, room = (part * (PEAK_LEVEL - DARK_LEVEL) * self.light.reflectance for part in self.light_on(z, is_lit))
+    def predict_sigma(
+        self, z: float, period: float, is_lit: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Return the standard deviation (h, w) mm of depth on the plane at depth z, NaN where not
+        ``is_lit`` (h, w), and the median modulation in grey levels. The exposure is chosen for a
+        white surface at that depth.
+        """
+        lit, room = (
+            part * (PEAK_LEVEL - DARK_LEVEL) * self.light.reflectance
+            for part in self.light_on(z, is_lit)
+        )
         black, camera = self.projector.black, self.camera
         modulation = lit * (1 - black) / 2 * np.exp(-2 * (np.pi * self.blur_px(z) / period) ** 2)
-        variance = camera.read_variance + camera.shot_variance * (lit * (1 + black) / 2 + room) + 1 / 12
+        variance = (
+            camera.read_variance + camera.shot_variance * (lit * (1 + black) / 2 + room) + 1 / 12
+        )
         sigma_phase = np.sqrt(2 / self.light.steps * variance) / modulation
-        sigmas = depth_per_px(self.rig, "x", np.full(is_lit.shape, float(z))) * sigma_phase * period / (2 * np.pi)
+        sigmas = (
+            depth_per_px(self.rig, "x", np.full(is_lit.shape, float(z)))
+            * sigma_phase
+            * period
+            / (2 * np.pi)
+        )
         return np.where(is_lit, sigmas, np.nan), float(np.median(modulation[is_lit]))
 
 
 def _best_period(blur: float, columns_per_px: float) -> float:
-    """Return the period, in whole projector columns, with the least noise: period / modulation is least at 2 pi blur
-    (the modulation falls as exp(-2 pi² blur² / period²))."""
+    """Return the period, in whole projector columns, with the least noise: period / modulation is
+    least at 2 pi blur (the modulation falls as exp(-2 pi² blur² / period²))."""
     return float(np.ceil(max(2 * np.pi * blur, _MIN_PERIOD_PX, _MIN_CAMERA_PX * columns_per_px)))
 
 
 def _middle_and_corner(sigmas: np.ndarray) -> tuple[float, float]:
-    """Return the median of a map (h, w) in its middle, and that of the outermost tenth of what is not NaN."""
+    """Return the median of a map (h, w) in its middle, and that of the outermost tenth of what is
+    not NaN."""
     rows, columns = np.nonzero(np.isfinite(sigmas))
     values = sigmas[rows, columns]
     height, width = sigmas.shape
@@ -266,7 +302,8 @@ def _middle_and_corner(sigmas: np.ndarray) -> tuple[float, float]:
 
 
 def _is_usable(optics: _Optics, z: float, period: float, coverage: float, sigma: float) -> bool:
-    """Whether at depth z enough is illuminated, and the noise is not far above `sigma`, that of the distance."""
+    """Whether at depth z enough is illuminated, and the noise is not far above `sigma`, that of the
+    distance."""
     is_lit = _is_illuminated(optics.rig, z)
     if is_lit.mean() < _USABLE_COVERAGE * coverage:
         return False

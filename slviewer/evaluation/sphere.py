@@ -28,11 +28,13 @@ def evaluate_sphere(
     radius: float | None = None,
     start: Sphere | None = None,
 ) -> SphereResult:
-    """Fit a sphere to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the radial distances from it.
+    """Fit a sphere to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the radial distances
+    from it.
 
-    ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found. ``sigma_z`` ``(h, w)``
-    mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the sphere; the fitted radius stays free, as
-    in the Letter's Table 2. ``start``: about where the sphere lies, if that is known.
+    ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found.
+    ``sigma_z`` ``(h, w)`` mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the
+    sphere; the fitted radius stays free, as in the Letter's Table 2. ``start``: about where the
+    sphere lies, if that is known.
     """
     if mask is None:
         start, mask = find_sphere(points, sigma_z=sigma_z, radius=radius)
@@ -45,6 +47,7 @@ def evaluate_sphere(
 def evaluate_spheres(
     points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
 ) -> list[SphereResult]:
-    """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise as above."""
+    """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise
+    as above."""
     spheres = find_spheres(points, count, sigma_z, radius)
     return [evaluate_sphere(points, region, sigma_z, radius, start) for start, region in spheres]

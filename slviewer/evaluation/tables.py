@@ -19,12 +19,13 @@ from slviewer.evaluation.sphere import SphereResult
 
 
 def letter_rows(comparisons: Mapping[str, Comparison]) -> list[Row]:
-    """Return one row a capture and, for more than one, a row of means; keys are the columns' titles, None is an empty
-    cell.
+    """Return one row a capture and, for more than one, a row of means; keys are the columns'
+    titles, None is an empty cell.
 
-    RMS and noise floor of each model in mm, for spheres the radius; ``ratio`` is the first model's RMS over pixelwise's
-    or, without that, the last one's (in the last row, the ratio of the means). Beside them the Letter's figures of the
-    pose whose number ends the capture's name (``plane_03``, ``sphere_3``), stereo and pixelwise.
+    RMS and noise floor of each model in mm, for spheres the radius; ``ratio`` is the first model's
+    RMS over pixelwise's or, without that, the last one's (in the last row, the ratio of the means).
+    Beside them the Letter's figures of the pose whose number ends the capture's name (``plane_03``,
+    ``sphere_3``), stereo and pixelwise.
     """
     table = [
         _make_row(name, comparison) | _letter_figures(name, comparison.shape)
@@ -37,10 +38,14 @@ def _make_row(name: str, comparison: Comparison) -> Row:
     """Return the table row of one capture: each model's RMS, noise floor, radius and coverage."""
     row: Row = {"capture": name}
     if comparison.incidence is not None:
-        row["R1/R2/R3 %"] = "/".join(f"{share:.1f}".removesuffix(".0") for share in comparison.incidence.values())
+        row["R1/R2/R3 %"] = "/".join(
+            f"{share:.1f}".removesuffix(".0") for share in comparison.incidence.values()
+        )
     for model, result in comparison.results.items():
         row[f"{model} mm"] = result.rms_mm
-        row[f"{model} floor"] = result.noise_floor_mm if np.isfinite(result.noise_floor_mm) else None
+        row[f"{model} floor"] = (
+            result.noise_floor_mm if np.isfinite(result.noise_floor_mm) else None
+        )
         if isinstance(result, SphereResult):
             row[f"{model} radius"] = result.radius_mm
         if np.isfinite(comparison.coverage[model]):
@@ -50,19 +55,27 @@ def _make_row(name: str, comparison: Comparison) -> Row:
 
 
 def _rms_ratio(row: Row, comparison: Comparison) -> Row:
-    """Return the ratio of the first model's RMS to that of the model to compare it with; {} for a single model."""
+    """Return the ratio of the first model's RMS to that of the model to compare it with; {} for a
+    single model."""
     first, *others = comparison.results
     if not others:
         return {}
-    return {"ratio": row[f"{first} mm"] / row[f"{'pixelwise' if 'pixelwise' in others else others[-1]} mm"]}
+    return {
+        "ratio": (
+            row[f"{first} mm"] / row[f"{'pixelwise' if 'pixelwise' in others else others[-1]} mm"]
+        )
+    }
 
 
 def _letter_figures(capture: str, shape: str) -> Row:
-    """Return the Letter's figures of the pose whose number the capture's name ends with; {} without one."""
+    """Return the Letter's figures of the pose whose number the capture's name ends with; {} without
+    one."""
     number = re.search(r"(\d+)$", capture)
     pose = int(number[1]) if number else 0
     if shape == "plane":
-        return next((_letter_row(p.stereo_mm, p.pixelwise_mm) for p in TABLE_1 if p.pose == pose), {})
+        return next(
+            (_letter_row(p.stereo_mm, p.pixelwise_mm) for p in TABLE_1 if p.pose == pose), {}
+        )
     return next(
         (
             _letter_row(p.stereo_mm, p.pixelwise_mm, (p.stereo_radius_mm, p.pixelwise_radius_mm))
@@ -74,8 +87,13 @@ def _letter_figures(capture: str, shape: str) -> Row:
 
 
 def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | None = None) -> Row:
-    """Return the Letter's RMS of both models in mm, their ratio, and the sphere's radii if given."""
-    row: Row = {"Letter stereo": stereo, "Letter pixelwise": pixelwise, "Letter ratio": stereo / pixelwise}
+    """Return the Letter's RMS of both models in mm, their ratio, and the sphere's radii if
+    given."""
+    row: Row = {
+        "Letter stereo": stereo,
+        "Letter pixelwise": pixelwise,
+        "Letter ratio": stereo / pixelwise,
+    }
     if radii is not None:
         row["Letter stereo radius"], row["Letter pixelwise radius"] = radii
     return row

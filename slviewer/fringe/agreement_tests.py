@@ -10,23 +10,27 @@ from slviewer.fringe.axis_reader import AxisFrames
 from slviewer.fringe.contradiction import Contradiction
 
 MIN_RULE, MIN_COMMON, MIN_RISING = 0.5, 0.5, 0.5
-"""Shares of the code edges below which the description fails: a wrong one gives no more than chance. Correct ones gave
-0.93 and more, also for a cluttered scene in room light."""
+"""Shares of the code edges below which the description fails: a wrong one gives no more than
+chance. Correct ones gave 0.93 and more, also for a cluttered scene in room light."""
 MIN_OPPOSED = 0.8
-"""Share below which two images are no bit and inverse: images of other patterns are alike at half of the pixels."""
+"""Share below which two images are no bit and inverse: images of other patterns are alike at half
+of the pixels."""
 SURE = 0.75
 """Shares that a hypothesis must exceed to be reported."""
 MIN_LEVEL = 0.4
-"""Length of the mean unit vector of the step from one period to the next. Steps that spread evenly give 0, and noise
-that loses every twentieth order 0.5."""
+"""Length of the mean unit vector of the step from one period to the next. Steps that spread evenly
+give 0, and noise that loses every twentieth order 0.5."""
 MAX_BEGIN_TURNS = 0.15
-"""Largest offset between Gray code and fringes, in periods: the tolerance of decoding at the code's edges."""
+"""Largest offset between Gray code and fringes, in periods: the tolerance of decoding at the code's
+edges."""
 MAX_LEVEL_TURNS = 0.2
 """Largest offset between two periods, in turns: half the tolerance of decoding."""
 SURE_LEVEL = 0.9
-"""Above this length the mean step is accurate to a hundredth of a period, and half of that offset is the limit."""
+"""Above this length the mean step is accurate to a hundredth of a period, and half of that offset
+is the limit."""
 MAX_CELL = 0.12
-"""Relative error of a cell's width: with a smaller one, the edges in view would still have one phase."""
+"""Relative error of a cell's width: with a smaller one, the edges in view would still have one
+phase."""
 MAX_OUTSIDE = 0.01
 """Largest share of coordinates outside the projector: blur moves a few across its border."""
 CERTAIN = 0.93
@@ -35,10 +39,11 @@ CERTAIN = 0.93
 
 @dataclass(frozen=True)
 class Answer:
-    """Contradictions that together explain the frames of an axis, and the agreement that results from them.
+    """Contradictions that together explain the frames of an axis, and the agreement that results
+    from them.
 
-    ``score``: sum of the agreement shares, see `sum_shares`. ``is_certain``: whether no other hypothesis needs to be
-    tried.
+    ``score``: sum of the agreement shares, see `sum_shares`. ``is_certain``: whether no other
+    hypothesis needs to be tried.
     """
 
     contradictions: tuple[Contradiction, ...]
@@ -52,7 +57,8 @@ def explain(contradictions: Iterable[Contradiction], a: Agreement) -> Answer:
 
 
 def sum_shares(a: Agreement) -> float:
-    """Return the sum of the agreement shares (0 to 1 each); an unknown share (NaN) counts as 0.5."""
+    """Return the sum of the agreement shares (0 to 1 each); an unknown share (NaN) counts as
+    0.5."""
     return float(sum(0.5 if np.isnan(share) else share for share in _list_shares(a)))
 
 
@@ -67,10 +73,11 @@ def is_certain(a: Agreement) -> bool:
 
 
 def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
-    """Return the names of the tests that the frames fail; a test that cannot be made counts as passed.
+    """Return the names of the tests that the frames fail; a test that cannot be made counts as
+    passed.
 
-    The names are "bits", "inverse", "rule", "common", "begin", "rising", "cell", "levels", "level offset" and
-    "outside".
+    The names are "bits", "inverse", "rule", "common", "begin", "rising", "cell", "levels", "level
+    offset" and "outside".
     """
     failed = set()
     if a.unreadable is not None:
@@ -101,9 +108,11 @@ def failed_tests(frames: AxisFrames, a: Agreement) -> set[str]:
 
 
 def has_evidence(frames: AxisFrames, a: Agreement) -> bool:
-    """Return whether the frames give positive evidence for a hypothesis, rather than merely no test against it.
+    """Return whether the frames give positive evidence for a hypothesis, rather than merely no test
+    against it.
 
-    Every share that can be measured must exceed ``SURE``, and enough code edges, or several periods, must be in view.
+    Every share that can be measured must exceed ``SURE``, and enough code edges, or several
+    periods, must be in view.
     """
     if frames.bits and not (a.edges >= FEWEST_EDGES and a.rule > SURE):
         return False

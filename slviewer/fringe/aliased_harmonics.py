@@ -1,12 +1,15 @@
-"""Phase errors that gamma causes in three and four phase steps: estimated from the frames themselves, and corrected.
+"""Phase errors that gamma causes in three and four phase steps: estimated from the frames
+themselves, and corrected.
 
-A response that is not linear adds harmonics to the fringe, B_m cos(m theta) with theta the argument of the cosine.
-Among n steps harmonics n - 1 and n + 1 appear as the first, which is measured as B_1 e^(i theta) (1 + M cos(n theta) -
-i d sin(n theta)), with M = (B_{n-1} + B_{n+1}) / B_1 and d = (B_{n-1} - B_{n+1}) / B_1. So the modulation ripples with
-the cosine, and the phase with the sine: the error is atan2(-d sin(n theta), 1 + M cos(n theta)). Each is fitted, beside
-a parabola, to pieces of image lines about one fringe long. Texture disturbs the modulation alone and relief the phase
-alone, and neither follows the fringe, so that only gamma affects both alike. Gamma adds no sine to the modulation and
-no cosine to the phase: amplitudes fitted to these are due to texture and relief, and serve as a control.
+A response that is not linear adds harmonics to the fringe, B_m cos(m theta) with theta the argument
+of the cosine. Among n steps harmonics n - 1 and n + 1 appear as the first, which is measured as B_1
+e^(i theta) (1 + M cos(n theta) - i d sin(n theta)), with M = (B_{n-1} + B_{n+1}) / B_1 and d =
+(B_{n-1} - B_{n+1}) / B_1. So the modulation ripples with the cosine, and the phase with the sine:
+the error is atan2(-d sin(n theta), 1 + M cos(n theta)). Each is fitted, beside a parabola, to
+pieces of image lines about one fringe long. Texture disturbs the modulation alone and relief the
+phase alone, and neither follows the fringe, so that only gamma affects both alike. Gamma adds no
+sine to the modulation and no cosine to the phase: amplitudes fitted to these are due to texture and
+relief, and serve as a control.
 """
 
 from dataclasses import dataclass
@@ -20,7 +23,8 @@ from slviewer.fringe.residual_sample import fit_cosine, select_rows
 from slviewer.fringe.suspect import Suspect
 
 MOST_STEPS = 4
-"""From five steps on, harmonics below the fourth cause no error, and blur removes most of the others."""
+"""From five steps on, harmonics below the fourth cause no error, and blur removes most of the
+others."""
 SIGMAS = 5.0
 """Standard errors beyond which a ripple is no accident: one in two million."""
 CONTROL = 3.0
@@ -39,17 +43,19 @@ FEWEST_BLOCKS = 6
 ROUNDS = 6
 """The phase itself is the argument of the ripple: fit and correct in turns, until both settle."""
 SETTLED = 0.01
-"""Change of both amplitudes, in their standard errors, below which they have settled; each round changes them by some
-percent of what the last one did."""
+"""Change of both amplitudes, in their standard errors, below which they have settled; each round
+changes them by some percent of what the last one did."""
 OUTLIER = 4.0
 """Times the usual deviation beyond which a piece (an edge, a step) does not count."""
 
 
 @dataclass(frozen=True)
 class AliasedHarmonics:
-    """Ripple of n phase steps: amplitudes ``modulation`` (M, relative) and ``phase`` (d, rad), zero if not significant.
+    """Ripple of n phase steps: amplitudes ``modulation`` (M, relative) and ``phase`` (d, rad), zero
+    if not significant.
 
-    ``is_corrected``: whether d is known well enough to be removed; ``error_rad``: rms error of the phase that remains.
+    ``is_corrected``: whether d is known well enough to be removed; ``error_rad``: rms error of the
+    phase that remains.
     """
 
     steps: int = 0
@@ -64,15 +70,21 @@ class AliasedHarmonics:
         return self.steps > 0
 
     def correction(self, theta: np.ndarray) -> np.ndarray:
-        """Return the correction, rad float32, to add to the measured argument ``theta`` (rad) of the cosine."""
-        return _compute_correction(theta, self.steps, self.modulation, self.phase).astype(np.float32)
+        """Return the correction, rad float32, to add to the measured argument ``theta`` (rad) of
+        the cosine."""
+        return _compute_correction(theta, self.steps, self.modulation, self.phase).astype(
+            np.float32
+        )
 
 
-def estimate_aliased_harmonics(layout: Layout, stack: np.ndarray, white: float, noise: Noise) -> AliasedHarmonics:
-    """Estimate the ripple that harmonics cause in the finest period of an axis; none where it has five or more steps.
+def estimate_aliased_harmonics(
+    layout: Layout, stack: np.ndarray, white: float, noise: Noise
+) -> AliasedHarmonics:
+    """Estimate the ripple that harmonics cause in the finest period of an axis; none where it has
+    five or more steps.
 
-    ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey levels. About 40,000
-    pixels along the image lines that cross the fringes are used.
+    ``stack`` (n, h, w) under equal light, which clips at ``white``; ``noise`` (a, b) of its grey
+    levels. About 40,000 pixels along the image lines that cross the fringes are used.
     """
     none = AliasedHarmonics()
     if not 0 < layout.steps <= MOST_STEPS:
@@ -93,7 +105,9 @@ def estimate_aliased_harmonics(layout: Layout, stack: np.ndarray, white: float, 
         noise_gain = max(float(np.mean(slope**-2.0)) - 1, 0.0)
         remaining = np.sqrt((spread**2 + d.error**2 + second**2) / 2 + noise_gain * pieces.sigma**2)
         return AliasedHarmonics(n, M.value, d.value, True, float(remaining))
-    if abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2:  # no phase follows: the modulation is texture's
+    if (
+        abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2
+    ):  # no phase follows: the modulation is texture's
         return none
     return AliasedHarmonics(n, M.value, d.value, False, abs(M.value) / np.sqrt(2))
 
@@ -101,7 +115,8 @@ def estimate_aliased_harmonics(layout: Layout, stack: np.ndarray, white: float, 
 def correct_harmonics(
     harmonics: AliasedHarmonics, layout: Layout, phase: np.ndarray, wrapped: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Remove the ripple from absolute and wrapped phase (h, w) float32 rad, where it is known well enough to correct.
+    """Remove the ripple from absolute and wrapped phase (h, w) float32 rad, where it is known well
+    enough to correct.
 
     Otherwise both are returned unchanged.
     """
@@ -120,11 +135,16 @@ def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]
     per_rad = layout.period_px / (2 * np.pi)
     theta = np.linspace(0, 2 * np.pi, 361)
     largest = float(np.abs(harmonics.correction(theta)).max()) * per_rad
-    outcome = "corrected" if harmonics.is_corrected else "it could not be measured well enough to correct it"
+    outcome = (
+        "corrected"
+        if harmonics.is_corrected
+        else "it could not be measured well enough to correct it"
+    )
     text = (
-        f"the projector response is nonlinear (gamma): with {harmonics.steps} phase steps this shifts the coordinates "
-        f"of axis {layout.axis} by up to {largest:.2g} px: {outcome}, and {harmonics.error_rad * per_rad:.2g} px was "
-        "added to the uncertainty; make the responses of projector and camera linear, or use 5 phase steps or more"
+        f"the projector response is nonlinear (gamma): with {harmonics.steps} phase steps this"
+        f" shifts the coordinates of axis {layout.axis} by up to {largest:.2g} px: {outcome}, and"
+        f" {harmonics.error_rad * per_rad:.2g} px was added to the uncertainty; make the responses"
+        " of projector and camera linear, or use 5 phase steps or more"
     )
     return [Suspect(layout.shifts[-1].indices[0], "gamma", text)]
 
@@ -133,8 +153,8 @@ def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]
 class _Pieces:
     """Pieces of image lines, k pieces of s pixels each.
 
-    ``theta`` (k, s): phase in rad, unwrapped; ``modulation`` (k, s): relative to the piece's mean; ``block`` (k,): part
-    of the image; ``sigma``: median phase noise, rad.
+    ``theta`` (k, s): phase in rad, unwrapped; ``modulation`` (k, s): relative to the piece's mean;
+    ``block`` (k,): part of the image; ``sigma``: median phase noise, rad.
     """
 
     steps: int
@@ -146,7 +166,8 @@ class _Pieces:
 
 @dataclass(frozen=True)
 class _Amplitude:
-    """Estimated amplitude of a ripple, its standard error, and the amplitude of a control that should be zero."""
+    """Estimated amplitude of a ripple, its standard error, and the amplitude of a control that
+    should be zero."""
 
     value: float
     error: float
@@ -159,9 +180,12 @@ class _Amplitude:
 
 
 def _cut_pieces(layout: Layout, stack: np.ndarray, white: float, noise: Noise) -> _Pieces | None:
-    """Cut rows or columns, whichever cross more fringes, into pieces; None where too few fringes are in view."""
+    """Cut rows or columns, whichever cross more fringes, into pieces; None where too few fringes
+    are in view."""
     indices = list(layout.shifts[-1].indices)
-    candidates = [_sample_lines(each, indices, white, noise) for each in (stack, stack.transpose(0, 2, 1))]
+    candidates = [
+        _sample_lines(each, indices, white, noise) for each in (stack, stack.transpose(0, 2, 1))
+    ]
     phasor, background, valid, cycles = max(candidates, key=lambda c: c[3])
     if not 0 < cycles < MOST_CYCLES:
         return None
@@ -209,7 +233,8 @@ def _sample_lines(
 def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] | None:
     """Fit the ripple's amplitudes M and d; None for too few pieces.
 
-    Third, the standard deviation of d over the image; fourth, the phase ripple that remains at the double frequency.
+    Third, the standard deviation of d over the image; fourth, the phase ripple that remains at the
+    double frequency.
     """
     M = d = 0.0
     n, size = pieces.steps, pieces.theta.shape[1]
@@ -222,7 +247,9 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
         design = np.stack(columns, axis=1)  # (k, 7, s)
         centred = theta - theta.mean(axis=1, keepdims=True)
         target = np.stack([centred, pieces.modulation * np.cos(added)], axis=1)
-        inverse = np.linalg.inv(design @ design.transpose(0, 2, 1) + 1e-6 * size * np.eye(len(columns)))
+        inverse = np.linalg.inv(
+            design @ design.transpose(0, 2, 1) + 1e-6 * size * np.eye(len(columns))
+        )
         weights = inverse @ (design @ target.transpose(0, 2, 1))
         residual = target - weights.transpose(0, 2, 1) @ design
         residual_rms = np.sqrt(np.einsum("kts,kts->kt", residual, residual) / size)
@@ -230,14 +257,22 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
         information = 1 / np.diagonal(inverse, axis1=1, axis2=2)
         # rows: constant, x, x^2, cos, sin, cos 2, sin 2; columns: phase, modulation
         phase_cosine, phase_sine, second, modulation_cosine, modulation_sine = (
-            _compute_robust_mean(weights[good, row, column], information[good, row], pieces.block[good])
+            _compute_robust_mean(
+                weights[good, row, column], information[good, row], pieces.block[good]
+            )
             for row, column in ((3, 0), (4, 0), (6, 0), (3, 1), (4, 1))
         )
         if not np.isfinite([phase_sine[0], modulation_cosine[0]]).all():
             return None
         limit, before = 0.9 / n, (M, d)
-        M, d = float(np.clip(modulation_cosine[0], -0.9, 0.9)), float(np.clip(d - phase_sine[0], -limit, limit))
-        if abs(M - before[0]) <= SETTLED * modulation_cosine[1] and abs(d - before[1]) <= SETTLED * phase_sine[1]:
+        M, d = (
+            float(np.clip(modulation_cosine[0], -0.9, 0.9)),
+            float(np.clip(d - phase_sine[0], -limit, limit)),
+        )
+        if (
+            abs(M - before[0]) <= SETTLED * modulation_cosine[1]
+            and abs(d - before[1]) <= SETTLED * phase_sine[1]
+        ):
             break
     return (
         _Amplitude(M, modulation_cosine[1], modulation_sine[0]),
@@ -247,8 +282,11 @@ def _fit_ripple(pieces: _Pieces) -> tuple[_Amplitude, _Amplitude, float, float] 
     )
 
 
-def _compute_robust_mean(values: np.ndarray, weights: np.ndarray, block: np.ndarray) -> tuple[float, float, float]:
-    """Return weighted mean without outliers, its standard error, and standard deviation of the blocks' means."""
+def _compute_robust_mean(
+    values: np.ndarray, weights: np.ndarray, block: np.ndarray
+) -> tuple[float, float, float]:
+    """Return weighted mean without outliers, its standard error, and standard deviation of the
+    blocks' means."""
     if len(values) == 0:
         return np.nan, np.nan, np.nan
     middle = np.median(values)
@@ -280,12 +318,14 @@ def _compute_correction(theta: np.ndarray, n: int, M: float, d: float) -> np.nda
 
 
 def _compute_slope(n: int, M: float, d: float) -> np.ndarray:
-    """Return the derivative of the measured argument with respect to the true one, at 1024 points of one wave."""
+    """Return the derivative of the measured argument with respect to the true one, at 1024 points
+    of one wave."""
     wave, error = _tabulate_ripple(M, d)
     return np.diff(wave + n * error) / np.diff(wave)
 
 
 def _tabulate_ripple(M: float, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1025 arguments (rad) of one wave of the ripple, and the errors of the phase (rad) there."""
+    """Return 1025 arguments (rad) of one wave of the ripple, and the errors of the phase (rad)
+    there."""
     wave = np.linspace(-np.pi, np.pi, 1025)
     return wave, np.arctan2(-d * np.sin(wave), 1 + M * np.cos(wave))

@@ -1,4 +1,5 @@
-"""Frames of one axis under a hypothesis, and the bits and phases that are read from them at sampled pixels."""
+"""Frames of one axis under a hypothesis, and the bits and phases that are read from them at sampled
+pixels."""
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,21 +22,23 @@ DECIDED_SIGMAS = 3.0
 """Distance from the middle, in standard deviations of the noise, that it must exceed as well."""
 FEWEST_PIXELS = 500
 COARSE_PIXELS = 8_000
-"""Size of a small sample, which excludes most hypotheses: the length of a mean unit vector is accurate to 0.02."""
+"""Size of a small sample, which excludes most hypotheses: the length of a mean unit vector is
+accurate to 0.02."""
 RECENT = 8
 INSIDE = 0.35
-"""Distance from the middle, as a share of the swing, beyond which a pixel is inside a stripe. With a gamma of 2.2,
-blurred stripes are 0.28 from the middle."""
+"""Distance from the middle, as a share of the swing, beyond which a pixel is inside a stripe. With
+a gamma of 2.2, blurred stripes are 0.28 from the middle."""
 
 
 @dataclass(frozen=True)
 class AxisFrames:
-    """Assignment of images to the frames of one axis: image indices, None where an image is missing.
+    """Assignment of images to the frames of one axis: image indices, None where an image is
+    missing.
 
-    ``extent``: None where the projector's size is not known. ``shifts``: (period, images by step), longest period
-    first. ``bits``: most significant first, the complementary bit last; ``inverse``: like ``bits``, or empty.
-    ``inverted``: bits and their inverses are exchanged. ``gamma``: exponent of the response of the light to the grey
-    level.
+    ``extent``: None where the projector's size is not known. ``shifts``: (period, images by step),
+    longest period first. ``bits``: most significant first, the complementary bit last; ``inverse``:
+    like ``bits``, or empty. ``inverted``: bits and their inverses are exchanged. ``gamma``:
+    exponent of the response of the light to the grey level.
     """
 
     extent: int | None
@@ -52,19 +55,25 @@ class AxisFrames:
 
     @property
     def fringe(self) -> tuple[float, Images] | None:
-        """Period (px) and images of the shift that is compared with the Gray code: the one most like its cells.
+        """Period (px) and images of the shift that is compared with the Gray code: the one most
+        like its cells.
 
         None for Gray code alone.
         """
-        return min(self.shifts, key=lambda shift: abs(np.log(shift[0] / self.cell_px)), default=None)
+        return min(
+            self.shifts, key=lambda shift: abs(np.log(shift[0] / self.cell_px)), default=None
+        )
 
     def cell_of(self, count: int) -> float:
         """Return the width, px, of the cells that the first ``count`` bits number."""
         return self.cell_px * 2.0 ** (len(self.bits) - self.complementary - count)
 
 
-def described_frames(sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None) -> AxisFrames:
-    """Return the frames of an axis as a sequence describes them, frame i being shown in image ``images[i]``.
+def described_frames(
+    sequence: PatternSequence, axis: Axis, images: Sequence[int | None] | None = None
+) -> AxisFrames:
+    """Return the frames of an axis as a sequence describes them, frame i being shown in image
+    ``images[i]``.
 
     ``images``: None where an image is missing; frame i is image i if no images are given.
     """
@@ -90,18 +99,22 @@ def described_frames(sequence: PatternSequence, axis: Axis, images: Sequence[int
 def reversed_bits(frames: AxisFrames, with_complementary: bool = False) -> AxisFrames:
     """Return the frames with their Gray bits in reverse order.
 
-    The complementary bit stays last, or, ``with_complementary``, is reversed with the others and comes first.
+    The complementary bit stays last, or, ``with_complementary``, is reversed with the others and
+    comes first.
     """
     if with_complementary:
         return replace(frames, bits=frames.bits[::-1])
     count = len(frames.bits) - frames.complementary
-    return replace(frames, bits=frames.bits[:count][::-1] + frames.bits[count:], inverse=frames.inverse[::-1])
+    return replace(
+        frames, bits=frames.bits[:count][::-1] + frames.bits[count:], inverse=frames.inverse[::-1]
+    )
 
 
 class BitReading(NamedTuple):
     """Bit as it is read from its images.
 
-    ``value`` and ``decided`` (p,) bool; ``share`` of decided pixels; ``stripe_px``: mean width of the stripes.
+    ``value`` and ``decided`` (p,) bool; ``share`` of decided pixels; ``stripe_px``: mean width of
+    the stripes.
     """
 
     value: np.ndarray
@@ -111,14 +124,17 @@ class BitReading(NamedTuple):
 
 
 class AxisReader:
-    """Reader of the bits and phases of sampled pixels, which caches results that several hypotheses share.
+    """Reader of the bits and phases of sampled pixels, which caches results that several hypotheses
+    share.
 
     ``bit`` and ``opposed`` are the cached `_read_bit` and `_measure_opposed`.
     """
 
     def __init__(self, sample: LineSample, indices: list[int]) -> None:
         """Select the pixels of ``sample`` that vary between the frames ``indices`` of the axis."""
-        chosen = sample.frames[indices] if indices else np.zeros((1, sample.frames.shape[1]), np.float32)
+        chosen = (
+            sample.frames[indices] if indices else np.zeros((1, sample.frames.shape[1]), np.float32)
+        )
         high, low = chosen.max(axis=0), chosen.min(axis=0)
         swing = high - low
         self.illuminated = swing > sample.least_swing
@@ -133,12 +149,19 @@ class AxisReader:
         # Every hypothesis requests each of them again.
         self.bit, self.opposed = cache(self._read_bit), cache(self._measure_opposed)
         self._in_view = cache(self._has_varying_pixels)
-        # Successive hypotheses share the code or the phase: pixels are cached for the last few only.
+        # Successive hypotheses share the code or the phase: pixels are cached for the last few
+        # only.
         self._results: dict[Callable[..., Any], Callable[..., Any]] = {}
-        self._wave, self._unwrapped = lru_cache(RECENT)(self._fit_wave), lru_cache(RECENT)(self._unwrap_wave)
+        self._wave, self._unwrapped = (
+            lru_cache(RECENT)(self._fit_wave),
+            lru_cache(RECENT)(self._unwrap_wave),
+        )
 
-    def recall(self, compute: Callable[..., Result], *arguments: Hashable, most: int | None = None) -> Result:
-        """Return ``compute(self, *arguments)``, cached; for the last ``most`` arguments only, if given."""
+    def recall(
+        self, compute: Callable[..., Result], *arguments: Hashable, most: int | None = None
+    ) -> Result:
+        """Return ``compute(self, *arguments)``, cached; for the last ``most`` arguments only, if
+        given."""
         if compute not in self._results:
             self._results[compute] = lru_cache(most)(partial(compute, self))
         return self._results[compute](*arguments)  # type: ignore[no-any-return]
@@ -149,7 +172,9 @@ class AxisReader:
         sample = self._sample
         count = sample.frames.shape[1]
         some = np.sort(np.random.default_rng(0).permutation(count)[:COARSE_PIXELS])
-        thinned = replace(sample, frames=sample.frames[:, some], line=sample.line[some], place=sample.place[some])
+        thinned = replace(
+            sample, frames=sample.frames[:, some], line=sample.line[some], place=sample.place[some]
+        )
         return AxisReader(thinned, self._indices)
 
     @cached_property
@@ -158,7 +183,8 @@ class AxisReader:
         return np.concatenate([[0], np.cumsum(~self.adjacent)])
 
     def is_in_view(self, frames: AxisFrames) -> bool:
-        """Return whether enough pixels vary between the images that a hypothesis assigns to this axis."""
+        """Return whether enough pixels vary between the images that a hypothesis assigns to this
+        axis."""
         assumed = (*frames.bits, *frames.inverse, *(i for _, steps in frames.shifts for i in steps))
         return self._in_view(frozenset(i for i in assumed if i is not None))
 
@@ -173,7 +199,8 @@ class AxisReader:
         return False
 
     def _measure_opposed(self, image: int | None, inverse: int | None) -> float:
-        """Return the share of pixels inside stripes of both images that are bright in only one of them.
+        """Return the share of pixels inside stripes of both images that are bright in only one of
+        them.
 
         NaN for a missing image or too few pixels.
         """
@@ -188,7 +215,8 @@ class AxisReader:
     def _read_bit(self, image: int | None, inverse: int | None) -> BitReading:
         """Read a bit from its image and its inverse.
 
-        None where one is missing; the middle of each pixel's darkest and brightest level stands in for it.
+        None where one is missing; the middle of each pixel's darkest and brightest level stands in
+        for it.
         """
         high = self.middle if image is None else self.frames[image]
         low = self.middle if inverse is None else self.frames[inverse]
@@ -201,7 +229,8 @@ class AxisReader:
         return BitReading(value, decided, share, self._measure_stripe_width(value))
 
     def _measure_stripe_width(self, value: np.ndarray) -> float:
-        """Return the mean stripe width in px along the rows or along the columns, whichever is smaller."""
+        """Return the mean stripe width in px along the rows or along the columns, whichever is
+        smaller."""
         edges = (value[1:] != value[:-1]) & self.adjacent
         across = int(np.count_nonzero(self._across))
         edges_across = int(np.count_nonzero(edges & self._across))
@@ -210,7 +239,8 @@ class AxisReader:
         return min((pixels / (1 + crossed) for pixels, crossed in parts if pixels), default=0.0)
 
     def phasor(self, images: Images, frames: AxisFrames) -> np.ndarray | None:
-        """Return modulation * e^(i phase), (p,) complex64; None with fewer than three of the steps."""
+        """Return modulation * e^(i phase), (p,) complex64; None with fewer than three of the
+        steps."""
         wave = self._wave(images, frames.gamma)
         if wave is None:
             return None
@@ -225,17 +255,22 @@ class AxisReader:
         return -frames.sign * self._unwrapped(images, frames.gamma)
 
     def _fit_wave(self, images: Images, gamma: float) -> np.ndarray | None:
-        """Fit `phasor` (p,) complex64 for a negative phase sign and without offset; None for fewer than three steps."""
+        """Fit `phasor` (p,) complex64 for a negative phase sign and without offset; None for fewer
+        than three steps."""
         steps = [k for k, image in enumerate(images) if image is not None]
         there = [image for image in images if image is not None]
         if len(steps) < 3:
             return None
-        weights = np.linalg.pinv(cosine_columns(np.array(steps), len(images), 1))[1:].astype(np.float32)
+        weights = np.linalg.pinv(cosine_columns(np.array(steps), len(images), 1))[1:].astype(
+            np.float32
+        )
         consecutive = there == list(range(there[0], there[0] + len(there)))
         levels = self.frames[there[0] : there[-1] + 1] if consecutive else self.frames[there]
         if gamma != 1.0:
             dark = self.middle - self.swing / 2
-            levels = np.maximum((levels - dark) / np.maximum(self.swing, 1e-6), 0) ** np.float32(1 / gamma)
+            levels = np.maximum((levels - dark) / np.maximum(self.swing, 1e-6), 0) ** np.float32(
+                1 / gamma
+            )
             levels = levels * self.swing
         cosine, sine = weights @ levels
         wave = np.empty(len(cosine), np.complex64)
@@ -246,4 +281,6 @@ class AxisReader:
         """Compute `unwrapped_phase` (p,) for a negative phase sign."""
         wave = self._wave(images, gamma)
         assert wave is not None
-        return np.concatenate([[0.0], np.cumsum(np.angle(wave[1:] * np.conj(wave[:-1])), dtype=np.float64)])
+        return np.concatenate(
+            [[0.0], np.cumsum(np.angle(wave[1:] * np.conj(wave[:-1])), dtype=np.float64)]
+        )

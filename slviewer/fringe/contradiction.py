@@ -9,8 +9,9 @@ from slviewer.fringe.sequence import Axis
 class Contradiction:
     """Contradiction between the frames of a capture and its description.
 
-    ``cause``: one of a fixed set of labels; ``message``: what was observed and what to do; ``axis``: None for both;
-    ``value``: the value that fits instead of the described one, in the unit of the message, None where it is no number.
+    ``cause``: one of a fixed set of labels; ``message``: what was observed and what to do;
+    ``axis``: None for both; ``value``: the value that fits instead of the described one, in the
+    unit of the message, None where it is no number.
     """
 
     cause: str

@@ -2,14 +2,33 @@
 
 import numpy as np
 
-from slviewer.fringe import kernels, kernels_coded, kernels_gray, kernels_levels, kernels_spikes, limits
+from slviewer.fringe import (
+    kernels,
+    kernels_coded,
+    kernels_gray,
+    kernels_levels,
+    kernels_spikes,
+    limits,
+)
 from slviewer.fringe.decoding_task import prepare_decoding
 from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.kernels_spikes import spike_rules
 from slviewer.fringe.layout import Layout, axis_layout, check_stack
-from slviewer.fringe.levels import cell_misfit, code_cell_px, layout_levels, lowest_coordinate, unambiguous_px
+from slviewer.fringe.levels import (
+    cell_misfit,
+    code_cell_px,
+    layout_levels,
+    lowest_coordinate,
+    unambiguous_px,
+)
 from slviewer.fringe.phase import Noise, PhaseMap
-from slviewer.fringe.reference import code_bits, complete_map, dark_sigmas, decode_reference, phase_shift
+from slviewer.fringe.reference import (
+    code_bits,
+    complete_map,
+    dark_sigmas,
+    decode_reference,
+    phase_shift,
+)
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
 
@@ -26,11 +45,12 @@ def decode(
 ) -> PhaseMap:
     """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
-    A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed between the
-    frames (see `frame_light`), they are decoded as they would be under equal light; the phase error that gamma
-    causes with three or four steps (see `aliased_harmonics`) is corrected. ``light``: from `estimate_frame_light`;
-    estimated if None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`. Raises
-    InputError when the frames are not those of the sequence, or cannot give an absolute phase.
+    A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed
+    between the frames (see `frame_light`), they are decoded as they would be under equal light; the
+    phase error that gamma causes with three or four steps (see `aliased_harmonics`) is corrected.
+    ``light``: from `estimate_frame_light`; estimated if None. ``mask_indirect``: mask pixels of
+    much indirect light, see `indirect_light`. Raises InputError when the frames are not those of
+    the sequence, or cannot give an absolute phase.
     """
     task = prepare_decoding(sequence, stack, axis, light)
     layout, stack = task.layout, task.stack
@@ -40,7 +60,9 @@ def decode(
         kernels_gray.decode_gray(stack, scale, _pack_gray_rules(layout), maps)
     elif layout.numbers_periods:
         mean = fringe_mean(layout, stack) if layout.is_plain else MIDDLE
-        kernels_coded.decode_coded(stack, pack_shifts(layout), scale, code_rules(layout, mean), maps)
+        kernels_coded.decode_coded(
+            stack, pack_shifts(layout), scale, code_rules(layout, mean), maps
+        )
     else:
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
         kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
@@ -51,8 +73,8 @@ def decode(
 def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
     """Return an image of the scene under white light, (h, w) of the stack's dtype.
 
-    The texture frame, else the white frame, else the background of the first axis' finest phase steps, else the
-    brightest level of each pixel.
+    The texture frame, else the white frame, else the background of the first axis' finest phase
+    steps, else the brightest level of each pixel.
     """
     check_stack(sequence, stack)
     for kind in ("texture", "white"):
@@ -68,7 +90,8 @@ def texture(sequence: PatternSequence, stack: np.ndarray) -> np.ndarray:
 
 
 def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> None:
-    """Move phases that were read on the wrong side of a code edge, and mask those without support, in place."""
+    """Move phases that were read on the wrong side of a code edge, and mask those without support,
+    in place."""
     rules, lists = spike_rules(layout), kernels_spikes.allocate_lists(phase.shape)
     if rules.is_plain:
         kernels_spikes.list_changes(phase, rules, False, *lists)
@@ -78,12 +101,14 @@ def _repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> Non
 
 
 def grey_scale(layout: Layout, noise: Noise, white: float) -> kernels.Scale:
-    """Return the grey levels that decide about a pixel, from the noise (a, b) and the clipping level ``white``."""
+    """Return the grey levels that decide about a pixel, from the noise (a, b) and the clipping
+    level ``white``."""
     return kernels.Scale(*noise, limits.DARK_LEVELS * white / 255, dark_sigmas(layout), white)
 
 
 def code_rules(layout: Layout, mean: float) -> kernels_coded.CodeRules:
-    """Return the Gray bits of a layout whose code numbers periods; ``mean`` as `threshold.fringe_mean` returns it."""
+    """Return the Gray bits of a layout whose code numbers periods; ``mean`` as
+    `threshold.fringe_mean` returns it."""
     return kernels_coded.CodeRules(
         np.array(layout.gray, np.int64),
         np.array(layout.inverse, np.int64),
@@ -108,7 +133,8 @@ def _pack_gray_rules(layout: Layout) -> kernels_gray.GrayRules:
 
 
 def pack_shifts(layout: Layout) -> kernels.Shifts:
-    """Pack the frames of all periods of a layout, and the cosines and sines that weight them, for the kernels."""
+    """Pack the frames of all periods of a layout, and the cosines and sines that weight them, for
+    the kernels."""
     frames, angles, half_turns, counted = [], [], [], []
     for shift in layout.shifts:
         n = len(shift.indices)
@@ -116,7 +142,9 @@ def pack_shifts(layout: Layout) -> kernels.Shifts:
         if n % 2:  # less the first frame, steps k and n - k
             lines = [(k, 0, 0, n - k) for k in range(1, half + 1)]
         else:
-            lines = [(0, 0, half, 0)] + [(k, half - k, half + k, n - k) for k in range(1, (half + 1) // 2)]
+            lines = [(0, 0, half, 0)] + [
+                (k, half - k, half + k, n - k) for k in range(1, (half + 1) // 2)
+            ]
             lines += [(half // 2, 0, half + half // 2, 0)] if half % 2 == 0 else []
         frames.append(np.array(shift.indices, np.int64)[np.array(lines)])
         angles.append(2 * np.pi * np.array([line[0] for line in lines]) / n)
@@ -147,13 +175,17 @@ def pack_levels(layout: Layout, mean: float = MIDDLE) -> kernels_levels.Ladder:
     bits = code_bits(layout) if layout.numbers_cells else ()
     extent = min(layout.extent, unambiguous_px(layout)) if levels else 0.0
     return kernels_levels.Ladder(
-        np.array([level.weights for level in levels], np.float64).reshape(len(levels), len(layout.shifts)),
+        np.array([level.weights for level in levels], np.float64).reshape(
+            len(levels), len(layout.shifts)
+        ),
         np.array([level.period_px for level in levels], np.float64),
         lowest_coordinate(levels[0].period_px, extent) if levels and not bits else 0.0,
         limits.LEVEL_MISFIT,
         cell_misfit(layout) if levels else 0.0,
         np.array(bits, np.int64),
-        np.array([*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))] if bits else [], np.int64),
+        np.array(
+            [*layout.inverse, *[-1] * (len(bits) - len(layout.inverse))] if bits else [], np.int64
+        ),
         layout.gray_origin_px,
         code_cell_px(layout),
         mean,

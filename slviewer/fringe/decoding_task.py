@@ -15,8 +15,9 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 class DecodingTask:
     """Frames of one axis under equal light, and what their pixels are judged by.
 
-    ``stack`` (k, h, w): the frames that ``sequence`` and ``layout`` describe, of ``noise``, clipped at ``white``. Their
-    grey levels are ``factor`` times those of the capture; ``full_scale``: its full scale in these levels.
+    ``stack`` (k, h, w): the frames that ``sequence`` and ``layout`` describe, of ``noise``, clipped
+    at ``white``. Their grey levels are ``factor`` times those of the capture; ``full_scale``: its
+    full scale in these levels.
     """
 
     sequence: PatternSequence
@@ -31,10 +32,11 @@ class DecodingTask:
 def prepare_decoding(
     sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
 ) -> DecodingTask:
-    """Return the frames of one axis of a capture (n, h, w); as captured where the light needs no correction.
+    """Return the frames of one axis of a capture (n, h, w); as captured where the light needs no
+    correction.
 
-    ``light``: estimated if None. Raises InputError when the frames are not those of the sequence, or cannot give an
-    absolute phase.
+    ``light``: estimated if None. Raises InputError when the frames are not those of the sequence,
+    or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
@@ -42,7 +44,9 @@ def prepare_decoding(
     white = white_level(sequence, stack, sequence.select(axis))
     light = light or estimate_frame_light(sequence, stack)
     if not light.is_significant:
-        return DecodingTask(sequence, layout, stack, measure_noise(layout, stack, white), white, white)
+        return DecodingTask(
+            sequence, layout, stack, measure_noise(layout, stack, white), white, white
+        )
     sequence, stack, factor = equalize_frames(sequence, stack, light, sequence.select(axis))
     layout = axis_layout(sequence, axis)
     noise = measure_noise(layout, stack, CLIPPED)

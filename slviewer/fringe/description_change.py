@@ -1,4 +1,5 @@
-"""Changes of the description of one axis that make its frames agree: bits, signs, offsets, cells, periods and sizes."""
+"""Changes of the description of one axis that make its frames agree: bits, signs, offsets, cells,
+periods and sizes."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,7 +17,13 @@ from slviewer.fringe.agreement_tests import (
     has_evidence,
     wrap,
 )
-from slviewer.fringe.axis_agreement import FEWEST_EDGES, Agreement, common_phase, fit_turns, measure_agreement
+from slviewer.fringe.axis_agreement import (
+    FEWEST_EDGES,
+    Agreement,
+    common_phase,
+    fit_turns,
+    measure_agreement,
+)
 from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames, reversed_bits
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -28,9 +35,11 @@ LINES = {"x": "columns", "y": "rows"}
 
 
 def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> list[Answer]:
-    """Return the smallest changes of the description of an axis that make its frames agree, the best first.
+    """Return the smallest changes of the description of an axis that make its frames agree, the
+    best first.
 
-    Several answers are returned if they explain the frames about equally well, none if no change does.
+    Several answers are returned if they explain the frames about equally well, none if no change
+    does.
     """
     answers: list[Answer] = []
     for variant, changes in _list_variants(described_frames(sequence, axis), axis):
@@ -54,44 +63,68 @@ def explain_axis(reader: AxisReader, sequence: PatternSequence, axis: Axis) -> l
     ]
 
 
-def _list_variants(frames: AxisFrames, axis: Axis) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
-    """Yield variants of the description (bit order, phase sign, gamma) and the contradictions that each stands for."""
+def _list_variants(
+    frames: AxisFrames, axis: Axis
+) -> Iterator[tuple[AxisFrames, list[Contradiction]]]:
+    """Yield variants of the description (bit order, phase sign, gamma) and the contradictions that
+    each stands for."""
     bits = [(frames, "")]
     if len(frames.bits) - frames.complementary > 1:
-        bits.append((reversed_bits(frames), "in reverse order, the finest stripes first: reverse the bit numbers"))
+        bits.append(
+            (
+                reversed_bits(frames),
+                "in reverse order, the finest stripes first: reverse the bit numbers",
+            )
+        )
         if frames.complementary:
-            text = "in reverse order, the complementary bit first: reverse the numbers of all of them"
+            text = (
+                "in reverse order, the complementary bit first: reverse the numbers of all of them"
+            )
             bits.append((reversed_bits(frames, True), text))
-        bits.append((replace(frames, inverted=True), "inverted: exchange each bit with its inverse"))
+        bits.append(
+            (replace(frames, inverted=True), "inverted: exchange each bit with its inverse")
+        )
     for variant, text in bits:
-        changes = [Contradiction("bit-order", f"the Gray bits of axis {axis} are {text}", axis, None)] if text else []
+        changes = (
+            [Contradiction("bit-order", f"the Gray bits of axis {axis} are {text}", axis, None)]
+            if text
+            else []
+        )
         yield variant, changes
         if frames.shifts:
             flipped = replace(variant, sign=-variant.sign)
             text = (
-                f"the fringes of axis {axis} shift in the opposite direction to the description: set phase_sign = "
-                f"{flipped.sign} for axis {axis}"
+                f"the fringes of axis {axis} shift in the opposite direction to the description:"
+                f" set phase_sign = {flipped.sign} for axis {axis}"
             )
             yield flipped, [*changes, Contradiction("step-order", text, axis, float(flipped.sign))]
     if frames.shifts and not frames.bits:
         for gamma in GAMMAS:
             text = (
-                f"the light of the projector or the camera follows the grey level by a gamma of about {gamma:g}, and "
-                f"{len(frames.shifts[-1][1])} phase steps cannot average that out: set the projector's gamma to 1, or "
-                "take more steps"
+                "the light of the projector or the camera follows the grey level by a gamma of"
+                f" about {gamma:g}, and {len(frames.shifts[-1][1])} phase steps cannot average that"
+                " out: set the projector's gamma to 1, or take more steps"
             )
             yield replace(frames, gamma=gamma), [Contradiction("gamma", text, axis, gamma)]
 
 
-def _fit_code_values(reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]) -> Answer | None:
-    """Fit cell width, offsets and size to frames with Gray bits; return the changes with which all tests pass.
+def _fit_code_values(
+    reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
+) -> Answer | None:
+    """Fit cell width, offsets and size to frames with Gray bits; return the changes with which all
+    tests pass.
 
-    ``changes``: those that the variant ``frames`` already makes. None if no values fit, or if nothing changes.
+    ``changes``: those that the variant ``frames`` already makes. None if no values fit, or if
+    nothing changes.
     """
     a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
     out = list(changes)
-    if failed & {"inverse", "bits", "rule", "rising"} or not a.rule > SURE or a.edges < FEWEST_EDGES:
+    if (
+        failed & {"inverse", "bits", "rule", "rising"}
+        or not a.rule > SURE
+        or a.edges < FEWEST_EDGES
+    ):
         return None
     if frames.fringe is not None:
         period = frames.fringe[0]
@@ -104,9 +137,10 @@ def _fit_code_values(reader: AxisReader, frames: AxisFrames, axis: Axis, changes
             out.append(
                 Contradiction(
                     "gray-cell",
-                    f"a cell of the Gray code of axis {axis} covers {cell / period:.3g} fringe periods, and the "
-                    f"description says {frames.cell_px / period:.3g}: set gray_cell_px = {cell:.4g}, or period_px = "
-                    f"{fitting:.4g} if the cells are right",
+                    f"a cell of the Gray code of axis {axis} covers {cell / period:.3g} fringe"
+                    f" periods, and the description says {frames.cell_px / period:.3g}: set"
+                    f" gray_cell_px = {cell:.4g}, or period_px = {fitting:.4g} if the cells are"
+                    " right",
                     axis,
                     cell,
                 )
@@ -114,11 +148,15 @@ def _fit_code_values(reader: AxisReader, frames: AxisFrames, axis: Axis, changes
         elif a.common < SURE or a.rising < SURE:
             return None
         late = wrap(a.begin_turns - frames.origin_px / period)
-        if out and out[-1].cause == "step-order" and abs(wrap(late + 1 / len(frames.fringe[1]))) < abs(late):
+        if (
+            out
+            and out[-1].cause == "step-order"
+            and abs(wrap(late + 1 / len(frames.fringe[1]))) < abs(late)
+        ):
             n = len(frames.fringe[1])
             text = (
-                f"the {n} phase steps of axis {axis} are in reverse order: number them backwards, or set "
-                f"phase_sign = {frames.sign} and phase_offset = {-2 * np.pi / n:.3f}"
+                f"the {n} phase steps of axis {axis} are in reverse order: number them backwards,"
+                f" or set phase_sign = {frames.sign} and phase_offset = {-2 * np.pi / n:.3f}"
             )
             out[-1] = Contradiction("step-order", text, axis, float(frames.sign))
             late = wrap(late + 1 / n)
@@ -132,7 +170,8 @@ def _fit_code_values(reader: AxisReader, frames: AxisFrames, axis: Axis, changes
 def _fit_cell_width(frames: AxisFrames, a: Agreement) -> tuple[float, float, float]:
     """Fit the width of the Gray cells: all code edges then have one phase of the fringes.
 
-    Returns the width in px, and the concentration and the mean (turns, -0.5 ... 0.5) of the phase, see `common_phase`.
+    Returns the width in px, and the concentration and the mean (turns, -0.5 ... 0.5) of the phase,
+    see `common_phase`.
     """
     assert frames.fringe is not None and a.borders is not None
     angle, border, weight = a.borders
@@ -141,11 +180,14 @@ def _fit_cell_width(frames: AxisFrames, a: Agreement) -> tuple[float, float, flo
     return (ratio * frames.fringe[0], *common_phase(angle, border * ratio, weight))
 
 
-def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: Axis) -> list[Contradiction]:
-    """Return the two contradictions that explain a shift of ``late`` periods between fringes and Gray code.
+def _describe_phase_shift(
+    frames: AxisFrames, a: Agreement, late: float, axis: Axis
+) -> list[Contradiction]:
+    """Return the two contradictions that explain a shift of ``late`` periods between fringes and
+    Gray code.
 
-    Either the phase steps or the Gray code may begin elsewhere than described; the more probable contradiction comes
-    first.
+    Either the phase steps or the Gray code may begin elsewhere than described; the more probable
+    contradiction comes first.
     """
     assert frames.fringe is not None
     period, steps = frames.fringe[0], len(frames.fringe[1])
@@ -160,22 +202,27 @@ def _describe_phase_shift(frames: AxisFrames, a: Agreement, late: float, axis: A
     origin = a.begin_turns - np.ceil(a.begin_turns - 0.25)
     moved = Contradiction(
         "gray-origin",
-        f"the Gray code of axis {axis} begins {share.rsplit(' ', 1)[0]} of the fringes from where it was described: "
-        f"set gray_origin = {origin * period:.2f} (px; of a PatternSequence: gray_origin_px)",
+        f"the Gray code of axis {axis} begins {share.rsplit(' ', 1)[0]} of the fringes from where"
+        f" it was described: set gray_origin = {origin * period:.2f} (px; of a PatternSequence:"
+        " gray_origin_px)",
         axis,
         float(origin * period),
     )
-    by_step = min(abs(wrap(late - k / steps)) for k in range(1, steps)) < 0.03 and abs(abs(late) - 0.5) > 0.05
+    by_step = (
+        min(abs(wrap(late - k / steps)) for k in range(1, steps)) < 0.03
+        and abs(abs(late) - 0.5) > 0.05
+    )
     by_quarter = abs(abs(late) - 0.25) < 0.05
     return [shifted, moved] if by_quarter or by_step else [moved, shifted]
 
 
 def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradiction]:
-    """Return the contradictions that explain coordinates outside the projector: its size, and the fringe period."""
+    """Return the contradictions that explain coordinates outside the projector: its size, and the
+    fringe period."""
     assert frames.extent is not None
     observation = (
-        f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector's {frames.extent} {LINES[axis]} and "
-        f"reach {a.reach_px:.0f}"
+        f"{100 * a.outside:.0f} % of the {axis} codes lie outside the projector's {frames.extent}"
+        f" {LINES[axis]} and reach {a.reach_px:.0f}"
     )
     size = f"{observation}: give the size of the projector that was used"
     out = [Contradiction("projector-size", size, axis, a.reach_px)]
@@ -189,7 +236,8 @@ def explain_reach(frames: AxisFrames, a: Agreement, axis: Axis) -> list[Contradi
 def _fit_level_offset(
     reader: AxisReader, frames: AxisFrames, axis: Axis, changes: list[Contradiction]
 ) -> Answer | None:
-    """Fit the phase offset to frames of several periods without Gray bits; return the changes, None without any."""
+    """Fit the phase offset to frames of several periods without Gray bits; return the changes, None
+    without any."""
     a = measure_agreement(reader, frames)
     failed = failed_tests(frames, a)
     if "levels" in failed or not has_evidence(frames, a):
@@ -204,17 +252,24 @@ def _fit_level_offset(
         turned = replace(frames, offset_rad=frames.offset_rad + 2 * np.pi * turns)
         b = measure_agreement(reader, turned)
         apart = max(map(abs, b.level_turns))
-        if not failed_tests(turned, b) and apart < MAX_LEVEL_TURNS / 4 and (best is None or apart < best[0]):
+        if (
+            not failed_tests(turned, b)
+            and apart < MAX_LEVEL_TURNS / 4
+            and (best is None or apart < best[0])
+        ):
             best = apart, turned, b
     if best is None:
         return None
     offset = wrap(best[1].offset_rad / (2 * np.pi)) * 2 * np.pi
-    text = f"the phase steps of axis {axis} begin {describe_turns(offset - frames.offset_rad)} than described"
+    text = (
+        f"the phase steps of axis {axis} begin {describe_turns(offset - frames.offset_rad)} than"
+        " described"
+    )
     out = Contradiction("phase-offset", f"{text}: {_describe_offset(offset)}", axis, offset)
     if changes:  # a sign and an offset: the steps in reverse order
         text = (
-            f"the {steps} phase steps of axis {axis} are in reverse order, or begin elsewhere: set phase_sign = "
-            f"{frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
+            f"the {steps} phase steps of axis {axis} are in reverse order, or begin elsewhere: set"
+            f" phase_sign = {frames.sign} and phase_offset = {offset:.3f} for axis {axis}"
         )
         out = Contradiction("step-order", text, axis, float(frames.sign))
     return explain([out], best[2])
@@ -231,7 +286,8 @@ def step_turns(steps: int) -> tuple[float, ...]:
 
 
 def describe_turns(angle: float) -> str:
-    """Return an angle (rad) as text, a share of a period with its direction: "a quarter period later"."""
+    """Return an angle (rad) as text, a share of a period with its direction: "a quarter period
+    later"."""
     turns = wrap(angle / (2 * np.pi))
     share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
     return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"

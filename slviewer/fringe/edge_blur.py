@@ -1,10 +1,12 @@
-"""Errors of the phase where the surface's brightness jumps, the effect of the camera's blur, and their correction.
+"""Errors of the phase where the surface's brightness jumps, the effect of the camera's blur, and
+their correction.
 
-A camera pixel receives light from a neighbourhood, and more of it from the brighter side: the pixel's phase is that of
-a place displaced towards that side. For a Gaussian point spread of standard deviation s the displacement is s^2 grad(ln
-B), B being the blurred modulation (Tweedie's formula), so that the phase is off by s^2 grad(phi) . grad(ln B): at
-silhouettes, shadows and printed edges, by far more than noise. The blur is estimated from the steepness of the edges,
-then from the phase itself: a surface that continues across an edge shows how far the phase is off there.
+A camera pixel receives light from a neighbourhood, and more of it from the brighter side: the
+pixel's phase is that of a place displaced towards that side. For a Gaussian point spread of
+standard deviation s the displacement is s^2 grad(ln B), B being the blurred modulation (Tweedie's
+formula), so that the phase is off by s^2 grad(phi) . grad(ln B): at silhouettes, shadows and
+printed edges, by far more than noise. The blur is estimated from the steepness of the edges, then
+from the phase itself: a surface that continues across an edge shows how far the phase is off there.
 """
 
 import math
@@ -29,24 +31,26 @@ NOISE_RANGE = 10.0
 EDGES = 10
 """Number of pixels at edges below which a tile has the blur of the whole image."""
 SHARPEST = 0.35
-"""Quantile of the edges' widths that is used: shading and printed gradients are wider than a blurred step."""
+"""Quantile of the edges' widths that is used: shading and printed gradients are wider than a
+blurred step."""
 LEAST_PX = 0.3
 """Standard deviation of an ideal pixel's own aperture, 12 ** -0.5, rounded up."""
 SIGNIFICANT = 1.0
-"""Standard deviations of noise from which on a displacement takes part in the estimate of the blur."""
+"""Standard deviations of noise from which on a displacement takes part in the estimate of the
+blur."""
 REFINED = 300
 """Number of such pixels below which nothing is corrected."""
 LEVELS = 6
-"""Bins between the levels on both sides of an edge; differences of pixels are steeper or flatter than the slope of a
-blurred step in each of them."""
+"""Bins between the levels on both sides of an edge; differences of pixels are steeper or flatter
+than the slope of a blurred step in each of them."""
 REFINED_AT_LEVEL = 50
 """Number of pixels below which a bin has the factor of all."""
 REFINEMENT = (0.25, 2.5)
-"""Displacement over the one expected from the edges' steepness: outside of these bounds, what looks like printed edges
-is something else."""
+"""Displacement over the one expected from the edges' steepness: outside of these bounds, what looks
+like printed edges is something else."""
 BENT, BENT_SIGMAS = 0.04, 4.0
-"""rad, and standard deviations of noise: phases on both sides of an edge that are further from one line are those of
-two surfaces, or of a crease."""
+"""rad, and standard deviations of noise: phases on both sides of an edge that are further from one
+line are those of two surfaces, or of a crease."""
 REMAINING = 0.25
 """Share of a corrected displacement that remains uncertain."""
 _STEP = math.sqrt(2 * math.pi)
@@ -56,8 +60,9 @@ _STEP = math.sqrt(2 * math.pi)
 class EdgeDisplacement:
     """Displacement of a phase by the camera's blur.
 
-    ``shift``: (h, w) float32, measured less true phase, NaN where that is; ``is_continuous``: (h, w) bool, where the
-    surface continues across the edge and its phase confirms the shift, which can be subtracted there.
+    ``shift``: (h, w) float32, measured less true phase, NaN where that is; ``is_continuous``: (h,
+    w) bool, where the surface continues across the edge and its phase confirms the shift, which can
+    be subtracted there.
     """
 
     shift: FloatMap
@@ -65,16 +70,22 @@ class EdgeDisplacement:
 
     @property
     def remaining(self) -> FloatMap:
-        """(h, w) float32: error of a phase from which the shift was subtracted where the surface is continuous."""
-        return np.abs(self.shift) * np.where(self.is_continuous, np.float32(REMAINING), np.float32(1))
+        """(h, w) float32: error of a phase from which the shift was subtracted where the surface is
+        continuous."""
+        return np.abs(self.shift) * np.where(
+            self.is_continuous, np.float32(REMAINING), np.float32(1)
+        )
 
 
-def estimate_camera_blur(modulation: FloatMap, mask: NDArray[np.bool_], noise: float = 0.0) -> FloatMap:
-    """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES` float32.
+def estimate_camera_blur(
+    modulation: FloatMap, mask: NDArray[np.bool_], noise: float = 0.0
+) -> FloatMap:
+    """Estimate the standard deviation, px, of the camera's point spread: (rows, columns) of `TILES`
+    float32.
 
-    From the steepness of the edges of the modulation (h, w) grey levels; the aperture of an ideal pixel where there are
-    none. ``mask`` (h, w): pixels whose modulation is above noise, which set the scale of contrast. ``noise``: standard
-    deviation of the modulation.
+    From the steepness of the edges of the modulation (h, w) grey levels; the aperture of an ideal
+    pixel where there are none. ``mask`` (h, w): pixels whose modulation is above noise, which set
+    the scale of contrast. ``noise``: standard deviation of the modulation.
     """
     blur = np.full(TILES, LEAST_PX, np.float32)
     if np.count_nonzero(mask) < EDGES:
@@ -87,7 +98,11 @@ def estimate_camera_blur(modulation: FloatMap, mask: NDArray[np.bool_], noise: f
     places, ranges, steepness = [], [], []
     for axis, window in enumerate((np.ones((size, 1), np.uint8), np.ones((1, size), np.uint8))):
         slope = slopes[axis]
-        steepest = (slope == cv2.dilate(slope, window)) & (slope >= slopes[1 - axis]) & (slope > least / size)
+        steepest = (
+            (slope == cv2.dilate(slope, window))
+            & (slope >= slopes[1 - axis])
+            & (slope > least / size)
+        )
         contrast = cv2.dilate(modulation, window) - cv2.erode(modulation, window)
         steepest &= contrast > least
         places.append(np.argwhere(steepest))
@@ -107,11 +122,13 @@ def estimate_camera_blur(modulation: FloatMap, mask: NDArray[np.bool_], noise: f
     return blur
 
 
-def estimate_displacement(phase: FloatMap, modulation: FloatMap, noise: float = 0.0) -> EdgeDisplacement:
+def estimate_displacement(
+    phase: FloatMap, modulation: FloatMap, noise: float = 0.0
+) -> EdgeDisplacement:
     """Estimate the displacement of the ``phase`` (h, w) rad by the camera's blur.
 
-    ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges add errors of their
-    own.
+    ``modulation`` (h, w) grey levels, of standard deviation ``noise``. Depth jumps and glossy edges
+    add errors of their own.
     """
     noise = max(noise, 1e-3)
     blur = estimate_camera_blur(modulation, np.isfinite(phase), noise)
@@ -119,7 +136,9 @@ def estimate_displacement(phase: FloatMap, modulation: FloatMap, noise: float = 
     shift, is_continuous = np.empty_like(phase), np.zeros(phase.shape, bool)
     level = np.zeros(phase.shape, np.uint8)
     _displace(modulation, phase, sigma, np.float32(noise), shift, is_continuous, level)
-    factors = _confirm(phase, modulation, EdgeDisplacement(shift, is_continuous), level, float(blur.max()), noise)
+    factors = _confirm(
+        phase, modulation, EdgeDisplacement(shift, is_continuous), level, float(blur.max()), noise
+    )
     is_continuous &= bool(factors.any())
     np.multiply(shift, factors[level], out=shift, where=is_continuous)
     return EdgeDisplacement(shift, is_continuous)
@@ -133,14 +152,17 @@ def _confirm(
     blur: float,
     noise: float,
 ) -> FloatMap:
-    """Return the factor (LEVELS,) by which displacements become those of the phase from a straight line.
+    """Return the factor (LEVELS,) by which displacements become those of the phase from a straight
+    line.
 
-    The line continues the phase of an edge's bright side, from beyond the reach of the ``blur``, px. 0 where too few
-    pixels show it, or it is not plausible at every level: shadows of a lamp out of focus, highlights and creases look
-    like printed edges, and displace otherwise.
+    The line continues the phase of an edge's bright side, from beyond the reach of the ``blur``,
+    px. 0 where too few pixels show it, or it is not plausible at every level: shadows of a lamp out
+    of focus, highlights and creases look like printed edges, and displace otherwise.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        v, u = np.nonzero(displaced.is_continuous & (np.abs(displaced.shift) * modulation > SIGNIFICANT * noise))
+        v, u = np.nonzero(
+            displaced.is_continuous & (np.abs(displaced.shift) * modulation > SIGNIFICANT * noise)
+        )
     height, width = phase.shape
     far = _beyond_blur(blur)
     inside = (v >= 2 * far) & (u >= 2 * far) & (v < height - 2 * far) & (u < width - 2 * far)
@@ -150,7 +172,8 @@ def _confirm(
     rise_u, rise_v = (modulation[v + k, u + 1 - k] - modulation[v - k, u - 1 + k] for k in (0, 1))
     across = np.abs(rise_u) >= np.abs(rise_v)
     dv, du = (
-        np.where(along, np.sign(rise) * far, 0).astype(int) for along, rise in ((~across, rise_v), (across, rise_u))
+        np.where(along, np.sign(rise) * far, 0).astype(int)
+        for along, rise in ((~across, rise_v), (across, rise_u))
     )
     shift = displaced.shift[v, u]
     ratio = (phase[v, u] - 2 * phase[v + dv, u + du] + phase[v + 2 * dv, u + 2 * du]) / shift
@@ -172,14 +195,16 @@ def _compute_weighted_median(values: FloatMap, weights: FloatMap) -> float:
 
 @kernel()
 def _beyond_blur(sigma):
-    """Return the distance, px, at which a step ten times as bright as its other side displaces nothing any more."""
+    """Return the distance, px, at which a step ten times as bright as its other side displaces
+    nothing any more."""
     return int(np.float32(3) * sigma) + 1
 
 
 @kernel(parallel=True)
 def _displace(modulation, phase, sigma, noise, shift, is_continuous, level):
-    """Fill ``shift`` (h, w) with s^2 grad(phi) . grad(ln B) less the part that noise causes, ``is_continuous``, and
-    ``level`` with the pixel's place, 0 ... LEVELS - 1, between the dark and the bright side of an edge.
+    """Fill ``shift`` (h, w) with s^2 grad(phi) . grad(ln B) less the part that noise causes,
+    ``is_continuous``, and ``level`` with the pixel's place, 0 ... LEVELS - 1, between the dark and
+    the bright side of an edge.
 
     Slopes of B are taken over about half a standard deviation, of phi on its brighter side.
     """
@@ -201,15 +226,23 @@ def _displace(modulation, phase, sigma, noise, shift, is_continuous, level):
             along = _compute_slope(phase, v, u, 0, step_u)
             down = _compute_slope(phase, v, u, step_v, 0)
             found = along * slope_u + down * slope_v
-            by_noise = np.float32(2) * (noise / here) ** 2 * ((along / span_u) ** 2 + (down / span_v) ** 2)
+            by_noise = (
+                np.float32(2) * (noise / here) ** 2 * ((along / span_u) ** 2 + (down / span_v) ** 2)
+            )
             size = np.sqrt(max(found * found - by_noise, np.float32(0))) * sigma[v, u] * sigma[v, u]
             shift[v, u] = size if found > 0 else -size
             beyond = _beyond_blur(sigma[v, u])
             if abs(slope_u) >= abs(slope_v):
-                one, other = modulation[v, max(u - beyond, 0)], modulation[v, min(u + beyond, width - 1)]
+                one, other = (
+                    modulation[v, max(u - beyond, 0)],
+                    modulation[v, min(u + beyond, width - 1)],
+                )
                 is_continuous[v, u] = _continues(phase, modulation, noise, v, u, 0, beyond)
             else:
-                one, other = modulation[max(v - beyond, 0), u], modulation[min(v + beyond, height - 1), u]
+                one, other = (
+                    modulation[max(v - beyond, 0), u],
+                    modulation[min(v + beyond, height - 1), u],
+                )
                 is_continuous[v, u] = _continues(phase, modulation, noise, v, u, beyond, 0)
             dark, bright = min(one, other), max(one, other)
             place = (here - dark) / max(bright - dark, noise)
@@ -218,7 +251,8 @@ def _displace(modulation, phase, sigma, noise, shift, is_continuous, level):
 
 @kernel()
 def _continues(phase, modulation, noise, v, u, step_v, step_u):
-    """Return whether the phases one and two steps from a pixel lie on one line: no depth jump, no crease.
+    """Return whether the phases one and two steps from a pixel lie on one line: no depth jump, no
+    crease.
 
     Beyond noise, and a little for curved surfaces and for what blur displaces beyond a step.
     """
@@ -228,21 +262,24 @@ def _continues(phase, modulation, noise, v, u, step_v, step_u):
         return False
     first, before = phase[v - far_v, u - far_u], phase[v - step_v, u - step_u]
     after, last = phase[v + step_v, u + step_u], phase[v + far_v, u + far_u]
-    if not (np.isfinite(first) and np.isfinite(before) and np.isfinite(after) and np.isfinite(last)):
+    if not (
+        np.isfinite(first) and np.isfinite(before) and np.isfinite(after) and np.isfinite(last)
+    ):
         return False
     near = _add_square_noise(modulation, noise, v, u, step_v, step_u)
     ends = _add_square_noise(modulation, noise, v, u, far_v, far_u)
     jump = abs(np.float32(2) * (after - before) - last + first)
     turn = abs(before - first - last + after)
     allowed, sigmas = np.float32(BENT), np.float32(BENT_SIGMAS)
-    return jump < allowed + sigmas * np.sqrt(np.float32(4) * near + ends) and turn < allowed + sigmas * np.sqrt(
-        near + ends
-    )
+    return jump < allowed + sigmas * np.sqrt(
+        np.float32(4) * near + ends
+    ) and turn < allowed + sigmas * np.sqrt(near + ends)
 
 
 @kernel()
 def _add_square_noise(modulation, noise, v, u, step_v, step_u):
-    """Return the sum of the variances of the phase, rad^2, a step before and a step after a pixel."""
+    """Return the sum of the variances of the phase, rad^2, a step before and a step after a
+    pixel."""
     before, after = modulation[v - step_v, u - step_u], modulation[v + step_v, u + step_u]
     return (noise / max(before, noise)) ** 2 + (noise / max(after, noise)) ** 2
 
@@ -255,16 +292,19 @@ def _compute_log_ratio(a, b, between):
     """
     if abs(a - b) < np.float32(0.1) * between:
         return (a - b) / between
-    least = np.float32(0.05) * between  # two and a half standard deviations outside of a straight edge
+    least = (
+        np.float32(0.05) * between
+    )  # two and a half standard deviations outside of a straight edge
     return np.log(max(a, least) / max(b, least))
 
 
 @kernel()
 def _compute_slope(phase, v, u, step_v, step_u):
-    """Return the slope of the phase per px, one to two steps from a pixel, on the brighter side of an edge.
+    """Return the slope of the phase per px, one to two steps from a pixel, on the brighter side of
+    an edge.
 
-    Nearer to the edge, blur has already flattened the phase. From the pixel itself where the surface ends before, 0
-    where it has no neighbour.
+    Nearer to the edge, blur has already flattened the phase. From the pixel itself where the
+    surface ends before, 0 where it has no neighbour.
     """
     height, width = phase.shape
     step = step_v + step_u
@@ -273,6 +313,11 @@ def _compute_slope(phase, v, u, step_v, step_u):
         return np.float32(0)
     near = phase[near_v, near_u]
     far_v, far_u = near_v + step_v, near_u + step_u
-    if 0 <= far_v < height and 0 <= far_u < width and np.isfinite(near) and np.isfinite(phase[far_v, far_u]):
+    if (
+        0 <= far_v < height
+        and 0 <= far_u < width
+        and np.isfinite(near)
+        and np.isfinite(phase[far_v, far_u])
+    ):
         return (phase[far_v, far_u] - near) / np.float32(step)
     return (near - phase[v, u]) / np.float32(step) if np.isfinite(near) else np.float32(0)

@@ -1,7 +1,8 @@
-"""Grouping of the images of an undescribed capture: runs of phase steps, blocks of Gray bits, and even light.
+"""Grouping of the images of an undescribed capture: runs of phase steps, blocks of Gray bits, and
+even light.
 
-Every image is compared with the darkest and the brightest level of each pixel: stripes of a code are at either end,
-phase steps have the same mean level in all pixels.
+Every image is compared with the darkest and the brightest level of each pixel: stripes of a code
+are at either end, phase steps have the same mean level in all pixels.
 """
 
 from dataclasses import dataclass, field
@@ -17,17 +18,20 @@ from slviewer.fringe.sequence import Indices
 MOST_STEPS = 36
 MOST_BITS = 16
 MAX_SPREAD = 0.12
-"""Largest standard deviation over the pixels of the mean of all steps, as a share of half the swing; 0 for a cosine.
-Three bits of a code give 0.5, three of four steps 0.24."""
+"""Largest standard deviation over the pixels of the mean of all steps, as a share of half the
+swing; 0 for a cosine. Three bits of a code give 0.5, three of four steps 0.24."""
 MIN_MIDDLE = 0.15
-"""Share of the levels of phase steps in the middle half of the swing: a third of a cosine's, none of a code's."""
+"""Share of the levels of phase steps in the middle half of the swing: a third of a cosine's, none
+of a code's."""
 MAX_COMMON = 0.9
-"""Length of the phases' mean unit vector; above it the view would hold a quarter of a period at most."""
+"""Length of the phases' mean unit vector; above it the view would hold a quarter of a period at
+most."""
 MAX_MISFIT = 0.25
-"""Largest residual of the steps from a curved response and noise, as a share of the amplitude. Frames of another period
-give 0.7."""
+"""Largest residual of the steps from a curved response and noise, as a share of the amplitude.
+Frames of another period give 0.7."""
 COARSE_PIXELS, COARSE = 4_000, 1.25
-"""Pixels on which images are compared with a cosine first, and the factor by which limits may be exceeded there."""
+"""Pixels on which images are compared with a cosine first, and the factor by which limits may be
+exceeded there."""
 DECIDED = 0.3
 """Distance from the middle, as a share of half the swing, from which a pixel is bright or dark."""
 READABLE = 0.5
@@ -35,17 +39,20 @@ READABLE = 0.5
 EVEN = 0.9
 """Share of pixels at the bright or the dark end from which an image shows no stripes."""
 OPPOSITE = 0.9
-"""Share of decided pixels that differ between a pattern and its inverse; two bits differ in about half."""
+"""Share of decided pixels that differ between a pattern and its inverse; two bits differ in about
+half."""
 OPPOSITE_BLURRED = -0.5
 """The correlation of a pattern and its inverse where blur decides few pixels."""
 REACH = 16
 """px between two decided pixels of neighbouring stripes, across the blur of their edge."""
 DROP = 0.6
-"""An image with fewer edges than this share of those before begins another code; each finer bit has about twice."""
+"""An image with fewer edges than this share of those before begins another code; each finer bit has
+about twice."""
 FEWEST_EDGES = 20
 """Edges of stripes from which a share of them is known to a fifth."""
 DIM = 0.25
-"""Share of the brightest pixels' swing below which a pixel may show reflections of other stripes."""
+"""Share of the brightest pixels' swing below which a pixel may show reflections of other
+stripes."""
 
 Even = Literal["white", "black"]
 Doubt = tuple[Indices, str]
@@ -56,8 +63,8 @@ Doubt = tuple[Indices, str]
 class PhaseRun:
     """Images of all steps of a period.
 
-    ``gradient`` (x, y): median phase gradient, rad per camera px, for a phase that rises by 2 pi / n from step to step;
-    ``misfit``: rms residual of the cosine, as a share of the amplitude.
+    ``gradient`` (x, y): median phase gradient, rad per camera px, for a phase that rises by 2 pi /
+    n from step to step; ``misfit``: rms residual of the cosine, as a share of the amplitude.
     """
 
     images: Indices
@@ -69,8 +76,8 @@ class PhaseRun:
 class Bit:
     """Image of stripes, or of even light (``even``), and its inverse, None without one.
 
-    ``edges`` (x, y): edges per camera px along rows and along columns; ``count``: number of edges; ``is_readable``:
-    whether most pixels are inside stripes.
+    ``edges`` (x, y): edges per camera px along rows and along columns; ``count``: number of edges;
+    ``is_readable``: whether most pixels are inside stripes.
     """
 
     image: int
@@ -118,7 +125,8 @@ class FrameBlocks:
 
 
 class BlockReader:
-    """Reader of the normalised levels (n, p) of the pixels that vary: -1 the darkest of all images, 1 the brightest."""
+    """Reader of the normalised levels (n, p) of the pixels that vary: -1 the darkest of all images,
+    1 the brightest."""
 
     def __init__(self, sample: LineSample) -> None:
         """Select the pixels of ``sample`` that vary, and normalise their levels."""
@@ -128,15 +136,19 @@ class BlockReader:
         if self.illuminated.any():  # dim pixels show noise and reflections of other stripes
             self.illuminated &= swing > DIM * float(np.quantile(swing[self.illuminated], 0.95))
         pixels = np.flatnonzero(self.illuminated)
-        self.levels = (2 * (sample.frames[:, pixels] - low[pixels]) / np.maximum(swing[pixels], 1e-6) - 1).astype(
-            np.float32
-        )
+        self.levels = (
+            2 * (sample.frames[:, pixels] - low[pixels]) / np.maximum(swing[pixels], 1e-6) - 1
+        ).astype(np.float32)
         line, place = sample.line[pixels], sample.place[pixels]
         self.line, self.place, self.across = line, place, line >= sample.rows
         self.adjacent = (np.diff(place) == 1) & (np.diff(line) == 0)
         some = np.sort(np.random.default_rng(0).permutation(len(pixels))[:COARSE_PIXELS])
         self._coarse = self.levels[:, some]
-        self._in_middle = np.mean(np.abs(self.levels) < 0.5, axis=1) if len(pixels) else np.zeros(len(self.levels))
+        self._in_middle = (
+            np.mean(np.abs(self.levels) < 0.5, axis=1)
+            if len(pixels)
+            else np.zeros(len(self.levels))
+        )
 
     @property
     def count(self) -> int:
@@ -153,7 +165,9 @@ class BlockReader:
     def run(self, images: Indices) -> PhaseRun | None:
         """Return the images as a run of all steps of one period; None if they are not."""
         rows = list(images)
-        if float(self._in_middle[rows].mean()) < MIN_MIDDLE or not _is_cosine(self._coarse[rows], COARSE):
+        if float(self._in_middle[rows].mean()) < MIN_MIDDLE or not _is_cosine(
+            self._coarse[rows], COARSE
+        ):
             return None
         levels = self.levels[rows]
         # Three images fit any cosine, also a bit with its inverse and even light.
@@ -163,23 +177,41 @@ class BlockReader:
             return None
         phasor = fit_cosine(levels)[1]
         step = np.angle(phasor[1:] * np.conj(phasor[:-1]))
-        along, across = (float(np.median(step[self.adjacent & part])) for part in (~self.across[1:], self.across[1:]))
+        along, across = (
+            float(np.median(step[self.adjacent & part]))
+            for part in (~self.across[1:], self.across[1:])
+        )
         return PhaseRun(images, (along, across), _measure_misfit(levels))
 
     def bit(self, image: int, inverse: int | None) -> Bit:
         """Measure the stripes of an image, compared with its inverse where there is one."""
-        level = self.levels[image] if inverse is None else (self.levels[image] - self.levels[inverse]) / 2
+        level = (
+            self.levels[image]
+            if inverse is None
+            else (self.levels[image] - self.levels[inverse]) / 2
+        )
         decided = np.abs(level) > DECIDED
         bright = float(np.mean(level > DECIDED))
         dark = float(np.mean(level < -DECIDED))
         even: Even | None = "white" if bright > EVEN else "black" if dark > EVEN else None
         decided_pixels = np.flatnonzero(decided)
-        near = (np.diff(self.place[decided_pixels]) <= REACH) & (np.diff(self.line[decided_pixels]) == 0)
+        near = (np.diff(self.place[decided_pixels]) <= REACH) & (
+            np.diff(self.line[decided_pixels]) == 0
+        )
         edge = near & np.diff(level[decided_pixels] > 0)
         across = self.across[decided_pixels[1:]]
         total = np.array([np.count_nonzero(~self.across), np.count_nonzero(self.across)])
-        x, y = np.array([np.count_nonzero(edge & ~across), np.count_nonzero(edge & across)]) / np.maximum(total, 1)
-        return Bit(image, inverse, (float(x), float(y)), int(edge.sum()), float(decided.mean()) > READABLE, even)
+        x, y = np.array(
+            [np.count_nonzero(edge & ~across), np.count_nonzero(edge & across)]
+        ) / np.maximum(total, 1)
+        return Bit(
+            image,
+            inverse,
+            (float(x), float(y)),
+            int(edge.sum()),
+            float(decided.mean()) > READABLE,
+            even,
+        )
 
     def are_opposite(self, first: int, second: int) -> bool:
         """Return whether one image is the inverse of the other."""
@@ -193,7 +225,8 @@ class BlockReader:
 
 
 def _is_cosine(levels: np.ndarray, tolerance: float = 1.0) -> bool:
-    """Return whether levels (n, p) are n steps of a cosine of many phases, within ``tolerance`` times the limits."""
+    """Return whether levels (n, p) are n steps of a cosine of many phases, within ``tolerance``
+    times the limits."""
     if float(np.std(levels.mean(axis=0))) > MAX_SPREAD * tolerance:
         return False
     phasor = fit_cosine(levels)[1]
@@ -204,7 +237,8 @@ def _is_cosine(levels: np.ndarray, tolerance: float = 1.0) -> bool:
 
 
 def _measure_misfit(levels: np.ndarray) -> float:
-    """Return the rms residual of a cosine fitted to levels (n, p), as a share of its median amplitude."""
+    """Return the rms residual of a cosine fitted to levels (n, p), as a share of its median
+    amplitude."""
     background, phasor = fit_cosine(levels)
     residual = levels - evaluate_cosine(background, phasor, len(levels))
     return float(np.sqrt(np.mean(residual**2))) / max(float(np.median(np.abs(phasor))), 1e-6)
@@ -230,29 +264,42 @@ def _detect_phase_runs(reader: BlockReader) -> list[PhaseRun]:
             if (run := reader.run(tuple(range(start, start + n)))) is not None
         ]
         if fitting:
-            runs.append(min(fitting, key=lambda run: run.misfit + 0.3 / len(run.images)))  # three steps fit anything
+            runs.append(
+                min(fitting, key=lambda run: run.misfit + 0.3 / len(run.images))
+            )  # three steps fit anything
             start = runs[-1].images[-1]
         start += 1
     return runs
 
 
 def _pair_inverses(reader: BlockReader, images: list[int]) -> list[Bit]:
-    """Return the bits of a segment, each with its inverse: the next image, or the one half a block later.
+    """Return the bits of a segment, each with its inverse: the next image, or the one half a block
+    later.
 
     Images without an inverse are returned as single bits.
     """
     bits = [reader.bit(image, None) for image in images]
     striped = [bit.image for bit in bits if bit.even is None]
     half = len(striped) // 2
-    if half > 1 and len(striped) % 2 == 0 and all(map(reader.are_opposite, striped[:half], striped[half:])):
+    if (
+        half > 1
+        and len(striped) % 2 == 0
+        and all(map(reader.are_opposite, striped[:half], striped[half:]))
+    ):
         inverse = dict(zip(striped[:half], striped[half:], strict=True))
-        return [reader.bit(bit.image, inverse.get(bit.image)) for bit in bits if bit.image not in set(inverse.values())]
+        return [
+            reader.bit(bit.image, inverse.get(bit.image))
+            for bit in bits
+            if bit.image not in set(inverse.values())
+        ]
     out: list[Bit] = []
     place = 0
     while place < len(images):
         here = bits[place : place + 2]
         # Stripes too fine to be read follow the pairs before them.
-        blurred = bool(out) and out[-1].inverse is not None and not any(bit.is_readable for bit in here)
+        blurred = (
+            bool(out) and out[-1].inverse is not None and not any(bit.is_readable for bit in here)
+        )
         if len(here) == 2 and (blurred or reader.are_opposite(here[0].image, here[1].image)):
             out.append(reader.bit(images[place], images[place + 1]))
             place += 1
@@ -287,13 +334,20 @@ def _split_segment(bits: list[Bit], blocks: FrameBlocks) -> None:
     _record_even_images(waiting, blocks.even)
 
 
-def _select_leading_bits(waiting: list[Bit], even: dict[int, Even], with_inverse: bool) -> list[Bit]:
-    """Return the most significant bits, black throughout the view, among the evenly illuminated images before a code.
+def _select_leading_bits(
+    waiting: list[Bit], even: dict[int, Even], with_inverse: bool
+) -> list[Bit]:
+    """Return the most significant bits, black throughout the view, among the evenly illuminated
+    images before a code.
 
     The other images are recorded in ``even``.
     """
     leading: list[Bit] = []
-    while waiting and waiting[-1].even == "black" and (waiting[-1].inverse is not None) == with_inverse:
+    while (
+        waiting
+        and waiting[-1].even == "black"
+        and (waiting[-1].inverse is not None) == with_inverse
+    ):
         leading.insert(0, waiting.pop())
     _record_even_images(waiting, even)
     return leading
@@ -309,15 +363,22 @@ def _record_even_images(bits: list[Bit], even: dict[int, Even]) -> None:
 
 
 def _add_block(block: list[Bit], blocks: FrameBlocks) -> None:
-    """Add successive bits to ``blocks`` as a Gray code, or as a doubt with the reason why they are none."""
+    """Add successive bits to ``blocks`` as a Gray code, or as a doubt with the reason why they are
+    none."""
     images = tuple(sorted(image for bit in block for image in bit.images))
     paired = {bit.inverse is not None for bit in block}
     readable = [bit for bit in block if bit.is_readable and bit.even is None]
     if not readable:
-        blocks.doubts.append((images, "they show neither phase steps, nor stripes of a code, nor even light"))
+        blocks.doubts.append(
+            (images, "they show neither phase steps, nor stripes of a code, nor even light")
+        )
     elif len(block) > MOST_BITS:
-        blocks.doubts.append((images, f"{len(block)} bits of one code: no projector has so many lines"))
+        blocks.doubts.append(
+            (images, f"{len(block)} bits of one code: no projector has so many lines")
+        )
     elif len(paired) > 1:
-        blocks.doubts.append((images, "some of these bits are followed by their inverse, and some are not"))
+        blocks.doubts.append(
+            (images, "some of these bits are followed by their inverse, and some are not")
+        )
     else:
         blocks.codes.append(GrayBlock(tuple(block)))

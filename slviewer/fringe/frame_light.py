@@ -1,9 +1,10 @@
 """Light of each frame of a capture: estimated from the frames themselves, and equalized.
 
-Frame i shows ``g_i(v) S_i(p) + o_i(p)``: S_i is what the scene shows of its pattern; the gain g_i varies with automatic
-exposure and unsteady lamps, under a rolling shutter also along the image rows v; o_i is the room light in excess of
-that of the other frames, uniform or in proportion to the scene's albedo. Of several models the simplest one that
-explains the frames is selected; see `light_fit`.
+Frame i shows ``g_i(v) S_i(p) + o_i(p)``: S_i is what the scene shows of its pattern; the gain g_i
+varies with automatic exposure and unsteady lamps, under a rolling shutter also along the image rows
+v; o_i is the room light in excess of that of the other frames, uniform or in proportion to the
+scene's albedo. Of several models the simplest one that explains the frames is selected; see
+`light_fit`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,50 +25,71 @@ from slviewer.fringe.light_fit import (
     fit_light,
     light_model,
 )
-from slviewer.fringe.light_sample import MIN_PIXELS, LightSample, estimate_albedo, list_shifts, sample_light
+from slviewer.fringe.light_sample import (
+    MIN_PIXELS,
+    LightSample,
+    estimate_albedo,
+    list_shifts,
+    sample_light,
+)
 from slviewer.fringe.sequence import Indices, PatternSequence
 from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
-"""rms variation of the gains below which they are not corrected: a camera's response and blur simulate at most this."""
+"""rms variation of the gains below which they are not corrected: a camera's response and blur
+simulate at most this."""
 LEAST_OF_THREE = 0.02
-"""The same of three steps, whose gains are known only as far as the scene's texture is independent of the fringes."""
+"""The same of three steps, whose gains are known only as far as the scene's texture is independent
+of the fringes."""
 LEAST_CODED_GAIN = 0.045
-"""The same of a frame without phase shift: between blurred stripes the light of neighbours adds to it."""
+"""The same of a frame without phase shift: between blurred stripes the light of neighbours adds to
+it."""
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
-"""rms of a wave along the rows, and change of the room's light over the mean grey level, that are corrected."""
+"""rms of a wave along the rows, and change of the room's light over the mean grey level, that are
+corrected."""
 NOISE_PART = 0.25
-"""A variation below this part of the noise of a grey level is not corrected either: it adds 3 % to the noise."""
+"""A variation below this part of the noise of a grey level is not corrected either: it adds 3 % to
+the noise."""
 BETTER = 1.03
-"""Factor by which a wave along the rows or room light must reduce the mean squared residual to be accepted."""
+"""Factor by which a wave along the rows or room light must reduce the mean squared residual to be
+accepted."""
 AS_GOOD = 1.02
-"""Models within this factor of the best explain the frames as well: the first, simplest, is selected."""
+"""Models within this factor of the best explain the frames as well: the first, simplest, is
+selected."""
 LEFT, LEFT_CONTRAST = 4.0, 0.02
-"""Light explains the frames if the mean squared residual is below ``LEFT`` times the squared roughness, plus the square
-of ``LEFT_CONTRAST`` times the contrast, for the effect of blur and the camera's response."""
+"""Light explains the frames if the mean squared residual is below ``LEFT`` times the squared
+roughness, plus the square of ``LEFT_CONTRAST`` times the contrast, for the effect of blur and the
+camera's response."""
 EXPLAINED = 0.6
-"""For Gray code alone, light explains the frames if the residual is below this share of that of equal light: blur,
-scattered light and compression add to it. Light explains up to a third of sound frames, and of misplaced ones."""
+"""For Gray code alone, light explains the frames if the residual is below this share of that of
+equal light: blur, scattered light and compression add to it. Light explains up to a third of sound
+frames, and of misplaced ones."""
 LEFT_OF_ROOM = 1.5
-"""``LEFT`` for gains and room light together: they have enough values to fit a misplaced frame as well."""
+"""``LEFT`` for gains and room light together: they have enough values to fit a misplaced frame as
+well."""
 ONE_FRAME = 6.0
-"""Largest residual of a frame relative to the median frame: frames that show another's pattern have more."""
+"""Largest residual of a frame relative to the median frame: frames that show another's pattern have
+more."""
 LEFT_OF_FRAME = 0.3
-"""For Gray code alone, a larger residual is accepted below this share of the frame's residual in equal light."""
+"""For Gray code alone, a larger residual is accepted below this share of the frame's residual in
+equal light."""
 CLEARLY_BETTER = 1.5
-"""Both factors for Gray code alone whose residual exceeds noise: some percent of it are blur and scattered light
-that a wave along the rows, or room light, happens to fit."""
+"""Both factors for Gray code alone whose residual exceeds noise: some percent of it are blur and
+scattered light that a wave along the rows, or room light, happens to fit."""
 MIN_FRAMES = 3
-"""Frames that must be known on either side of a change of the room's light: one or two may just be of other gain."""
+"""Frames that must be known on either side of a change of the room's light: one or two may just be
+of other gain."""
 CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
 """Share of pixels inside stripes below which a coded frame has fine stripes throughout."""
 REPORTED = 3.0
-"""Percent of brightness, from the darkest to the brightest frame, that the operator should know about."""
+"""Percent of brightness, from the darkest to the brightest frame, that the operator should know
+about."""
 FEW_STEPS = 4
-"""Largest number of steps between which a change of room light is not corrected reliably: with four steps on a textured
-board, light of a quarter of the mean caused an error of 1.4 px when modelled as uniform."""
+"""Largest number of steps between which a change of room light is not corrected reliably: with four
+steps on a textured board, light of a quarter of the mean caused an error of 1.4 px when modelled as
+uniform."""
 FARTHEST = 0.7
 """Logarithm of a gain beyond which a frame shows something else."""
 CLIPPED = 65535.0
@@ -85,10 +107,11 @@ MODELS: tuple[tuple[Term, ...], ...] = (
 class FrameLight:
     """Light of each of n frames, relative to their mean.
 
-    ``terms``: terms of the light that are to be corrected, empty where no correction is necessary or possible;
-    ``unexplained``: terms by which the frames differ, although these explain too little to be corrected. ``drift``: rms
-    of the gains' logarithm; ``wave``: rms amplitude of the wave along the rows, relative; ``room`` (n,): room light of
-    each frame as a share of the mean grey level, from 0 on.
+    ``terms``: terms of the light that are to be corrected, empty where no correction is necessary
+    or possible; ``unexplained``: terms by which the frames differ, although these explain too
+    little to be corrected. ``drift``: rms of the gains' logarithm; ``wave``: rms amplitude of the
+    wave along the rows, relative; ``room`` (n,): room light of each frame as a share of the mean
+    grey level, from 0 on.
     """
 
     light: Light
@@ -105,10 +128,11 @@ class FrameLight:
 
 
 def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
-    """Estimate the light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them together.
+    """Estimate the light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them
+    together.
 
-    A small sample decides first whether there is anything to estimate. Frames that cannot be judged have gain 1. Raises
-    InputError when the frames are not those of the sequence.
+    A small sample decides first whether there is anything to estimate. Frames that cannot be judged
+    have gain 1. Raises InputError when the frames are not those of the sequence.
     """
     check_stack(sequence, stack)
     steady = FrameLight(Light.constant(len(stack)), ())
@@ -119,7 +143,9 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     if sample is None:
         return steady
     fit = fit_light(sample, ("gain",), Light.constant(len(stack)))
-    if np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded:  # bits and inverses are now separated better
+    if (
+        np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded
+    ):  # bits and inverses are now separated better
         sample = sample_light(sequence, stack, fit.light.gain) or sample
         coarse = sample_light(sequence, stack, fit.light.gain, coarse=True) or coarse
         fit = fit_light(sample, ("gain",), fit.light)
@@ -138,21 +164,31 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
 
 
 def equalize_frames(
-    sequence: PatternSequence, stack: np.ndarray, light: FrameLight, frames: Sequence[int] | None = None
+    sequence: PatternSequence,
+    stack: np.ndarray,
+    light: FrameLight,
+    frames: Sequence[int] | None = None,
 ) -> tuple[PatternSequence, np.ndarray, float]:
-    """Scale frames to equal light: their sequence, (k, h, w) uint16, and the factor that multiplied the grey levels.
+    """Scale frames to equal light: their sequence, (k, h, w) uint16, and the factor that multiplied
+    the grey levels.
 
-    ``frames``: indices of the frames to scale, all if None. Phase-shifted frames are 65535 throughout at pixels that
-    the camera clipped in one of the frames of their period, and nowhere else. Room light is added to the frames that
-    lack it rather than subtracted, so that nothing becomes negative.
+    ``frames``: indices of the frames to scale, all if None. Phase-shifted frames are 65535
+    throughout at pixels that the camera clipped in one of the frames of their period, and nowhere
+    else. Room light is added to the frames that lack it rather than subtracted, so that nothing
+    becomes negative.
     """
     chosen = list(range(len(stack)) if frames is None else frames)
     height, values = stack.shape[1], light.light
     angle = 2 * np.pi * values.cycles * np.arange(height) / (height - 1)
     waves = np.stack([np.cos(angle), np.sin(angle)])
     gain = values.gain[:, None] * (1 + values.wave @ waves)
-    along_rows = values.albedo[:, :1] + values.albedo[:, 2:] * (np.arange(height) / (height - 1) - 0.5)
-    offset, along_columns = values.uniform - values.uniform.max(), values.albedo[:, 1] - values.albedo[:, 1].max()
+    along_rows = values.albedo[:, :1] + values.albedo[:, 2:] * (
+        np.arange(height) / (height - 1) - 0.5
+    )
+    offset, along_columns = (
+        values.uniform - values.uniform.max(),
+        values.albedo[:, 1] - values.albedo[:, 1].max(),
+    )
     along_rows = along_rows - along_rows.max(axis=0)
     white = white_level(sequence, stack, chosen)
     albedo = np.zeros((0, 0), np.float32)
@@ -174,28 +210,43 @@ def equalize_frames(
             for k in places:
                 out[k][clipped] = CLIPPED
     full_scale = None if sequence.full_scale is None else int(CLIPPED)
-    return replace(sequence, frames=tuple(sequence.frames[i] for i in chosen), full_scale=full_scale), out, scale
+    return (
+        replace(sequence, frames=tuple(sequence.frames[i] for i in chosen), full_scale=full_scale),
+        out,
+        scale,
+    )
 
 
 def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
-    """Return the fault that these ``terms`` of the light stand for, and the message: what differs, and what to do.
+    """Return the fault that these ``terms`` of the light stand for, and the message: what differs,
+    and what to do.
 
     The message is for light that differs by more than can be corrected.
     """
     if "wave" in terms:
-        return "flicker", (
-            "the light varies along the image rows and between the frames by more than can be corrected (lamps or a "
-            "projector that flicker, under a rolling shutter): make the exposure time a multiple of 10 ms (8.33 ms "
-            "where the mains have 60 Hz) and of the projector's frame, and switch off the lamps of the room"
+        return (
+            "flicker",
+            (
+                "the light varies along the image rows and between the frames by more than can be"
+                " corrected (lamps or a projector that flicker, under a rolling shutter): make the"
+                " exposure time a multiple of 10 ms (8.33 ms where the mains have 60 Hz) and of the"
+                " projector's frame, and switch off the lamps of the room"
+            ),
         )
     if len(terms) > 1:
-        return "room-light", (
-            "the light of the room changes between the frames by more than can be corrected: keep it constant, or "
-            "switch it off"
+        return (
+            "room-light",
+            (
+                "the light of the room changes between the frames by more than can be corrected:"
+                " keep it constant, or switch it off"
+            ),
         )
-    return "exposure-drift", (
-        "the brightness varies from frame to frame by more than can be corrected (automatic exposure, or an unsteady "
-        "lamp): lock the camera's exposure, gain and white balance"
+    return (
+        "exposure-drift",
+        (
+            "the brightness varies from frame to frame by more than can be corrected (automatic"
+            " exposure, or an unsteady lamp): lock the camera's exposure, gain and white balance"
+        ),
     )
 
 
@@ -207,15 +258,16 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
     span = 100 * (float(gain.max() / gain.min()) - 1)
     if "gain" in light.terms and span > REPORTED:
         text = (
-            f"the brightness of the frames varies by {span:.1f} % (automatic exposure, or an unsteady lamp): "
-            "corrected; lock the camera's exposure, gain and white balance"
+            f"the brightness of the frames varies by {span:.1f} % (automatic exposure, or an"
+            " unsteady lamp): corrected; lock the camera's exposure, gain and white balance"
         )
         out.append(Suspect(used[int(np.argmax(np.abs(np.log(gain))))], "exposure-drift", text))
     if "wave" in light.terms and light.wave > LEAST_WAVE:
         text = (
-            f"the light varies along the image rows by {100 * np.sqrt(2) * light.wave:.0f} %, in "
-            f"{light.light.cycles:.1f} waves per image (mains flicker under a rolling shutter): corrected; make the "
-            "exposure time a multiple of 10 ms (8.33 ms where the mains have 60 Hz)"
+            f"the light varies along the image rows by {100 * np.sqrt(2) * light.wave:.0f} %, in"
+            f" {light.light.cycles:.1f} waves per image (mains flicker under a rolling shutter):"
+            " corrected; make the exposure time a multiple of 10 ms (8.33 ms where the mains have"
+            " 60 Hz)"
         )
         out.append(Suspect(used[0], "flicker", text))
     if light.room is not None and ("uniform" in light.terms or "albedo" in light.terms):
@@ -226,19 +278,23 @@ def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Su
             outcome = "corrected; keep the light of the room constant, or switch it off"
             if steps:
                 outcome = (
-                    f"between {steps} phase steps this cannot be corrected reliably; capture again in constant room "
-                    "light"
+                    f"between {steps} phase steps this cannot be corrected reliably; capture again"
+                    " in constant room light"
                 )
-            text = f"the light of the room changed: from frame {k + 1} on the scene is {abs(change):.0f} % {more}"
+            text = (
+                f"the light of the room changed: from frame {k + 1} on the scene is"
+                f" {abs(change):.0f} % {more}"
+            )
             out.append(Suspect(k, "room-light", f"{text}: {outcome}"))
     return out
 
 
 def _count_steps_across_change(sequence: PatternSequence, k: int) -> int:
-    """Return the number of phase steps of the period during which the light changes before frame ``k``.
+    """Return the number of phase steps of the period during which the light changes before frame
+    ``k``.
 
-    0 if there is no such period, or if it has enough steps to separate uniform light from light in proportion to the
-    albedo.
+    0 if there is no such period, or if it has enough steps to separate uniform light from light in
+    proportion to the albedo.
     """
     for steps in list_shifts(sequence):
         if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
@@ -247,7 +303,8 @@ def _count_steps_across_change(sequence: PatternSequence, k: int) -> int:
 
 
 def _is_light_varying(sample: LightSample) -> bool:
-    """Return whether one step of any model, on a small sample, promises a significant correction."""
+    """Return whether one step of any model, on a small sample, promises a significant
+    correction."""
     model, count = light_model(sample), len(sample.frames)
     if not model.informed:
         return False
@@ -261,7 +318,9 @@ def _is_light_varying(sample: LightSample) -> bool:
     )
 
 
-def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tuple[Term, ...], Light]]:
+def _list_candidate_models(
+    sample: LightSample, gains: Fit
+) -> Iterator[tuple[tuple[Term, ...], Light]]:
     """Yield the models besides gains alone, each with the light to start from."""
     constant = Light.constant(len(sample.frames))
     remainder = light_model(sample).eliminate(gains.light, gains.share, gains.weight)
@@ -274,13 +333,18 @@ def _list_candidate_models(sample: LightSample, gains: Fit) -> Iterator[tuple[tu
             yield terms, replace(start, gain=constant.gain, changes=changes)
 
 
-def _locate_room_changes(sample: LightSample, light: Light, weight: np.ndarray) -> tuple[Indices, Indices]:
-    """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
+def _locate_room_changes(
+    sample: LightSample, light: Light, weight: np.ndarray
+) -> tuple[Indices, Indices]:
+    """Return the frame before which a change of the room light explains most of the residual; empty
+    if there is none.
 
     First of a change of room light alone, then together with gains. ``weight`` (p,) of the pixels.
     """
     model = light_model(sample)
-    if model.phased and not model.phase_freedom:  # three steps: nothing but the Gray code contradicts a change
+    if (
+        model.phased and not model.phase_freedom
+    ):  # three steps: nothing but the Gray code contradicts a change
         return (), ()
     remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
     normal, moment = remainder.normal_equations(
@@ -294,11 +358,14 @@ def _locate_room_changes(sample: LightSample, light: Light, weight: np.ndarray) 
     )
 
 
-def _select_room_change(model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]) -> Indices:
-    """Return the frame before which a change of the room light explains most of the residual; empty if there is none.
+def _select_room_change(
+    model: LightModel, normal: np.ndarray, moment: np.ndarray, free_columns: list[int]
+) -> Indices:
+    """Return the frame before which a change of the room light explains most of the residual; empty
+    if there is none.
 
-    ``normal`` and ``moment`` of gains, uniform light and albedo. The unknowns ``free_columns``, which every change has
-    beside it, are eliminated first.
+    ``normal`` and ``moment`` of gains, uniform light and albedo. The unknowns ``free_columns``,
+    which every change has beside it, are eliminated first.
     """
     used, u = np.array(model.used), len(model.used)
     inverse = np.linalg.inv(normal[np.ix_(free_columns, free_columns)])
@@ -320,24 +387,36 @@ def _select_room_change(model: LightModel, normal: np.ndarray, moment: np.ndarra
     step = (used >= np.array(usable)[:, None]).astype(float)
     part = step @ target.reshape(2, u).T
     precision = np.stack(
-        [((step @ block) * step).sum(axis=1) for block in own.reshape(2, u, 2, u).swapaxes(1, 2).reshape(4, u, u)]
+        [
+            ((step @ block) * step).sum(axis=1)
+            for block in own.reshape(2, u, 2, u).swapaxes(1, 2).reshape(4, u, u)
+        ]
     )
-    gain = np.einsum("ki,ki->k", part, np.linalg.solve(precision.T.reshape(-1, 2, 2), part[:, :, None])[:, :, 0])
+    gain = np.einsum(
+        "ki,ki->k", part, np.linalg.solve(precision.T.reshape(-1, 2, 2), part[:, :, None])[:, :, 0]
+    )
     best = int(np.argmax(gain))
     return (usable[best],) if gain[best] > 0 else ()
 
 
 def _has_large_gains(sample: LightSample, fit: Fit) -> bool:
-    """Return whether the gains vary significantly among the steps of a period, or among the other frames.
+    """Return whether the gains vary significantly among the steps of a period, or among the other
+    frames.
 
-    Only the former shift the phase. The latter appear to vary by some percent where stripes are blurred, and thresholds
-    tolerate more.
+    Only the former shift the phase. The latter appear to vary by some percent where stripes are
+    blurred, and thresholds tolerate more.
     """
     used = list(fit.informed)
     level = float(np.mean(sample.frames[used]))
     gain = np.log(fit.light.gain)
-    spread = {shift: float(np.std(gain[list(shift)])) for shift in sample.shifts if set(shift) <= set(used)}
-    within = max((s for shift, s in spread.items() if len(shift) > 3 or s > LEAST_OF_THREE), default=0.0)
+    spread = {
+        shift: float(np.std(gain[list(shift)]))
+        for shift in sample.shifts
+        if set(shift) <= set(used)
+    }
+    within = max(
+        (s for shift, s in spread.items() if len(shift) > 3 or s > LEAST_OF_THREE), default=0.0
+    )
     coded = [i for i in used if i in sample.coded]
     between = float(np.abs(gain[coded] - np.median(gain[coded])).max()) if coded else 0.0
     least = max(LEAST_GAIN, NOISE_PART * np.sqrt(fit.variance) / level)
@@ -345,7 +424,8 @@ def _has_large_gains(sample: LightSample, fit: Fit) -> bool:
 
 
 def _needs_correction(sample: LightSample, fit: Fit) -> bool:
-    """Return whether a wave along the rows, or a change of the room light, is large enough to be corrected."""
+    """Return whether a wave along the rows, or a change of the room light, is large enough to be
+    corrected."""
     light, used = fit.light, list(fit.informed)
     if "wave" in fit.terms and np.sqrt(np.mean(light.wave[used] ** 2)) > LEAST_WAVE:
         return True
@@ -360,15 +440,24 @@ def _compute_room_light(sample: LightSample, light: Light, used: Sequence[int]) 
 
 
 def _choose_model(coarse: LightSample, sample: LightSample, first: Fit) -> Fit:
-    """Select the simplest model that explains the frames about as well as the best, on a coarse sample, and fit it."""
+    """Select the simplest model that explains the frames about as well as the best, on a coarse
+    sample, and fit it."""
     weight = np.ones(coarse.frames.shape[1], np.float32)
     own = fit_light(coarse, ("gain",), first.light, weight, 2)
-    fits = [own, *(fit_light(coarse, terms, start, weight, 3) for terms, start in _list_candidate_models(coarse, own))]
+    fits = [
+        own,
+        *(
+            fit_light(coarse, terms, start, weight, 3)
+            for terms, start in _list_candidate_models(coarse, own)
+        ),
+    ]
     best = min(fit.variance for fit in fits)
     is_noise = bool(coarse.shifts) or own.variance < LEFT * coarse.roughness**2
     if own.variance < (BETTER if is_noise else CLEARLY_BETTER) * best:
         return first
-    chosen = next(fit for fit in fits if fit.variance <= (AS_GOOD if is_noise else CLEARLY_BETTER) * best)
+    chosen = next(
+        fit for fit in fits if fit.variance <= (AS_GOOD if is_noise else CLEARLY_BETTER) * best
+    )
     if any("wave" in term for term in chosen.terms):
         chosen = _refine_wave(coarse, chosen)
     return fit_light(sample, chosen.terms, chosen.light, most_steps=3)
@@ -378,7 +467,11 @@ def _refine_wave(sample: LightSample, fit: Fit) -> Fit:
     """Refine the number of cycles of the wave by a parabola through the residuals of three fits."""
     tried = [fit]
     for step in (-0.12, 0.12):
-        tried.append(fit_light(sample, fit.terms, replace(fit.light, cycles=fit.light.cycles + step), fit.weight, 2))
+        tried.append(
+            fit_light(
+                sample, fit.terms, replace(fit.light, cycles=fit.light.cycles + step), fit.weight, 2
+            )
+        )
     middle, below, above = (f.variance for f in tried)
     curvature = below + above - 2 * middle
     if curvature <= 0:
@@ -389,7 +482,8 @@ def _refine_wave(sample: LightSample, fit: Fit) -> Fit:
 
 
 def _estimate_strongest_wave(remainder: Remainder) -> float:
-    """Return the cycles per image height of the strongest wave that the residual light has along the rows."""
+    """Return the cycles per image height of the strongest wave that the residual light has along
+    the rows."""
     excess, rows = remainder.row_excess()
     excess = excess - excess.mean(axis=1, keepdims=True)
     power = (np.abs(excess @ np.exp(-2j * np.pi * rows[:, None] * CYCLES)) ** 2).sum(axis=0)
@@ -410,11 +504,17 @@ def _explains_frames(sample: LightSample, fit: Fit) -> bool:
     limit = ONE_FRAME * max(float(np.median(each)), sample.roughness**2 / 2)
     if sample.shifts:
         most = LEFT if len(fit.terms) < 3 else LEFT_OF_ROOM
-        small = most * sample.roughness**2 + LEFT_CONTRAST**2 * float(np.mean(sample.amplitudes) ** 2)
+        small = most * sample.roughness**2 + LEFT_CONTRAST**2 * float(
+            np.mean(sample.amplitudes) ** 2
+        )
         return fit.variance < small and bool(each.max() < limit)
-    equal = model.eliminate(Light.constant(len(sample.frames)), SHARE_PRIOR[0], np.ones_like(fit.weight))
+    equal = model.eliminate(
+        Light.constant(len(sample.frames)), SHARE_PRIOR[0], np.ones_like(fit.weight)
+    )
     unequal = (fit.weight * equal.left**2).sum(axis=1)[judged] / np.maximum(entries[judged], 1)
-    return _explains_most(sample, fit) and bool((each < np.maximum(limit, LEFT_OF_FRAME * unequal)).all())
+    return _explains_most(sample, fit) and bool(
+        (each < np.maximum(limit, LEFT_OF_FRAME * unequal)).all()
+    )
 
 
 def _explains_most(sample: LightSample, fit: Fit) -> bool:
@@ -445,15 +545,21 @@ def _fill_unknown_frames(sample: LightSample, fit: Fit) -> Fit:
 
 
 def _estimate_fine_stripes(sample: LightSample, fit: Fit) -> Light:
-    """Estimate the gains of coded frames whose stripes are too fine to have an interior, and return the light.
+    """Estimate the gains of coded frames whose stripes are too fine to have an interior, and return
+    the light.
 
-    Over many fine stripes the mean of each bit and of each inverse is the same share of white: about half, more or less
-    by what the camera's response makes of blurred stripes, which all of them have in common.
+    Over many fine stripes the mean of each bit and of each inverse is the same share of white:
+    about half, more or less by what the camera's response makes of blurred stripes, which all of
+    them have in common.
     """
     model, light = light_model(sample), fit.light
     remainder = model.eliminate(light, fit.share, fit.weight)
     inside = sample.interior.mean(axis=1) if sample.coded else np.zeros(0)
-    fine = [i for i, share in zip(sample.coded, inside, strict=True) if share < FINE and i not in fit.informed]
+    fine = [
+        i
+        for i, share in zip(sample.coded, inside, strict=True)
+        if share < FINE and i not in fit.informed
+    ]
     dark, bright = remainder.levels
     both = (remainder.counts[0] > 0) & (remainder.counts[1] > 0)
     if "gain" not in fit.terms or not fine or np.count_nonzero(both) < MIN_PIXELS:

@@ -7,7 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
-from slviewer.fringe.agreement_tests import SURE, Answer, failed_tests, has_evidence, is_proven, sum_shares
+from slviewer.fringe.agreement_tests import (
+    SURE,
+    Answer,
+    failed_tests,
+    has_evidence,
+    is_proven,
+    sum_shares,
+)
 from slviewer.fringe.axis_agreement import measure_agreement, measure_code_agreement
 from slviewer.fringe.axis_reader import AxisFrames, AxisReader, Images, described_frames
 from slviewer.fringe.contradiction import Contradiction
@@ -15,7 +22,11 @@ from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.ghost import detect_ghosting
 from slviewer.fringe.layout import Shift
 from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.residual_order import detect_misordered_steps, detect_strange_frames, recover_step_order
+from slviewer.fringe.residual_order import (
+    detect_misordered_steps,
+    detect_strange_frames,
+    recover_step_order,
+)
 from slviewer.fringe.residual_sample import BESIDE, sample_fringe
 from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.suspect import Suspect
@@ -31,8 +42,9 @@ COARSE_MARGIN = 0.15
 class _StepFindings:
     """Findings about the order of the phase steps of one period.
 
-    ``order``: step of each frame where these are permuted, else None; ``misplaced``: frames that show another step;
-    ``strange``: frames that no step explains, judged only where none is misplaced.
+    ``order``: step of each frame where these are permuted, else None; ``misplaced``: frames that
+    show another step; ``strange``: frames that no step explains, judged only where none is
+    misplaced.
     """
 
     order: list[int] | None
@@ -41,15 +53,19 @@ class _StepFindings:
 
 
 class StepReader:
-    """Checks the phase steps of a sample against a fitted cosine, cached for each order of their images."""
+    """Checks the phase steps of a sample against a fitted cosine, cached for each order of their
+    images."""
 
     def __init__(self, sequence: PatternSequence, sample: LineSample) -> None:
         """Check the phase steps of ``sequence`` at the pixels of ``sample``."""
         self._sequence, self._sample = sequence, sample
         self._cached_findings = cache(self._judge_period)
 
-    def detect_misplaced_steps(self, axis: Axis, images: Images | None = None) -> list[Contradiction]:
-        """Return the contradictions of phase steps that are out of order, from the residual of the fitted cosine.
+    def detect_misplaced_steps(
+        self, axis: Axis, images: Images | None = None
+    ) -> list[Contradiction]:
+        """Return the contradictions of phase steps that are out of order, from the residual of the
+        fitted cosine.
 
         ``images``: image of each frame, None for a missing one; the described order if omitted.
         """
@@ -59,8 +75,8 @@ class StepReader:
             if steps := findings.order:
                 order = ", ".join(str(step) for step in steps)
                 text = (
-                    f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number the frames so in "
-                    "the description"
+                    f"the {len(steps)} phase steps of axis {axis} come in the order {order}: number"
+                    " the frames so in the description"
                 )
                 return [Contradiction("step-order", text, axis, None)]
             for suspect in findings.misplaced:
@@ -70,12 +86,14 @@ class StepReader:
         return out
 
     def detect_unexplained_steps(self, images: Images | None = None) -> set[int]:
-        """Return the frames that no step of their period explains, with or without a share of the image before."""
+        """Return the frames that no step of their period explains, with or without a share of the
+        image before."""
         findings = (f for axis in self._sequence.axes for f in self._judge_axis(axis, images))
         return {suspect.frame for each in findings for suspect in each.strange}
 
     def _judge_axis(self, axis: Axis, images: Images | None) -> Iterator[_StepFindings]:
-        """Yield the findings of each period whose steps are all present and whose fringes are in view."""
+        """Yield the findings of each period whose steps are all present and whose fringes are in
+        view."""
         count = len(self._sample.lines)
         images = images or tuple(range(count))
         for period, steps in self._sequence.phase_shifts(axis):
@@ -88,7 +106,8 @@ class StepReader:
                 yield findings
 
     def _judge_period(self, shift: Shift, first: int, seen: Indices) -> _StepFindings | None:
-        """Return the findings of one period, image ``seen[i]`` shown as frame ``first + i``; None without fringes."""
+        """Return the findings of one period, image ``seen[i]`` shown as frame ``first + i``; None
+        without fringes."""
         lines, white = self._sample.lines, self._sample.white
         images = [*range(first), *seen, *range(first + len(seen), len(lines))]
         sampled = sample_fringe(lines[images], shift, (0.0, 0.0), white)
@@ -105,7 +124,8 @@ class StepReader:
 def detect_copies(
     sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness
 ) -> tuple[Contradiction, ...]:
-    """Return the contradictions of images that repeat another one; empty unless all tests pass without them."""
+    """Return the contradictions of images that repeat another one; empty unless all tests pass
+    without them."""
     pairs = likeness.repeated()
     if not pairs:
         return ()
@@ -119,7 +139,9 @@ def detect_copies(
 
 def _describe_duplicate(sequence: PatternSequence, i: int, j: int) -> Contradiction:
     """Return the contradiction of frame ``i`` that repeats the pattern of frame ``j``."""
-    text = f"frame {i + 1} shows the pattern of frame {j + 1}: it is late or repeated; capture again"
+    text = (
+        f"frame {i + 1} shows the pattern of frame {j + 1}: it is late or repeated; capture again"
+    )
     return Contradiction("duplicate-frame", text, sequence.frames[i].axis, float(i))
 
 
@@ -134,14 +156,18 @@ def search_order(
 
     Return its contradiction and score, None if none passes.
 
-    ``disordered``: contradictions of the phase steps alone; an order that agrees with them is preferred.
+    ``disordered``: contradictions of the phase steps alone; an order that agrees with them is
+    preferred.
     """
     named_by_steps = {(contradiction.cause, contradiction.value) for contradiction in disordered}
     passed: list[tuple[float, Images, Contradiction]] = []
     for images, contradiction, penalty in _list_orders(sequence):
         score = _score_order(sequence, readers, likeness, images)
         if score is not None:
-            score += NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in named_by_steps) - penalty
+            score += (
+                NAMED_BY_STEPS * ((contradiction.cause, contradiction.value) in named_by_steps)
+                - penalty
+            )
             passed.append((score, images, contradiction))
     for score, images, contradiction in sorted(passed, key=lambda order: -round(order[0] / 0.02)):
         ordered = not any(steps.detect_misplaced_steps(axis, images) for axis in sequence.axes)
@@ -154,7 +180,10 @@ def search_order(
 
 
 def _score_order(
-    sequence: PatternSequence, readers: dict[Axis, AxisReader], likeness: FrameLikeness, images: Images
+    sequence: PatternSequence,
+    readers: dict[Axis, AxisReader],
+    likeness: FrameLikeness,
+    images: Images,
 ) -> float | None:
     """Return the sum of the agreement shares of all axes in this order of the images.
 
@@ -163,7 +192,10 @@ def _score_order(
     if not all(map(likeness.is_even, range(len(images)), images)):
         return None
     described = {axis: described_frames(sequence, axis, images) for axis in sequence.axes}
-    if any(_is_refuted(readers[axis], own) and readers[axis].is_in_view(own) for axis, own in described.items()):
+    if any(
+        _is_refuted(readers[axis], own) and readers[axis].is_in_view(own)
+        for axis, own in described.items()
+    ):
         return None
     score, is_any_supported = 0.0, False
     for axis, frames in described.items():
@@ -178,17 +210,22 @@ def _score_order(
 
 
 def _is_refuted(reader: AxisReader, frames: AxisFrames) -> bool:
-    """Return whether the Gray code alone, or the levels of a small part of the sample, certainly fail a test.
+    """Return whether the Gray code alone, or the levels of a small part of the sample, certainly
+    fail a test.
 
     This takes a fraction of the time that all tests take, and excludes most orders.
     """
     if frames.bits:
         return not is_proven(frames, measure_code_agreement(reader, frames))
-    return min(measure_agreement(reader.coarse, frames).level_common, default=1.0) < SURE - COARSE_MARGIN
+    return (
+        min(measure_agreement(reader.coarse, frames).level_common, default=1.0)
+        < SURE - COARSE_MARGIN
+    )
 
 
 def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradiction, float]]:
-    """Yield hypotheses of the frame order, the simplest first: lag, exchange, repetition, or a missing frame.
+    """Yield hypotheses of the frame order, the simplest first: lag, exchange, repetition, or a
+    missing frame.
 
     Each is (image of each frame, None for a missing one; the contradiction to report; a penalty).
     """
@@ -197,22 +234,32 @@ def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradict
         images: Images = tuple(i + lag if 0 <= i + lag < n else None for i in range(n))
         count = "one image" if abs(lag) == 1 else f"{abs(lag)} images"
         way = (
-            "late, so that each shows the pattern before its own: let the camera wait longer after each pattern, or "
-            "switch its buffering off, where it hands out old images (the preflight shows which)"
+            "late, so that each shows the pattern before its own: let the camera wait longer after"
+            " each pattern, or switch its buffering off, where it hands out old images (the"
+            " preflight shows which)"
             if lag > 0
-            else "early, so that each shows the pattern after its own, and the first is missing: let the camera begin "
-            "with the first pattern"
+            else (
+                "early, so that each shows the pattern after its own, and the first is missing: let"
+                " the camera begin with the first pattern"
+            )
         )
         text = f"all frames are {count} {way}; capture again, or move the files by {count}"
-        # Without its first bit an inverted code is a code as well: the fewer images are lost, the better.
+        # Without its first bit an inverted code is a code as well: the fewer images are lost, the
+        # better.
         yield images, Contradiction("frame-lag", text, None, float(lag)), 0.04 * (abs(lag) - 1)
     every = tuple(range(n))
     lagging = (
-        "from frame {0} on the camera is one image behind the projector, and image {0} repeats the one before: capture "
-        "again"
+        "from frame {0} on the camera is one image behind the projector, and image {0} repeats the"
+        " one before: capture again"
     )
-    missing = "frame {0} is missing, and those that follow come one place too early: add the image, or capture again"
-    foreign = "frame {0} does not show the pattern described for it: look at this image, and capture again"
+    missing = (
+        "frame {0} is missing, and those that follow come one place too early: add the image, or"
+        " capture again"
+    )
+    foreign = (
+        "frame {0} does not show the pattern described for it: look at this image, and capture"
+        " again"
+    )
     swapped = "frames {0} and {1} have changed places: exchange these two files, or capture again"
 
     def describe(cause: str, text: str, k: int) -> Contradiction:
@@ -230,4 +277,6 @@ def _list_orders(sequence: PatternSequence) -> Iterator[tuple[Images, Contradict
 
 def _lacks_steps(frames: AxisFrames) -> bool:
     """Return whether so many steps are missing that the periods of an axis cannot be compared."""
-    return not frames.bits and any(sum(image is not None for image in images) < 3 for _, images in frames.shifts)
+    return not frames.bits and any(
+        sum(image is not None for image in images) < 3 for _, images in frames.shifts
+    )

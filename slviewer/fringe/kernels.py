@@ -1,7 +1,8 @@
 """Phase shift, compiled; `reference` is the definition that it must agree with.
 
-A row of the image at a time, so that sums and codes stay in the cache while each frame is read once. Loops over a row
-have no branches and no library calls: the compiler turns them into vector instructions.
+A row of the image at a time, so that sums and codes stay in the cache while each frame is read
+once. Loops over a row have no branches and no library calls: the compiler turns them into vector
+instructions.
 """
 
 from typing import NamedTuple
@@ -31,10 +32,11 @@ HALF_PI, PI = np.float32(np.pi / 2), np.float32(np.pi)
 class Steps(NamedTuple):
     """Frames of a phase shift, four to a line, with the weights of their samples.
 
-    Of a line (p, q, r, s) with weights a and b, a (p - r - q + s) is added to the cosines' sum and b (p - r + q - s) to
-    the sines'. Steps k, n/2 - k, n/2 + k and n - k share their cosine and sine but for signs: one product serves four
-    frames. The first frame stands in where there are fewer. ``first``: its index; ``counted``: how often all frames are
-    read. ``turn_cosine`` and ``turn_sine``: of the phase offset, by which the sums are rotated back.
+    Of a line (p, q, r, s) with weights a and b, a (p - r - q + s) is added to the cosines' sum and
+    b (p - r + q - s) to the sines'. Steps k, n/2 - k, n/2 + k and n - k share their cosine and sine
+    but for signs: one product serves four frames. The first frame stands in where there are fewer.
+    ``first``: its index; ``counted``: how often all frames are read. ``turn_cosine`` and
+    ``turn_sine``: of the phase offset, by which the sums are rotated back.
     """
 
     frames: np.ndarray
@@ -50,8 +52,8 @@ class Steps(NamedTuple):
 class Shifts(NamedTuple):
     """`Steps` of all periods, longest first.
 
-    Period i has the lines ``starts[i]`` to ``starts[i + 1]``, and entry i of ``first``, ``steps`` and ``counted``; the
-    phase offset is that of all.
+    Period i has the lines ``starts[i]`` to ``starts[i + 1]``, and entry i of ``first``, ``steps``
+    and ``counted``; the phase offset is that of all.
     """
 
     frames: np.ndarray
@@ -71,7 +73,16 @@ def select_period(shifts, i):
     a, b = shifts.starts[i], shifts.starts[i + 1]
     lines = shifts.frames[a:b], shifts.cosines[a:b], shifts.sines[a:b]
     turn = shifts.turn_cosine, shifts.turn_sine
-    return Steps(lines[0], lines[1], lines[2], shifts.first[i], shifts.steps[i], shifts.counted[i], turn[0], turn[1])
+    return Steps(
+        lines[0],
+        lines[1],
+        lines[2],
+        shifts.first[i],
+        shifts.steps[i],
+        shifts.counted[i],
+        turn[0],
+        turn[1],
+    )
 
 
 class Scale(NamedTuple):
@@ -121,22 +132,30 @@ def prefetch_row(stack, frame, row):
 
 @numba.njit
 def combine_samples(a, b, c, d):
-    """Combine the samples (p, q, r, s) of a line of `Steps`: sum, p - r - q + s, p - r + q - s, and the largest."""
-    ac, bd = subtract_fixed_width(to_signed(a), to_signed(c)), subtract_fixed_width(to_signed(b), to_signed(d))
-    total = add_fixed_width(add_fixed_width(to_signed(a), to_signed(b)), add_fixed_width(to_signed(c), to_signed(d)))
+    """Combine the samples (p, q, r, s) of a line of `Steps`: sum, p - r - q + s, p - r + q - s, and
+    the largest."""
+    ac, bd = (
+        subtract_fixed_width(to_signed(a), to_signed(c)),
+        subtract_fixed_width(to_signed(b), to_signed(d)),
+    )
+    total = add_fixed_width(
+        add_fixed_width(to_signed(a), to_signed(b)), add_fixed_width(to_signed(c), to_signed(d))
+    )
     return total, subtract_fixed_width(ac, bd), add_fixed_width(ac, bd), max(max(a, b), max(c, d))
 
 
 @numba.njit
 def add_four(a, b, c, d, cos_a, sin_a):
-    """Return what one line adds to the sums of samples, cosines and sines, and its largest sample."""
+    """Return what one line adds to the sums of samples, cosines and sines, and its largest
+    sample."""
     total, even, odd, peak = combine_samples(a, b, c, d)
     return np.float32(total), cos_a * np.float32(even), sin_a * np.float32(odd), peak
 
 
 @numba.njit
 def add_eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
-    """Return what two lines add to the sums of samples, cosines and sines, and their largest sample."""
+    """Return what two lines add to the sums of samples, cosines and sines, and their largest
+    sample."""
     one, even, odd, peak = combine_samples(a, b, c, d)
     two, even_e, odd_e, peak_e = combine_samples(e, f, g, h)
     cosine = fma(cos_a, np.float32(even), cos_e * np.float32(even_e))
@@ -146,17 +165,25 @@ def add_eight(a, b, c, d, e, f, g, h, cos_a, sin_a, cos_e, sin_e):
 
 @numba.njit(inline="always")
 def sums_row(stack, shift, row, cosine, sine, total, peak):
-    """Sum the samples of one image row, weighted by cosines and sines; also the sum of all samples and the largest one.
+    """Sum the samples of one image row, weighted by cosines and sines; also the sum of all samples
+    and the largest one.
 
-    Fills ``cosine``, ``sine``, ``total`` (w,) float32, the last as the `Steps` count the samples, and ``peak`` (w,) of
-    the frames' dtype.
+    Fills ``cosine``, ``sine``, ``total`` (w,) float32, the last as the `Steps` count the samples,
+    and ``peak`` (w,) of the frames' dtype.
     """
     width, lines = stack.shape[2], len(shift.cosines)
-    for k in range(0, lines - 1, 2):  # two lines to a pass: the sums are read and written less often
+    for k in range(
+        0, lines - 1, 2
+    ):  # two lines to a pass: the sums are read and written less often
         i, j = shift.frames[k], shift.frames[k + 1]
         a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
         e, f, g, h = stack[j[0], row], stack[j[1], row], stack[j[2], row], stack[j[3], row]
-        cos_a, sin_a, cos_e, sin_e = shift.cosines[k], shift.sines[k], shift.cosines[k + 1], shift.sines[k + 1]
+        cos_a, sin_a, cos_e, sin_e = (
+            shift.cosines[k],
+            shift.sines[k],
+            shift.cosines[k + 1],
+            shift.sines[k + 1],
+        )
         for q in range(4):
             prefetch_row(stack, i[q], row)
             prefetch_row(stack, j[q], row)
@@ -180,7 +207,9 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
             prefetch_row(stack, i[q], row)
         if k == 0:
             for x in range(width):
-                total[x], cosine[x], sine[x], peak[x] = add_four(a[x], b[x], c[x], d[x], cos_a, sin_a)
+                total[x], cosine[x], sine[x], peak[x] = add_four(
+                    a[x], b[x], c[x], d[x], cos_a, sin_a
+                )
         else:
             for x in range(width):
                 all_x, cos_x, sin_x, peak_x = add_four(a[x], b[x], c[x], d[x], cos_a, sin_a)
@@ -200,9 +229,17 @@ def shift_row(stack, shift, row, wrapped, modulation, background, peak):
     ``peak`` is of the frames' dtype, the others are float32.
     """
     width, first = stack.shape[2], stack[shift.first, row]
-    cosine, sine, total = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    cosine, sine, total = (
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+        np.empty(width, np.float32),
+    )
     sums_row(stack, shift, row, cosine, sine, total, peak)
-    per_two, per_one, counted = np.float32(2 / shift.steps), np.float32(1 / shift.steps), np.float32(shift.counted)
+    per_two, per_one, counted = (
+        np.float32(2 / shift.steps),
+        np.float32(1 / shift.steps),
+        np.float32(shift.counted),
+    )
     for x in range(width):
         wrapped[x] = arctan2(ZERO - sine[x], cosine[x])
         modulation[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
@@ -218,7 +255,8 @@ def is_dark(modulation, background, scale):
 
 @numba.njit
 def is_dark_squared(squared, background, scale):
-    """Return whether the modulation, given as its square, is too small for the noise at this brightness."""
+    """Return whether the modulation, given as its square, is too small for the noise at this
+    brightness."""
     sigmas = np.float32(scale.dark_sigmas)
     variance = np.float32(scale.noise_a) + np.float32(scale.noise_b) * background
     levels = np.float32(scale.dark_levels)
@@ -227,8 +265,11 @@ def is_dark_squared(squared, background, scale):
 
 @numba.njit
 def is_clipped(modulation, background, peak, scale):
-    """Return whether the fringe reaches the white level, in a sample and as fitted: noise alone does not do both."""
-    return (np.float32(peak) >= np.float32(scale.white)) & (background + modulation >= np.float32(scale.white))
+    """Return whether the fringe reaches the white level, in a sample and as fitted: noise alone
+    does not do both."""
+    return (np.float32(peak) >= np.float32(scale.white)) & (
+        background + modulation >= np.float32(scale.white)
+    )
 
 
 @numba.njit
@@ -252,6 +293,7 @@ def bit_height(stack, frames, inverses, bit, row, x, threshold):
 
 @numba.njit(inline="always")
 def allocate_five(width):
-    """Allocate five rows of float32; separate arrays, so that the compiler knows that none overlap."""
+    """Allocate five rows of float32; separate arrays, so that the compiler knows that none
+    overlap."""
     a, b, c = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     return a, b, c, np.empty(width, np.float32), np.empty(width, np.float32)

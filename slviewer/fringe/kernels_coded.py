@@ -1,4 +1,5 @@
-"""Decoding of Gray code with a phase shift, compiled; `reference` is the definition that it must agree with."""
+"""Decoding of Gray code with a phase shift, compiled; `reference` is the definition that it must
+agree with."""
 
 from typing import NamedTuple
 
@@ -30,15 +31,19 @@ from slviewer.fringe.kernels import (
 from slviewer.geometry.jit import fma, kernel, read_only, run_rows
 
 EDGE, FAR_EDGE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE)
-WEAK, WEAKER, UNDECIDED = np.float32(limits.WEAK_BIT / 2), np.float32(limits.WEAKER), np.float32(limits.UNDECIDED_BIT)
+WEAK, WEAKER, UNDECIDED = (
+    np.float32(limits.WEAK_BIT / 2),
+    np.float32(limits.WEAKER),
+    np.float32(limits.UNDECIDED_BIT),
+)
 
 
 class CodeRules(NamedTuple):
     """Frames and origin of a Gray code that numbers the periods of a phase shift.
 
-    ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or none;
-    ``complementary``: that of the complementary bit, or -1. Code 0 begins ``origin_turns`` periods from phase 0;
-    ``mean``: see `threshold`.
+    ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or
+    none; ``complementary``: that of the complementary bit, or -1. Code 0 begins ``origin_turns``
+    periods from phase 0; ``mean``: see `threshold`.
     """
 
     gray: np.ndarray
@@ -50,28 +55,35 @@ class CodeRules(NamedTuple):
 
 @numba.njit
 def read_bit(value, level, digit, over_least, under_most, at_one, at_nought, full):
-    """Read one Gray bit: return the next binary digit and the updated extremes of the samples so far.
+    """Read one Gray bit: return the next binary digit and the updated extremes of the samples so
+    far.
 
-    The digit is the parity of all Gray bits so far. The extremes, see `code_row`, are the least sample above the level
-    and the largest below it, and the last samples at a 1 and at a 0.
+    The digit is the parity of all Gray bits so far. The extremes, see `code_row`, are the least
+    sample above the level and the largest below it, and the last samples at a 1 and at a 0.
     """
     over = value > level
     one = np.uint8(digit ^ np.uint8(over))
     over_least = min(over_least, value if over else full)
     under_most = max(under_most, under_most if over else value)
-    return one, over_least, under_most, value if one != 0 else at_one, at_nought if one != 0 else value
+    return (
+        one,
+        over_least,
+        under_most,
+        value if one != 0 else at_one,
+        at_nought if one != 0 else value,
+    )
 
 
 @numba.njit(inline="always")
 def code_row(stack, frames, inverses, row, threshold, code, least, top, bottom, lower, upper):
     """Read the binary code of one image row, and the heights of its bits above their threshold.
 
-    Fills ``code`` (w,) and, in grey levels (w,): ``least``, the smallest height in size; ``top``, the highest, at least
-    0; ``bottom``, the lowest, at most 0; and the heights of the bits that change at the ``lower`` and at the ``upper``
-    edge of the code.
+    Fills ``code`` (w,) and, in grey levels (w,): ``least``, the smallest height in size; ``top``,
+    the highest, at least 0; ``bottom``, the lowest, at most 0; and the heights of the bits that
+    change at the ``lower`` and at the ``upper`` edge of the code.
 
-    From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1 that of its last 0. A
-    code without such a bit has no such edge: infinite.
+    From k - 1 to k the Gray bit changes at whose place k has its last binary 1; from k to k + 1
+    that of its last 0. A code without such a bit has no such edge: infinite.
     """
     if len(inverses):
         opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, lower, upper)
@@ -107,7 +119,8 @@ def opposed_code_row(stack, frames, inverses, row, code, least, top, bottom, low
 def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lower, upper):
     """Read the binary code of one image row from bits and their threshold, see `code_row`."""
     width = stack.shape[2]
-    # Against one threshold the frames' own numbers can be compared: four times as many fit a register.
+    # Against one threshold the frames' own numbers can be compared: four times as many fit a
+    # register.
     grey = stack.dtype.type
     full = grey(65535 if stack.itemsize == 2 else 255)
     level, bits = np.empty(width, stack.dtype), np.empty(width, np.uint8)
@@ -127,7 +140,14 @@ def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lowe
             for x in range(width):
                 value, digit = frame[x], np.uint8(bits[x] & 1)
                 one, over_least[x], under_most[x], at_one[x], at_nought[x] = read_bit(
-                    value, level[x], digit, over_least[x], under_most[x], at_one[x], at_nought[x], full
+                    value,
+                    level[x],
+                    digit,
+                    over_least[x],
+                    under_most[x],
+                    at_one[x],
+                    at_nought[x],
+                    full,
                 )
                 bits[x] = np.uint8(np.uint8(bits[x] + bits[x]) | one)
                 most[x], fewest[x] = max(most[x], value), min(fewest[x], value)
@@ -138,19 +158,33 @@ def plain_code_row(stack, frames, row, threshold, code, least, top, bottom, lowe
             for x in range(width):
                 value, after, digit = frame[x], other[x], np.uint8(bits[x] & 1)
                 one, least_x, most_x, one_x, nought_x = read_bit(
-                    value, level[x], digit, over_least[x], under_most[x], at_one[x], at_nought[x], full
+                    value,
+                    level[x],
+                    digit,
+                    over_least[x],
+                    under_most[x],
+                    at_one[x],
+                    at_nought[x],
+                    full,
                 )
                 two, over_least[x], under_most[x], at_one[x], at_nought[x] = read_bit(
                     after, level[x], one, least_x, most_x, one_x, nought_x, full
                 )
                 so_far = np.uint8(np.uint8(bits[x] + bits[x]) | one)
                 bits[x] = np.uint8(np.uint8(so_far + so_far) | two)
-                most[x], fewest[x] = max(most[x], max(value, after)), min(fewest[x], min(value, after))
+                most[x], fewest[x] = (
+                    max(most[x], max(value, after)),
+                    min(fewest[x], min(value, after)),
+                )
         more, held = np.int32(1 << (last - start)), np.uint8((1 << (last - start)) - 1)
         for x in range(width):
             code[x] = np.int32(np.int32(code[x] * more) + np.int32(np.uint8(bits[x] & held)))
     for x in range(width):
-        level_x, nearest_over, nearest_under = threshold[x], np.float32(over_least[x]), np.float32(under_most[x])
+        level_x, nearest_over, nearest_under = (
+            threshold[x],
+            np.float32(over_least[x]),
+            np.float32(under_most[x]),
+        )
         above = nearest_over - level_x if most[x] > level[x] else ENDLESS
         below = level_x - nearest_under if fewest[x] <= level[x] else ENDLESS
         least[x] = min(above, below)
@@ -183,7 +217,9 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             whole = np.floor(turns)
             part = turns - whole
             last = np.float32(extra[x]) - A[x]
-            cell = np.int32(np.int32(code[x] + code[x]) + np.int32(np.int32(code[x] & 1) ^ np.int32(last > 0)))
+            cell = np.int32(
+                np.int32(code[x] + code[x]) + np.int32(np.int32(code[x] & 1) ^ np.int32(last > 0))
+            )
             middle = (part >= QUARTER) & (part < THREE_QUARTERS)
             beside = np.int32(np.int32(np.int32(cell + 1) >> 1) - np.int32(part >= THREE_QUARTERS))
             order = np.int32(cell >> 1) if middle else beside
@@ -201,9 +237,13 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
             unclear = (least[x] < UNDECIDED * B[x]) & (part >= EDGE) & (part < FAR_EDGE)
             dark, clipped = is_dark(B[x], A[x], scale), is_clipped(B[x], A[x], peak[x], scale)
             reason[x] = select_reason(dark, clipped, unclear)
-            # On a blurred edge the bit nearest the middle and the phase may disagree about the side: the phase decides.
+            # On a blurred edge the bit nearest the middle and the phase may disagree about the
+            # side: the phase decides.
             contrast = max(top[x] * per_rest, ZERO - bottom[x] * per_mean)
-            below, above = abs(lower[x] - off_middle * contrast), abs(upper[x] - off_middle * contrast)
+            below, above = (
+                abs(lower[x] - off_middle * contrast),
+                abs(upper[x] - off_middle * contrast),
+            )
             ahead = (part < EDGE) & (above < WEAK * contrast) & (above < WEAKER * below)
             behind = (part >= FAR_EDGE) & (below < WEAK * contrast) & (below < WEAKER * above)
             periods = np.float32(code[x]) - whole
@@ -217,7 +257,11 @@ def coded_row(stack, row, scale, rules, psi, B, A, peak, code, buffers, phase, r
 def coded_rows(stack, shifts, scale, rules, first, phase, wrapped, modulation, background, reason):
     """Decode rows from ``first`` on, see `decode_coded`; the five maps contain only these rows."""
     width, steps = stack.shape[2], select_period(shifts, 0)
-    peak, code, buffers = np.empty(width, stack.dtype), np.empty(width, np.int32), allocate_five(width)
+    peak, code, buffers = (
+        np.empty(width, stack.dtype),
+        np.empty(width, np.int32),
+        allocate_five(width),
+    )
     for i in range(len(phase)):
         row, psi, B, A = first + i, wrapped[i], modulation[i], background[i]
         shift_row(stack, steps, row, psi, B, A, peak)
@@ -229,8 +273,8 @@ def decode_coded(
 ) -> None:
     """Decode the phase shift of one period with a plain or complementary Gray code.
 
-    Fills the five (h, w) ``maps``: phase, wrapped phase, modulation, background and reason. The phase is NaN where the
-    reason is not VALID, here as in the other kernels.
+    Fills the five (h, w) ``maps``: phase, wrapped phase, modulation, background and reason. The
+    phase is NaN where the reason is not VALID, here as in the other kernels.
     """
     stack = read_only(stack)
 

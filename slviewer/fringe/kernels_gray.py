@@ -14,9 +14,9 @@ TWO_PI = 2 * np.pi
 class GrayRules(NamedTuple):
     """Frames and cells of a Gray code without phase steps.
 
-    ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or none; ``white`` and
-    ``black``: frames, or -1. Cells of ``cell`` px begin at ``origin`` px; the projector ends at ``high`` px.
-    ``sigma_part``: noise of a bit over that of a grey level.
+    ``gray``, ``inverse``: frames of the bits, most significant first, and of their inverses, or
+    none; ``white`` and ``black``: frames, or -1. Cells of ``cell`` px begin at ``origin`` px; the
+    projector ends at ``high`` px. ``sigma_part``: noise of a bit over that of a grey level.
     """
 
     gray: np.ndarray
@@ -29,7 +29,9 @@ class GrayRules(NamedTuple):
     sigma_part: float
 
 
-def decode_gray(stack: np.ndarray, scale: Scale, rules: GrayRules, maps: tuple[np.ndarray, ...]) -> None:
+def decode_gray(
+    stack: np.ndarray, scale: Scale, rules: GrayRules, maps: tuple[np.ndarray, ...]
+) -> None:
     """Decode the projector's column or row from Gray bits alone.
 
     Fills the five (h, w) ``maps``, see `kernels_coded.decode_coded`; the wrapped phase is NaN.
@@ -38,7 +40,9 @@ def decode_gray(stack: np.ndarray, scale: Scale, rules: GrayRules, maps: tuple[n
 
 
 @kernel()
-def _decode_gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulation, background, reason):
+def _decode_gray_rows(
+    start, stop, stack, scale, rules, phase, wrapped, modulation, background, reason
+):
     """Decode a range of rows, see `decode_gray`."""
     gray, inverse, white, black = rules.gray, rules.inverse, rules.white, rules.black
     width = stack.shape[2]
@@ -51,13 +55,21 @@ def _decode_gray_rows(start, stop, stack, scale, rules, phase, wrapped, modulati
                 B, A = (bright - dim) * HALF, (bright + dim) * HALF
             else:
                 for b in range(len(gray)):
-                    bright, dim = np.float32(stack[gray[b], row, x]), np.float32(stack[inverse[b], row, x])
+                    bright, dim = (
+                        np.float32(stack[gray[b], row, x]),
+                        np.float32(stack[inverse[b], row, x]),
+                    )
                     B += abs(bright - dim)
                     A += bright + dim
                 B *= np.float32(0.5 / len(gray))
                 A *= np.float32(0.5 / len(gray))
-            sigma = np.sqrt(np.float32(scale.noise_a) + np.float32(scale.noise_b) * A) * np.float32(rules.sigma_part)
-            limit = max(np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma, np.float32(limits.GRAY_UNDECIDED_PART) * B)
+            sigma = np.sqrt(np.float32(scale.noise_a) + np.float32(scale.noise_b) * A) * np.float32(
+                rules.sigma_part
+            )
+            limit = max(
+                np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma,
+                np.float32(limits.GRAY_UNDECIDED_PART) * B,
+            )
             code, other, bit, flipped, doubts = 0, 0, 0, 0, 0
             for b in range(len(gray)):
                 bit_above = bit_height(stack, gray, inverse, b, row, x, A)

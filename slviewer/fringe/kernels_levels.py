@@ -30,12 +30,13 @@ PER_RAD = 1 / (2 * np.pi)
 class Ladder(NamedTuple):
     """Levels by which several periods are unwrapped to one absolute phase.
 
-    ``weights`` (levels, m) of the m wrapped phases and ``periods`` (levels,) px describe the levels, longest first.
-    ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and `levels.cell_misfit`.
+    ``weights`` (levels, m) of the m wrapped phases and ``periods`` (levels,) px describe the
+    levels, longest first. ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and
+    `levels.cell_misfit`.
 
-    The first level begins at ``low`` px, or, where there are Gray ``bits``, is unwrapped by the cells that they number:
-    frames (b,), most significant bit first, and of their ``inverses``, -1 for none. Cells of ``cell`` px begin at
-    ``origin``; ``mean``: see `threshold`.
+    The first level begins at ``low`` px, or, where there are Gray ``bits``, is unwrapped by the
+    cells that they number: frames (b,), most significant bit first, and of their ``inverses``, -1
+    for none. Cells of ``cell`` px begin at ``origin``; ``mean``: see `threshold`.
     """
 
     weights: np.ndarray
@@ -52,7 +53,8 @@ class Ladder(NamedTuple):
 
 @numba.njit(inline="always")
 def read_cell_bits(stack, row, x, threshold, bits, inverses, heights):
-    """Read the Gray bits of a pixel, whose ``heights`` (b,) it fills; return their code, the highest and the lowest."""
+    """Read the Gray bits of a pixel, whose ``heights`` (b,) it fills; return their code, the
+    highest and the lowest."""
     code, bit, top, bottom = 0, 0, ZERO, ZERO
     for b in range(len(bits)):
         value = np.float32(stack[bits[b], row, x])
@@ -67,10 +69,11 @@ def read_cell_bits(stack, row, x, threshold, bits, inverses, heights):
 
 @numba.njit
 def cell_row(stack, row, B, A, ladder, heights, cell, worst):
-    """Compute the coordinates px of the cells of one row that the bits number, or of the border that a pixel is at.
+    """Compute the coordinates px of the cells of one row that the bits number, or of the border
+    that a pixel is at.
 
-    Fills ``cell`` (w,) and ``worst`` (w,): infinite where a bit that does not change at the border is undecided, else
-    0.
+    Fills ``cell`` (w,) and ``worst`` (w,): infinite where a bit that does not change at the border
+    is undecided, else 0.
     """
     bits, inverses = ladder.bits, ladder.inverses
     last = len(bits) - 1
@@ -101,15 +104,18 @@ def cell_row(stack, row, B, A, ladder, heights, cell, worst):
 
 
 @numba.njit(inline="always")
-def levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase, reason):
+def levels_row(
+    psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase, reason
+):
     """Compute the absolute phase and the reason of one row from its (m, w) wrapped phases.
 
     ``coordinate`` ... ``worst`` (w,) are buffers.
 
-    ``cell``: the coordinates px (w,) near which the first level's are, with ``worst`` infinite where they are not
-    known; empty where the first level begins at ``low`` instead. ``weakest``: the smallest square of a modulation.
-    float32 represents a coordinate to some 1e-4 px, enough to separate whole periods; the phase itself is never
-    computed from a coordinate. Loops run along the row, which the compiler turns into vector instructions.
+    ``cell``: the coordinates px (w,) near which the first level's are, with ``worst`` infinite
+    where they are not known; empty where the first level begins at ``low`` instead. ``weakest``:
+    the smallest square of a modulation. float32 represents a coordinate to some 1e-4 px, enough to
+    separate whole periods; the phase itself is never computed from a coordinate. Loops run along
+    the row, which the compiler turns into vector instructions.
     """
     count, width = psi.shape
     low, misfit = np.float32(ladder.low), np.float32(ladder.misfit)
@@ -170,11 +176,12 @@ def allocate_levels(width):
 
 @numba.njit(inline="always")
 def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
-    """Compute the wrapped phases of all periods of one row, and modulation and background of the finest.
+    """Compute the wrapped phases of all periods of one row, and modulation and background of the
+    finest.
 
-    Fills ``psi`` (m, w), ``out`` (the finest wrapped phase), modulation ``B`` and background ``A`` (w,); ``clipped``
-    and ``weakest`` of the ``buffers`` are of all periods. The other periods' modulations are compared as squares, which
-    avoids their roots.
+    Fills ``psi`` (m, w), ``out`` (the finest wrapped phase), modulation ``B`` and background ``A``
+    (w,); ``clipped`` and ``weakest`` of the ``buffers`` are of all periods. The other periods'
+    modulations are compared as squares, which avoids their roots.
     """
     clipped, weakest, _, _, _, _, cosine, sine, total = buffers
     width, white = stack.shape[2], np.float32(scale.white)
@@ -184,7 +191,11 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
         steps = select_period(shifts, i)
         sums_row(stack, steps, row, cosine, sine, total, peak)
         first, wrapped = stack[steps.first, row], psi[i]
-        per_two, per_one, counted = np.float32(2 / steps.steps), np.float32(1 / steps.steps), np.float32(steps.counted)
+        per_two, per_one, counted = (
+            np.float32(2 / steps.steps),
+            np.float32(1 / steps.steps),
+            np.float32(steps.counted),
+        )
         for x in range(width):
             wrapped[x] = arctan2(ZERO - sine[x], cosine[x])
             level = np.float32(first[x])
@@ -201,10 +212,16 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
 
 
 @kernel()
-def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason):
+def levels_rows(
+    stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason
+):
     """Decode rows from ``first`` on, see `decode_levels`; the five maps contain only these rows."""
     count, width, bits = len(shifts.steps), stack.shape[2], len(ladder.bits)
-    psi, peak, buffers = np.empty((count, width), np.float32), np.empty(width, stack.dtype), allocate_levels(width)
+    psi, peak, buffers = (
+        np.empty((count, width), np.float32),
+        np.empty(width, stack.dtype),
+        allocate_levels(width),
+    )
     clipped, weakest, coordinate, order, own, worst, _, _, _ = buffers
     heights, cell = np.empty(bits, np.float32), np.empty(width if bits else 0, np.float32)
     for i in range(len(phase)):
@@ -212,7 +229,21 @@ def levels_rows(stack, shifts, ladder, scale, first, phase, wrapped, modulation,
         phases_row(stack, shifts, scale, first + i, psi, wrapped[i], B, A, peak, buffers)
         if bits:
             cell_row(stack, first + i, B, A, ladder, heights, cell, worst)
-        levels_row(psi, ladder, weakest, A, clipped, scale, cell, coordinate, order, own, worst, phase[i], reason[i])
+        levels_row(
+            psi,
+            ladder,
+            weakest,
+            A,
+            clipped,
+            scale,
+            cell,
+            coordinate,
+            order,
+            own,
+            worst,
+            phase[i],
+            reason[i],
+        )
 
 
 def decode_levels(

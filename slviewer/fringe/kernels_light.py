@@ -8,10 +8,11 @@ from slviewer.geometry.jit import kernel
 
 @kernel(parallel=True)
 def equalize(stack, frames, gain, offset, along_rows, along_columns, albedo, scale, out):
-    """Fill ``out`` (k, h, w) uint16: frames (k,) of the stack less their room light, over their gain, times ``scale``.
+    """Fill ``out`` (k, h, w) uint16: frames (k,) of the stack less their room light, over their
+    gain, times ``scale``.
 
-    ``gain`` (k, h); room light ``offset[k] + albedo (along_rows[k, y] + along_columns[k] (x / (w - 1) - 0.5))``, with
-    ``albedo`` (h, w), or (0, 0) where there is none in proportion to it.
+    ``gain`` (k, h); room light ``offset[k] + albedo (along_rows[k, y] + along_columns[k] (x / (w -
+    1) - 0.5))``, with ``albedo`` (h, w), or (0, 0) where there is none in proportion to it.
     """
     _, height, width = stack.shape
     per_column = np.float32(1.0 / max(width - 1, 1))
@@ -23,7 +24,9 @@ def equalize(stack, frames, gain, offset, along_rows, along_columns, albedo, sca
             if len(albedo):
                 a, b = np.float32(along_rows[k, row]), np.float32(along_columns[k])
                 for x in range(width):
-                    room_light = added + albedo[row, x] * (a + b * (np.float32(x) * per_column - np.float32(0.5)))
+                    room_light = added + albedo[row, x] * (
+                        a + b * (np.float32(x) * per_column - np.float32(0.5))
+                    )
                     level = (np.float32(source[x]) - room_light) * times + np.float32(0.5)
                     target[x] = np.uint16(min(max(level, np.float32(0)), np.float32(65534)))
             else:

@@ -1,8 +1,10 @@
-"""Spikes of one period and pixels without support, compiled: the rule of a pixel, and kernels that apply it to a map.
+"""Spikes of one period and pixels without support, compiled: the rule of a pixel, and kernels that
+apply it to a map.
 
-The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`); `reference_spikes` is the
-definition that it must agree with. All changes are listed before the first is made, because a pixel's neighbours vote
-with their original phase. Nearly every pixel agrees with its four neighbours, and is skipped at the speed of memory.
+The rule is also compiled for CUDA devices (`geometry.cuda_device.device_function`);
+`reference_spikes` is the definition that it must agree with. All changes are listed before the
+first is made, because a pixel's neighbours vote with their original phase. Nearly every pixel
+agrees with its four neighbours, and is skipped at the speed of memory.
 """
 
 import math
@@ -17,11 +19,19 @@ from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.phase import Reason
 from slviewer.geometry.jit import kernel, run_rows
 
-INCONSISTENT, OUTSIDE, UNCHANGED = np.uint8(Reason.INCONSISTENT), np.uint8(Reason.OUTSIDE), np.uint8(0)
+INCONSISTENT, OUTSIDE, UNCHANGED = (
+    np.uint8(Reason.INCONSISTENT),
+    np.uint8(Reason.OUTSIDE),
+    np.uint8(0),
+)
 UP, DOWN = np.uint8(1), np.uint8(2)
 TURN, PER_TURN = np.float32(2 * math.pi), np.float32(0.5 / math.pi)
 HALF, ONE, INVALID = np.float32(0.5), np.float32(1), np.float32(math.nan)
-EDGE, FAR_EDGE, WHOLE = np.float32(limits.EDGE), np.float32(1 - limits.EDGE), np.float32(limits.WHOLE_PERIOD)
+EDGE, FAR_EDGE, WHOLE = (
+    np.float32(limits.EDGE),
+    np.float32(1 - limits.EDGE),
+    np.float32(limits.WHOLE_PERIOD),
+)
 WINDOW, MAJORITY, NEIGHBOURS = limits.WINDOW, limits.SPIKE_MAJORITY, limits.SPIKE_NEIGHBOURS
 LONELY, LONELY_NEIGHBOURS = limits.LONELY, limits.LONELY_NEIGHBOURS
 RUN = 8
@@ -29,11 +39,13 @@ RUN = 8
 
 
 class SpikeRules(NamedTuple):
-    """Parameters of a layout that the decision about a pixel from its neighbourhood needs; thresholds are in `limits`.
+    """Parameters of a layout that the decision about a pixel from its neighbourhood needs;
+    thresholds are in `limits`.
 
-    ``cell_rad``: the phase by which neighbours differ that count as a cell apart; ``is_plain``: the order comes from a
-    plain Gray code, whose edges are at ``origin_rad``; ``low_rad`` and ``high_rad``: phases of the projector's borders,
-    a tolerance outside, infinite for a relative phase, which repeats after ``repeat`` cells.
+    ``cell_rad``: the phase by which neighbours differ that count as a cell apart; ``is_plain``: the
+    order comes from a plain Gray code, whose edges are at ``origin_rad``; ``low_rad`` and
+    ``high_rad``: phases of the projector's borders, a tolerance outside, infinite for a relative
+    phase, which repeats after ``repeat`` cells.
     """
 
     cell_rad: float
@@ -48,13 +60,22 @@ def spike_rules(layout: Layout) -> SpikeRules:
     """Return the rules for the phases of a layout."""
     period = 2 * np.pi
     # Gray code alone has no period: neighbouring cells agree
-    cell = period if layout.shifts else period * max(limits.GRAY_CELL_PX / layout.gray_cell_px, limits.GRAY_CELLS)
+    cell = (
+        period
+        if layout.shifts
+        else period * max(limits.GRAY_CELL_PX / layout.gray_cell_px, limits.GRAY_CELLS)
+    )
     unambiguous, low, high = unambiguous_px(layout), -np.inf, np.inf
     if not np.isfinite(unambiguous):
         low, high = -0.5 - limits.OUTSIDE_PX, layout.extent - 0.5 + limits.OUTSIDE_PX
     per_px = period / layout.period_px
     return SpikeRules(
-        cell, layout.is_plain, layout.origin_rad, low * per_px, high * per_px, unambiguous / layout.period_px
+        cell,
+        layout.is_plain,
+        layout.origin_rad,
+        low * per_px,
+        high * per_px,
+        unambiguous / layout.period_px,
     )
 
 
@@ -70,13 +91,20 @@ def is_suspect(phase, row, x, per_cell):
     if row == 0 or row == phase.shape[0] - 1 or x == 0 or x == phase.shape[1] - 1:
         return True
     own = phase[row, x]
-    vertical = do_agree(own, phase[row - 1, x], per_cell) and do_agree(own, phase[row + 1, x], per_cell)
-    return not (vertical and do_agree(own, phase[row, x - 1], per_cell) and do_agree(own, phase[row, x + 1], per_cell))
+    vertical = do_agree(own, phase[row - 1, x], per_cell) and do_agree(
+        own, phase[row + 1, x], per_cell
+    )
+    return not (
+        vertical
+        and do_agree(own, phase[row, x - 1], per_cell)
+        and do_agree(own, phase[row, x + 1], per_cell)
+    )
 
 
 @numba.njit(inline="always")
 def count_votes(phase, row, x, rules):
-    """Count the neighbours in a pixel's window that are valid, that agree, and that are a cell above or below it."""
+    """Count the neighbours in a pixel's window that are valid, that agree, and that are a cell
+    above or below it."""
     height, width = phase.shape
     per_cell, own = np.float32(1 / rules.cell_rad), phase[row, x]
     valid, agreeing, above, below = -1, -1, 0, 0  # the pixel itself is valid, and agrees
@@ -84,7 +112,9 @@ def count_votes(phase, row, x, rules):
         for u in range(max(0, x - WINDOW), min(width, x + WINDOW + 1)):
             cells = (phase[v, u] - own) * per_cell
             if rules.repeat < math.inf:
-                cells -= np.float32(rules.repeat) * np.float32(round(cells * np.float32(1 / rules.repeat)))
+                cells -= np.float32(rules.repeat) * np.float32(
+                    round(cells * np.float32(1 / rules.repeat))
+                )
             valid += cells == cells  # not NaN
             agreeing += abs(cells) <= HALF
             above += abs(cells - ONE) < WHOLE
@@ -94,7 +124,8 @@ def count_votes(phase, row, x, rules):
 
 @numba.njit
 def period_change(phase, row, x, rules):
-    """Return UP or DOWN for a pixel at a code edge that a clear majority of the neighbours moves by one period.
+    """Return UP or DOWN for a pixel at a code edge that a clear majority of the neighbours moves by
+    one period.
 
     Otherwise UNCHANGED.
     """
@@ -112,12 +143,15 @@ def period_change(phase, row, x, rules):
 
 @numba.njit
 def masking_reason(phase, row, x, suspect, rules):
-    """Return the reason to mask a pixel, or UNCHANGED; neighbours vote only where one is ``suspect``."""
+    """Return the reason to mask a pixel, or UNCHANGED; neighbours vote only where one is
+    ``suspect``."""
     if suspect:
         valid, agreeing, _, _ = count_votes(phase, row, x, rules)
         if valid < LONELY_NEIGHBOURS or agreeing < LONELY * valid:
             return INCONSISTENT
-    is_outside = phase[row, x] < np.float32(rules.low_rad) or phase[row, x] > np.float32(rules.high_rad)
+    is_outside = phase[row, x] < np.float32(rules.low_rad) or phase[row, x] > np.float32(
+        rules.high_rad
+    )
     return OUTSIDE if is_outside else UNCHANGED
 
 
@@ -127,11 +161,18 @@ def allocate_lists(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def list_changes(
-    phase: np.ndarray, rules: SpikeRules, masking: bool, columns: np.ndarray, words: np.ndarray, counts: np.ndarray
+    phase: np.ndarray,
+    rules: SpikeRules,
+    masking: bool,
+    columns: np.ndarray,
+    words: np.ndarray,
+    counts: np.ndarray,
 ) -> None:
-    """List the pixels to change in ``phase`` (h, w): in row v ``counts[v]`` pixels, at ``columns[v]``.
+    """List the pixels to change in ``phase`` (h, w): in row v ``counts[v]`` pixels, at
+    ``columns[v]``.
 
-    ``masking``: pixels to mask, ``words[v]`` being their reasons; else those to be moved by a period, UP or DOWN.
+    ``masking``: pixels to mask, ``words[v]`` being their reasons; else those to be moved by a
+    period, UP or DOWN.
     """
     run_rows(_list_rows, phase.shape[0], phase, rules, masking, columns, words, counts)
 
@@ -148,7 +189,8 @@ def _list_rows(start, stop, phase, rules, masking, columns, words, counts):
 def _list_row(phase, row, rules, masking, columns, words, runs):
     """List the changes of one row and return their number.
 
-    Fills ``columns`` and ``words``; ``runs`` is a buffer of a byte for each pixel, zero beyond the last.
+    Fills ``columns`` and ``words``; ``runs`` is a buffer of a byte for each pixel, zero beyond the
+    last.
     """
     width, per_cell, examined = phase.shape[1], np.float32(1 / rules.cell_rad), runs.view(np.uint8)
     low = np.float32(rules.low_rad if masking else -math.inf)
@@ -172,7 +214,8 @@ def _list_row(phase, row, rules, masking, columns, words, runs):
 
 @numba.njit(inline="always")
 def _mark_examined(phase, row, per_cell, low, high, examined):
-    """Mark the valid pixels of a row that are suspect, see `is_suspect`, or not in ``low`` to ``high``.
+    """Mark the valid pixels of a row that are suspect, see `is_suspect`, or not in ``low`` to
+    ``high``.
 
     Without branches, for vector instructions.
     """

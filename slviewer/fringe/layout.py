@@ -15,7 +15,8 @@ WHITE_LEVELS = (255, 1023, 4095, 16383, 65535)
 LEFT_ALIGNED_WHITE = (65472, 65520, 65532)
 """Full scale of 10, 12 and 14 bits that fill a uint16 from its top."""
 SAME_WIDTH = 1e-6
-"""Relative difference up to which a Gray cell is a fringe period: over a thousand cells they part by a hundredth px."""
+"""Relative difference up to which a Gray cell is a fringe period: over a thousand cells they part
+by a hundredth px."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Shift:
 class Layout:
     """Frame indices of one axis, and the conventions of its sequence.
 
-    ``extent`` is that of the projector in px, infinite where its size is not known. ``shifts`` longest period first;
-    ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty. ``relative``: whether a phase that is not
-    absolute is acceptable.
+    ``extent`` is that of the projector in px, infinite where its size is not known. ``shifts``
+    longest period first; ``gray`` most significant bit first; ``inverse`` like ``gray``, or empty.
+    ``relative``: whether a phase that is not absolute is acceptable.
     """
 
     axis: Axis
@@ -63,7 +64,8 @@ class Layout:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the order comes from a plain Gray code, whose edges coincide with the wraps of the phase."""
+        """Whether the order comes from a plain Gray code, whose edges coincide with the wraps of
+        the phase."""
         return self.numbers_periods and self.complementary is None
 
     @property
@@ -83,9 +85,14 @@ class Layout:
 
 
 def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
-    """Return the layout of one axis. Raises InputError where its frames cannot give an absolute phase."""
+    """Return the layout of one axis. Raises InputError where its frames cannot give an absolute
+    phase."""
     if axis not in sequence.axes:
-        there = f"use axis {sequence.axes[0]}" if sequence.axes else "phase steps or Gray bits are needed"
+        there = (
+            f"use axis {sequence.axes[0]}"
+            if sequence.axes
+            else "phase steps or Gray bits are needed"
+        )
         raise InputError(f"no frame carries a pattern along axis {axis}: {there}")
     shifts = tuple(Shift(*shift) for shift in sequence.phase_shifts(axis))
     complementary, white, black = (
@@ -107,43 +114,61 @@ def axis_layout(sequence: PatternSequence, axis: Axis) -> Layout:
         sequence.relative or sequence.projector_size is None,
     )
     if not (shifts or layout.inverse or None not in (white, black)):
-        raise InputError(f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add them")
+        raise InputError(
+            f"axis {axis}: Gray code alone needs its inverses, or a white and a black frame: add"
+            " them"
+        )
     if layout.gray or complementary is not None:
         _check_code(layout)
     return layout
 
 
 def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
-    """Raise InputError unless the stack is (n, h, w) uint8 or uint16 with one frame for each of the sequence."""
+    """Raise InputError unless the stack is (n, h, w) uint8 or uint16 with one frame for each of the
+    sequence."""
     if not isinstance(stack, np.ndarray):
         sizes = sorted({np.shape(frame) for frame in stack})
-        raise InputError(f"the frames are no single array (their shapes: {sizes}): stack frames of one size")
+        raise InputError(
+            f"the frames are no single array (their shapes: {sizes}): stack frames of one size"
+        )
     if stack.ndim != 3 or 0 in stack.shape:
-        raise InputError(f"the stack has shape {stack.shape}: give (frames, rows, columns), one channel")
+        raise InputError(
+            f"the stack has shape {stack.shape}: give (frames, rows, columns), one channel"
+        )
     if stack.dtype not in (np.uint8, np.uint16):
         raise InputError(f"the frames hold {stack.dtype} values: give uint8 or uint16")
     if len(stack) != len(sequence.frames):
-        raise InputError(f"{len(stack)} frames for a sequence of {len(sequence.frames)}: give one image for each frame")
+        raise InputError(
+            f"{len(stack)} frames for a sequence of {len(sequence.frames)}: give one image for each"
+            " frame"
+        )
 
 
 def white_level(sequence: PatternSequence, stack: np.ndarray, indices: Sequence[int]) -> float:
-    """Return the grey level at which the camera clips: `clip_level` of these frames of a capture (n, h, w).
+    """Return the grey level at which the camera clips: `clip_level` of these frames of a capture
+    (n, h, w).
 
     Raises InputError for frames that contradict the full scale that the sequence states.
     """
     stated = sequence.full_scale
-    largest = 0 if stack.dtype == np.uint8 and stated in (None, 255) else max(int(stack[i].max()) for i in indices)
+    largest = (
+        0
+        if stack.dtype == np.uint8 and stated in (None, 255)
+        else max(int(stack[i].max()) for i in indices)
+    )
     if stated is not None and not largest <= stated <= np.iinfo(stack.dtype).max:
         raise InputError(
-            f"full_scale is stated as {stated}, and the frames are {stack.dtype} and reach {largest}: correct it in "
-            "the description of the images or in the driver of the camera, then import or capture again"
+            f"full_scale is stated as {stated}, and the frames are {stack.dtype} and reach"
+            f" {largest}: correct it in the description of the images or in the driver of the"
+            " camera, then import or capture again"
         )
     return clip_level(stack.dtype, largest, stated)
 
 
 def clip_level(dtype: np.dtype, largest: int, full_scale: float | None = None) -> float:
-    """Return the grey level at which a camera clips: ``full_scale`` where it is stated, 255 for uint8, for uint16 the
-    full scale of the bit depth that ``largest``, the largest grey level in the frames, needs.
+    """Return the grey level at which a camera clips: ``full_scale`` where it is stated, 255 for
+    uint8, for uint16 the full scale of the bit depth that ``largest``, the largest grey level in
+    the frames, needs.
     """
     if full_scale is not None:
         return float(full_scale)
@@ -154,15 +179,22 @@ def clip_level(dtype: np.dtype, largest: int, full_scale: float | None = None) -
     return float(next(level for level in WHITE_LEVELS if level >= largest))
 
 
-def to_eight_bits(image: np.ndarray, full_scale: float | None = None, largest: int | None = None) -> NDArray[np.uint8]:
-    """Convert an image (h, w) or (h, w, 3), uint8 or uint16, to uint8: the upper eight of the camera's bits.
+def to_eight_bits(
+    image: np.ndarray, full_scale: float | None = None, largest: int | None = None
+) -> NDArray[np.uint8]:
+    """Convert an image (h, w) or (h, w, 3), uint8 or uint16, to uint8: the upper eight of the
+    camera's bits.
 
-    ``full_scale`` as in `clip_level`; ``largest``: the largest grey level of the frame that the image is a part of,
-    None: its own.
+    ``full_scale`` as in `clip_level`; ``largest``: the largest grey level of the frame that the
+    image is a part of, None: its own.
     """
     if image.dtype == np.uint8:
         return image
-    white = int(clip_level(image.dtype, int(image.max(initial=0)) if largest is None else largest, full_scale))
+    white = int(
+        clip_level(
+            image.dtype, int(image.max(initial=0)) if largest is None else largest, full_scale
+        )
+    )
     shift = max(white.bit_length() - 8, 0)
     if white >> shift < 255:  # not all bits are used
         return np.asarray(cv2.convertScaleAbs(image, alpha=255 / white), np.uint8)
@@ -180,7 +212,7 @@ def _check_code(layout: Layout) -> None:
     if 2 ** len(layout.gray) < cells - 0.5:
         what = "periods" if layout.numbers_periods else f"cells of {layout.gray_cell_px:g} px"
         raise InputError(
-            f"{where}: {len(layout.gray)} Gray bits number {2 ** len(layout.gray)} {what}, and {layout.extent:g} px "
-            f"hold {cells:.0f}: give the fringe period, gray_cell_px and the size of the projector that were used, or "
-            "the missing bits"
+            f"{where}: {len(layout.gray)} Gray bits number {2 ** len(layout.gray)} {what}, and"
+            f" {layout.extent:g} px hold {cells:.0f}: give the fringe period, gray_cell_px and the"
+            " size of the projector that were used, or the missing bits"
         )

@@ -10,24 +10,25 @@ from slviewer.fringe.residual_sample import estimate_roughness
 from slviewer.fringe.sequence import Axis, PatternSequence
 
 PIXELS = 40_000
-"""Number of pixels on rows, and on columns: twenty edges even of the most significant bit, in either direction."""
+"""Number of pixels on rows, and on columns: twenty edges even of the most significant bit, in
+either direction."""
 GRID = 100
 """Pixels along the shorter side of the grid that shows where the patterns are."""
 BLOCK = 4
 """Neighbouring columns that are read together: they share the memory's cache lines."""
 NOISE_RANGE = 2 * limits.DARK_SIGMAS
-"""Range of a pixel's grey levels, in standard deviations, from which it shows a pattern: in fifty frames of
-noise alone the range stays below seven in 99.99 % of the pixels."""
+"""Range of a pixel's grey levels, in standard deviations, from which it shows a pattern: in fifty
+frames of noise alone the range stays below seven in 99.99 % of the pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineSample:
     """Pixels of some rows and columns of n frames.
 
-    ``frames`` (n, p) float32 grey levels; ``line`` (p,): index of the line, image rows below ``rows``, columns from
-    there; ``place`` (p,): px along a line. ``lines`` (n, rows, width): the same pixels of the rows, and ``grid`` (n,
-    gh, gw): a thinned image, as captured. ``white``: level at which the camera clips; ``noise``: grey levels by which
-    neighbours differ.
+    ``frames`` (n, p) float32 grey levels; ``line`` (p,): index of the line, image rows below
+    ``rows``, columns from there; ``place`` (p,): px along a line. ``lines`` (n, rows, width): the
+    same pixels of the rows, and ``grid`` (n, gh, gw): a thinned image, as captured. ``white``:
+    level at which the camera clips; ``noise``: grey levels by which neighbours differ.
     """
 
     frames: np.ndarray
@@ -40,7 +41,8 @@ class LineSample:
     noise: float
 
     def swing(self, indices: list[int]) -> np.ndarray:
-        """Return the range of grey levels, (p,) float32, from the darkest to the brightest of these frames."""
+        """Return the range of grey levels, (p,) float32, from the darkest to the brightest of these
+        frames."""
         chosen = self.frames[indices]
         return chosen.max(axis=0) - chosen.min(axis=0)
 
@@ -51,14 +53,16 @@ class LineSample:
 
 
 def sample_lines(sequence: PatternSequence, stack: np.ndarray, pixels: int = PIXELS) -> LineSample:
-    """Sample rows and columns of an (n, h, w) stack, spread evenly over the area that the patterns illuminate."""
+    """Sample rows and columns of an (n, h, w) stack, spread evenly over the area that the patterns
+    illuminate."""
     return sample_frames(stack, coded_frames(sequence), pixels, sequence.full_scale)
 
 
 def sample_frames(
     stack: np.ndarray, coded: list[int], pixels: int = PIXELS, full_scale: int | None = None
 ) -> LineSample:
-    """Sample rows and columns of an (n, h, w) stack whose frames ``coded`` show a pattern, see `sample_lines`."""
+    """Sample rows and columns of an (n, h, w) stack whose frames ``coded`` show a pattern, see
+    `sample_lines`."""
     height, width = stack.shape[1:]
     step = max(1, min(height, width) // GRID)
     grid = np.ascontiguousarray(stack[:, step // 2 :: step, step // 2 :: step])
@@ -71,11 +75,18 @@ def sample_frames(
     columns = np.unique(np.minimum(columns[:, None] + np.arange(BLOCK), width - 1))
     lines = np.ascontiguousarray(stack[:, rows])
     across = stack[:, :, columns].transpose(0, 2, 1)
-    frames = np.concatenate([lines.reshape(len(stack), -1), across.reshape(len(stack), -1)], axis=1).astype(np.float32)
+    frames = np.concatenate(
+        [lines.reshape(len(stack), -1), across.reshape(len(stack), -1)], axis=1
+    ).astype(np.float32)
     line = np.concatenate(
-        [np.repeat(np.arange(len(rows)), width), len(rows) + np.repeat(np.arange(len(columns)), height)]
+        [
+            np.repeat(np.arange(len(rows)), width),
+            len(rows) + np.repeat(np.arange(len(columns)), height),
+        ]
     )
-    place = np.concatenate([np.tile(np.arange(width), len(rows)), np.tile(np.arange(height), len(columns))])
+    place = np.concatenate(
+        [np.tile(np.arange(width), len(rows)), np.tile(np.arange(height), len(columns))]
+    )
     noise = estimate_roughness(frames[coded][:, : len(rows) * width], width)
     return LineSample(frames, line, len(rows), place, lines, grid, white, noise)
 
@@ -86,12 +97,17 @@ def grid_sample(sample: LineSample) -> LineSample:
     place = np.tile(np.arange(width), height)
     line = np.repeat(np.arange(height), width)
     return replace(
-        sample, frames=sample.grid.reshape(count, -1).astype(np.float32), line=line, rows=height, place=place
+        sample,
+        frames=sample.grid.reshape(count, -1).astype(np.float32),
+        line=line,
+        rows=height,
+        place=place,
     )
 
 
 def _select_lines(weight: np.ndarray, step: int, size: int, count: int) -> np.ndarray:
-    """Select about ``count`` of ``size`` rows or columns, with a density in proportion to ``weight``.
+    """Select about ``count`` of ``size`` rows or columns, with a density in proportion to
+    ``weight``.
 
     ``weight``: of every ``step``-th row or column.
     """

@@ -11,35 +11,44 @@ from slviewer.fringe.residual_sample import cosine_columns, fit_common_harmonics
 ROWS = 20
 """Image rows that are sampled."""
 BLOCK = 8
-"""Neighbouring pixels whose variances are averaged before the median: single variances are too skewed."""
+"""Neighbouring pixels whose variances are averaged before the median: single variances are too
+skewed."""
 BINS = 16
 QUANTISATION = 1 / 12
 """Variance of rounding to whole grey levels, in squared grey levels: no frame has less noise."""
 OWN_HARMONICS = 4
-"""Highest harmonic that is fitted pixel by pixel; those that gamma adds beyond it are below the noise."""
+"""Highest harmonic that is fitted pixel by pixel; those that gamma adds beyond it are below the
+noise."""
 
 
 def measure_noise(layout: Layout, stack: np.ndarray, white: float) -> tuple[float, float]:
-    """Measure (a, b): the variance of one frame's grey level is a + b * level, in squared grey levels.
+    """Measure (a, b): the variance of one frame's grey level is a + b * level, in squared grey
+    levels.
 
     Both non-negative, and together at least what rounding to whole grey levels adds.
 
-    From the residual of an n-step phase shift: per pixel, cosines up to a harmonic that n allows are removed; then,
-    from all pixels together, what the remaining harmonics have in common with the fringe, so that gamma does not count
-    as noise. Three steps, and Gray code alone, have no such residual, nor have pixels that are black or saturated in
-    one of the steps (a gamma of 2.2 can make that all pixels): then from the constancy of Gray + inverse, or from
-    differences along image rows or columns, whichever are smaller: those along the stripes. Sampled from a few rows,
+    From the residual of an n-step phase shift: per pixel, cosines up to a harmonic that n allows
+    are removed; then, from all pixels together, what the remaining harmonics have in common with
+    the fringe, so that gamma does not count as noise. Three steps, and Gray code alone, have no
+    such residual, nor have pixels that are black or saturated in one of the steps (a gamma of 2.2
+    can make that all pixels): then from the constancy of Gray + inverse, or from differences along
+    image rows or columns, whichever are smaller: those along the stripes. Sampled from a few rows,
     or columns, of the image.
     """
     bins = []
     if layout.steps >= 4:
         bins.append(_measure_phase_step_noise(sample(stack, layout.shifts[-1].indices), white))
     elif len(layout.inverse) >= 2:
-        bins.append(_measure_inverse_noise(sample(stack, layout.gray), sample(stack, layout.inverse), white))
+        bins.append(
+            _measure_inverse_noise(sample(stack, layout.gray), sample(stack, layout.inverse), white)
+        )
     if not any(len(levels) for levels, *_ in bins):
         frames = layout.shifts[-1].indices if layout.shifts else (layout.white, layout.black)
         indices = tuple(i for i in frames if i is not None)
-        bins = [_measure_difference_noise(sample(s, indices), white) for s in (stack, stack.transpose(0, 2, 1))]
+        bins = [
+            _measure_difference_noise(sample(s, indices), white)
+            for s in (stack, stack.transpose(0, 2, 1))
+        ]
     fits = [_bin_variances(*measured) for measured in bins if len(measured[0])]
     # Fringes and texture only ever add to the differences.
     a, b = _fit_line(*min(fits, key=_compute_mean_variance)) if fits else (0.0, 0.0)
@@ -53,7 +62,8 @@ def _compute_mean_variance(bins: tuple[np.ndarray, np.ndarray, np.ndarray]) -> f
 
 
 def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
-    """Sample evenly spread rows of the frames: (n, rows, blocks, BLOCK) float32; pixels that fill whole blocks."""
+    """Sample evenly spread rows of the frames: (n, rows, blocks, BLOCK) float32; pixels that fill
+    whole blocks."""
     height, width = stack.shape[1:]
     rows = np.unique(np.linspace(0, height - 1, min(ROWS, height)).round().astype(int))
     block = BLOCK if width >= BLOCK else 1
@@ -65,8 +75,11 @@ def sample(stack: np.ndarray, indices: tuple[int, ...]) -> np.ndarray:
     return out
 
 
-def _measure_phase_step_noise(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return levels, variances and degrees of freedom of blocks, from the residual of cosines in the phase steps."""
+def _measure_phase_step_noise(
+    samples: np.ndarray, white: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return levels, variances and degrees of freedom of blocks, from the residual of cosines in
+    the phase steps."""
     n = len(samples)
     samples = samples[:, _select_unclipped_blocks(samples, white)]  # (n, blocks, BLOCK)
     own = max(1, min(OWN_HARMONICS, (n - 1) // 2 - 2))
@@ -76,21 +89,28 @@ def _measure_phase_step_noise(samples: np.ndarray, white: float) -> tuple[np.nda
     if own < OWN_HARMONICS:
         residue -= fit_common_harmonics(frames, phasor, own)
     freedom = n - 1 - 2 * own
-    # Not a matrix product: BLAS would start its threads for this little, and they get in the way of numba's.
+    # Not a matrix product: BLAS would start its threads for this little, and they get in the way of
+    # numba's.
     residue = np.einsum("wk,kp->wp", _list_residual_directions(n, own), residue)
-    variance = np.einsum("wp,wp->p", residue, residue).reshape(samples.shape[1:]).mean(axis=-1) / freedom
+    variance = (
+        np.einsum("wp,wp->p", residue, residue).reshape(samples.shape[1:]).mean(axis=-1) / freedom
+    )
     return samples.mean(axis=(0, 2)), variance, freedom * samples.shape[-1]
 
 
 @cache
 def _list_residual_directions(n: int, own: int) -> np.ndarray:
-    """Return orthonormal rows (n - 1 - 2 own, n) float32: what cosines up to harmonic ``own`` of n steps do not fit."""
+    """Return orthonormal rows (n - 1 - 2 own, n) float32: what cosines up to harmonic ``own`` of n
+    steps do not fit."""
     basis, _ = np.linalg.qr(cosine_columns(np.arange(n), n, own), mode="complete")
     return np.ascontiguousarray(basis[:, 1 + 2 * own :].T.astype(np.float32))
 
 
-def _measure_inverse_noise(gray: np.ndarray, inverse: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return levels, variances and degrees of freedom of blocks, from sums of bits and their inverses."""
+def _measure_inverse_noise(
+    gray: np.ndarray, inverse: np.ndarray, white: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return levels, variances and degrees of freedom of blocks, from sums of bits and their
+    inverses."""
     usable = _select_unclipped_blocks(np.concatenate([gray, inverse]), white)
     total = (gray + inverse)[:, usable]
     # Interreflected light and room light hardly differ between neighbours.
@@ -100,8 +120,11 @@ def _measure_inverse_noise(gray: np.ndarray, inverse: np.ndarray, white: float) 
     return total.mean(axis=(0, -1)) / 2, (rest**2).sum(axis=(0, -1)) / (2 * freedom), freedom
 
 
-def _measure_difference_noise(samples: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return levels, variances and degrees of freedom of blocks, from third differences along a line.
+def _measure_difference_noise(
+    samples: np.ndarray, white: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return levels, variances and degrees of freedom of blocks, from third differences along a
+    line.
 
     Fringes and shading are nearly quadratic over four pixels.
     """
@@ -113,11 +136,16 @@ def _measure_difference_noise(samples: np.ndarray, white: float) -> tuple[np.nda
     else:
         samples = samples[(samples.max(axis=-1) < white) & (samples.min(axis=-1) > 0)]
     third = np.diff(samples, n=3, axis=-1)
-    return samples.mean(axis=-1), (third**2).mean(axis=-1) / 20, 2.5  # 1 + 9 + 9 + 1; five that overlap
+    return (
+        samples.mean(axis=-1),
+        (third**2).mean(axis=-1) / 20,
+        2.5,
+    )  # 1 + 9 + 9 + 1; five that overlap
 
 
 def _select_unclipped_blocks(samples: np.ndarray, white: float) -> np.ndarray:
-    """Return a mask (rows, blocks) of the blocks clipped neither at white nor at black, which would hide noise."""
+    """Return a mask (rows, blocks) of the blocks clipped neither at white nor at black, which would
+    hide noise."""
     return (samples.max(axis=0).max(axis=-1) < white) & (samples.min(axis=0).min(axis=-1) > 0)
 
 

@@ -17,8 +17,8 @@ def render_pattern(sequence: PatternSequence, index: int) -> np.ndarray:
 def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndarray]:
     """Return the axis along which frame ``index`` varies, and its uint8 grey levels along it.
 
-    A frame without an axis gives (None, one level per projector column). Cosines span 0 ... 255, bits are 0 or 255.
-    Where the sequence has a table of `levels`, it is applied to the cosines.
+    A frame without an axis gives (None, one level per projector column). Cosines span 0 ... 255,
+    bits are 0 or 255. Where the sequence has a table of `levels`, it is applied to the cosines.
     """
     if not 0 <= index < len(sequence.frames):
         raise InputError(f"frame {index} of {len(sequence.frames)} does not exist: count from 0")
@@ -30,16 +30,22 @@ def profile(sequence: PatternSequence, index: int) -> tuple[Axis | None, np.ndar
         turns = u / frame.period_px + sequence.sign(frame.axis) * frame.step / frame.steps
         angle = 2 * np.pi * turns + sequence.offset_rad(frame.axis)
         cosine = np.floor(127.5 + 127.5 * np.cos(angle) + 0.5).astype(np.uint8)
-        return frame.axis, cosine if sequence.levels is None else np.array(sequence.levels, np.uint8)[cosine]
-    return frame.axis, np.where(_compute_gray_bit(sequence, frame.axis, frame), 255, 0).astype(np.uint8)
+        return frame.axis, (
+            cosine if sequence.levels is None else np.array(sequence.levels, np.uint8)[cosine]
+        )
+    return frame.axis, np.where(_compute_gray_bit(sequence, frame.axis, frame), 255, 0).astype(
+        np.uint8
+    )
 
 
 def _compute_gray_bit(sequence: PatternSequence, axis: Axis, frame: Frame) -> np.ndarray:
-    """Return the Gray bit, (extent,) bool, at the centre of each projector column or row. Raises InputError."""
+    """Return the Gray bit, (extent,) bool, at the centre of each projector column or row. Raises
+    InputError."""
     bits = len(sequence.find("gray", axis))
     cell, origin = sequence.gray_cell(axis), sequence.origin_px(axis)
     half = frame.kind == "complementary"
-    # A column belongs to the cell that holds its left edge plus half a pixel, less the origin's own half.
+    # A column belongs to the cell that holds its left edge plus half a pixel, less the origin's own
+    # half.
     u = np.arange(sequence.extent(axis), dtype=np.float64) - origin - 0.5
     code = np.floor((2 if half else 1) * u / cell + 1e-9).astype(np.int64)
     if code.min() < 0 or code.max() >= 1 << (bits + half):

@@ -13,7 +13,8 @@ MICRO_PX = (12.0, 16.0)
 
 
 def p18(projector: Size) -> PatternSequence:
-    """Return 18 steps at a period of 18 px, seven Gray bits (more if the projector needs them), then white.
+    """Return 18 steps at a period of 18 px, seven Gray bits (more if the projector needs them),
+    then white.
 
     X, then y.
     """
@@ -25,7 +26,8 @@ def p18(projector: Size) -> PatternSequence:
 
 
 def gray(projector: Size) -> PatternSequence:
-    """Return Gray code alone, each bit followed by its inverse; x, then y, white, black (procam-calibration layout)."""
+    """Return Gray code alone, each bit followed by its inverse; x, then y, white, black
+    (procam-calibration layout)."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
         for bit in gray_bits(axis, bits_for(extent)):
@@ -34,18 +36,24 @@ def gray(projector: Size) -> PatternSequence:
 
 
 def complementary(projector: Size, steps: int = 8, period_px: float = 16.0) -> PatternSequence:
-    """Return phase steps, Gray bits of the fringe order and the complementary bit; x, then y, then white."""
+    """Return phase steps, Gray bits of the fringe order and the complementary bit; x, then y, then
+    white."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        frames += phase_steps(axis, steps, period_px) + gray_bits(axis, bits_for(extent / period_px))
+        frames += phase_steps(axis, steps, period_px) + gray_bits(
+            axis, bits_for(extent / period_px)
+        )
         frames.append(Frame("complementary", axis))
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
-def multifrequency(projector: Size, steps: int = 6, periods_px: Sequence[float] | None = None) -> PatternSequence:
+def multifrequency(
+    projector: Size, steps: int = 6, periods_px: Sequence[float] | None = None
+) -> PatternSequence:
     """Return phase steps at several periods, longest first; x, then y, then white.
 
-    ``periods_px`` defaults to 16 px, and as many periods eight times as long each as it takes to cover the axis.
+    ``periods_px`` defaults to 16 px, and as many periods eight times as long each as it takes to
+    cover the axis.
     """
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
@@ -58,19 +66,25 @@ def multifrequency(projector: Size, steps: int = 6, periods_px: Sequence[float] 
 
 
 def micro(projector: Size) -> PatternSequence:
-    """Return phase steps at four periods from 12 to at most 17 px, for surfaces with interreflections; x, y, white.
+    """Return phase steps at four periods from 12 to at most 17 px, for surfaces with
+    interreflections; x, y, white.
 
-    Micro phase shifting (Gupta and Nayar, "Micro phase shifting", CVPR 2012): light that reaches a point by way of
-    other surfaces, or through the material, averages over such narrow stripes and shifts no phase. There is no long
-    period and no Gray code that it could mislead; beats of the periods replace them. The beats' ratios are equal, so
-    that no unwrapping step is weaker than the others. Eight steps of the finest period, four of the others.
+    Micro phase shifting (Gupta and Nayar, "Micro phase shifting", CVPR 2012): light that reaches a
+    point by way of other surfaces, or through the material, averages over such narrow stripes and
+    shifts no phase. There is no long period and no Gray code that it could mislead; beats of the
+    periods replace them. The beats' ratios are equal, so that no unwrapping step is weaker than the
+    others. Eight steps of the finest period, four of the others.
     """
     periods = 4
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        longest = max(1.1 * extent, 700.0)  # of small projectors too: shorter beats need wider stripes
+        longest = max(
+            1.1 * extent, 700.0
+        )  # of small projectors too: shorter beats need wider stripes
         ratio = (longest / MICRO_PX[1]) ** (1 / (periods - 1))
-        differences = [1 / (longest / ratio**k) for k in range(periods - 1)]  # of neighbouring frequencies
+        differences = [
+            1 / (longest / ratio**k) for k in range(periods - 1)
+        ]  # of neighbouring frequencies
         frequencies = [1 / MICRO_PX[0] - sum(differences[k:]) for k in range(periods)]
         for i, frequency in enumerate(frequencies):
             frames += phase_steps(axis, 8 if i == periods - 1 else 4, 1 / frequency)
@@ -78,15 +92,19 @@ def micro(projector: Size) -> PatternSequence:
 
 
 def short(projector: Size, axis: Axis) -> PatternSequence:
-    """Return 11 frames of one axis, for live scanning: 3 + 3 + 4 phase steps of three periods, then white.
+    """Return 11 frames of one axis, for live scanning: 3 + 3 + 4 phase steps of three periods, then
+    white.
 
-    Three steps each of a period longer than the axis and of an intermediate one, four of the finest, 16 px. The ratios
-    of the periods are equal, so that neither unwrapping step is the weaker. Four steps of the finest suppress the
-    second harmonic of the projector, and contradict each other where something moved.
+    Three steps each of a period longer than the axis and of an intermediate one, four of the
+    finest, 16 px. The ratios of the periods are equal, so that neither unwrapping step is the
+    weaker. Four steps of the finest suppress the second harmonic of the projector, and contradict
+    each other where something moved.
     """
     finest, longest = 16.0, 1.1 * projector[AXES.index(axis)]
     between = (finest * longest) ** 0.5
-    frames = phase_steps(axis, 3, longest) + phase_steps(axis, 3, between) + phase_steps(axis, 4, finest)
+    frames = (
+        phase_steps(axis, 3, longest) + phase_steps(axis, 3, between) + phase_steps(axis, 4, finest)
+    )
     return PatternSequence(projector, (*frames, Frame("texture")))
 
 
@@ -101,7 +119,9 @@ PRESETS: dict[str, Callable[[Size], PatternSequence]] = {
 
 def phase_steps(axis: Axis, steps: int, period_px: float) -> list[Frame]:
     """Return all steps of one period, in order."""
-    return [Frame("phase", axis, step=k, steps=steps, period_px=float(period_px)) for k in range(steps)]
+    return [
+        Frame("phase", axis, step=k, steps=steps, period_px=float(period_px)) for k in range(steps)
+    ]
 
 
 def gray_bits(axis: Axis, bits: int) -> list[Frame]:
@@ -115,7 +135,8 @@ def bits_for(cells: float) -> int:
 
 
 def covering_periods(extent: int) -> list[float]:
-    """Return periods px from 16 px up to one that covers the axis, each eight times as long as the one before.
+    """Return periods px from 16 px up to one that covers the axis, each eight times as long as the
+    one before.
 
     The last is a tenth longer than the axis so that its ends cannot be confused.
     """

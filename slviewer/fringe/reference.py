@@ -26,7 +26,8 @@ TWO_PI = 2 * np.pi
 
 
 def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
-    """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad, absolute to 1e-4 rad."""
+    """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad,
+    absolute to 1e-4 rad."""
     task = prepare_decoding(sequence, stack, axis)
     layout, stack, noise, white = task.layout, task.stack, task.noise, task.white
     if not layout.shifts:
@@ -34,12 +35,19 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         wrapped = np.full_like(phase, np.nan)
         weakest, saturated = modulation, np.zeros(phase.shape, bool)
     else:
-        shifted = [phase_shift(stack, shift.indices, layout.sign, layout.offset_rad) for shift in layout.shifts]
+        shifted = [
+            phase_shift(stack, shift.indices, layout.sign, layout.offset_rad)
+            for shift in layout.shifts
+        ]
         wrapped, modulation, background, _ = shifted[-1]
         weakest = np.minimum.reduce([b for _, b, _, _ in shifted])
-        saturated = np.logical_or.reduce([(peak >= white) & (a + b >= white) for _, b, a, peak in shifted])
+        saturated = np.logical_or.reduce(
+            [(peak >= white) & (a + b >= white) for _, b, a, peak in shifted]
+        )
         if layout.numbers_periods:
-            order, inconsistent = _decode_period_order(layout, stack, wrapped, modulation, background)
+            order, inconsistent = _decode_period_order(
+                layout, stack, wrapped, modulation, background
+            )
         else:
             cell = _decode_cell(layout, stack, modulation, background) if layout.gray else None
             order, inconsistent = _unwrap_by_levels(layout, [psi for psi, _, _, _ in shifted], cell)
@@ -47,18 +55,24 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
         dark = np.zeros(phase.shape, bool)
     dark |= weakest < dark_limit(background, noise, task.full_scale, dark_sigmas(layout))
     reason = np.select(
-        [saturated, dark, inconsistent], [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT], Reason.VALID
+        [saturated, dark, inconsistent],
+        [Reason.SATURATED, Reason.DARK, Reason.INCONSISTENT],
+        Reason.VALID,
     ).astype(np.uint8)
     phase[reason != Reason.VALID] = np.nan
     phase, reason = repair_spikes(layout, phase, reason)
     return complete_map(task, (phase, wrapped, modulation, background, reason))
 
 
-def complete_map(task: DecodingTask, maps: tuple[np.ndarray, ...], mask_indirect: bool = True) -> PhaseMap:
-    """Return the phase map of decoded ``maps`` (phase, wrapped phase, modulation, background, reason), each (h, w).
+def complete_map(
+    task: DecodingTask, maps: tuple[np.ndarray, ...], mask_indirect: bool = True
+) -> PhaseMap:
+    """Return the phase map of decoded ``maps`` (phase, wrapped phase, modulation, background,
+    reason), each (h, w).
 
-    With ``mask_indirect`` pixels of much indirect light are masked, see `indirect_light`. The phase is corrected
-    for gamma, grey levels are those of the capture, and the scatter of the phase is measured.
+    With ``mask_indirect`` pixels of much indirect light are masked, see `indirect_light`. The phase
+    is corrected for gamma, grey levels are those of the capture, and the scatter of the phase is
+    measured.
     """
     layout, factor, (a, b) = task.layout, task.factor, task.noise
     if mask_indirect:
@@ -88,7 +102,8 @@ def complete_map(task: DecodingTask, maps: tuple[np.ndarray, ...], mask_indirect
 def phase_shift(
     stack: np.ndarray, indices: Indices, sign: int, offset_rad: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return wrapped phase (rad), modulation, background and largest sample of one period, float32 (h, w) each.
+    """Return wrapped phase (rad), modulation, background and largest sample of one period, float32
+    (h, w) each.
 
     ``sign`` and ``offset_rad`` are the sequence's.
     """
@@ -108,11 +123,17 @@ def phase_shift(
         turn, across = np.float32(np.cos(offset_rad)), np.float32(np.sin(offset_rad))
         cosine, sine = turn * cosine - across * sine, turn * sine + across * cosine
     wrapped = np.arctan2(0 - sine, cosine)  # a zero without sign, for pi rather than -pi
-    return wrapped, np.hypot(cosine, sine) * np.float32(2 / n), first + total * np.float32(1 / n), peak
+    return (
+        wrapped,
+        np.hypot(cosine, sine) * np.float32(2 / n),
+        first + total * np.float32(1 / n),
+        peak,
+    )
 
 
 def dark_sigmas(layout: Layout) -> float:
-    """Return the modulation, in standard deviations of a grey level, below which a pixel is DARK."""
+    """Return the modulation, in standard deviations of a grey level, below which a pixel is
+    DARK."""
     if layout.numbers_periods or not layout.shifts:
         return limits.DARK_SIGMAS
     steps = min(len(shift.indices) for shift in layout.shifts)
@@ -138,9 +159,14 @@ def bit_heights(layout: Layout, stack: np.ndarray, index: int, threshold: np.nda
 
 
 def _decode_period_order(
-    layout: Layout, stack: np.ndarray, wrapped: np.ndarray, modulation: np.ndarray, background: np.ndarray
+    layout: Layout,
+    stack: np.ndarray,
+    wrapped: np.ndarray,
+    modulation: np.ndarray,
+    background: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the periods to add to the wrapped phase, and where this order is inconsistent, (h, w) each."""
+    """Return the periods to add to the wrapped phase, and where this order is inconsistent, (h, w)
+    each."""
     code, bit, heights = _read_code(layout, stack, layout.gray, background)
     least = np.min(np.abs(heights), axis=0)
     turns = wrapped * np.float32(1 / TWO_PI) - np.float32(layout.gray_origin_px / layout.period_px)
@@ -151,12 +177,17 @@ def _decode_period_order(
     if layout.complementary is not None:
         last = bit_heights(layout, stack, layout.complementary, background)
         half = 2 * code + (bit ^ (last > 0))
-        # Near an order's edge the half-period cells on both sides count as one; the phase decides between them.
+        # Near an order's edge the half-period cells on both sides count as one; the phase decides
+        # between them.
         order = np.where(middle, half >> 1, ((half + 1) >> 1) - (part >= 0.75))
         inconsistent = np.where(middle, least, np.abs(last)) < undecided
     else:
         ahead, behind, _ = _detect_border_pixels(layout, stack, code, heights)
-        order = code + (ahead & (part < np.float32(limits.EDGE))) - (behind & (part >= np.float32(1 - limits.EDGE)))
+        order = (
+            code
+            + (ahead & (part < np.float32(limits.EDGE)))
+            - (behind & (part >= np.float32(1 - limits.EDGE)))
+        )
         inner = (part >= np.float32(limits.EDGE)) & (part < np.float32(1 - limits.EDGE))
         inconsistent = inner & (least < undecided)
     return order - whole, inconsistent
@@ -165,9 +196,12 @@ def _decode_period_order(
 def _read_code(
     layout: Layout, stack: np.ndarray, bits: Indices, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits' heights (b, h, w)."""
+    """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits'
+    heights (b, h, w)."""
     heights = np.stack([bit_heights(layout, stack, i, background) for i in bits])
-    digits = np.logical_xor.accumulate(heights > 0)  # a binary digit is the parity of all Gray bits so far
+    digits = np.logical_xor.accumulate(
+        heights > 0
+    )  # a binary digit is the parity of all Gray bits so far
     places = 1 << np.arange(len(bits), dtype=np.int32)[::-1]
     return np.tensordot(places, digits.astype(np.int32), 1), digits[-1].astype(np.int32), heights
 
@@ -177,33 +211,41 @@ def _detect_border_pixels(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where a pixel is at the upper and at the lower border of its cell, (h, w) bool each.
 
-    Third, the least height (h, w) of the bits that change at neither border. The bit that is near the middle of black
-    and white determines the border.
+    Third, the least height (h, w) of the bits that change at neither border. The bit that is near
+    the middle of black and white determines the border.
     """
-    top, bottom = np.maximum(heights.max(axis=0), np.float32(0)), np.minimum(heights.min(axis=0), np.float32(0))
+    top, bottom = (
+        np.maximum(heights.max(axis=0), np.float32(0)),
+        np.minimum(heights.min(axis=0), np.float32(0)),
+    )
     mean = np.float32(fringe_mean(layout, stack))
     contrast = np.maximum(top / (1 - mean), -bottom / mean)
     middle = (np.float32(0.5) - mean) * contrast
     lower, upper, least = (np.full(code.shape, np.inf, np.float32) for _ in range(3))
     for from_least, height in enumerate(heights[::-1]):
-        # From k - 1 to k the Gray bit changes whose number, from the least, is the count of trailing zeros of k; from k
-        # to k + 1 that of its trailing ones.
+        # From k - 1 to k the Gray bit changes whose number, from the least, is the count of
+        # trailing zeros of k; from k to k + 1 that of its trailing ones.
         low_bits = code & ((2 << from_least) - 1)
         at_lower, at_upper = low_bits == 1 << from_least, low_bits == (1 << from_least) - 1
         lower = np.where(at_lower, np.abs(height - middle), lower)
         upper = np.where(at_upper, np.abs(height - middle), upper)
         least = np.where(at_lower | at_upper, least, np.minimum(least, np.abs(height)))
     weak, weaker = np.float32(limits.WEAK_BIT / 2) * contrast, np.float32(limits.WEAKER)
-    return (upper < weak) & (upper < weaker * lower), (lower < weak) & (lower < weaker * upper), least
+    return (
+        (upper < weak) & (upper < weaker * lower),
+        (lower < weak) & (lower < weaker * upper),
+        least,
+    )
 
 
 def _decode_cell(
     layout: Layout, stack: np.ndarray, modulation: np.ndarray, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coordinate px of the cell that the Gray bits number, and where it is undecided, (h, w) each.
+    """Return the coordinate px of the cell that the Gray bits number, and where it is undecided,
+    (h, w) each.
 
-    The coordinate is the middle of the cell, or its border where the bit that changes there is near the middle of black
-    and white. It is undecided where any other bit is.
+    The coordinate is the middle of the cell, or its border where the bit that changes there is near
+    the middle of black and white. It is undecided where any other bit is.
     """
     code, _, heights = _read_code(layout, stack, code_bits(layout), background)
     ahead, behind, least = _detect_border_pixels(layout, stack, code, heights)
@@ -213,14 +255,16 @@ def _decode_cell(
 
 
 def code_bits(layout: Layout) -> Indices:
-    """Return the frames of all Gray bits, the most significant first and the complementary one last."""
+    """Return the frames of all Gray bits, the most significant first and the complementary one
+    last."""
     return (*layout.gray, *(() if layout.complementary is None else (layout.complementary,)))
 
 
 def _unwrap_by_levels(
     layout: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the periods to add to the finest wrapped phase, and where levels or cell are inconsistent, (h, w) each.
+    """Return the periods to add to the finest wrapped phase, and where levels or cell are
+    inconsistent, (h, w) each.
 
     ``cell``: see `_decode_cell`, None without Gray code.
     """
@@ -237,15 +281,20 @@ def _unwrap_by_levels(
 def _decode_gray_alone(
     layout: Layout, stack: np.ndarray, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return phase, modulation, background, inconsistent and dark, (h, w) each, from Gray bits alone.
+    """Return phase, modulation, background, inconsistent and dark, (h, w) each, from Gray bits
+    alone.
 
-    One undecided bit whose two readings are neighbouring columns puts the pixel on the border between them.
+    One undecided bit whose two readings are neighbouring columns puts the pixel on the border
+    between them.
     """
     modulation, background = measure_gray_contrast(layout, stack)
     part_of_sigma = np.sqrt(0.5 if layout.inverse else 1.5)
-    sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background) * np.float32(part_of_sigma)
+    sigma = np.sqrt(np.float32(noise[0]) + np.float32(noise[1]) * background) * np.float32(
+        part_of_sigma
+    )
     limit = np.maximum(
-        np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma, np.float32(limits.GRAY_UNDECIDED_PART) * modulation
+        np.float32(limits.GRAY_UNDECIDED_SIGMAS) * sigma,
+        np.float32(limits.GRAY_UNDECIDED_PART) * modulation,
     )
     code, other = np.zeros(modulation.shape, np.int32), np.zeros(modulation.shape, np.int32)
     bit, flipped = np.zeros_like(code), np.zeros_like(code)
@@ -260,7 +309,10 @@ def _decode_gray_alone(
     inconsistent = (doubts > 1) | (np.abs(code - other) > 1)
     # At the projector's ends only a part of a cell may have been shown.
     cell, origin = layout.gray_cell_px, layout.gray_origin_px
-    start, end = origin + cell * np.minimum(code, other), origin + cell * (np.maximum(code, other) + 1.0)
+    start, end = (
+        origin + cell * np.minimum(code, other),
+        origin + cell * (np.maximum(code, other) + 1.0),
+    )
     first, last = np.maximum(start, -0.5), np.minimum(end, layout.extent - 0.5)
     centre = 0.5 * np.where(first < last, first + last, start + end)
     phase = (TWO_PI / cell * centre).astype(np.float32)

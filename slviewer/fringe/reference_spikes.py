@@ -10,12 +10,15 @@ from slviewer.fringe.phase import Reason
 TWO_PI = 2 * np.pi
 
 
-def repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def repair_spikes(
+    layout: Layout, phase: np.ndarray, reason: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return phase and reason, (h, w) each, new arrays, corrected by each pixel's neighbourhood.
 
-    A plain Gray code may be read on the wrong side of its edge: where a clear majority of the neighbours indicates
-    this, such a pixel is moved by the one period. A pixel that still has too few supporting neighbours is INCONSISTENT.
-    A depth step has enough neighbours on its own side, and is not changed.
+    A plain Gray code may be read on the wrong side of its edge: where a clear majority of the
+    neighbours indicates this, such a pixel is moved by the one period. A pixel that still has too
+    few supporting neighbours is INCONSISTENT. A depth step has enough neighbours on its own side,
+    and is not changed.
     """
     rules = spike_rules(layout)
     phase, reason = phase.copy(), reason.copy()
@@ -29,18 +32,25 @@ def repair_spikes(layout: Layout, phase: np.ndarray, reason: np.ndarray) -> tupl
             move = enough & (votes[word] >= limits.SPIKE_MAJORITY * votes["valid"])
             phase[v[move], u[move]] += np.float32(shift * TWO_PI)
     v, u, votes = _count_votes(phase, rules)
-    lonely = (votes["valid"] < limits.LONELY_NEIGHBOURS) | (votes["agree"] < limits.LONELY * votes["valid"])
+    lonely = (votes["valid"] < limits.LONELY_NEIGHBOURS) | (
+        votes["agree"] < limits.LONELY * votes["valid"]
+    )
     reason[v[lonely], u[lonely]] = Reason.INCONSISTENT
     with np.errstate(invalid="ignore"):
-        reason[(reason == Reason.VALID) & ((phase < rules.low_rad) | (phase > rules.high_rad))] = Reason.OUTSIDE
+        reason[(reason == Reason.VALID) & ((phase < rules.low_rad) | (phase > rules.high_rad))] = (
+            Reason.OUTSIDE
+        )
     return np.where(reason == Reason.VALID, phase, np.float32(np.nan)), reason
 
 
-def _count_votes(phase: np.ndarray, rules: SpikeRules) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return row and column of the pixels that differ from one of their four neighbours, and the votes of their window.
+def _count_votes(
+    phase: np.ndarray, rules: SpikeRules
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return row and column of the pixels that differ from one of their four neighbours, and the
+    votes of their window.
 
-    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``. The phase is known
-    modulo ``rules.repeat`` cells.
+    ``valid`` neighbours; those that ``agree``; those that are just one cell ``above``, ``below``.
+    The phase is known modulo ``rules.repeat`` cells.
     """
     margin, repeat = limits.WINDOW, rules.repeat
     padded = np.pad(phase, margin, constant_values=np.nan)
@@ -49,7 +59,10 @@ def _count_votes(phase: np.ndarray, rules: SpikeRules) -> tuple[np.ndarray, np.n
     suspect = np.zeros(phase.shape, bool)
     with np.errstate(invalid="ignore"):
         for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            near = padded[margin + dv : margin + dv + phase.shape[0], margin + du : margin + du + phase.shape[1]]
+            near = padded[
+                margin + dv : margin + dv + phase.shape[0],
+                margin + du : margin + du + phase.shape[1],
+            ]
             suspect |= ~(np.abs(np.rint((near - centre) * per_cell)) < 0.5)
         v, u = np.nonzero(suspect & np.isfinite(phase))
         votes = {word: np.zeros(len(v), np.int32) for word in ("valid", "agree", "above", "below")}

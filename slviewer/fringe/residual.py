@@ -1,10 +1,11 @@
-"""Consistency of the frames of a capture: the residual of each frame, and the frames that stand out.
+"""Consistency of the frames of a capture: the residual of each frame, and the frames that stand
+out.
 
-Phase-shifted frames are one cosine per pixel, so that more than three of them are redundant, and contradict each other
-when one was late, lost or repeated. Frames of unequal light are compared as they would be under equal light. The
-harmonics that the projector's gamma adds are common to all frames, and are not counted against one of them; where they
-shift the phase of three or four steps, this is reported. Frames of a Gray code contradict each other too: see
-`description_check`.
+Phase-shifted frames are one cosine per pixel, so that more than three of them are redundant, and
+contradict each other when one was late, lost or repeated. Frames of unequal light are compared as
+they would be under equal light. The harmonics that the projector's gamma adds are common to all
+frames, and are not counted against one of them; where they shift the phase of three or four steps,
+this is reported. Frames of a Gray code contradict each other too: see `description_check`.
 """
 
 from contextlib import suppress
@@ -17,7 +18,13 @@ from slviewer.errors import InputError
 from slviewer.fringe.aliased_harmonics import describe_gamma, estimate_aliased_harmonics
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.description_check import FrameReadings, find_contradictions
-from slviewer.fringe.frame_light import CLIPPED, FrameLight, detect_light_faults, equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import (
+    CLIPPED,
+    FrameLight,
+    detect_light_faults,
+    equalize_frames,
+    estimate_frame_light,
+)
 from slviewer.fringe.layout import Layout, axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps
@@ -26,7 +33,8 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.suspect import LIGHT_FAULTS, ORDER_FAULTS, Fault, Suspect
 
 SMALL_DRIFT = 0.05
-"""rms variation of the light up to which a misplaced frame is detected without correcting the light first."""
+"""rms variation of the light up to which a misplaced frame is detected without correcting the light
+first."""
 _CODE_FAULTS: dict[str, Fault] = {
     "frame-lag": "lag", "frame-order": "swapped", "missing-frame": "dropped", "duplicate-frame": "late"
 }  # fmt: skip
@@ -36,9 +44,10 @@ _CODE_FAULTS: dict[str, Fault] = {
 class FrameResidual:
     """Residual of one frame from the cosine fitted through all frames of its period.
 
-    ``rms``: grey levels, over the valid pixels that were sampled; ``sigmas``: the same as a multiple of the expected
-    noise, 1 for a frame that fits. Both NaN where there are no more than three steps, or no valid pixels. ``light``:
-    relative light of this frame, 1 like the others'; NaN where it cannot be measured.
+    ``rms``: grey levels, over the valid pixels that were sampled; ``sigmas``: the same as a
+    multiple of the expected noise, 1 for a frame that fits. Both NaN where there are no more than
+    three steps, or no valid pixels. ``light``: relative light of this frame, 1 like the others';
+    NaN where it cannot be measured.
     """
 
     frame: int
@@ -61,10 +70,11 @@ class FrameResiduals:
 
 
 def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> FrameResiduals:
-    """Measure how well the (n, h, w) frames of one axis fit each other. Raises InputError like `decode`.
+    """Measure how well the (n, h, w) frames of one axis fit each other. Raises InputError like
+    `decode`.
 
-    About 60,000 pixels of evenly spread rows are sampled. Gamma raises `sigmas` of all frames alike; only a frame that
-    contradicts the others is a suspect.
+    About 60,000 pixels of evenly spread rows are sampled. Gamma raises `sigmas` of all frames
+    alike; only a frame that contradicts the others is a suspect.
     """
     light = estimate_frame_light(sequence, stack)
     return _measure_axis_residuals(_Frames(FrameReadings(sequence, stack), light), axis)
@@ -73,11 +83,14 @@ def frame_residuals(sequence: PatternSequence, stack: np.ndarray, axis: Axis) ->
 def capture_residuals(
     sequence: PatternSequence, stack: np.ndarray, readings: FrameReadings | None = None
 ) -> list[FrameResiduals]:
-    """Return `frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded is skipped.
+    """Return `frame_residuals` of each axis of a capture (n, h, w); an axis that cannot be decoded
+    is skipped.
 
     ``readings``: of the stack, new ones if None.
     """
-    frames = _Frames(readings or FrameReadings(sequence, stack), estimate_frame_light(sequence, stack))
+    frames = _Frames(
+        readings or FrameReadings(sequence, stack), estimate_frame_light(sequence, stack)
+    )
     residuals = []
     for axis in sequence.axes:
         with suppress(InputError):  # decoding reports it, with the remedy
@@ -87,7 +100,8 @@ def capture_residuals(
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """Frames of a capture, their grey levels multiplied by ``factor``, and cached results that all axes share."""
+    """Frames of a capture, their grey levels multiplied by ``factor``, and cached results that all
+    axes share."""
 
     readings: FrameReadings
     light: FrameLight
@@ -111,12 +125,17 @@ class _Frames:
 
     @cached_property
     def contradictions(self) -> tuple[Contradiction, ...]:
-        """Contradictions between the frames and their description, except for those of the phase steps."""
+        """Contradictions between the frames and their description, except for those of the phase
+        steps."""
         return find_contradictions(self.readings, with_steps=False)
 
     def white(self, axis: Axis) -> float:
         """Return the grey level at which the frames of an axis are clipped."""
-        return CLIPPED if self.factor != 1 else white_level(self.sequence, self.stack, self.sequence.select(axis))
+        return (
+            CLIPPED
+            if self.factor != 1
+            else white_level(self.sequence, self.stack, self.sequence.select(axis))
+        )
 
 
 def _measure_axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:
@@ -134,12 +153,16 @@ def _measure_axis_residuals(frames: _Frames, axis: Axis) -> FrameResiduals:
     if any(suspect.fault != "gamma" for suspect in compared.suspects):
         return compared  # a misplaced frame distorts the estimate of the light, too
     return replace(
-        compared, suspects=tuple(_deduplicate_suspects([*detect_light_faults(sequence, light), *compared.suspects]))
+        compared,
+        suspects=tuple(
+            _deduplicate_suspects([*detect_light_faults(sequence, light), *compared.suspects])
+        ),
     )
 
 
 def _compare_frames(frames: _Frames, layout: Layout) -> FrameResiduals:
-    """Compute the residuals and the suspects of one axis for frames that are taken to be of equal light."""
+    """Compute the residuals and the suspects of one axis for frames that are taken to be of equal
+    light."""
     axis, stack, white = layout.axis, frames.stack, frames.white(layout.axis)
     noise = measure_noise(layout, stack, white)
     residuals: list[FrameResidual] = []
@@ -153,14 +176,20 @@ def _compare_frames(frames: _Frames, layout: Layout) -> FrameResiduals:
             remarks.append(f"{what}: too few pixels see fringes to judge its frames")
             continue
         if len(shift.indices) == 3:
-            remarks.append(f"{what}: three steps fit any three frames, so that only a repeated one can be told")
+            remarks.append(
+                f"{what}: three steps fit any three frames, so that only a repeated one can be told"
+            )
         suspects += detect_misordered_steps(sampled) or detect_foreign_frames(sampled)
         gain = frames.light.light.gain[list(shift.indices)]
-        residuals += _measure_residuals(sampled, _estimate_relative_light(sampled) * gain, frames.factor)
+        residuals += _measure_residuals(
+            sampled, _estimate_relative_light(sampled) * gain, frames.factor
+        )
     suspects += describe_gamma(estimate_aliased_harmonics(layout, stack, white, noise), layout)
     if layout.gray and not suspects:
         suspects += _detect_code_faults(frames, axis)
-    return FrameResiduals(axis, tuple(residuals), tuple(_deduplicate_suspects(suspects)), "; ".join(remarks))
+    return FrameResiduals(
+        axis, tuple(residuals), tuple(_deduplicate_suspects(suspects)), "; ".join(remarks)
+    )
 
 
 def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
@@ -181,7 +210,8 @@ def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
 def _measure_residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list[FrameResidual]:
     """Return the residual of each frame of one period.
 
-    ``gain`` (n,): relative light of each frame; ``factor``: that of `_Frames`, by which the rms is divided.
+    ``gain`` (n,): relative light of each frame; ``factor``: that of `_Frames`, by which the rms is
+    divided.
     """
     n = sampled.steps
     if n == 3:
@@ -189,7 +219,9 @@ def _measure_residuals(sampled: Fringe, gain: np.ndarray, factor: float) -> list
     differences = sampled.frames - sampled.fitted
     a, b = sampled.noise
     expected = np.maximum((a + b * sampled.fitted.mean(axis=0)) * (1 - 3 / n), 1e-6)
-    rms, sigmas = (np.sqrt(np.mean(square, axis=1)) for square in (differences**2, differences**2 / expected))
+    rms, sigmas = (
+        np.sqrt(np.mean(square, axis=1)) for square in (differences**2, differences**2 / expected)
+    )
     return [
         FrameResidual(i, float(rms[k]) / factor, float(sigmas[k]), float(gain[k]))
         for k, i in enumerate(sampled.shift.indices)
@@ -201,8 +233,8 @@ def _estimate_relative_light(sampled: Fringe) -> np.ndarray:
 
     NaN where a fringe does not determine it.
 
-    To first order a frame of light 1 + e has a residual of e times itself, less the part that the fit of the cosine
-    absorbs.
+    To first order a frame of light 1 + e has a residual of e times itself, less the part that the
+    fit of the cosine absorbs.
     """
     n = sampled.steps
     if n == 3 or not sampled.turns:
@@ -216,8 +248,11 @@ def _estimate_relative_light(sampled: Fringe) -> np.ndarray:
 
 
 def _deduplicate_suspects(suspects: list[Suspect]) -> list[Suspect]:
-    """Return the first suspect about the order of each frame, and all about light, sorted by frame."""
+    """Return the first suspect about the order of each frame, and all about light, sorted by
+    frame."""
     first_by_frame: dict[tuple[int, str], Suspect] = {}
     for suspect in suspects:
-        first_by_frame.setdefault((suspect.frame, suspect.fault if suspect.fault in LIGHT_FAULTS else ""), suspect)
+        first_by_frame.setdefault(
+            (suspect.frame, suspect.fault if suspect.fault in LIGHT_FAULTS else ""), suspect
+        )
     return [first_by_frame[key] for key in sorted(first_by_frame)]

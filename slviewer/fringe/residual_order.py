@@ -1,8 +1,8 @@
 """Estimation of the step that each phase-shifted frame shows.
 
-Every way in which frames can be out of order is tested as a hypothesis: it fits when its residual is as small as the
-noise, and it is accepted when it explains as much residual as such a fault would have caused. This needs only the
-frames' products with each other, (n, n) numbers.
+Every way in which frames can be out of order is tested as a hypothesis: it fits when its residual
+is as small as the noise, and it is accepted when it explains as much residual as such a fault would
+have caused. This needs only the frames' products with each other, (n, n) numbers.
 """
 
 from collections.abc import Iterator
@@ -17,30 +17,38 @@ from slviewer.fringe.sequence import Indices
 from slviewer.fringe.suspect import Fault, Suspect
 
 _AS_EXPECTED = 0.7
-"""Residual that a hypothesis must explain, as a share of the residual that its fault would cause."""
+"""Residual that a hypothesis must explain, as a share of the residual that its fault would
+cause."""
 _STRANGE = 0.08
 """rms error, as a share of the modulation, from which a frame that no step explains is strange."""
 _STRANGE_NOISE = 5.0  # its square must also exceed this many times the variance of the other frames
-_AS_GOOD = (
-    1.3  # hypotheses within this factor of the least noise, plus this share of the squared fringe, are equally good
-)
+# hypotheses within this factor of the least noise, plus this share of the squared fringe, are
+# equally good
+_AS_GOOD = 1.3
 _AS_GOOD_FRINGE = 3e-3
 _SAME = 1e-6
-_ALIKE = 0.1  # squared difference of repeated frames, as a share of the usual one between successive frames
-_LIGHT_ALONE = 0.4  # share of the squared difference that remains after scaling, if only the light differs
+# squared difference of repeated frames, as a share of the usual one between successive frames
+_ALIKE = 0.1
+_LIGHT_ALONE = (
+    0.4  # share of the squared difference that remains after scaling, if only the light differs
+)
 _DARKEST = 0.6  # no lamp flickers by more
 _MOST_FAULTS = 3
-_FEWEST_ORDERED = 5  # of four steps and fewer every order is a turn, a reflection or an exchange of two
+_FEWEST_ORDERED = (
+    5  # of four steps and fewer every order is a turn, a reflection or an exchange of two
+)
 _OFF_STEP = 0.25  # tolerance of a frame's position, in steps, and of its radius
-_FEW_MISPLACED = 0.5  # share of the frames below which single frames have changed places, and the others are in order
+# share of the frames below which single frames have changed places, and the others are in order
+_FEW_MISPLACED = 0.5
 
 
 @dataclass(frozen=True)
 class _Hypothesis:
     """Hypothesis of a fault: the step that each frame shows.
 
-    ``steps``: step by position in the capture, 0 for this period's first frame. ``place``: position of the faulty
-    frame; ``other``: position of the frame whose pattern it shows, or the number of images of lag.
+    ``steps``: step by position in the capture, 0 for this period's first frame. ``place``: position
+    of the faulty frame; ``other``: position of the frame whose pattern it shows, or the number of
+    images of lag.
     """
 
     fault: Fault
@@ -57,7 +65,10 @@ def detect_misordered_steps(sampled: Fringe) -> list[Suspect]:
     n = sampled.steps
     products = _Products(sampled, sampled.frames)
     if repeated := _detect_repeated_steps(sampled, products):
-        return [_report_fault([_Hypothesis("late", {}, k, k - 1)], sampled.shift.indices) for k in repeated]
+        return [
+            _report_fault([_Hypothesis("late", {}, k, k - 1)], sampled.shift.indices)
+            for k in repeated
+        ]
     if n == 3:
         return []
     products = _choose_products(sampled, products)
@@ -73,12 +84,14 @@ def detect_misordered_steps(sampled: Fringe) -> list[Suspect]:
 
 
 def recover_step_order(sampled: Fringe) -> list[int] | None:
-    """Return the step that each frame of a period shows, if all steps are present but not in the described order.
+    """Return the step that each frame of a period shows, if all steps are present but not in the
+    described order.
 
-    None where the frames are in their described order, up to its first step and direction, or in no order.
+    None where the frames are in their described order, up to its first step and direction, or in no
+    order.
 
-    The frames less their mean span the plane of the vectors cos(2 pi k / n) and sin(2 pi k / n): in any orthonormal
-    basis of this plane the position of a frame is its step, rotated or mirrored.
+    The frames less their mean span the plane of the vectors cos(2 pi k / n) and sin(2 pi k / n): in
+    any orthonormal basis of this plane the position of a frame is its step, rotated or mirrored.
     """
     n = sampled.steps
     if n < _FEWEST_ORDERED:
@@ -89,7 +102,11 @@ def recover_step_order(sampled: Fringe) -> list[int] | None:
     turns -= np.angle(np.mean(np.exp(2j * np.pi * turns))) / (2 * np.pi)  # whole steps apart
     places = np.rint(turns).astype(int) % n
     radius = np.hypot(*basis.T) / np.sqrt(2 / n)
-    if len(set(places.tolist())) < n or np.abs(turns - np.rint(turns)).max() > _OFF_STEP or np.ptp(radius) > _OFF_STEP:
+    if (
+        len(set(places.tolist())) < n
+        or np.abs(turns - np.rint(turns)).max() > _OFF_STEP
+        or np.ptp(radius) > _OFF_STEP
+    ):
         return None
     described = np.arange(n)
     orders = [(sign * places + first) % n for sign in (1, -1) for first in range(n)]
@@ -100,19 +117,23 @@ def recover_step_order(sampled: Fringe) -> list[int] | None:
 
 
 def detect_foreign_frames(sampled: Fringe) -> list[Suspect]:
-    """Return suspects for frames that contain a share of the image before them, or that no step explains."""
+    """Return suspects for frames that contain a share of the image before them, or that no step
+    explains."""
     return detect_ghosting(sampled) or detect_strange_frames(sampled)
 
 
 def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
-    """Return suspects for frames that no step explains, after order, light and ghosting have been excluded."""
+    """Return suspects for frames that no step explains, after order, light and ghosting have been
+    excluded."""
     n = sampled.steps
     products = _choose_products(sampled, _Products(sampled, sampled.frames))
     steps = {k: k for k in range(n)}
     out: list[Suspect] = []
     while len(out) < _MOST_FAULTS:
         residual, freedom = products.compute_residual(steps)
-        without = {k: products.compute_residual({i: s for i, s in steps.items() if i != k}) for k in steps}
+        without = {
+            k: products.compute_residual({i: s for i, s in steps.items() if i != k}) for k in steps
+        }
         k = min(without, key=lambda i: without[i][0])
         rest, more = without[k]
         if more < 1:
@@ -123,7 +144,10 @@ def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
             break
         del steps[k]
         i = sampled.shift.indices[k]
-        text = f"frame {i + 1} does not fit the other steps: something else was shown, or something moved"
+        text = (
+            f"frame {i + 1} does not fit the other steps: something else was shown, or something"
+            " moved"
+        )
         out.append(Suspect(i, "strange", text))
     return out
 
@@ -131,24 +155,29 @@ def detect_strange_frames(sampled: Fringe) -> list[Suspect]:
 def _differs_in_light_only(sampled: Fringe, k: int) -> bool:
     """Return whether frame ``k`` is what the other frames predict, up to a factor of brightness."""
     n, others = sampled.steps, np.delete(np.arange(sampled.steps), k)
-    weights = cosine_columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(cosine_columns(others, n, sampled.own))
+    weights = cosine_columns(np.array([k]), n, sampled.own) @ np.linalg.pinv(
+        cosine_columns(others, n, sampled.own)
+    )
     expected = np.einsum("k,kp->p", weights[0].astype(np.float32), sampled.frames[others])
     frame = sampled.frames[k]
     scale = float(frame @ expected) / max(float(expected @ expected), 1e-9)
     if not _DARKEST < scale < 1 / _DARKEST:
         return False
-    return float(np.mean((frame - scale * expected) ** 2)) < _LIGHT_ALONE * float(np.mean((frame - expected) ** 2))
+    return float(np.mean((frame - scale * expected) ** 2)) < _LIGHT_ALONE * float(
+        np.mean((frame - expected) ** 2)
+    )
 
 
 class _Products:
     """Mean products of the frames of a period, and of those around them, over the sampled pixels.
 
-    ``places``: positions of these frames, 0 for the period's first; ``strength``: mean square of the modulation,
-    halved.
+    ``places``: positions of these frames, 0 for the period's first; ``strength``: mean square of
+    the modulation, halved.
     """
 
     def __init__(self, sampled: Fringe, frames: np.ndarray) -> None:
-        """Compute the products of ``frames`` (n, p) and of the frames shown right before and after them."""
+        """Compute the products of ``frames`` (n, p) and of the frames shown right before and after
+        them."""
         first = sampled.shift.indices[0]
         mean = frames.mean(axis=0)  # the fitted background absorbs it, and numbers become smaller
         rows = dict(enumerate(frames))
@@ -158,13 +187,15 @@ class _Products:
         self._products = (data @ data.T).astype(float) / data.shape[1]
         self._index = {place: i for i, place in enumerate(self.places)}
         self._n, self._own = sampled.steps, sampled.own
-        # The fringe at step angle d is its real part times cos d, less its imaginary part times sin d.
+        # The fringe at step angle d is its real part times cos d, less its imaginary part times sin
+        # d.
         parts = np.stack([sampled.phasor.real, -sampled.phasor.imag])
         self._fringe = (parts @ parts.T).astype(float) / parts.shape[1]
         self.strength = float(np.trace(self._fringe)) / 2
 
     def compute_residual(self, steps: dict[int, int]) -> tuple[float, int]:
-        """Return the residual of a hypothesis, squared grey levels per pixel, and its degrees of freedom.
+        """Return the residual of a hypothesis, squared grey levels per pixel, and its degrees of
+        freedom.
 
         ``steps``: the step that the frame at each position shows.
         """
@@ -173,29 +204,37 @@ class _Products:
         return float((projection * self._products[rows[:, None], rows]).sum()), freedom
 
     def judge(self, accepted: dict[int, int], n: int) -> list[tuple[_Hypothesis, float, int]]:
-        """Return each further hypothesis besides ``accepted`` of n steps that can fail, with its `compute_residual`."""
+        """Return each further hypothesis besides ``accepted`` of n steps that can fail, with its
+        `compute_residual`."""
         hypotheses = _list_hypotheses(accepted, self.places, n)
-        judged = [(hypothesis, *self.compute_residual(hypothesis.steps)) for hypothesis in hypotheses]
+        judged = [
+            (hypothesis, *self.compute_residual(hypothesis.steps)) for hypothesis in hypotheses
+        ]
         return [each for each in judged if each[2] >= 1]
 
     def predict_residual(self, before: dict[int, int], after: dict[int, int]) -> float:
-        """Return the residual that the fringe alone has under ``before`` if ``after`` is true, in squared grey levels.
+        """Return the residual that the fringe alone has under ``before`` if ``after`` is true, in
+        squared grey levels.
 
         Both are steps by position; only positions in both count.
         """
         shared = [place for place in before if place in after]
-        projection, _ = _compute_residual_projector(tuple(before[place] for place in shared), self._n, self._own)
+        projection, _ = _compute_residual_projector(
+            tuple(before[place] for place in shared), self._n, self._own
+        )
         fringe = cosine_columns(np.array([after[place] for place in shared]), self._n, 1)[:, 1:]
         return float(np.sum(projection * (fringe @ self._fringe @ fringe.T)))
 
     def predict_least_residual(self, steps: dict[int, int], n: int) -> float:
-        """Return the residual that the smallest fault causes, one late frame, in squared grey levels."""
+        """Return the residual that the smallest fault causes, one late frame, in squared grey
+        levels."""
         return min(self.predict_residual(steps, steps | {k: k - 1}) for k in range(1, n))
 
 
 @lru_cache(4096)
 def _compute_residual_projector(steps: Indices, n: int, own: int) -> tuple[np.ndarray, int]:
-    """Return the (k, k) matrix that projects frames of these k steps onto their residual, and its degrees of freedom.
+    """Return the (k, k) matrix that projects frames of these k steps onto their residual, and its
+    degrees of freedom.
 
     ``n``: steps of the period; ``own``: number of harmonics fitted per pixel.
     """
@@ -210,19 +249,27 @@ def _choose_products(sampled: Fringe, products: _Products) -> _Products:
     A frame far out of order distorts the harmonics that are attributed to gamma.
     """
     nominal = {k: k for k in range(sampled.steps)}
-    if products.compute_residual(nominal)[0] < _AS_EXPECTED * products.predict_least_residual(nominal, sampled.steps):
+    if products.compute_residual(nominal)[0] < _AS_EXPECTED * products.predict_least_residual(
+        nominal, sampled.steps
+    ):
         return products
     raw = _Products(sampled, sampled.seen)
 
     def compute_lowest_residual(products: _Products) -> float:
         """Return the smallest residual, per degree of freedom, of any hypothesis."""
-        return min((rest / more for _, rest, more in products.judge(nominal, sampled.steps)), default=np.inf)
+        return min(
+            (rest / more for _, rest, more in products.judge(nominal, sampled.steps)),
+            default=np.inf,
+        )
 
     return min((products, raw), key=compute_lowest_residual)
 
 
-def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> list[_Hypothesis] | None:
-    """Return the hypothesis to accept instead of ``accepted``, with those that are as good; None if there is none."""
+def _choose_hypothesis(
+    products: _Products, accepted: _Hypothesis, n: int
+) -> list[_Hypothesis] | None:
+    """Return the hypothesis to accept instead of ``accepted``, with those that are as good; None if
+    there is none."""
     residual, freedom = products.compute_residual(accepted.steps)
     least = products.predict_least_residual(accepted.steps, n)
     if residual < _AS_EXPECTED * least:
@@ -233,9 +280,12 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
     noise = min(rest / more for _, rest, more in judged)
     limit = _AS_GOOD * noise + _AS_GOOD_FRINGE * products.strength
     fitting = [each for each in judged if each[1] / each[2] <= limit]
-    # The hypothesis that explains the most frames is the most easily refuted, hence the one to accept.
+    # The hypothesis that explains the most frames is the most easily refuted, hence the one to
+    # accept.
     fine = _SAME * products.strength
-    hypothesis, rest, more = min(fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank_hypothesis(each[0])))
+    hypothesis, rest, more = min(
+        fitting, key=lambda each: (-each[2], round(each[1] / fine), _rank_hypothesis(each[0]))
+    )
     gain = (residual - freedom * noise) - (rest - more * noise)
     caused = products.predict_residual(accepted.steps, hypothesis.steps)
     if caused > least / 2:
@@ -244,7 +294,9 @@ def _choose_hypothesis(products: _Products, accepted: _Hypothesis, n: int) -> li
         believed = gain > max(_STRANGE**2 * products.strength, _STRANGE_NOISE * noise)
     if hypothesis.fault == "strange" or not believed:
         return None
-    swaps = [s for s, r, m in fitting if s.fault == "swapped" and m == more and abs(r - rest) <= fine]
+    swaps = [
+        s for s, r, m in fitting if s.fault == "swapped" and m == more and abs(r - rest) <= fine
+    ]
     return swaps if hypothesis.fault == "swapped" else [hypothesis]
 
 
@@ -292,7 +344,9 @@ def _list_shifted_frames(places: list[int], n: int) -> Iterator[_Hypothesis]:
 
 def _report_fault(hypotheses: list[_Hypothesis], indices: Indices) -> Suspect:
     """Return the suspect for hypotheses that explain the frames equally well."""
-    texts = list(dict.fromkeys(_describe_hypothesis(hypothesis, indices) for hypothesis in hypotheses))
+    texts = list(
+        dict.fromkeys(_describe_hypothesis(hypothesis, indices) for hypothesis in hypotheses)
+    )
     return Suspect(indices[hypotheses[0].place], hypotheses[0].fault, ", or ".join(texts))
 
 
@@ -312,9 +366,12 @@ def _describe_hypothesis(hypothesis: _Hypothesis, indices: Indices) -> str:
 
 
 def _detect_repeated_steps(sampled: Fringe, products: _Products) -> list[int]:
-    """Return the steps whose frame repeats the frame before it, judged by the usual difference of successive frames."""
+    """Return the steps whose frame repeats the frame before it, judged by the usual difference of
+    successive frames."""
     n, seen = sampled.steps, sampled.seen
-    if n == 3 and not sampled.turns:  # two steps look alike where the pixels cover one side of the fringe only
+    if (
+        n == 3 and not sampled.turns
+    ):  # two steps look alike where the pixels cover one side of the fringe only
         return []
     differences = np.array([float(np.mean((seen[k] - seen[k - 1]) ** 2)) for k in range(1, n)])
     noise = 2 * sampled.roughness**2
@@ -327,4 +384,8 @@ def _detect_repeated_steps(sampled: Fringe, products: _Products) -> list[int]:
     nominal = {k: k for k in range(n)}
     residual, _ = products.compute_residual(nominal)
     rest, _ = products.compute_residual({k: k for k in range(n) if k not in alike})
-    return alike if rest < residual / 2 and residual > products.predict_least_residual(nominal, n) / 3 else []
+    return (
+        alike
+        if rest < residual / 2 and residual > products.predict_least_residual(nominal, n) / 3
+        else []
+    )

@@ -19,17 +19,19 @@ HIGHEST = 6
 """The highest harmonic of the fringe that is attributed to gamma."""
 ONE_SIDED = 0.5
 """Length of the mean unit phasor from which pixels do not cover all phases of the fringe."""
-_OUTLIER_CLIPS = 0.5  # a frame that alone clips more of the pixels shows something else, and does not count as clipped
+# a frame that alone clips more of the pixels shows something else, and does not count as clipped
+_OUTLIER_CLIPS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Fringe:
     """Frames of one period at p valid pixels, float32 grey levels.
 
-    ``seen``, ``frames`` and ``fitted`` (n, p): as captured; less the harmonics that gamma adds to all of them; and
-    background + modulation cos. ``beside``: frames shown right before and after these, by index, (p,) each. ``phasor``
-    (p,) complex64, modulation e^(i phase). ``own``: number of harmonics fitted per pixel. ``noise``: (a, b), see
-    `noise.measure_noise`. ``roughness``: grey levels by which neighbouring pixels differ, noise and texture.
+    ``seen``, ``frames`` and ``fitted`` (n, p): as captured; less the harmonics that gamma adds to
+    all of them; and background + modulation cos. ``beside``: frames shown right before and after
+    these, by index, (p,) each. ``phasor`` (p,) complex64, modulation e^(i phase). ``own``: number
+    of harmonics fitted per pixel. ``noise``: (a, b), see `noise.measure_noise`. ``roughness``: grey
+    levels by which neighbouring pixels differ, noise and texture.
     """
 
     shift: Shift
@@ -58,12 +60,14 @@ class Fringe:
 
     @property
     def turns(self) -> bool:
-        """Whether the pixels cover all phases of the fringe; only then can light and phase changes be separated."""
+        """Whether the pixels cover all phases of the fringe; only then can light and phase changes
+        be separated."""
         return measure_concentration(self.phasor) < ONE_SIDED
 
 
 def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
-    """Return the design matrix (len(steps), 1 + 2 own) of a fringe: constant, cosines and sines at each step of n.
+    """Return the design matrix (len(steps), 1 + 2 own) of a fringe: constant, cosines and sines at
+    each step of n.
 
     ``own``: number of harmonics.
     """
@@ -79,7 +83,8 @@ def select_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
 
 
 def sample_fringe(stack: np.ndarray, shift: Shift, noise: Noise, white: float) -> Fringe | None:
-    """Return the sampled fringes of one period of a stack (n, h, w); None where too few pixels are modulated.
+    """Return the sampled fringes of one period of a stack (n, h, w); None where too few pixels are
+    modulated.
 
     ``noise``: (a, b) of the grey levels; ``white``: level at which the camera clips.
     """
@@ -108,25 +113,33 @@ def sample_fringe(stack: np.ndarray, shift: Shift, noise: Noise, white: float) -
         background, phasor = fit_cosine(frames)
     fitted = evaluate_cosine(background, phasor, n)
     neighbours = {
-        i: stack[i][rows].ravel()[valid].astype(np.float32) for i in _list_adjacent_frames(shift.indices, len(stack))
+        i: stack[i][rows].ravel()[valid].astype(np.float32)
+        for i in _list_adjacent_frames(shift.indices, len(stack))
     }
     return Fringe(shift, levels, frames, fitted, neighbours, phasor, own, noise, rough)
 
 
 def estimate_roughness(frames: np.ndarray, width: int) -> float:
-    """Return the grey levels by which neighbours along a row deviate from a smooth curve, at least 0.29.
+    """Return the grey levels by which neighbours along a row deviate from a smooth curve, at least
+    0.29.
 
-    ``frames`` (n, p) of whole rows of ``width`` pixels, integral grey levels. A fault of a frame does not affect it.
-    The minimum is the noise of rounding: dark and saturated pixels do not differ at all.
+    ``frames`` (n, p) of whole rows of ``width`` pixels, integral grey levels. A fault of a frame
+    does not affect it. The minimum is the noise of rounding: dark and saturated pixels do not
+    differ at all.
     """
     third = np.diff(frames.reshape(len(frames), -1, width), n=3, axis=-1).ravel()
-    counts = np.cumsum(np.bincount(np.abs(third, out=third).astype(np.intp)))  # faster than sorting integral values
-    median = float(np.searchsorted(counts, [(third.size - 1) // 2, third.size // 2], side="right").mean())
+    counts = np.cumsum(
+        np.bincount(np.abs(third, out=third).astype(np.intp))
+    )  # faster than sorting integral values
+    median = float(
+        np.searchsorted(counts, [(third.size - 1) // 2, third.size // 2], side="right").mean()
+    )
     return max(median / (0.6745 * np.sqrt(20)), 12**-0.5)  # 1 + 9 + 9 + 1 variances
 
 
 def fit_cosine(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return background (p,) float32 and modulation e^(i phase) (p,) complex64 of ``frames`` (n, p), equidistant steps.
+    """Return background (p,) float32 and modulation e^(i phase) (p,) complex64 of ``frames`` (n,
+    p), equidistant steps.
 
     The phase is that of a positive phase sign.
     """
@@ -144,12 +157,14 @@ def evaluate_cosine(background: np.ndarray, phasor: np.ndarray, n: int) -> np.nd
 
 
 def measure_concentration(phasor: np.ndarray) -> float:
-    """Return the length of the mean unit phasor (p,): 0 for evenly spread phases, 1 for a common one."""
+    """Return the length of the mean unit phasor (p,): 0 for evenly spread phases, 1 for a common
+    one."""
     return abs(complex(np.mean(phasor / np.maximum(np.abs(phasor), 1e-6))))
 
 
 def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np.ndarray:
-    """Fit the harmonics beyond ``own`` that all pixels share, with each fringe's phase and strength; returns (n, p).
+    """Fit the harmonics beyond ``own`` that all pixels share, with each fringe's phase and
+    strength; returns (n, p).
 
     Harmonic m of the fringe appears among n steps as the m-th, or as its alias.
     """
@@ -167,7 +182,10 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
     for place, (scale, direct, mirrored) in enumerate(aliases):
         residual = np.empty_like(phasor)
         residual.real, residual.imag = scale * measured[2 * place : 2 * place + 2]
-        design = np.stack([strength * powers[m] for m in direct] + [strength * np.conj(powers[m]) for m in mirrored])
+        design = np.stack(
+            [strength * powers[m] for m in direct]
+            + [strength * np.conj(powers[m]) for m in mirrored]
+        )
         normal, moment = design.conj() @ design.T, design.conj() @ residual
         if len(design) == 1:  # the pseudo-inverse of one number, in a tenth of the time
             weights = moment * (1 / normal.real[0]) if normal[0, 0] else np.zeros_like(moment)
@@ -179,14 +197,20 @@ def fit_common_harmonics(frames: np.ndarray, phasor: np.ndarray, own: int) -> np
 
 
 @cache
-def _list_common_harmonics(n: int, own: int) -> tuple[np.ndarray, list[tuple[np.float32, list[int], list[int]]]]:
-    """Return the waves beyond harmonic ``own`` of n steps, (2 q, n) float32, in which harmonics of a fringe appear.
+def _list_common_harmonics(
+    n: int, own: int
+) -> tuple[np.ndarray, list[tuple[np.float32, list[int], list[int]]]]:
+    """Return the waves beyond harmonic ``own`` of n steps, (2 q, n) float32, in which harmonics of
+    a fringe appear.
 
-    Also, for each of the q: the scale of its amplitude, and the harmonics that appear in it directly and mirrored.
+    Also, for each of the q: the scale of its amplitude, and the harmonics that appear in it
+    directly and mirrored.
     """
     waves, aliases = [np.zeros((0, n))], []
     for q in range(own + 1, n // 2 + 1):
-        direct, mirrored = ([m for m in range(2, HIGHEST + 1) if (m + s * q) % n == 0] for s in (-1, 1))
+        direct, mirrored = (
+            [m for m in range(2, HIGHEST + 1) if (m + s * q) % n == 0] for s in (-1, 1)
+        )
         if direct or mirrored:
             angle = 2 * np.pi * q * np.arange(n) / n
             waves.append(np.stack([np.cos(angle), -np.sin(angle)]))
@@ -195,7 +219,8 @@ def _list_common_harmonics(n: int, own: int) -> tuple[np.ndarray, list[tuple[np.
 
 
 def _list_adjacent_frames(indices: tuple[int, ...], count: int) -> list[int]:
-    """Return the frames up to ``BESIDE`` before and after a period; none if its frames are not consecutive."""
+    """Return the frames up to ``BESIDE`` before and after a period; none if its frames are not
+    consecutive."""
     if indices != tuple(range(indices[0], indices[0] + len(indices))):
         return []
     first, last = max(indices[0] - BESIDE, 0), min(indices[-1] + BESIDE + 1, count)

@@ -1,7 +1,7 @@
 """Response of the light that a camera measures to the grey level that a projector shows.
 
-A response is given as `shown` (n,) grey levels, increasing from 0 to 255, and `seen` (n,) light, 0 for dark and 1 for
-white, noise included. Between them it is a monotone piecewise cubic (PCHIP).
+A response is given as `shown` (n,) grey levels, increasing from 0 to 255, and `seen` (n,) light, 0
+for dark and 1 for white, noise included. Between them it is a monotone piecewise cubic (PCHIP).
 """
 
 import numpy as np
@@ -16,7 +16,9 @@ _FINE = 16  # places per grey level at which a response is tabulated before it i
 def fit_gamma(shown: np.ndarray, seen: np.ndarray) -> float:
     """Fit the exponent of the power of shown / 255 that approximates the response best."""
     x, y = _check_response(shown, seen)
-    fit = minimize_scalar(lambda g: float(np.sum((x**g - y) ** 2)), bounds=(0.2, 5.0), method="bounded")
+    fit = minimize_scalar(
+        lambda g: float(np.sum((x**g - y) ** 2)), bounds=(0.2, 5.0), method="bounded"
+    )
     return float(fit.x)
 
 
@@ -27,7 +29,8 @@ def measure_nonlinearity(shown: np.ndarray, seen: np.ndarray) -> float:
 
 
 def predict_phase_error(shown: np.ndarray, seen: np.ndarray, steps: int) -> float:
-    """Predict the rms error of the phase, rad, that the response causes in `steps` phase steps, without any blur."""
+    """Predict the rms error of the phase, rad, that the response causes in `steps` phase steps,
+    without any blur."""
     curve = _fit_monotonic_curve(shown, seen)
     phase = 2 * np.pi * np.arange(360) / 360
     k = 2 * np.pi * np.arange(steps)[:, None] / steps
@@ -51,16 +54,32 @@ def linearise_levels(shown: np.ndarray, seen: np.ndarray) -> tuple[int, ...]:
 def _fit_monotonic_curve(shown: np.ndarray, seen: np.ndarray) -> PchipInterpolator:
     """Fit an interpolator to the response, made monotonic: noise must not reverse it."""
     x, y = _check_response(shown, seen)
-    rising = (np.maximum.accumulate(y) + np.minimum.accumulate(y[::-1])[::-1]) / 2  # noise must not turn it round
+    rising = (
+        np.maximum.accumulate(y) + np.minimum.accumulate(y[::-1])[::-1]
+    ) / 2  # noise must not turn it round
     rising[0], rising[-1] = 0.0, 1.0
     return PchipInterpolator(x, np.clip(rising, 0, 1))
 
 
 def _check_response(shown: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return grey levels (0 to 1) and light as float arrays. Raises InputError where they are no response."""
+    """Return grey levels (0 to 1) and light as float arrays. Raises InputError where they are no
+    response."""
     x, y = np.asarray(shown, float) / 255, np.asarray(seen, float)
-    if x.ndim != 1 or x.shape != y.shape or len(x) < 3 or x[0] != 0 or x[-1] != 1 or (np.diff(x) <= 0).any():
-        raise InputError("a response needs three or more grey levels that rise from 0 to 255, and the light of each")
+    if (
+        x.ndim != 1
+        or x.shape != y.shape
+        or len(x) < 3
+        or x[0] != 0
+        or x[-1] != 1
+        or (np.diff(x) <= 0).any()
+    ):
+        raise InputError(
+            "a response needs three or more grey levels that rise from 0 to 255, and the light of"
+            " each"
+        )
     if not np.isfinite(y).all():
-        raise InputError("a response has light that is no number: measure it where the projector lights the scene")
+        raise InputError(
+            "a response has light that is no number: measure it where the projector lights the"
+            " scene"
+        )
     return x, y

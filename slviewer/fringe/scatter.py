@@ -1,8 +1,10 @@
-"""Noise of the phase measured from neighbouring pixels, which includes what the residual over phase steps does not.
+"""Noise of the phase measured from neighbouring pixels, which includes what the residual over phase
+steps does not.
 
-Lossy compression adds errors that are partly in the fringe's own harmonic. The n steps of a pixel fit these as well as
-the fringe itself, so that the noise of grey levels predicts too little; but the phase of a smooth surface then scatters
-more than predicted from pixel to pixel, or, where JPEG has smoothed its blocks of 8 x 8 pixels, from block to block.
+Lossy compression adds errors that are partly in the fringe's own harmonic. The n steps of a pixel
+fit these as well as the fringe itself, so that the noise of grey levels predicts too little; but
+the phase of a smooth surface then scatters more than predicted from pixel to pixel, or, where JPEG
+has smoothed its blocks of 8 x 8 pixels, from block to block.
 """
 
 from dataclasses import dataclass, replace
@@ -18,18 +20,21 @@ WINDOWS = 14
 FEWEST = 30
 """Number of valid windows below which the scatter is not measured."""
 BLOCK = 8
-"""px: side of a block of JPEG, and of the parts of a window whose third differences are averaged."""
+"""px: side of a block of JPEG, and of the parts of a window whose third differences are
+averaged."""
 QUANTILE = 0.25
-"""Quantile of the blocks' ratios of observed to predicted variance that is used: up to three quarters of a scene may be
-edges and texture."""
+"""Quantile of the blocks' ratios of observed to predicted variance that is used: up to three
+quarters of a scene may be edges and texture."""
 SIGNIFICANT = 2.0
-"""Times the predicted standard deviation, below which none is raised without compression: the relief of an object,
-which is no noise, reaches 1.3."""
+"""Times the predicted standard deviation, below which none is raised without compression: the
+relief of an object, which is no noise, reaches 1.3."""
 BLOCKINESS = 1.5
-"""Third differences across the borders of blocks over those inside, from which an image counts as compressed: without
-compression noise leaves it within 1.15, with JPEG of quality 85 it is 2 to 3."""
+"""Third differences across the borders of blocks over those inside, from which an image counts as
+compressed: without compression noise leaves it within 1.15, with JPEG of quality 85 it is 2 to
+3."""
 ROUNDING = 1 / 12
-"""Variance of a rounded grey level: frames without noise still have it, and residuals may not include it."""
+"""Variance of a rounded grey level: frames without noise still have it, and residuals may not
+include it."""
 _VARIANCES = 20.0  # of a third difference: 1 + 9 + 9 + 1
 _FREEDOM = 25.0  # of the mean over a block: its differences overlap
 
@@ -38,8 +43,9 @@ _FREEDOM = 25.0  # of the mean over a block: its differences overlap
 class Scatter:
     """Scatter of the phase between neighbouring pixels.
 
-    ``ratio``: observed over predicted standard deviation of the phase; NaN for too few valid pixels. ``blockiness``:
-    phase differences across the borders of a grid of 8 x 8 pixels over those inside; 1 without a grid.
+    ``ratio``: observed over predicted standard deviation of the phase; NaN for too few valid
+    pixels. ``blockiness``: phase differences across the borders of a grid of 8 x 8 pixels over
+    those inside; 1 without a grid.
     """
 
     ratio: float
@@ -59,7 +65,8 @@ def with_scatter(phase: PhaseMap) -> PhaseMap:
 
 
 def measure_scatter(phase: PhaseMap) -> Scatter:
-    """Measure the scatter of the phase between neighbouring pixels of smooth surfaces, relative to ``phase.noise``."""
+    """Measure the scatter of the phase between neighbouring pixels of smooth surfaces, relative to
+    ``phase.noise``."""
     if not phase.steps or min(phase.phase.shape) < WINDOW:
         return Scatter(np.nan, 1.0)
     where, first = _select_valid_windows(phase)
@@ -68,10 +75,16 @@ def measure_scatter(phase: PhaseMap) -> Scatter:
     values = phase.phase[where]
     values = values - values.mean(axis=(1, 2), keepdims=True)  # exact enough in float32
     third = [np.diff(values, n=3, axis=axis) for axis in (1, 2)]
-    blockiness = max(_measure_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2))
+    blockiness = max(
+        _measure_blockiness(np.abs(np.moveaxis(third[i], i + 1, 2)), first[:, i]) for i in range(2)
+    )
     a, b = phase.noise
-    predicted = np.maximum(np.float32(a) + np.float32(b) * phase.background[where], np.float32(ROUNDING))
-    predicted *= np.float32(2 / phase.steps) / np.maximum(phase.modulation[where], np.float32(1e-6)) ** 2
+    predicted = np.maximum(
+        np.float32(a) + np.float32(b) * phase.background[where], np.float32(ROUNDING)
+    )
+    predicted *= (
+        np.float32(2 / phase.steps) / np.maximum(phase.modulation[where], np.float32(1e-6)) ** 2
+    )
     predicted += np.float32(phase.model_error_rad**2)
     if blockiness > BLOCKINESS:
         ratio = float(np.median(_compute_window_variance(values) / predicted.mean(axis=(1, 2))))
@@ -90,7 +103,8 @@ def _select_valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray
     """
     height, width = phase.phase.shape
     corners = [
-        np.unique(np.linspace(0, size - WINDOW, min(WINDOWS, size // WINDOW)).astype(int)) for size in (height, width)
+        np.unique(np.linspace(0, size - WINDOW, min(WINDOWS, size // WINDOW)).astype(int))
+        for size in (height, width)
     ]
     first = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 2)
     reach = np.arange(WINDOW)
@@ -100,13 +114,17 @@ def _select_valid_windows(phase: PhaseMap) -> tuple[tuple[np.ndarray, np.ndarray
 
 
 def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
-    """Measure the blockiness, see `Scatter`, from sizes of third differences (m, lines, WINDOW - 3).
+    """Measure the blockiness, see `Scatter`, from sizes of third differences (m, lines, WINDOW -
+    3).
 
-    The differences are along the last axis; ``first`` (m,): px at which each window begins along it.
+    The differences are along the last axis; ``first`` (m,): px at which each window begins along
+    it.
     """
     offset = (first[:, None] + np.arange(third.shape[2])) % BLOCK
     size = third.mean(axis=1)
-    sizes = np.array([np.median(size[offset == k]) if (offset == k).any() else np.nan for k in range(BLOCK)])
+    sizes = np.array(
+        [np.median(size[offset == k]) if (offset == k).any() else np.nan for k in range(BLOCK)]
+    )
     if not np.isfinite(sizes).all():
         return 1.0
     k = int(np.argmax(sizes))
@@ -115,7 +133,8 @@ def _measure_blockiness(third: np.ndarray, first: np.ndarray) -> float:
 
 
 def _compute_window_variance(values: np.ndarray) -> np.ndarray:
-    """Return the variance (m,) of windows (m, WINDOW, WINDOW) about the cubic surface fitted to each."""
+    """Return the variance (m,) of windows (m, WINDOW, WINDOW) about the cubic surface fitted to
+    each."""
     x = np.linspace(-1, 1, WINDOW)
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
     basis, _ = np.linalg.qr(np.stack([np.outer(x**i, x**j).ravel() for i, j in powers], axis=1))
@@ -125,7 +144,8 @@ def _compute_window_variance(values: np.ndarray) -> np.ndarray:
 
 
 def _compute_block_variance(values: np.ndarray) -> np.ndarray:
-    """Return the variance (4 m,) of each block of the windows, from third differences along rows and columns."""
+    """Return the variance (4 m,) of each block of the windows, from third differences along rows
+    and columns."""
     blocks = _split_blocks(values)
     squares = [(np.diff(blocks, n=3, axis=axis) ** 2).mean(axis=(1, 2)) for axis in (1, 2)]
     return np.asarray((squares[0] + squares[1]) / (2 * _VARIANCES))

@@ -50,10 +50,11 @@ class PerAxis(NamedTuple, Generic[T]):
 class Frame:
     """One projected image.
 
-    ``phase``: step ``step`` of ``steps`` of a cosine of ``period_px``. ``gray``: bit ``bit`` (0 = most significant) of
-    ``bits`` of the Gray code of the fringe order; ``inverse``: its negative. ``complementary``: the one extra, least
-    significant bit, so that Gray and complementary bits together number the half periods. ``white``, ``black``,
-    ``texture`` (the scene under white light): no axis.
+    ``phase``: step ``step`` of ``steps`` of a cosine of ``period_px``. ``gray``: bit ``bit`` (0 =
+    most significant) of ``bits`` of the Gray code of the fringe order; ``inverse``: its negative.
+    ``complementary``: the one extra, least significant bit, so that Gray and complementary bits
+    together number the half periods. ``white``, ``black``, ``texture`` (the scene under white
+    light): no axis.
     """
 
     kind: Kind
@@ -67,23 +68,39 @@ class Frame:
     def __post_init__(self) -> None:
         """Raise InputError where the fields of the frame are missing or out of range."""
         if self.kind not in get_args(Kind):
-            raise InputError(f"frame kind '{self.kind}' is unknown: use one of {', '.join(get_args(Kind))}")
+            raise InputError(
+                f"frame kind '{self.kind}' is unknown: use one of {', '.join(get_args(Kind))}"
+            )
         if self.axis not in (None, "x", "y"):
-            raise InputError(f"frame axis '{self.axis}' is unknown: use x (varies along columns) or y (along rows)")
+            raise InputError(
+                f"frame axis '{self.axis}' is unknown: use x (varies along columns) or y (along"
+                " rows)"
+            )
         if "axis" in _FIELDS[self.kind] and self.axis is None:
-            raise InputError(f"a {self.kind} frame has no axis: say x (varies along columns) or y (along rows)")
+            raise InputError(
+                f"a {self.kind} frame has no axis: say x (varies along columns) or y (along rows)"
+            )
         if self.kind == "phase":
             if not 3 <= self.steps <= MAX_STEPS:
-                raise InputError(f"{self.steps} phase steps cannot be decoded: use 3 to {MAX_STEPS}")
+                raise InputError(
+                    f"{self.steps} phase steps cannot be decoded: use 3 to {MAX_STEPS}"
+                )
             if not 0 <= self.step < self.steps:
-                raise InputError(f"phase step {self.step} of {self.steps} does not exist: count from 0")
+                raise InputError(
+                    f"phase step {self.step} of {self.steps} does not exist: count from 0"
+                )
             if not 2 <= self.period_px <= MAX_EXTENT:
-                raise InputError(f"a fringe period of {self.period_px:g} px cannot be shown: use 2 px or more")
+                raise InputError(
+                    f"a fringe period of {self.period_px:g} px cannot be shown: use 2 px or more"
+                )
         if self.kind in ("gray", "inverse") and not 0 <= self.bit < 31:
-            raise InputError(f"Gray bit {self.bit} does not exist: count from 0, the most significant")
+            raise InputError(
+                f"Gray bit {self.bit} does not exist: count from 0, the most significant"
+            )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields that apply to the kind of the frame, with the keys of the `frames` TOML."""
+        """Return the fields that apply to the kind of the frame, with the keys of the `frames`
+        TOML."""
         return (
             {"kind": self.kind}
             | ({"axis": self.axis} if self.axis else {})
@@ -92,11 +109,14 @@ class Frame:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Frame":
-        """Return the frame of a `[[frame]]` table or of `to_dict`; entries that its kind does not need are ignored."""
+        """Return the frame of a `[[frame]]` table or of `to_dict`; entries that its kind does not
+        need are ignored."""
         known = {"kind", "axis", "step", "steps", "period_px", "bit", "bits"}
         unknown = sorted(set(data) - known - {"file"})
         if unknown:
-            raise InputError(f"a frame has the unknown entry '{unknown[0]}': use {', '.join(sorted(known))}")
+            raise InputError(
+                f"a frame has the unknown entry '{unknown[0]}': use {', '.join(sorted(known))}"
+            )
         if "kind" not in data:
             raise InputError('a frame does not say its kind: add kind = "phase", "gray", ...')
         try:
@@ -108,29 +128,36 @@ class Frame:
             }
             numbers["period_px"] = convert(data.get("period_px", 0.0), float, strict=False)
         except ValidationError as error:
-            raise InputError(f"a {data['kind']} frame has an entry that is no number ({error}): correct it") from error
+            raise InputError(
+                f"a {data['kind']} frame has an entry that is no number ({error}): correct it"
+            ) from error
         values = {name: value for name, value in numbers.items() if name in _FIELDS.get(kind, ())}
         return cls(kind=kind, axis=axis, **values)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class PatternSequence:
-    """Frames of one capture, in the order in which they are shown, and the conventions that they follow.
+    """Frames of one capture, in the order in which they are shown, and the conventions that they
+    follow.
 
-    ``projector_size`` is (width, height) in px, None where it is not known. Phase step k of n shows A + B cos(phi +
-    phase_sign 2 pi k / n + phase_offset_rad). ``gray_origin_px`` is the projector coordinate at which Gray code 0
-    begins; a displayed column u reaches from u - 0.5 to u + 0.5, hence -0.5. ``gray_cell_px`` is the width of the cells
-    that the Gray bits number (the complementary bit halves them); None: the longest fringe period, or 1 px for Gray
-    code alone. These four are one value for both axes, or a `PerAxis`.
+    ``projector_size`` is (width, height) in px, None where it is not known. Phase step k of n shows
+    A + B cos(phi + phase_sign 2 pi k / n + phase_offset_rad). ``gray_origin_px`` is the projector
+    coordinate at which Gray code 0 begins; a displayed column u reaches from u - 0.5 to u + 0.5,
+    hence -0.5. ``gray_cell_px`` is the width of the cells that the Gray bits number (the
+    complementary bit halves them); None: the longest fringe period, or 1 px for Gray code alone.
+    These four are one value for both axes, or a `PerAxis`.
 
-    ``relative``: an axis of phase steps alone, whose periods do not cover the projector, is decoded modulo the longest
-    unambiguous range; otherwise it is refused. Without a projector size such an axis is always relative. ``levels``:
-    for each grey level 0 ... 255 of a cosine the one that is shown in its place, so that a projector whose light is not
-    proportional to it shows cosines; None where they are the same. It records what was shown; decoding does not use it.
-    ``full_scale``: grey level at which the camera clips, as the camera, the format or the operator states it, 4095 for
-    the 12 bits in a uint16; None: derived from the brightest pixel, see `layout.clip_level`.
+    ``relative``: an axis of phase steps alone, whose periods do not cover the projector, is decoded
+    modulo the longest unambiguous range; otherwise it is refused. Without a projector size such an
+    axis is always relative. ``levels``: for each grey level 0 ... 255 of a cosine the one that is
+    shown in its place, so that a projector whose light is not proportional to it shows cosines;
+    None where they are the same. It records what was shown; decoding does not use it.
+    ``full_scale``: grey level at which the camera clips, as the camera, the format or the operator
+    states it, 4095 for the 12 bits in a uint16; None: derived from the brightest pixel, see
+    `layout.clip_level`.
 
-    Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value is out of range.
+    Raises InputError when steps or bits are missing, repeated, or contradict each other, or a value
+    is out of range.
     """
 
     projector_size: Size | None
@@ -144,18 +171,26 @@ class PatternSequence:
     full_scale: int | None = None
 
     def __post_init__(self) -> None:
-        """Check the frames and conventions, and replace pairs of equal values by one value. Raises InputError."""
+        """Check the frames and conventions, and replace pairs of equal values by one value. Raises
+        InputError."""
         size = self.projector_size
         if size is not None and (len(size) != 2 or min(size) < 1):
-            raise InputError(f"a projector of {size} px does not exist: give width and height, like 912x1140")
+            raise InputError(
+                f"a projector of {size} px does not exist: give width and height, like 912x1140"
+            )
         for name in ("phase_sign", "gray_origin_px", "phase_offset_rad", "gray_cell_px"):
             value = getattr(self, name)
-            if isinstance(value, PerAxis) and value.x == value.y:  # one way to write it, so that equal is equal
+            if (
+                isinstance(value, PerAxis) and value.x == value.y
+            ):  # one way to write it, so that equal is equal
                 object.__setattr__(self, name, value.x)
         for axis in get_args(Axis):
             self._check_values(axis)
         if self.full_scale is not None and not 1 <= self.full_scale < 1 << 16:
-            raise InputError(f"full_scale is {self.full_scale}: give the level at which the camera clips, such as 4095")
+            raise InputError(
+                f"full_scale is {self.full_scale}: give the level at which the camera clips, such"
+                " as 4095"
+            )
         if self.levels is not None:
             _check_levels(self.levels)
         for axis in self.axes:
@@ -167,8 +202,8 @@ class PatternSequence:
         """Projector size (width, height) in px. Raises InputError where it is not known."""
         if self.projector_size is None:
             raise InputError(
-                "the size of the projector is not known, and it is needed here: import the capture again with "
-                'projector = "912x1140" (width x height), or --projector'
+                "the size of the projector is not known, and it is needed here: import the capture"
+                ' again with projector = "912x1140" (width x height), or --projector'
             )
         return self.projector_size
 
@@ -183,8 +218,14 @@ class PatternSequence:
         return self.projector[0] if axis == "x" else self.projector[1]
 
     def periods_px(self, axis: Axis) -> tuple[float, ...]:
-        """Return the phase-shifted periods of the axis, longest first; empty for Gray code alone."""
-        return tuple(sorted({f.period_px for f in self.frames if f.kind == "phase" and f.axis == axis}, reverse=True))
+        """Return the phase-shifted periods of the axis, longest first; empty for Gray code
+        alone."""
+        return tuple(
+            sorted(
+                {f.period_px for f in self.frames if f.kind == "phase" and f.axis == axis},
+                reverse=True,
+            )
+        )
 
     def period_px(self, axis: Axis) -> float:
         """Return the finest period, px; the width of a Gray cell for Gray code alone."""
@@ -212,7 +253,8 @@ class PatternSequence:
         return periods[0] if periods else 1.0
 
     def select(self, axis: Axis) -> list[int]:
-        """Return the indices of the frames that decoding this axis needs: its own, and white and black."""
+        """Return the indices of the frames that decoding this axis needs: its own, and white and
+        black."""
         return [
             i
             for i, f in enumerate(self.frames)
@@ -229,10 +271,12 @@ class PatternSequence:
         return tuple(sorted(self.find(kind, axis), key=lambda i: self.frames[i].bit))
 
     def phase_shifts(self, axis: Axis) -> tuple[tuple[float, Indices], ...]:
-        """Return (period px, frame indices by step) of each phase shift of the axis, longest period first."""
+        """Return (period px, frame indices by step) of each phase shift of the axis, longest period
+        first."""
         steps = sorted(self.find("phase", axis), key=lambda i: self.frames[i].step)
         return tuple(
-            (period, tuple(i for i in steps if self.frames[i].period_px == period)) for period in self.periods_px(axis)
+            (period, tuple(i for i in steps if self.frames[i].period_px == period))
+            for period in self.periods_px(axis)
         )
 
     def _check_values(self, axis: Axis) -> None:
@@ -241,22 +285,30 @@ class PatternSequence:
             raise InputError(f"phase_sign is {self.sign(axis)}: use 1 or -1")
         if not isfinite(self.offset_rad(axis)) or not isfinite(self.origin_px(axis)):
             raise InputError(
-                f"axis {axis}: phase_offset (phase_offset_rad) is {self.offset_rad(axis)} rad and gray_origin "
-                f"(gray_origin_px) {self.origin_px(axis)} px: give finite numbers"
+                f"axis {axis}: phase_offset (phase_offset_rad) is {self.offset_rad(axis)} rad and"
+                f" gray_origin (gray_origin_px) {self.origin_px(axis)} px: give finite numbers"
             )
         cell = select_axis_value(self.gray_cell_px, axis)
         if cell is not None and not (isfinite(cell) and cell > 0):
-            raise InputError(f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in projector px")
+            raise InputError(
+                f"axis {axis}: a Gray cell of {cell} px does not exist: give its width in"
+                " projector px"
+            )
 
     def _check_phase(self, axis: Axis) -> None:
         """Raise InputError where phase steps of a period are missing, repeated or disagree."""
         for period in self.periods_px(axis):
-            frames = [f for f in self.frames if f.kind == "phase" and f.axis == axis and f.period_px == period]
+            frames = [
+                f
+                for f in self.frames
+                if f.kind == "phase" and f.axis == axis and f.period_px == period
+            ]
             counts = {f.steps for f in frames}
             where = f"axis {axis}, period {period:g} px"
             if len(counts) > 1:
                 raise InputError(
-                    f"{where}: the frames speak of {_join_numbers(counts)} phase steps: they must all say the same"
+                    f"{where}: the frames speak of {_join_numbers(counts)} phase steps: they must"
+                    " all say the same"
                 )
             _check_complete([f.step for f in frames], range(counts.pop()), f"{where}: phase step")
 
@@ -265,12 +317,16 @@ class PatternSequence:
         gray = [f.bit for f in self.frames if f.kind == "gray" and f.axis == axis]
         inverse = [f.bit for f in self.frames if f.kind == "inverse" and f.axis == axis]
         complementary = len(self.find("complementary", axis))
-        # `bits` of a foreign description may or may not count the complementary bit; the frames themselves decide,
-        # yet a least significant bit that was announced and is absent must not pass for a shorter code.
-        stated_counts = {f.bits for f in self.frames if f.kind == "gray" and f.axis == axis and f.bits}
+        # `bits` of a foreign description may or may not count the complementary bit; the frames
+        # themselves decide, yet a least significant bit that was announced and is absent must not
+        # pass for a shorter code.
+        stated_counts = {
+            f.bits for f in self.frames if f.kind == "gray" and f.axis == axis and f.bits
+        }
         if len(stated_counts) > 1:
             raise InputError(
-                f"axis {axis}: the frames speak of {_join_numbers(stated_counts)} Gray bits: they must all say the same"
+                f"axis {axis}: the frames speak of {_join_numbers(stated_counts)} Gray bits: they"
+                " must all say the same"
             )
         needed = max([b + 1 for b in gray + inverse], default=0)
         if stated_counts:
@@ -279,15 +335,21 @@ class PatternSequence:
         if inverse:
             _check_complete(inverse, range(needed), f"axis {axis}: inverse of Gray bit")
         if complementary > 1:
-            raise InputError(f"axis {axis}: {complementary} complementary frames: there is only one such bit, keep one")
+            raise InputError(
+                f"axis {axis}: {complementary} complementary frames: there is only one such bit,"
+                " keep one"
+            )
         if complementary and not self.periods_px(axis):
-            raise InputError(f"axis {axis}: a complementary bit without phase steps says nothing: call it a Gray bit")
+            raise InputError(
+                f"axis {axis}: a complementary bit without phase steps says nothing: call it a"
+                " Gray bit"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON or TOML, with the keys of the `frames` TOML.
 
-        Entries that were added in later versions appear only where they are used, so that descriptions written before,
-        and their hashes, do not change.
+        Entries that were added in later versions appear only where they are used, so that
+        descriptions written before, and their hashes, do not change.
         """
         size = self.projector_size
         values: dict[str, Any] = {"projector": f"{size[0]}x{size[1]}"} if size else {}
@@ -314,13 +376,17 @@ class PatternSequence:
             raise InputError("the sequence names no frames: add a [[frame]] table for each image")
         levels, relative = data.get("levels"), data.get("relative", False)
         if levels is not None and not isinstance(levels, list):
-            raise InputError(f"levels is {levels!r}: give a list of 256 grey levels, or leave it out")
+            raise InputError(
+                f"levels is {levels!r}: give a list of 256 grey levels, or leave it out"
+            )
         if not isinstance(relative, bool):
             raise InputError(f"relative is {relative!r}: use true or false")
         try:
             full_scale = convert(data.get("full_scale"), int | None)
         except ValidationError as error:
-            raise InputError(f"full_scale is {data['full_scale']!r}: give a whole number, such as 4095") from error
+            raise InputError(
+                f"full_scale is {data['full_scale']!r}: give a whole number, such as 4095"
+            ) from error
         return cls(
             None if data.get("projector") is None else parse_size(data["projector"]),
             tuple(Frame.from_dict(f) for f in frames),
@@ -340,7 +406,9 @@ def parse_size(text: Any) -> Size:
     try:
         width, height = convert(parts, Size, strict=False)
     except ValidationError as error:
-        raise InputError(f"'{text}' is no size: write width and height in px like 912x1140") from error
+        raise InputError(
+            f"'{text}' is no size: write width and height in px like 912x1140"
+        ) from error
     if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
         raise InputError(f"'{text}' is no size: write width and height in px like 912x1140")
     return width, height
@@ -368,20 +436,31 @@ def _read_values(data: Mapping[str, Any], name: str, default: Any, kind: type) -
         raise InputError(f"{name} has the unknown entry '{unknown[0]}': use x and y")
     try:
         if isinstance(given, Mapping):
-            pair = (convert(given[axis], kind, strict=False) if axis in given else default for axis in get_args(Axis))
+            pair = (
+                convert(given[axis], kind, strict=False) if axis in given else default
+                for axis in get_args(Axis)
+            )
             return PerAxis(*pair)
         return given if given is default else convert(given, kind, strict=False)
     except ValidationError as error:
-        raise InputError(f"{name} must be a number, or {{x = ..., y = ...}} ({error}): correct it") from error
+        raise InputError(
+            f"{name} must be a number, or {{x = ..., y = ...}} ({error}): correct it"
+        ) from error
 
 
 def _check_levels(levels: tuple[int, ...]) -> None:
     """Raise InputError for a table that is not 256 rising grey levels from 0 to 255."""
     whole = all(isinstance(level, int) and not isinstance(level, bool) for level in levels)
-    if not whole or len(levels) != 256 or levels[0] != 0 or levels[-1] != 255 or list(levels) != sorted(levels):
+    if (
+        not whole
+        or len(levels) != 256
+        or levels[0] != 0
+        or levels[-1] != 255
+        or list(levels) != sorted(levels)
+    ):
         raise InputError(
-            f"a table of {len(levels)} grey levels cannot stand in for 0 ... 255: give 256 whole numbers that never "
-            "fall, the first 0 and the last 255, or none"
+            f"a table of {len(levels)} grey levels cannot stand in for 0 ... 255: give 256 whole"
+            " numbers that never fall, the first 0 and the last 255, or none"
         )
 
 
@@ -390,11 +469,14 @@ def _check_complete(numbers: list[int], wanted: range, what: str) -> None:
     missing = sorted(set(wanted) - set(numbers))
     if missing:
         raise InputError(
-            f"{what} {_join_numbers(missing)} of {len(wanted)} is missing: add the frame, or correct its description"
+            f"{what} {_join_numbers(missing)} of {len(wanted)} is missing: add the frame, or"
+            " correct its description"
         )
     double = [value for value, count in Counter(numbers).items() if count > 1]
     if double:
-        raise InputError(f"{what} {_join_numbers(double)} occurs more than once: keep one frame of each")
+        raise InputError(
+            f"{what} {_join_numbers(double)} occurs more than once: keep one frame of each"
+        )
 
 
 def _join_numbers(values: Any) -> str:

@@ -1,8 +1,9 @@
-"""The Brown distortion polynomial as compiled functions (Letter eq. 3 and 5), shared by lenses and kernels.
+"""The Brown distortion polynomial as compiled functions (Letter eq. 3 and 5), shared by lenses and
+kernels.
 
-Kernels take a lens as ten numbers, ``parameters = [fx, fy, cx, cy, k1, k2, p1, p2, k3, fold]``, where
-``fold`` is the squared radius (normalised) at which the radial polynomial stops growing: beyond it one pixel belongs
-to two rays, and nothing past it is ever returned.
+Kernels take a lens as ten numbers, ``parameters = [fx, fy, cx, cy, k1, k2, p1, p2, k3, fold]``,
+where ``fold`` is the squared radius (normalised) at which the radial polynomial stops growing:
+beyond it one pixel belongs to two rays, and nothing past it is ever returned.
 """
 
 import numba
@@ -11,12 +12,14 @@ import numpy as np
 from slviewer.geometry.jit import kernel
 
 TOLERANCE = 1e-12
-"""Normalised units at which an inversion has converged: far below the promised 1e-9, and above rounding."""
+"""Normalised units at which an inversion has converged: far below the promised 1e-9, and above
+rounding."""
 MAX_STEPS = 60
 
 
 def fold_radius_squared(D: np.ndarray) -> float:
-    """Smallest r^2 at which d(r')/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 vanishes; inf if it never does."""
+    """Smallest r^2 at which d(r')/dr = 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 vanishes; inf if it never
+    does."""
     k1, k2, _, _, k3 = D
     roots = np.roots(np.trim_zeros(np.array([7 * k3, 5 * k2, 3 * k1, 1.0]), "f"))
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots.real))].real
@@ -26,7 +29,8 @@ def fold_radius_squared(D: np.ndarray) -> float:
 
 @kernel()
 def distort_point(x, y, parameters):
-    """Return distorted normalised (x, y) and the derivatives (dx'/dx, dx'/dy, dy'/dy); the Jacobian is symmetric."""
+    """Return distorted normalised (x, y) and the derivatives (dx'/dx, dx'/dy, dy'/dy); the Jacobian
+    is symmetric."""
     k1, k2, p1, p2, k3 = parameters[4], parameters[5], parameters[6], parameters[7], parameters[8]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -41,7 +45,8 @@ def distort_point(x, y, parameters):
 
 @kernel()
 def undistort_point(xd, yd, parameters):
-    """Undistorted normalised (x, y) of a distorted point by damped Newton steps; NaN where it fails or folds over."""
+    """Undistorted normalised (x, y) of a distorted point by damped Newton steps; NaN where it fails
+    or folds over."""
     fold = parameters[9]
     x, y = xd, yd
     r2 = x * x + y * y
@@ -86,14 +91,16 @@ def distort_to_px(x, y, parameters):
 
 @kernel(parallel=True)
 def distort_all(normalised, parameters, pixels):
-    """Fill ``pixels`` (n, 2) from undistorted normalised coordinates (n, 2); NaN at and past the fold."""
+    """Fill ``pixels`` (n, 2) from undistorted normalised coordinates (n, 2); NaN at and past the
+    fold."""
     for i in numba.prange(normalised.shape[0]):
         pixels[i, 0], pixels[i, 1] = distort_to_px(normalised[i, 0], normalised[i, 1], parameters)
 
 
 @kernel(parallel=True)
 def undistort_all(pixels, parameters, normalised):
-    """Fill ``normalised`` (n, 2) with undistorted coordinates of pixels (n, 2); NaN where the inversion fails."""
+    """Fill ``normalised`` (n, 2) with undistorted coordinates of pixels (n, 2); NaN where the
+    inversion fails."""
     for i in numba.prange(pixels.shape[0]):
         xd = (pixels[i, 0] - parameters[2]) / parameters[0]
         yd = (pixels[i, 1] - parameters[3]) / parameters[1]
@@ -102,11 +109,13 @@ def undistort_all(pixels, parameters, normalised):
 
 @kernel(parallel=True)
 def project_all(points, parameters, pixels):
-    """Fill ``pixels`` (n, 2) with projections of points (n, 3) in the lens's frame; NaN behind the lens and past the
-    fold."""
+    """Fill ``pixels`` (n, 2) with projections of points (n, 3) in the lens's frame; NaN behind the
+    lens and past the fold."""
     for i in numba.prange(points.shape[0]):
         z = points[i, 2]
         pixels[i, 0] = np.nan
         pixels[i, 1] = np.nan
         if z > 0.0:
-            pixels[i, 0], pixels[i, 1] = distort_to_px(points[i, 0] / z, points[i, 1] / z, parameters)
+            pixels[i, 0], pixels[i, 1] = distort_to_px(
+                points[i, 0] / z, points[i, 1] / z, parameters
+            )

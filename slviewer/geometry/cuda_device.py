@@ -23,8 +23,9 @@ _cached_name: list[str | None] = []  # empty until the first call of `find_devic
 def find_device() -> str | None:
     """The name of the device that computes; None where there is none, or where it failed before.
 
-    It needs the package numba-cuda (``pip install 'slviewer[cuda]'``); without it, no device is searched for. A driver
-    that does not work is logged once. ``CUDA_VISIBLE_DEVICES=`` hides the devices, as from any program.
+    It needs the package numba-cuda (``pip install 'slviewer[cuda]'``); without it, no device is
+    searched for. A driver that does not work is logged once. ``CUDA_VISIBLE_DEVICES=`` hides the
+    devices, as from any program.
     """
     with _LOCK:
         if not _cached_name:
@@ -36,12 +37,15 @@ def disable_device(error: Exception) -> None:
     """Log that the device failed; from now on `find_device` returns None."""
     with _LOCK:
         if _cached_name != [None]:
-            _LOG.warning("the CUDA device failed, and the processor takes over: %s", _first_line(error))
+            _LOG.warning(
+                "the CUDA device failed, and the processor takes over: %s", _first_line(error)
+            )
         _cached_name[:] = [None]
 
 
 def allocate_frames(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """Return an uninitialised array, in page-locked memory where there is a device, for transfers at full speed."""
+    """Return an uninitialised array, in page-locked memory where there is a device, for transfers
+    at full speed."""
     if find_device() is not None:
         from numba import cuda
 
@@ -53,7 +57,8 @@ def allocate_frames(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def _probe_device() -> str | None:
-    """Return the name of a CUDA device that runs a kernel, simulated ones included; None without one."""
+    """Return the name of a CUDA device that runs a kernel, simulated ones included; None without
+    one."""
     simulated = os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
     if not simulated:
         if importlib.util.find_spec("numba_cuda") is None:
@@ -70,14 +75,17 @@ def _probe_device() -> str | None:
         name = cuda.current_context().device.name
         name = name.decode() if isinstance(name, bytes) else str(name)
     except Exception as error:
-        _LOG.warning("the CUDA device cannot be used, and the processor computes: %s", _first_line(error))
+        _LOG.warning(
+            "the CUDA device cannot be used, and the processor computes: %s", _first_line(error)
+        )
         return None
     _LOG.info("clouds are computed on %s", name)
     return name
 
 
 def _count_devices() -> tuple[int, str, int]:
-    """Return the number of CUDA devices, and where it is 0 the reason and the log level to report it at."""
+    """Return the number of CUDA devices, and where it is 0 the reason and the log level to report
+    it at."""
     count = ctypes.c_int()
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
@@ -85,7 +93,11 @@ def _count_devices() -> tuple[int, str, int]:
     except (OSError, AttributeError) as error:
         return 0, f"there is no driver ({_first_line(error)})", logging.INFO
     if code not in (0, _NO_DEVICE):
-        return 0, f"its driver reports error {code}: reinstall the graphics card's driver", logging.WARNING
+        return (
+            0,
+            f"its driver reports error {code}: reinstall the graphics card's driver",
+            logging.WARNING,
+        )
     return count.value, "the driver has none", logging.INFO
 
 
@@ -95,9 +107,11 @@ def _first_line(error: Exception) -> str:
 
 
 def device_function(function: Any) -> Any:
-    """Convert a function compiled by numba for the processor, and those that it calls, for use in CUDA kernels.
+    """Convert a function compiled by numba for the processor, and those that it calls, for use in
+    CUDA kernels.
 
-    A rule for one pixel is written once: what such a function calls must exist on both sides (``math``, not ``numpy``).
+    A rule for one pixel is written once: what such a function calls must exist on both sides
+    (``math``, not ``numpy``).
     """
     from numba import cuda
 
@@ -106,6 +120,8 @@ def device_function(function: Any) -> Any:
     for name in python.__code__.co_names:
         if hasattr(names.get(name), "py_func"):
             names[name] = device_function(names[name])
-    twin = FunctionType(python.__code__, names, python.__name__, python.__defaults__, python.__closure__)
+    twin = FunctionType(
+        python.__code__, names, python.__name__, python.__defaults__, python.__closure__
+    )
     twin.__module__ = python.__module__
     return cuda.jit(device=True)(twin)

@@ -1,4 +1,5 @@
-"""Decorator for the compiled kernels, with a cache that is optional and never returns stale machine code."""
+"""Decorator for the compiled kernels, with a cache that is optional and never returns stale machine
+code."""
 
 import os
 import threading
@@ -24,19 +25,27 @@ _LOCK = threading.Lock()
 _SETTINGS: Any = numba.config
 
 
-def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: ``numba.njit`` that releases the GIL and caches its machine code where a folder can be written.
+def kernel(
+    *, parallel: bool = False, fastmath: bool = False
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator: ``numba.njit`` that releases the GIL and caches its machine code where a folder
+    can be written.
 
     Where none can, a kernel is compiled in memory at its first call.
     """
     options: dict[str, Any] = {"parallel": parallel, "fastmath": fastmath, "nogil": True}
 
     def compile_lazily(function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function compiled by numba at its first call, with its cache in the module's folder."""
+        """Return the function compiled by numba at its first call, with its cache in the module's
+        folder."""
         folder = cache_folder(function.__module__)
         if folder is None:
             return numba.njit(**options)(function)
-        with _LOCK:  # numba reads the setting while it decorates; kernels of other packages keep their own folder
+        with (
+            _LOCK
+            # numba reads the setting while it decorates; kernels of other packages keep their own
+            # folder
+        ):
             before, _SETTINGS.CACHE_DIR = _SETTINGS.CACHE_DIR, str(folder)
             try:
                 compiled = numba.njit(cache=True, **options)(function)
@@ -49,23 +58,32 @@ def kernel(*, parallel: bool = False, fastmath: bool = False) -> Callable[[Calla
 
 
 def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[Any], Any]:
-    """Wrap a dispatcher's ``compile(signature)``: what one process compiles, others wait for, and load."""
+    """Wrap a dispatcher's ``compile(signature)``: what one process compiles, others wait for, and
+    load."""
 
     def compile_or_load(signature: Any) -> Any:
-        """Compile while this process holds the kernel's lock; without it where the disk has no locks."""
-        with global_compiler_lock, ExitStack() as stack:  # in the order in which numba takes its own for callees
+        """Compile while this process holds the kernel's lock; without it where the disk has no
+        locks."""
+        with (
+            global_compiler_lock,
+            ExitStack() as stack,
+        ):  # in the order in which numba takes its own for callees
             with suppress(OSError, NotImplementedError):
-                stack.enter_context(FileLock(path, thread_local=False))  # of this process, were it forked
+                stack.enter_context(
+                    FileLock(path, thread_local=False)
+                )  # of this process, were it forked
             return compile_here(signature)
 
     return compile_or_load
 
 
 def run_rows(function: Callable[..., Any], rows: int, *arguments: Any, multiple: int = 1) -> None:
-    """Call a kernel ``function(first, last, *arguments)`` for ranges of rows that together are ``rows``, side by side.
+    """Call a kernel ``function(first, last, *arguments)`` for ranges of rows that together are
+    ``rows``, side by side.
 
-    As many threads work as numba's own parallel loops would use; a parallel function, however, takes the compiler
-    three times as long as a plain one. The ranges begin at multiples of ``multiple``.
+    As many threads work as numba's own parallel loops would use; a parallel function, however,
+    takes the compiler three times as long as a plain one. The ranges begin at multiples of
+    ``multiple``.
     """
     blocks = -(-rows // multiple)
     threads = max(1, min(numba.get_num_threads(), blocks))
@@ -92,7 +110,8 @@ def _threads(process: int) -> ThreadPoolExecutor:
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
-    """View of an array that cannot be written: a kernel is compiled once for arrays that can be and that cannot."""
+    """View of an array that cannot be written: a kernel is compiled once for arrays that can be and
+    that cannot."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -101,14 +120,16 @@ def read_only(array: np.ndarray) -> np.ndarray:
 def _fused_multiply_add(_typing: Any, a: Any, b: Any, c: Any) -> Any:
     """``a b + c`` of float32, rounded once, in compiled code.
 
-    A compiler that is merely allowed to fuse may decide differently for cached and for newly compiled code, and then
-    the last bit differs.
+    A compiler that is merely allowed to fuse may decide differently for cached and for newly
+    compiled code, and then the last bit differs.
     """
 
     def build(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         """Emit a call of LLVM's ``fma`` intrinsic."""
         kind = arguments[0].type
-        function = builder.module.declare_intrinsic("llvm.fma", [kind], ir.FunctionType(kind, [kind] * 3))
+        function = builder.module.declare_intrinsic(
+            "llvm.fma", [kind], ir.FunctionType(kind, [kind] * 3)
+        )
         return builder.call(function, arguments)
 
     return numba.float32(numba.float32, numba.float32, numba.float32), build
@@ -128,7 +149,8 @@ def _to_signed(_typing: Any, level: Any) -> Any:
 
 
 def _add_fixed_width(_typing: Any, a: Any, b: Any) -> Any:
-    """``a + b`` in the operands' own integer width: numba widens to 64 bits, of which few fit a vector register."""
+    """``a + b`` in the operands' own integer width: numba widens to 64 bits, of which few fit a
+    vector register."""
     return a(a, a), lambda _context, builder, _signature, arguments: builder.add(*arguments)
 
 
@@ -147,7 +169,9 @@ def _prefetch(_typing: Any, array: Any, index: Any) -> Any:
         at = builder.bitcast(builder.gep(view.data, [arguments[1]]), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [at, flag(0), flag(1), flag(1)])  # to read; into the outer caches; data
+        builder.call(
+            function, [at, flag(0), flag(1), flag(1)]
+        )  # to read; into the outer caches; data
         return context.get_dummy_value()
 
     return numba.types.void(array, index), build

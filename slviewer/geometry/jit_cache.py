@@ -1,8 +1,9 @@
-"""Cache folders for the kernels' machine code, one a module, named after a hash of the module's sources.
+"""Cache folders for the kernels' machine code, one a module, named after a hash of the module's
+sources.
 
-numba itself checks the kernel's own file only. A kernel also compiles in what it calls and constants of
-other files, and stale machine code is a wrong answer: so a folder's name carries a hash over the sources of a module
-and of all the package's modules that it imports.
+numba itself checks the kernel's own file only. A kernel also compiles in what it calls and
+constants of other files, and stale machine code is a wrong answer: so a folder's name carries a
+hash over the sources of a module and of all the package's modules that it imports.
 """
 
 import hashlib
@@ -17,7 +18,9 @@ from functools import cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-_IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+(slviewer[\w.]*)[ \t]+)?import[ \t]+(\([^)]*\)|[^\n]*)", re.MULTILINE)
+_IMPORT = re.compile(
+    rb"^[ \t]*(?:from[ \t]+(slviewer[\w.]*)[ \t]+)?import[ \t]+(\([^)]*\)|[^\n]*)", re.MULTILINE
+)
 _NAME = re.compile(rb"[\w.]+")
 
 
@@ -36,13 +39,16 @@ def cache_folder(module: str) -> Path | None:
                 if old != folder:  # another process may just have made it
                     shutil.rmtree(old, ignore_errors=True)
             folder.mkdir(exist_ok=True)
-    except OSError:  # no source beside the byte code, no temporary folder, or a disk that has filled up
+    except (
+        OSError
+    ):  # no source beside the byte code, no temporary folder, or a disk that has filled up
         return None
     return folder
 
 
 def hash_sources(module: str) -> str:
-    """Hash over the sources of a module and of all package modules it imports. Raises OSError without sources."""
+    """Hash over the sources of a module and of all package modules it imports. Raises OSError
+    without sources."""
     digests, ahead = dict[str, bytes](), [module]
     while ahead:
         name = ahead.pop()
@@ -66,15 +72,25 @@ def _hash_source(module: str) -> tuple[bytes, tuple[str, ...]]:
     named = set[str]()
     for where, what in _IMPORT.findall(text):
         names = [name.decode() for name in _NAME.findall(what)]
-        named |= {where.decode(), *(f"{where.decode()}.{name}" for name in names)} if where else set(names)
-    imported = (name for name in sorted(named) if name.split(".")[0] == "slviewer" and _source_path(name) is not None)
+        named |= (
+            {where.decode(), *(f"{where.decode()}.{name}" for name in names)}
+            if where
+            else set(names)
+        )
+    imported = (
+        name
+        for name in sorted(named)
+        if name.split(".")[0] == "slviewer" and _source_path(name) is not None
+    )
     return hashlib.blake2b(text, digest_size=20).digest(), tuple(imported)
 
 
 def _source_path(module: str) -> Path | None:
     """Return the source file of a module; None where there is none of that name."""
     parts = PACKAGE.parent.joinpath(*module.split("."))
-    return next((path for path in (parts.with_suffix(".py"), parts / "__init__.py") if path.is_file()), None)
+    return next(
+        (path for path in (parts.with_suffix(".py"), parts / "__init__.py") if path.is_file()), None
+    )
 
 
 @cache
@@ -103,12 +119,15 @@ def _candidate_folders() -> Iterator[Path]:
 
 
 def _is_private_and_writable(place: Path) -> bool:
-    """Whether this user, and no other, can write there: loading the cache runs the code it holds."""
+    """Whether this user, and no other, can write there: loading the cache runs the code it
+    holds."""
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         place.mkdir(mode=0o700, exist_ok=True)
         status = place.lstat()
-        if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        if hasattr(os, "getuid") and (
+            status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        ):
             return False
         tempfile.TemporaryFile(dir=place).close()
     except OSError:

@@ -1,4 +1,5 @@
-"""A camera or a projector as a pinhole with Brown distortion: from points to pixels and from pixels to rays."""
+"""A camera or a projector as a pinhole with Brown distortion: from points to pixels and from pixels
+to rays."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +12,8 @@ from slviewer.geometry.brown import distort_all, fold_radius_squared, project_al
 from slviewer.geometry.jit import read_only
 
 FOCAL_PX = 1.0, 1e7
-"""Focal lengths that a lens may have; the principal point is as near to the image as the longest."""
+"""Focal lengths that a lens may have; the principal point is as near to the image as the
+longest."""
 LARGEST_PX = 100_000
 LARGEST_DISTORTION = 1e9
 """Of k3 of a telephoto lens, which multiplies the sixth power of a small angle."""
@@ -21,11 +23,12 @@ LARGEST_DISTORTION = 1e9
 class Lens:
     """Pinhole and Brown distortion of one device (Letter eq. 1-5).
 
-    ``K``: (3, 3), px, without skew. ``D``: (5,), OpenCV's order (k1, k2, p1, p2, k3); four coefficients, or more of
-    which the rest are zero, are accepted. ``size``: (width, height) px. The arrays are kept as read-only
-    float64 copies.
+    ``K``: (3, 3), px, without skew. ``D``: (5,), OpenCV's order (k1, k2, p1, p2, k3); four
+    coefficients, or more of which the rest are zero, are accepted. ``size``: (width, height) px.
+    The arrays are kept as read-only float64 copies.
 
-    Raises InputError for matrices that are no pinhole, and for distortion models other than Brown's.
+    Raises InputError for matrices that are no pinhole, and for distortion models other than
+    Brown's.
     """
 
     K: np.ndarray
@@ -37,40 +40,46 @@ class Lens:
         D = np.array(self.D, dtype=np.float64).ravel()
         if K.shape != (3, 3) or not np.isfinite(K).all():
             raise InputError(
-                f"A camera matrix must be 3x3 finite numbers, this one is {K.shape}: give K as OpenCV does."
+                f"A camera matrix must be 3x3 finite numbers, this one is {K.shape}: give K as"
+                " OpenCV does."
             )
         form = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         if K[0, 0] <= 0 or K[1, 1] <= 0 or not np.allclose(K, form, rtol=0, atol=1e-9 * K[0, 0]):
             raise InputError(
-                f"A camera matrix must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], this one is {K.tolist()}: "
-                "check the key and calibrate without skew."
+                "A camera matrix must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], this one is"
+                f" {K.tolist()}: check the key and calibrate without skew."
             )
         if D.size in (1, 2, 3) or D[5:].any() or not np.isfinite(D).all():
             raise InputError(
-                f"{D.size} distortion coefficients were given, {D.tolist()}, and this lens has five "
-                "(k1, k2, p1, p2, k3): calibrate without the rational, thin-prism and tilted models."
+                f"{D.size} distortion coefficients were given, {D.tolist()}, and this lens has five"
+                " (k1, k2, p1, p2, k3): calibrate without the rational, thin-prism and tilted"
+                " models."
             )
         D = np.concatenate([D, np.zeros(5)])[:5]
         width, height = map(int, self.size)
         if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(
-                f"An image of {width}x{height} px was given: its size is width x height, 1 to {LARGEST_PX} px each."
+                f"An image of {width}x{height} px was given: its size is width x height, 1 to"
+                f" {LARGEST_PX} px each."
             )
         low, high = FOCAL_PX
         if not (low <= K[0, 0] <= high and low <= K[1, 1] <= high) or np.abs(K[:2, 2]).max() > high:
             raise InputError(
-                f"The focal lengths {K[0, 0]:.6g} and {K[1, 1]:.6g} px and the principal point ({K[0, 2]:.6g}, "
-                f"{K[1, 2]:.6g}) px belong to no lens (focal lengths are {low:g} to {high:g} px): give K in pixels."
+                f"The focal lengths {K[0, 0]:.6g} and {K[1, 1]:.6g} px and the principal point"
+                f" ({K[0, 2]:.6g}, {K[1, 2]:.6g}) px belong to no lens (focal lengths are {low:g}"
+                f" to {high:g} px): give K in pixels."
             )
         if np.abs(D).max() > LARGEST_DISTORTION:
             raise InputError(
-                f"The distortion coefficients {D.tolist()} belong to no lens: check them, or calibrate again."
+                f"The distortion coefficients {D.tolist()} belong to no lens: check them, or"
+                " calibrate again."
             )
         vars(self).update(K=read_only(K), D=read_only(D), size=(width, height))
 
     @classmethod
     def from_parameters(cls, parameters: Iterable[float], size: tuple[int, int]) -> "Lens":
-        """Return the lens of fx, fy, cx, cy in px, and distortion coefficients in OpenCV's order, if any."""
+        """Return the lens of fx, fy, cx, cy in px, and distortion coefficients in OpenCV's order,
+        if any."""
         fx, fy, cx, cy, *D = parameters
         return cls(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(D), size)
 
@@ -83,7 +92,8 @@ class Lens:
     def project(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) mm in this device's frame to pixels (..., 2) (eq. 1-3).
 
-        NaN for NaN points, behind the device, and past the radius where the distortion polynomial folds over.
+        NaN for NaN points, behind the device, and past the radius where the distortion polynomial
+        folds over.
         """
         flat = _flatten(points, 3, "points")
         pixels = np.empty((len(flat), 2))
@@ -91,7 +101,8 @@ class Lens:
         return pixels.reshape(*np.shape(points)[:-1], 2)
 
     def distort(self, normalised: np.ndarray) -> np.ndarray:
-        """Undistorted normalised coordinates (..., 2) to pixels (..., 2) (eq. 3); NaN past the fold."""
+        """Undistorted normalised coordinates (..., 2) to pixels (..., 2) (eq. 3); NaN past the
+        fold."""
         flat = _flatten(normalised, 2, "normalised coordinates")
         pixels = np.empty((len(flat), 2))
         distort_all(flat, self.parameters, pixels)
@@ -100,7 +111,8 @@ class Lens:
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Pixels (..., 2) to undistorted normalised coordinates (..., 2) (eq. 4, 5), exact to 1e-9.
 
-        NaN for NaN pixels, and where no ray within the fold of the distortion polynomial meets the pixel.
+        NaN for NaN pixels, and where no ray within the fold of the distortion polynomial meets the
+        pixel.
         """
         flat = _flatten(pixels, 2, "pixels")
         normalised = np.empty((len(flat), 2))
@@ -114,7 +126,8 @@ class Lens:
         return np.asarray(inside.all(axis=-1))
 
     def rays(self) -> np.ndarray:
-        """(h, w, 2) float64: undistorted normalised coordinates of every pixel; computed once, read-only."""
+        """(h, w, 2) float64: undistorted normalised coordinates of every pixel; computed once,
+        read-only."""
         return self._rays
 
     @cached_property
@@ -125,8 +138,8 @@ class Lens:
         return read_only(self.undistort(np.stack([u, v], axis=-1)))
 
     def resize(self, factor: float) -> "Lens":
-        """Return the same lens at another resolution: pixel centres stay at whole numbers, so c' = (c + 0.5) factor -
-        0.5."""
+        """Return the same lens at another resolution: pixel centres stay at whole numbers, so c' =
+        (c + 0.5) factor - 0.5."""
         K = self.K.copy()
         K[:2, :2] *= factor
         K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5
@@ -138,5 +151,8 @@ def _flatten(values: np.ndarray, last: int, what: str) -> np.ndarray:
     """(n, last) contiguous float64; InputError where the last dimension differs."""
     values = np.asarray(values, dtype=np.float64)
     if values.ndim < 1 or values.shape[-1] != last:
-        raise InputError(f"An array of shape {values.shape} was given as {what}: the last dimension must be {last}.")
+        raise InputError(
+            f"An array of shape {values.shape} was given as {what}: the last dimension must be"
+            f" {last}."
+        )
     return np.ascontiguousarray(values.reshape(-1, last))

@@ -15,9 +15,11 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Polynomial2D:
-    """Sum of c_ij T_i(t) T_j(s), Chebyshev polynomials in v and u scaled to -1 ... 1 over ``box`` (u0, v0, u1, v1) px.
+    """Sum of c_ij T_i(t) T_j(s), Chebyshev polynomials in v and u scaled to -1 ... 1 over ``box``
+    (u0, v0, u1, v1) px.
 
-    ``coefficients``: (degree + 1, degree + 1), zero where i + j exceeds the degree. NaN outside the box.
+    ``coefficients``: (degree + 1, degree + 1), zero where i + j exceeds the degree. NaN outside the
+    box.
     """
 
     coefficients: np.ndarray
@@ -33,9 +35,13 @@ class Polynomial2D:
     def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
         height, width = shape
-        s, t = _normalise_pixels(origin[0] + np.arange(width), origin[1] + np.arange(height), self.box)
+        s, t = _normalise_pixels(
+            origin[0] + np.arange(width), origin[1] + np.arange(height), self.box
+        )
         degree = len(self.coefficients) - 1
-        out = chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
+        out = (
+            chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
+        )
         out[np.abs(t) > 1.0], out[:, np.abs(s) > 1.0] = np.nan, np.nan
         return out
 
@@ -49,25 +55,28 @@ def fit_polynomial(
     degree: int,
     robust: bool = False,
 ) -> Polynomial2D:
-    """Least-squares polynomial of total ``degree`` through ``values`` (n,) at pixels ``u``, ``v`` (n,).
+    """Least-squares polynomial of total ``degree`` through ``values`` (n,) at pixels ``u``, ``v``
+    (n,).
 
-    ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
-    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are excluded. ``robust``: Tukey's weights,
-    which reject outliers. Raises InputError where fewer samples than coefficients are left.
+    ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1)
+    px, or a size (w, h) for a whole image; samples outside it, not finite, or of weight 0 are
+    excluded. ``robust``: Tukey's weights, which reject outliers. Raises InputError where fewer
+    samples than coefficients are left.
     """
     box = parse_box(extent)
     u, v, values, weights = select_valid_samples(u, v, values, weights, box)
     i, j = np.array([(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]).T
     if len(values) < len(i):
         raise InputError(
-            f"{len(values)} samples are too few for a polynomial of degree {degree} with {len(i)} coefficients: "
-            "lower the degree, or check that the target is illuminated."
+            f"{len(values)} samples are too few for a polynomial of degree {degree} with {len(i)}"
+            " coefficients: lower the degree, or check that the target is illuminated."
         )
     s, t = _normalise_pixels(u, v, box)
     design = chebyshev.chebvander(t, degree)[:, i] * chebyshev.chebvander(s, degree)[:, j]
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficients (m,) and fitted values (n,) of weighted least squares with weights (n,)."""
+        """Return the coefficients (m,) and fitted values (n,) of weighted least squares with
+        weights (n,)."""
         weighted = design * w[:, None]
         solution = np.linalg.lstsq(weighted.T @ design, weighted.T @ values, rcond=1e-14)[0]
         return solution, design @ solution
@@ -78,13 +87,19 @@ def fit_polynomial(
 
 
 def monomials(points: np.ndarray, degree: int) -> np.ndarray:
-    """(n, m): x^i y^j of points (n, 2) for i from 0 and j from 0 while i + j <= ``degree``; j runs fastest."""
-    x, y = (np.vander(column, degree + 1, increasing=True) for column in points.T)  # products, much faster than powers
-    return np.stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    """(n, m): x^i y^j of points (n, 2) for i from 0 and j from 0 while i + j <= ``degree``; j runs
+    fastest."""
+    x, y = (
+        np.vander(column, degree + 1, increasing=True) for column in points.T
+    )  # products, much faster than powers
+    return np.stack(
+        [x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
+    )
 
 
 def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the slopes (k, m) of values (n, m) by ``inputs`` (n, k), by least squares with a constant.
+    """Return the slopes (k, m) of values (n, m) by ``inputs`` (n, k), by least squares with a
+    constant.
 
     Rows with NaN do not count.
     """
@@ -94,7 +109,8 @@ def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def grid_points(*coordinates: np.ndarray) -> np.ndarray:
-    """Return all combinations (n, k) of so many ``coordinates``, the first varying fastest in two dimensions."""
+    """Return all combinations (n, k) of so many ``coordinates``, the first varying fastest in two
+    dimensions."""
     return np.stack(np.meshgrid(*coordinates), axis=-1).reshape(-1, len(coordinates))
 
 
@@ -105,25 +121,34 @@ def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
 
 
 def parse_box(extent: Sequence[float]) -> Box:
-    """(u0, v0, u1, v1) px of a box, or of a whole image given as (width, height), outer pixel edges included."""
+    """(u0, v0, u1, v1) px of a box, or of a whole image given as (width, height), outer pixel edges
+    included."""
     if len(extent) == 2:
         return (-0.5, -0.5, extent[0] - 0.5, extent[1] - 0.5)
     u0, v0, u1, v1 = (float(edge) for edge in extent)
     if not (u1 > u0 and v1 > v0):
-        raise InputError(f"The region {tuple(extent)} is empty: give (u0, v0, u1, v1) with u0 < u1 and v0 < v1.")
+        raise InputError(
+            f"The region {tuple(extent)} is empty: give (u0, v0, u1, v1) with u0 < u1 and v0 < v1."
+        )
     return (u0, v0, u1, v1)
 
 
 def select_valid_samples(
     u: np.ndarray, v: np.ndarray, values: np.ndarray, weights: np.ndarray | None, box: Box
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The finite samples of positive weight inside the box, as float64 (n,); InputError for unequal lengths."""
+    """The finite samples of positive weight inside the box, as float64 (n,); InputError for unequal
+    lengths."""
     arrays = [np.asarray(a, dtype=np.float64).ravel() for a in (u, v, values)]
-    arrays.append(np.ones(len(arrays[2])) if weights is None else np.asarray(weights, dtype=np.float64).ravel())
+    arrays.append(
+        np.ones(len(arrays[2]))
+        if weights is None
+        else np.asarray(weights, dtype=np.float64).ravel()
+    )
     u, v, values, w = arrays
     if len({len(a) for a in arrays}) != 1:
         raise InputError(
-            f"A surface fit was given {[len(a) for a in arrays]} of u, v, values, weights: equal numbers needed."
+            f"A surface fit was given {[len(a) for a in arrays]} of u, v, values, weights: equal"
+            " numbers needed."
         )
     selected = np.isfinite(u) & np.isfinite(v) & np.isfinite(values) & np.isfinite(w) & (w > 0)
     selected &= (u >= box[0]) & (u <= box[2]) & (v >= box[1]) & (v <= box[3])

@@ -1,4 +1,5 @@
-"""RANSAC detection of a plane or a sphere in a cluttered cloud: initial values for the least-squares fits."""
+"""RANSAC detection of a plane or a sphere in a cluttered cloud: initial values for the
+least-squares fits."""
 
 from collections.abc import Callable
 
@@ -17,14 +18,16 @@ REFINED_HYPOTHESES = 12
 
 
 def ransac_plane(points: np.ndarray, tolerance: float) -> tuple[Plane, np.ndarray]:
-    """The plane with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
+    """The plane with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask
+    (n,) bool.
 
-    Draws from a subsample and ends with least squares over all inliers; deterministic. NaN rows are excluded.
-    Raises InputError where no plane is detected.
+    Draws from a subsample and ends with least squares over all inliers; deterministic. NaN rows are
+    excluded. Raises InputError where no plane is detected.
     """
 
     def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3, 3)."""
+        """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3,
+        3)."""
         a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
         normals = np.cross(b - a, c - a)
         regular = lengths(normals) > 0
@@ -38,18 +41,23 @@ def ransac_plane(points: np.ndarray, tolerance: float) -> tuple[Plane, np.ndarra
     return _search(points, 3, tolerance, hypotheses, distances, fit_plane, "plane")
 
 
-def ransac_sphere(points: np.ndarray, tolerance: float, radius: float | None = None) -> tuple[Sphere, np.ndarray]:
-    """The sphere with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask (n,) bool.
+def ransac_sphere(
+    points: np.ndarray, tolerance: float, radius: float | None = None
+) -> tuple[Sphere, np.ndarray]:
+    """The sphere with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask
+    (n,) bool.
 
-    With ``radius`` (mm), only spheres of about that size are considered and the result has exactly that radius;
-    without, spheres larger than the cloud are excluded, because any flat patch would fit one.
+    With ``radius`` (mm), only spheres of about that size are considered and the result has exactly
+    that radius; without, spheres larger than the cloud are excluded, because any flat patch would
+    fit one.
     """
     finite = np.asarray(points, dtype=np.float64)[finite_rows(points)]
     extent = diagonal(finite) if len(finite) else 0.0
     low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
 
     def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4, 3)."""
+        """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4,
+        3)."""
         origin = quads[:, :1]
         edges = quads[:, 1:] - origin
         regular = np.abs(np.linalg.det(edges)) > 1e-12 * lengths(edges).prod(axis=1)
@@ -67,10 +75,14 @@ def ransac_sphere(points: np.ndarray, tolerance: float, radius: float | None = N
         return np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
 
     def fit(chosen: np.ndarray) -> Sphere:
-        """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed range."""
+        """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed
+        range."""
         sphere = fit_sphere(chosen, radius)
         if not low <= sphere.radius <= high:
-            raise InputError(f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its cloud.")
+            raise InputError(
+                f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its"
+                " cloud."
+            )
         return sphere
 
     return _search(points, 4, tolerance, hypotheses, distances, fit, "sphere")
@@ -85,13 +97,15 @@ def _search(
     fit: Callable,
     what: str,
 ) -> tuple:
-    """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few refined."""
+    """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few
+    refined."""
     points = np.asarray(points, dtype=np.float64)
     finite = finite_rows(points)
     valid = points[finite]
     if len(valid) < 3 * needed:
         raise InputError(
-            f"{len(valid)} points were measured, too few to detect a {what}: check the capture's exposure."
+            f"{len(valid)} points were measured, too few to detect a {what}: check the capture's"
+            " exposure."
         )
     rng = np.random.default_rng(0)
     sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
@@ -106,7 +120,9 @@ def _search(
     )
     best, best_score = None, np.inf
     for index in np.argsort(scores)[:REFINED_HYPOTHESES]:
-        chosen = np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
+        chosen = (
+            np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
+        )
         try:
             for _ in range(5):
                 before, shape = chosen, fit(sample[chosen])
@@ -131,15 +147,18 @@ def _search(
 
 
 def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
-    """(HYPOTHESES, size, 3): each a random point and some of its nearest 1, 3, 10 or 25 % of the sample.
+    """(HYPOTHESES, size, 3): each a random point and some of its nearest 1, 3, 10 or 25 % of the
+    sample.
 
-    Four points drawn anywhere lie on a shape that fills a tenth of the cloud once in ten thousand draws; four
-    neighbours, often.
+    Four points drawn anywhere lie on a shape that fills a tenth of the cloud once in ten thousand
+    draws; four neighbours, often.
     """
     seeds = rng.choice(len(sample), HYPOTHESES)
     tree = cKDTree(sample)
     sets = np.empty((HYPOTHESES, size, 3))
-    for share, group in zip((0.01, 0.03, 0.1, 0.25), np.array_split(np.arange(HYPOTHESES), 4), strict=True):
+    for share, group in zip(
+        (0.01, 0.03, 0.1, 0.25), np.array_split(np.arange(HYPOTHESES), 4), strict=True
+    ):
         count = min(max(3 * size, round(share * len(sample))), len(sample))
         _, neighbours = tree.query(sample[seeds[group]], k=count)
         picks = rng.integers(1, count, (len(group), size - 1))
@@ -149,5 +168,6 @@ def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np
 
 
 def _score(residuals: np.ndarray, tolerance: float) -> np.ndarray:
-    """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals cost more."""
+    """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals
+    cost more."""
     return np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)

@@ -8,8 +8,8 @@ import numpy as np
 def fill_points(x, y, z, points):
     """Fill ``points`` (w, 3) with (x z, y z, z) of an image row's rays (w,) and depths.
 
-    A flat view and indices without a sign: only so does the compiler write three numbers a pixel in wide registers,
-    four times as fast.
+    A flat view and indices without a sign: only so does the compiler write three numbers a pixel in
+    wide registers, four times as fast.
     """
     flat, three, one, two = points.reshape(-1), np.uint64(3), np.uint64(1), np.uint64(2)
     for i in range(len(z)):

@@ -14,9 +14,11 @@ LARGEST_BASELINE_MM = 1e6
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Camera, projector, and the transform between them: X_projector = R X_camera + t (the Letter's R(theta_s), t_s).
+    """Camera, projector, and the transform between them: X_projector = R X_camera + t (the Letter's
+    R(theta_s), t_s).
 
-    ``R``: (3, 3) rotation. ``t``: (3,) mm; OpenCV's (3, 1) is accepted. Kept as read-only float64 copies.
+    ``R``: (3, 3) rotation. ``t``: (3,) mm; OpenCV's (3, 1) is accepted. Kept as read-only float64
+    copies.
     """
 
     camera: Lens
@@ -27,16 +29,24 @@ class StereoRig:
     def __post_init__(self) -> None:
         R = np.array(self.R, dtype=np.float64)
         t = np.array(self.t, dtype=np.float64).ravel()
-        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
+        if (
+            R.shape != (3, 3)
+            or not np.allclose(R @ R.T, np.eye(3), atol=1e-5)
+            or np.linalg.det(R) < 0
+        ):
             raise InputError(
-                f"The rotation from camera to projector is no 3x3 rotation matrix, {R.tolist()}: check its key."
+                f"The rotation from camera to projector is no 3x3 rotation matrix, {R.tolist()}:"
+                " check its key."
             )
         if t.shape != (3,) or not np.isfinite(t).all():
-            raise InputError(f"The translation from camera to projector must be 3 numbers in mm, not {t.tolist()}.")
+            raise InputError(
+                "The translation from camera to projector must be 3 numbers in mm, not"
+                f" {t.tolist()}."
+            )
         if not np.linalg.norm(t) <= LARGEST_BASELINE_MM:
             raise InputError(
-                f"Camera and projector are {np.linalg.norm(t):.3g} mm apart: give the translation in mm, "
-                f"{LARGEST_BASELINE_MM:g} at most."
+                f"Camera and projector are {np.linalg.norm(t):.3g} mm apart: give the translation"
+                f" in mm, {LARGEST_BASELINE_MM:g} at most."
             )
         vars(self).update(R=read_only(R), t=read_only(t))
 
@@ -50,5 +60,6 @@ class StereoRig:
         return np.asarray(points, dtype=np.float64) @ self.R.T + self.t
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Camera-frame points (..., 3) mm to projector pixels (..., 2); NaN behind the projector and past its fold."""
+        """Camera-frame points (..., 3) mm to projector pixels (..., 2); NaN behind the projector
+        and past its fold."""
         return self.projector.project(self.to_projector(points))

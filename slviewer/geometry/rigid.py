@@ -8,19 +8,22 @@ Floats = NDArray[np.float64]
 
 
 def rigid_transform(R: Floats, t: Floats) -> Floats:
-    """(..., 4, 4): the motion X -> R X + t of rotations ``R`` (..., 3, 3) and shifts ``t`` (..., 3) mm."""
+    """(..., 4, 4): the motion X -> R X + t of rotations ``R`` (..., 3, 3) and shifts ``t`` (..., 3)
+    mm."""
     T = np.zeros((*np.shape(R)[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T
 
 
 def transform_from_rvec(rvec: ArrayLike, tvec: ArrayLike) -> Floats:
-    """(4, 4): the motion of a rotation vector (rad) and a translation (mm) as OpenCV returns them, of any shape."""
+    """(4, 4): the motion of a rotation vector (rad) and a translation (mm) as OpenCV returns them,
+    of any shape."""
     return rigid_transform(Rotation.from_rotvec(np.ravel(rvec)).as_matrix(), np.ravel(tvec))
 
 
 def turn_about(rotation: Floats, centre: Floats, shift: Floats | float = 0.0) -> Floats:
-    """(4, 4): the turn by a rotation vector (3,) rad about ``centre`` (3,) mm, then the shift (3,) mm."""
+    """(4, 4): the turn by a rotation vector (3,) rad about ``centre`` (3,) mm, then the shift (3,)
+    mm."""
     R = Rotation.from_rotvec(rotation).as_matrix()
     return rigid_transform(R, centre - R @ centre + shift)
 
@@ -31,7 +34,8 @@ def move_points(T: Floats, points: np.ndarray) -> Floats:
 
 
 def motion_jacobian(arm: Floats) -> Floats:
-    """Return the derivatives (m, 3, 6) of points by a small rotation (rad) about a centre and a shift (mm).
+    """Return the derivatives (m, 3, 6) of points by a small rotation (rad) about a centre and a
+    shift (mm).
 
     ``arm`` (m, 3) mm: the points less the centre.
     """
@@ -59,7 +63,8 @@ def largest_angle_deg(directions: Floats) -> float:
 
 
 def fit_rigid(points: Floats, targets: Floats) -> Floats:
-    """(..., 4, 4): the motion of least squares that brings points (..., n, 3) onto ``targets`` (..., n, 3), in order.
+    """(..., 4, 4): the motion of least squares that brings points (..., n, 3) onto ``targets``
+    (..., n, 3), in order.
 
     Kabsch's algorithm; the points must be finite, three or more and not on one line.
     """

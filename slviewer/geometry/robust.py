@@ -9,8 +9,8 @@ Solution = TypeVar("Solution")
 
 
 def robust_sigma(residuals: np.ndarray, about: float | None = None) -> float:
-    """1.4826 times the median absolute deviation from the median, or from ``about``: the standard deviation of normal
-    residuals, robust to outliers."""
+    """1.4826 times the median absolute deviation from the median, or from ``about``: the standard
+    deviation of normal residuals, robust to outliers."""
     centre = np.median(residuals) if about is None else about
     return float(1.4826 * np.median(np.abs(residuals - centre)))
 
@@ -22,13 +22,15 @@ def tukey_weights(residuals: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def fit_reweighted(
-    solve: Callable[[np.ndarray], tuple[Solution, np.ndarray]], values: np.ndarray, weights: np.ndarray
+    solve: Callable[[np.ndarray], tuple[Solution, np.ndarray]],
+    values: np.ndarray,
+    weights: np.ndarray,
 ) -> Solution:
     """Iteratively reweighted least squares with Tukey's weights.
 
-    ``solve(weights)`` returns a solution and its fitted values (n,); ``values`` (n,) are the observations, and
-    ``weights`` (n,) one over the variance of each, known up to a factor. Ends when the fit moves by less than a
-    hundredth of the residuals' robust sigma.
+    ``solve(weights)`` returns a solution and its fitted values (n,); ``values`` (n,) are the
+    observations, and ``weights`` (n,) one over the variance of each, known up to a factor. Ends
+    when the fit moves by less than a hundredth of the residuals' robust sigma.
     """
     solution, fitted = solve(weights)
     rounding = 1e-12 * float(np.abs(values).max(initial=0.0))

@@ -1,7 +1,9 @@
-"""A cubic B-spline surface over a part of the image: smooths scattered values, and keeps what a lens does locally.
+"""A cubic B-spline surface over a part of the image: smooths scattered values, and keeps what a
+lens does locally.
 
-A polynomial of low degree over the whole image removes the local distortion that a pixel-wise calibration should learn
-(its step 2); a spline of some cells across keeps it, and still averages hundreds of pixels.
+A polynomial of low degree over the whole image removes the local distortion that a pixel-wise
+calibration should learn (its step 2); a spline of some cells across keeps it, and still averages
+hundreds of pixels.
 """
 
 from collections.abc import Sequence
@@ -13,21 +15,28 @@ from scipy.linalg import solveh_banded
 
 from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial, parse_box, select_valid_samples
+from slviewer.geometry.polynomial import (
+    Polynomial2D,
+    fit_polynomial,
+    parse_box,
+    select_valid_samples,
+)
 from slviewer.geometry.robust import fit_reweighted
 
 TREND_DEGREE = 3
-"""Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls where samples are."""
+"""Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls
+where samples are."""
 RIDGE = 1e-7
-"""Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls elsewhere."""
+"""Of a cell's weight: holds coefficients that no sample reaches at the trend, and hardly pulls
+elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class SplineSurface:
     """A trend plus a tensor-product uniform cubic B-spline over ``trend.box``.
 
-    ``coefficients``: (ny + 3, nx + 3) for ny x nx cells. NaN outside the box; in cells without samples it continues
-    smoothly from its neighbours, which is no measurement: mask those.
+    ``coefficients``: (ny + 3, nx + 3) for ny x nx cells. NaN outside the box; in cells without
+    samples it continues smoothly from its neighbours, which is no measurement: mask those.
     """
 
     trend: Polynomial2D
@@ -65,20 +74,24 @@ def fit_spline(
     smooth: float = 1e-3,
     robust: bool = False,
 ) -> SplineSurface:
-    """Cubic B-spline surface through ``values`` (n,) at pixels ``u``, ``v`` (n,), by penalised least squares.
+    """Cubic B-spline surface through ``values`` (n,) at pixels ``u``, ``v`` (n,), by penalised
+    least squares.
 
-    ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1) px, or a size
-    (w, h) for a whole image; samples outside it, not finite, or of weight 0 are excluded. ``cells``: (across, down).
-    ``smooth``: weight of the squared second differences of the coefficients, relative to a mean cell's data: at 1e-3
-    a wave of four cells loses 1 % of its height, and cells without samples are held by their neighbours. ``robust``:
-    Tukey's weights, so that outliers (contrast edges, 2 pi spikes) do not pull.
+    ``weights``: (n,), one over each value's variance, or None. ``extent``: the box (u0, v0, u1, v1)
+    px, or a size (w, h) for a whole image; samples outside it, not finite, or of weight 0 are
+    excluded. ``cells``: (across, down). ``smooth``: weight of the squared second differences of the
+    coefficients, relative to a mean cell's data: at 1e-3 a wave of four cells loses 1 % of its
+    height, and cells without samples are held by their neighbours. ``robust``: Tukey's weights, so
+    that outliers (contrast edges, 2 pi spikes) do not pull.
 
     Raises InputError where fewer samples are left than the trend has coefficients, or for no cells.
     """
     box = parse_box(extent)
     nx, ny = cells
     if nx < 1 or ny < 1:
-        raise InputError(f"A surface of {nx}x{ny} cells was requested: at least one each way is needed.")
+        raise InputError(
+            f"A surface of {nx}x{ny} cells was requested: at least one each way is needed."
+        )
     u, v, values, weights = select_valid_samples(u, v, values, weights, box)
     trend = fit_polynomial(u, v, values, weights, box, TREND_DEGREE, robust)
     rest = values - trend.evaluate(u, v)
@@ -93,15 +106,20 @@ def fit_spline(
     prior *= weights.sum() / reached
 
     def solve(w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficients (ny + 3, nx + 3) and fitted values (n,) for sample weights (n,)."""
+        """Return the coefficients (ny + 3, nx + 3) and fitted values (n,) for sample weights
+        (n,)."""
         band = prior.copy()
         right = np.zeros(count)
         _accumulate(cells_u, basis_u, cells_v, basis_v, w, rest, columns, band, right)
-        solution = solveh_banded(band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False)
+        solution = solveh_banded(
+            band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False
+        )
         coefficients = solution.reshape(-1, columns)
         return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
 
-    return SplineSurface(trend, fit_reweighted(solve, rest, weights) if robust else solve(weights)[0])
+    return SplineSurface(
+        trend, fit_reweighted(solve, rest, weights) if robust else solve(weights)[0]
+    )
 
 
 def _basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) -> np.ndarray:
@@ -112,8 +130,11 @@ def _basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) -
     return matrix
 
 
-def cubic_basis(positions: np.ndarray, start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return each position's cell (n,), one of those from start to end, and its four cubic B-spline weights (n, 4)."""
+def cubic_basis(
+    positions: np.ndarray, start: float, end: float, cells: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return each position's cell (n,), one of those from start to end, and its four cubic B-spline
+    weights (n, 4)."""
     x = (positions - start) * (cells / (end - start))
     cell = np.clip(np.floor(x).astype(np.int64), 0, cells - 1)
     f = x - cell
@@ -128,7 +149,8 @@ def second_differences(count: int) -> sp.dia_array:
 
 
 def bending_energy(columns: int, rows: int) -> sp.sparray:
-    """Return the quadratic form d_uu^2 + 2 d_uv^2 + d_vv^2 of coefficients (rows, columns), as of a thin plate.
+    """Return the quadratic form d_uu^2 + 2 d_uv^2 + d_vv^2 of coefficients (rows, columns), as of a
+    thin plate.
 
     It is a sparse matrix (rows columns, rows columns) of first and second differences.
     """
@@ -149,7 +171,9 @@ def _accumulate(cells_u, basis_u, cells_v, basis_v, weights, values, columns, ba
         for a in range(4):
             for b in range(4):
                 products[4 * a + b] = basis_v[k, a] * basis_u[k, b]
-        corner = np.uint64(cells_v[k] * columns + cells_u[k])  # an index with a sign would be tested for its end
+        corner = np.uint64(
+            cells_v[k] * columns + cells_u[k]
+        )  # an index with a sign would be tested for its end
         for a in range(4):
             for b in range(4):
                 row = corner + np.uint64(a * columns + b)
@@ -163,12 +187,15 @@ def _accumulate(cells_u, basis_u, cells_v, basis_v, weights, values, columns, ba
 
 @kernel()
 def _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients):
-    """Return the spline's values (n,) at samples given by their cells (n,) and basis weights (n, 4)."""
+    """Return the spline's values (n,) at samples given by their cells (n,) and basis weights (n,
+    4)."""
     out = np.empty(cells_u.shape[0])
     for k in range(cells_u.shape[0]):
         total = 0.0
         for a in range(4):
             for b in range(4):
-                total += basis_v[k, a] * basis_u[k, b] * coefficients[cells_v[k] + a, cells_u[k] + b]
+                total += (
+                    basis_v[k, a] * basis_u[k, b] * coefficients[cells_v[k] + a, cells_u[k] + b]
+                )
         out[k] = total
     return out

@@ -17,20 +17,25 @@ TOLERANCE_PX = 1e-7
 MAX_STEPS = 25
 CHUNK = 1024
 MARGIN = 0.1
-"""A point may fall outside the projector's image by this share of its width and height: a calibration's own error is
-smaller, and points further out were never illuminated."""
+"""A point may fall outside the projector's image by this share of its width and height: a
+calibration's own error is smaller, and points further out were never illuminated."""
 
 
 def triangulate(
-    rig: StereoRig, coordinate: np.ndarray, axis: Literal["x", "y"], z_range: tuple[float, float] | None = None
+    rig: StereoRig,
+    coordinate: np.ndarray,
+    axis: Literal["x", "y"],
+    z_range: tuple[float, float] | None = None,
 ) -> np.ndarray:
-    """Depth (h, w) float64 mm of each camera pixel from its projector column (axis x) or row (axis y).
+    """Depth (h, w) float64 mm of each camera pixel from its projector column (axis x) or row (axis
+    y).
 
-    ``coordinate``: (h, w) px, NaN where invalid. Starts from Letter eq. 6, whose projector coordinate is normalised
-    without undistorting it (that needs the other coordinate, not known yet), then Newton steps on z until the
-    *distorted* projection meets the measured coordinate. NaN where the coordinate is invalid, the point would lie
-    behind a device, more than a tenth outside the projector's image or past the fold of a lens, the steps do not
-    converge, or z lies outside ``z_range`` (mm). Raises InputError where the map has not the camera's image size.
+    ``coordinate``: (h, w) px, NaN where invalid. Starts from Letter eq. 6, whose projector
+    coordinate is normalised without undistorting it (that needs the other coordinate, not known
+    yet), then Newton steps on z until the *distorted* projection meets the measured coordinate. NaN
+    where the coordinate is invalid, the point would lie behind a device, more than a tenth outside
+    the projector's image or past the fold of a lens, the steps do not converge, or z lies outside
+    ``z_range`` (mm). Raises InputError where the map has not the camera's image size.
     """
     check_map(rig.camera.size, coordinate, "projector coordinates")
     z = _solve(rig, rig.camera.rays().reshape(-1, 2), np.asarray(coordinate).reshape(-1), axis)
@@ -42,15 +47,16 @@ def triangulate(
 def triangulate_pixels(
     rig: StereoRig, pixels: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]
 ) -> np.ndarray:
-    """Points (n, 3) mm in the camera's frame of scattered camera pixels (n, 2) and their projector coordinate (n,) px.
+    """Points (n, 3) mm in the camera's frame of scattered camera pixels (n, 2) and their projector
+    coordinate (n,) px.
 
     NaN rows under the same conditions as ``triangulate``.
     """
     pixels, coordinate = np.asarray(pixels), np.asarray(coordinate)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or coordinate.shape != pixels.shape[:1]:
         raise InputError(
-            f"Pixels of shape {pixels.shape} and coordinates of shape {coordinate.shape} were given: "
-            "they must be (n, 2) and (n,)."
+            f"Pixels of shape {pixels.shape} and coordinates of shape {coordinate.shape} were"
+            " given: they must be (n, 2) and (n,)."
         )
     rays = rig.camera.undistort(pixels)
     z = _solve(rig, rays, coordinate, axis)
@@ -58,30 +64,45 @@ def triangulate_pixels(
 
 
 def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.ndarray:
-    """|dz/du_p| (h, w) float64, mm per projector px, along each camera pixel's ray at its depth ``z`` (h, w) mm.
+    """|dz/du_p| (h, w) float64, mm per projector px, along each camera pixel's ray at its depth
+    ``z`` (h, w) mm.
 
-    What a projector coordinate's uncertainty becomes in depth; NaN where z is, or where the point cannot be projected.
+    What a projector coordinate's uncertainty becomes in depth; NaN where z is, or where the point
+    cannot be projected.
     """
     check_map(rig.camera.size, z, "depths")
     slopes = np.empty(np.size(z))
-    rays, depths = _as_read_only(rig.camera.rays().reshape(-1, 2)), _as_read_only(np.asarray(z).reshape(-1))
-    _coordinate_slopes(rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _axis_row(axis), slopes)
+    rays, depths = (
+        _as_read_only(rig.camera.rays().reshape(-1, 2)),
+        _as_read_only(np.asarray(z).reshape(-1)),
+    )
+    _coordinate_slopes(
+        rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _axis_row(axis), slopes
+    )
     with np.errstate(divide="ignore"):
         return np.abs(1.0 / slopes).reshape(np.shape(z))
 
 
 def points_from_depth(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Camera-frame points (h, w, 3) float32 mm from rays (h, w, 2) and depths (h, w) mm: eq. 7, 8."""
+    """Camera-frame points (h, w, 3) float32 mm from rays (h, w, 2) and depths (h, w) mm: eq. 7,
+    8."""
     if rays.shape != (*z.shape, 2):
-        raise InputError(f"Rays of shape {rays.shape} and depths of shape {z.shape} do not belong to the same image.")
+        raise InputError(
+            f"Rays of shape {rays.shape} and depths of shape {z.shape} do not belong to the same"
+            " image."
+        )
     points = np.empty((*z.shape, 3), dtype=np.float32)
     points[..., 0] = rays[..., 0] * z
     points[..., 1] = rays[..., 1] * z
-    points[..., 2] = np.where(np.isnan(points[..., 0]), np.nan, z)  # a pixel without a ray is invalid as a whole
+    points[..., 2] = np.where(
+        np.isnan(points[..., 0]), np.nan, z
+    )  # a pixel without a ray is invalid as a whole
     return points
 
 
-def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]) -> np.ndarray:
+def _solve(
+    rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]
+) -> np.ndarray:
     """Depths (n,) of rays (n, 2) at projector coordinates (n,)."""
     z = np.empty(len(rays))
     extent = np.array(rig.projector.size, dtype=np.float64)
@@ -101,7 +122,9 @@ def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Liter
 def _axis_row(axis: str) -> int:
     """Return the projector coordinate's index of an axis: 0 for x (columns), 1 for y (rows)."""
     if axis not in ("x", "y"):
-        raise InputError(f"The axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows).")
+        raise InputError(
+            f"The axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)."
+        )
     return 0 if axis == "x" else 1
 
 
@@ -110,13 +133,15 @@ def check_map(size: Iterable[float], values: np.ndarray, what: str) -> None:
     width, height = map(int, size)
     if np.shape(values) != (height, width):
         raise InputError(
-            f"A map of {what} of shape {np.shape(values)} was given, and the camera was calibrated at {width}x{height} "
-            "px: use captures of the same camera, at the same resolution and without cropping."
+            f"A map of {what} of shape {np.shape(values)} was given, and the camera was calibrated"
+            f" at {width}x{height} px: use captures of the same camera, at the same resolution and"
+            " without cropping."
         )
 
 
 def _as_read_only(values: np.ndarray) -> np.ndarray:
-    """Convert to read-only contiguous float64: one array type for the kernels, so that they compile once."""
+    """Convert to read-only contiguous float64: one array type for the kernels, so that they compile
+    once."""
     return read_only(np.ascontiguousarray(values, dtype=np.float64))
 
 
@@ -132,9 +157,11 @@ def _rotate_ray(R, uc, vc):
 
 @kernel()
 def _projection(z, a0, a1, a2, t, parameters, row):
-    """Of the point at depth z: (measured coordinate, the other one, d(measured)/dz, d(undistorted)/dz, undistorted).
+    """Of the point at depth z: (measured coordinate, the other one, d(measured)/dz,
+    d(undistorted)/dz, undistorted).
 
-    The point is z a + t in the projector's frame, a = R (u_c, v_c, 1); NaN where it cannot be projected.
+    The point is z a + t in the projector's frame, a = R (u_c, v_c, 1); NaN where it cannot be
+    projected.
     """
     depth = z * a2 + t[2]
     if not (z > 0.0 and depth > 0.0):
@@ -154,8 +181,8 @@ def _projection(z, a0, a1, a2, t, parameters, row):
 
 @kernel()
 def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
-    """(depth of one ray, undistorted minus distorted normalised coordinate there, px a mm of depth); NaN as
-    ``triangulate`` says.
+    """(depth of one ray, undistorted minus distorted normalised coordinate there, px a mm of
+    depth); NaN as ``triangulate`` says.
 
     ``shift``: initial value of the second.
     """
@@ -174,7 +201,8 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
             size = extent[1 - row]
             if not -0.5 - MARGIN * size <= other <= (1.0 + MARGIN) * size - 0.5:
                 return math.nan, 0.0, math.nan
-            # where distortion turns the coordinate back along the ray, two depths share it: ambiguous, so invalid
+            # where distortion turns the coordinate back along the ray, two depths share it:
+            # ambiguous, so invalid
             return (z if slope * straight > 0.0 else math.nan), undistorted - reading, slope
         if not abs(error) < math.inf or slope == 0.0:
             return math.nan, 0.0, math.nan
@@ -182,7 +210,9 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
         damping = 1.0
         while True:  # shorten the step until it stays in view and comes nearer
             nz = z + damping * step
-            nu, other, slope, straight, undistorted = _projection(nz, a0, a1, a2, t, parameters, row)
+            nu, other, slope, straight, undistorted = _projection(
+                nz, a0, a1, a2, t, parameters, row
+            )
             if abs(measured - nu) < abs(error):
                 break
             damping *= 0.5
@@ -194,11 +224,14 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
 
 @kernel(parallel=True)
 def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
-    """Fill ``z`` (n,) mm with the depths of rays (n, 2) at projector coordinates (n,); NaN where there is none."""
+    """Fill ``z`` (n,) mm with the depths of rays (n, 2) at projector coordinates (n,); NaN where
+    there is none."""
     size = extent[row]
     low, high = -0.5 - MARGIN * size, (1.0 + MARGIN) * size - 0.5
     for chunk in numba.prange((coordinate.shape[0] + CHUNK - 1) // CHUNK):
-        shift = 0.0  # the neighbour's distortion is a guess that saves a step or two; a chunk's first ray has none
+        # the neighbour's distortion is a guess that saves a step or two; a chunk's first ray has
+        # none
+        shift = 0.0
         for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, coordinate.shape[0])):
             uc, vc, measured = rays[i, 0], rays[i, 1], coordinate[i]
             z[i] = np.nan
@@ -211,7 +244,8 @@ def _triangulate_all(rays, coordinate, R, t, parameters, row, extent, z):
 
 @kernel(parallel=True)
 def _coordinate_slopes(rays, depths, R, t, parameters, row, slopes):
-    """Fill ``slopes`` (n,) with d(projector coordinate)/dz in px per mm of rays (n, 2) at depths (n,) mm."""
+    """Fill ``slopes`` (n,) with d(projector coordinate)/dz in px per mm of rays (n, 2) at depths
+    (n,) mm."""
     for i in numba.prange(depths.shape[0]):
         a0, a1, a2 = _rotate_ray(R, rays[i, 0], rays[i, 1])
         _, _, slopes[i], _, _ = _projection(depths[i], a0, a1, a2, t, parameters, row)

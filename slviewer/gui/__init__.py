@@ -1,5 +1,6 @@
-"""The wizard's page: panels that draw a snapshot and send requests; no fact lives here, and nothing is computed here.
+"""The wizard's page: panels that draw a snapshot and send requests; no fact lives here, and nothing
+is computed here.
 
-`app` starts it, `shell` is the frame of the page, `steps/` holds one panel file for each step of the wizard,
-`scene` the 3D view, `widgets` what several panels draw.
+`app` starts it, `shell` is the frame of the page, `steps/` holds one panel file for each step of
+the wizard, `scene` the 3D view, `widgets` what several panels draw.
 """

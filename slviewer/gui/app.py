@@ -55,9 +55,11 @@ class App:
         pages: PageChannels | None = None,
         print_links: Callable[[SafeServer], None] = lambda _: None,
     ) -> None:
-        """Serve `operator`, and the pages of devices if `pages` is given, those that its rigs are set up with.
+        """Serve `operator`, and the pages of devices if `pages` is given, those that its rigs are
+        set up with.
 
-        `print_links` is called when the links were replaced. Raises SlviewerError where it cannot be served.
+        `print_links` is called when the links were replaced. Raises SlviewerError where it cannot
+        be served.
         """
         self.operator = operator
         self.pages = pages
@@ -81,7 +83,8 @@ class App:
         self.server.stop()
 
     def _start(self) -> None:
-        """Build the page and its shell, subscribe to snapshots and previews, and start the drawing thread."""
+        """Build the page and its shell, subscribe to snapshots and previews, and start the drawing
+        thread."""
         page, operator = self.server.viser, self.operator
         page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
         page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
@@ -111,14 +114,19 @@ class App:
         self._notified = snapshot.notices[-1].number if snapshot.notices else 0
         self.shell = Shell(context, snapshot.steps)
         page.on_client_connect(self._greet_client)
-        self._unsubscribe = operator.subscribe(lambda _: self._changed.set(), lambda _: self._changed.set())
-        self._thread = threading.Thread(target=self._draw_forever, name="slviewer drawing", daemon=True)
+        self._unsubscribe = operator.subscribe(
+            lambda _: self._changed.set(), lambda _: self._changed.set()
+        )
+        self._thread = threading.Thread(
+            target=self._draw_forever, name="slviewer drawing", daemon=True
+        )
         self._thread.start()
 
     # drawing
 
     def _draw_forever(self) -> None:
-        """Draw new snapshots and previews until closing; a failure is reported once and retried every second."""
+        """Draw new snapshots and previews until closing; a failure is reported once and retried
+        every second."""
         version, number = -1, -1
         pages: list[PageState | None] = []
         while not self._closing:
@@ -140,7 +148,8 @@ class App:
             time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
 
     def _draw(self, version: int, number: int) -> tuple[int, int]:
-        """Draw the snapshot and the preview if they are newer than these; returns the version and number drawn."""
+        """Draw the snapshot and the preview if they are newer than these; returns the version and
+        number drawn."""
         snapshot, preview = self.operator.snapshot(), self.operator.preview()
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
@@ -190,7 +199,8 @@ class App:
         return (self.pages.projector if role == "projector" else self.pages.camera).page_state()
 
     def _greet_client(self, client: viser.ClientHandle) -> None:
-        """Show a browser that may only watch that it may, and an operator's what only operators see."""
+        """Show a browser that may only watch that it may, and an operator's what only operators
+        see."""
         if self.server.role(client.client_id) == "operate":
             ViserClient(self.server.viser, client.client_id).send_private_values()
         else:
@@ -206,13 +216,15 @@ class App:
             """Replace all links, and print the new ones."""
             try:
                 self.server.renew_links(number)
-                self.operator.notify("info", "The links were replaced: pages opened by the old ones are closed")
+                self.operator.notify(
+                    "info", "The links were replaced: pages opened by the old ones are closed"
+                )
             except OSError as error:
                 file = self.server.serving.token_file
                 self.operator.notify(
                     "error",
-                    f"The links were replaced, but {file} holds the old tokens, valid again after a restart "
-                    f"({error.strerror}): write new ones into it",
+                    f"The links were replaced, but {file} holds the old tokens, valid again after a"
+                    f" restart ({error.strerror}): write new ones into it",
                 )
             self._print_links(self.server)
 
@@ -225,7 +237,8 @@ def run(
     serving: Serving | None = None,
     open_browser: bool = True,
 ) -> None:
-    """Serve the wizard until Ctrl-C. `rig` as in `rig_choice`; empty: the session's, else the simulated one.
+    """Serve the wizard until Ctrl-C. `rig` as in `rig_choice`; empty: the session's, else the
+    simulated one.
 
     Raises SlviewerError where the session, the rig or the address cannot be used.
     """
@@ -234,8 +247,12 @@ def run(
         _check_granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
         store = operator.session
         remembered = store is not None and (store.valid_decision("rig") or store.decision_faults())
-        if rig or not remembered:  # a remembered rig that is not connected now is not replaced by the simulated one
-            _check_granted(operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session)))
+        if (
+            rig or not remembered
+        ):  # a remembered rig that is not connected now is not replaced by the simulated one
+            _check_granted(
+                operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session))
+            )
         app = App(operator, serving or Serving(), pages=pages, print_links=print_links)
         preparation = Preparation(operator.set_preparing)
         preparation.start()
@@ -252,7 +269,8 @@ def run(
 
 
 def print_links(server: SafeServer) -> None:
-    """Print the links of all roles, or, where their tokens are in a file, its path: the output may be logged."""
+    """Print the links of all roles, or, where their tokens are in a file, its path: the output may
+    be logged."""
     file = server.serving.token_file
     if file is None:
         print(f"slviewer is ready: {server.link()}")
@@ -260,17 +278,24 @@ def print_links(server: SafeServer) -> None:
         print(f"projector page:    {server.link('project')}")
         print(f"camera page:       {server.link('camera')}")
     else:
-        print(f"slviewer is ready: {server.origin}/#TOKEN, with the tokens {', '.join(ROLES)} of {file}")
+        print(
+            f"slviewer is ready: {server.origin}/#TOKEN, with the tokens {', '.join(ROLES)} of"
+            f" {file}"
+        )
     if server.certificate is None and not server.loopback:
         print("The connection is not encrypted: use --tls, or a network that you trust.")
     elif server.certificate is not None and server.certificate.self_made:
-        print("Browsers warn of the self-made certificate. Compare its SHA-256 fingerprint before you continue:")
+        print(
+            "Browsers warn of the self-made certificate. Compare its SHA-256 fingerprint before you"
+            " continue:"
+        )
         print(f"  {server.certificate.fingerprint}")
     print(end="", flush=True)
 
 
 def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
-    """Parse a rig from text: "simulated" (half resolution), "simulated:0.25", a preset's name or a file.
+    """Parse a rig from text: "simulated" (half resolution), "simulated:0.25", a preset's name or a
+    file.
 
     Returns the choice that `Operator.choose_rig` takes. Raises UsageError for an invalid scale.
     """
@@ -280,7 +305,9 @@ def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
     try:
         return {"driver": name, "scale": float(scale or 0.5)}
     except ValueError:
-        raise UsageError(f"{text!r} is no rig: write simulated, or simulated:0.25 for a quarter of the size") from None
+        raise UsageError(
+            f"{text!r} is no rig: write simulated, or simulated:0.25 for a quarter of the size"
+        ) from None
 
 
 def _wait_for_stop() -> None:
@@ -294,22 +321,26 @@ def _wait_for_stop() -> None:
 def _check_granted(operator: Operator, granted: bool) -> None:
     """Raise SlviewerError with the notice of the error unless a request was granted."""
     if not granted:
-        raise SlviewerError(next(notice.text for notice in reversed(operator.notices()) if notice.level == "error"))
+        raise SlviewerError(
+            next(notice.text for notice in reversed(operator.notices()) if notice.level == "error")
+        )
 
 
 @contextlib.contextmanager
 def browser_opened(server: SafeServer) -> Iterator[None]:
     """Open the wizard in the default browser without waiting; nothing happens where there is none.
 
-    The command line of a browser can be read by every user of the machine: it is given a file that this user alone can
-    read, which leads to a link that can be opened once. The file is in the home folder, as some browsers are kept from
-    all others, and removed once it is no longer needed.
+    The command line of a browser can be read by every user of the machine: it is given a file that
+    this user alone can read, which leads to a link that can be opened once. The file is in the home
+    folder, as some browsers are kept from all others, and removed once it is no longer needed.
     """
     try:
         webbrowser.get()
         home = Path.home()
         folder = tempfile.TemporaryDirectory(
-            prefix="slviewer-", dir=home if os.access(home, os.W_OK) else None, ignore_cleanup_errors=True
+            prefix="slviewer-",
+            dir=home if os.access(home, os.W_OK) else None,
+            ignore_cleanup_errors=True,
         )
     except (webbrowser.Error, OSError, RuntimeError):
         yield
@@ -317,7 +348,9 @@ def browser_opened(server: SafeServer) -> Iterator[None]:
     with folder as place:
         page = Path(place, "open.html")
         link = server.one_time_link()
-        with os.fdopen(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+        with os.fdopen(
+            os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8"
+        ) as file:
             file.write(f'<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
                        f"<title>slviewer</title><script>location.replace({link!r})</script>")  # fmt: skip
 

@@ -19,10 +19,13 @@ _MARKS: dict[Tone, str] = {
     "error": '<path d="M6 6l8 8M14 6l-8 8"/>',
 }
 MIN_WEIGHT = 0.7
-"""Undisturbed poses have weights of 0.8 or more in the joint adjustment; those below this are listed."""
+"""Undisturbed poses have weights of 0.8 or more in the joint adjustment; those below this are
+listed."""
 
 
-def verdict_html(verdict: Verdict, of_calibration: bool, calibration: CalibrationView | None) -> Html:
+def verdict_html(
+    verdict: Verdict, of_calibration: bool, calibration: CalibrationView | None
+) -> Html:
     """Return the verdict as text, colour and icon, then every finding with its remedy.
 
     `of_calibration`: whether the judged attempt made the current calibration.
@@ -55,7 +58,10 @@ def exclusions_html(calibration: CalibrationView) -> Html:
     """List excluded poses and features, each with its reason; empty where there are none."""
     n = calibration.stereo.features_excluded
     features = (
-        f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma): shadow or occlusion." if n else ""
+        f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma): shadow or"
+        " occlusion."
+        if n
+        else ""
     )
     note = paragraph(coloured(features, "dim")) if features else Html("")
     lines = [f"{name}: {why}" for name, why in calibration.stereo.excluded.items()]
@@ -66,16 +72,22 @@ def exclusions_html(calibration: CalibrationView) -> Html:
         ]
     if not lines:
         return note
-    items = "".join(f'<li style="margin:0.15em 0">{to_html(_capitalise(line))}</li>' for line in lines)
+    items = "".join(
+        f'<li style="margin:0.15em 0">{to_html(_capitalise(line))}</li>' for line in lines
+    )
     listed = f'<ul style="margin:0.2em 0 0;padding-left:1.2em">{items}</ul>'
-    return Html(alert(Html(f"{coloured('Excluded', 'warning', bold=True)}{listed}"), "warning") + note)
+    return Html(
+        alert(Html(f"{coloured('Excluded', 'warning', bold=True)}{listed}"), "warning") + note
+    )
 
 
 def model_choice_html(calibration: CalibrationView) -> Html:
     """Describe which model is used, and why; empty where there is only one."""
     if calibration.chosen and calibration.chosen != calibration.recommended:
         return alert(
-            f"{calibration.chosen} is used (your choice); {calibration.recommended} is recommended.", "warning"
+            f"{calibration.chosen} is used (your choice); {calibration.recommended} is"
+            " recommended.",
+            "warning",
         )
     if len(calibration.models) < 2:
         return Html("")
@@ -85,14 +97,19 @@ def model_choice_html(calibration: CalibrationView) -> Html:
         why = "smallest error on held-out boards."
     else:
         why = "default."
-    return paragraph(Html(f"{coloured(calibration.best, 'good', bold=True)} is used: {to_html(why)}"))
+    return paragraph(
+        Html(f"{coloured(calibration.best, 'good', bold=True)} is used: {to_html(why)}")
+    )
 
 
 def splined_html(splined: SplinedView) -> Html:
-    """Return a table of the joint adjustment, and poses with a low weight or turned by 180 degrees."""
+    """Return a table of the joint adjustment, and poses with a low weight or turned by 180
+    degrees."""
     named = {
         f"Weights below {MIN_WEIGHT:g}": [
-            f"{name} {min(pair):.2f}" for name, pair in splined.weights.items() if min(pair) < MIN_WEIGHT
+            f"{name} {min(pair):.2f}"
+            for name, pair in splined.weights.items()
+            if min(pair) < MIN_WEIGHT
         ],
         "Board turned by 180°, corrected": splined.turned,
     }
@@ -119,7 +136,8 @@ def _draw_icon(tone: Tone) -> str:
     """Return the SVG icon of a tone: a disc with a check mark, an exclamation mark or a cross."""
     colour = {"good": "green-7", "warning": "orange-7", "error": "red-7"}[tone]
     return (
-        '<svg viewBox="0 0 20 20" width="22" height="22" style="flex:none" fill="none" stroke="#fff" '
-        'stroke-width="2.2" stroke-linecap="round" stroke-linejoin="round">'
-        f'<circle cx="10" cy="10" r="10" stroke="none" fill="var(--mantine-color-{colour})"/>{_MARKS[tone]}</svg>'
+        '<svg viewBox="0 0 20 20" width="22" height="22" style="flex:none" fill="none"'
+        ' stroke="#fff" stroke-width="2.2" stroke-linecap="round" stroke-linejoin="round"><circle'
+        ' cx="10" cy="10" r="10" stroke="none"'
+        f' fill="var(--mantine-color-{colour})"/>{_MARKS[tone]}</svg>'
     )

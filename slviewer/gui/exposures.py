@@ -28,7 +28,13 @@ class ExposureInputs:
         self._drawn: ExposureChange | None = None
         gui = context.gui
         self._budget = gui.add_number(
-            "Time limit, s", BUDGET_S, min=0.5, max=600.0, step=0.5, visible=not for_scan, hint="Of one capture"
+            "Time limit, s",
+            BUDGET_S,
+            min=0.5,
+            max=600.0,
+            step=0.5,
+            visible=not for_scan,
+            hint="Of one capture",
         )
         self._suggest = context.button(
             "Suggest exposure",
@@ -43,7 +49,9 @@ class ExposureInputs:
         if for_scan:
             return
         self._several = gui.add_dropdown(
-            "Exposures", (*_MULTIPLES, _SUGGESTED), hint="Several for shiny and dark parts: each pixel uses the best"
+            "Exposures",
+            (*_MULTIPLES, _SUGGESTED),
+            hint="Several for shiny and dark parts: each pixel uses the best",
         )
         self._several.on_update(context.callback(self._set_several, by_user=True))
         self._several_value = SessionValue(self._several)
@@ -62,7 +70,9 @@ class ExposureInputs:
             if latest is None:
                 self._picture.hide()
             else:
-                self._picture.set(draw_suggestion(latest.suggestion), suggestion_html(latest.suggestion))
+                self._picture.set(
+                    draw_suggestion(latest.suggestion), suggestion_html(latest.suggestion)
+                )
         if self._for_scan:
             return
         change(self._budget, visible=shown)
@@ -85,20 +95,26 @@ class ExposureInputs:
         if self._several.value == _SUGGESTED:
             self._request()
         elif now is not None:
-            self._context.operator.set_exposures([now * times for times in _MULTIPLES[self._several.value]])
+            self._context.operator.set_exposures(
+                [now * times for times in _MULTIPLES[self._several.value]]
+            )
 
 
 def draw_suggestion(suggestion: ExposureSuggestion) -> np.ndarray:
-    """The scene before and now, side by side (h, 2 w, 3) uint8: saturated pixels red, too dark ones blue, and those
-    that the projector does not light dim."""
-    before, now = (_paint(suggestion.image, state) for state in (suggestion.state_before, suggestion.state))
+    """The scene before and now, side by side (h, 2 w, 3) uint8: saturated pixels red, too dark ones
+    blue, and those that the projector does not light dim."""
+    before, now = (
+        _paint(suggestion.image, state) for state in (suggestion.state_before, suggestion.state)
+    )
     gap = np.full((len(now), _GAP_PX, 3), 255, np.uint8)
     return np.concatenate([before, gap, now], axis=1)
 
 
 def suggestion_html(suggestion: ExposureSuggestion) -> Html:
     """State what is measured before and now, and what the colours mean."""
-    marks = f"{coloured('■ saturated', 'error')}&ensp;<span style='color:rgb{_DARK}'>■ too dark</span>"
+    marks = (
+        f"{coloured('■ saturated', 'error')}&ensp;<span style='color:rgb{_DARK}'>■ too dark</span>"
+    )
     return paragraph(
         Html(
             '<div style="display:flex;justify-content:space-between">'

@@ -1,6 +1,7 @@
 """Links from panels to the help: a section for each step, and one for each finding.
 
-A finding's section is named after its key: the cause of a diagnosis, the name of a check, the reason of a refusal.
+A finding's section is named after its key: the cause of a diagnosis, the name of a check, the
+reason of a refusal.
 """
 
 from slviewer.gui.widgets import Html, to_html
@@ -24,11 +25,14 @@ STAGES = {
 def help_link(anchor: str, page: str = FINDINGS_PAGE, style: str = "") -> Html:
     """Return a link that opens a section of a page of the help in another tab.
 
-    Its address is relative to the wizard's own, which differs between the operator and those who watch.
+    Its address is relative to the wizard's own, which differs between the operator and those who
+    watch.
     """
     address = to_html(f"{PREFIX}{page}#{anchor}")
     colour = "color:var(--mantine-color-anchor);font-weight:400;white-space:nowrap"
-    return Html(f'<a href="{address}" target="_blank" rel="noopener" style="{colour};{style}">Help</a>')
+    return Html(
+        f'<a href="{address}" target="_blank" rel="noopener" style="{colour};{style}">Help</a>'
+    )
 
 
 def step_help_link(step: str) -> Html:

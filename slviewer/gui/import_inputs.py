@@ -1,4 +1,5 @@
-"""Inputs to import captures of other tools: from a folder of the computer that runs slviewer, or from a zip."""
+"""Inputs to import captures of other tools: from a folder of the computer that runs slviewer, or
+from a zip."""
 
 from typing import Any, get_args
 
@@ -25,20 +26,36 @@ class ImportInputs:
         gui, callback = context.gui, context.callback
         self._context, self._role = context, role
         with gui.add_folder("Import captures", expand_by_default=False):
-            Text(gui).write(f"Imports images of another program as {_RESULTS[role]}, one folder each.", "dim")
-            self._layout = Choice(gui, "Layout", "How the files are named; detect uses the names, or a TOML")
+            Text(gui).write(
+                f"Imports images of another program as {_RESULTS[role]}, one folder each.", "dim"
+            )
+            self._layout = Choice(
+                gui, "Layout", "How the files are named; detect uses the names, or a TOML"
+            )
             self._layout.offer([(_DETECT, _DETECT), *((name, name) for name in layouts())])
             self._description = Text(gui)
-            self._projector = gui.add_text("Projector", "", hint="Columns x rows, for example 1280x800")
+            self._projector = gui.add_text(
+                "Projector", "", hint="Columns x rows, for example 1280x800"
+            )
             self._size_hint = Text(gui)
             self._channel = gui.add_dropdown(
                 "Channel", get_args(Channel), initial_value=DEFAULT_CHANNEL, hint="Of colour images"
             )
-            self._codec = gui.add_dropdown("Codec", (_AUTOMATIC, *get_args(Codec)), visible=False, hint="Of SLStudio")
-            self._prefix = gui.add_text("Prefix", "", hint="Put before the names: part gives part_pose_01")
-            self._folder = gui.add_text("Folder path", "", hint="On the computer that runs slviewer")
-            self._import = context.button("Import folder", self._import_folder, viser.Icon.FOLDER_SYMLINK, None)
-            self._upload = gui.add_upload_button("Upload zip", icon=viser.Icon.UPLOAD, color="gray", mime_type=".zip")
+            self._codec = gui.add_dropdown(
+                "Codec", (_AUTOMATIC, *get_args(Codec)), visible=False, hint="Of SLStudio"
+            )
+            self._prefix = gui.add_text(
+                "Prefix", "", hint="Put before the names: part gives part_pose_01"
+            )
+            self._folder = gui.add_text(
+                "Folder path", "", hint="On the computer that runs slviewer"
+            )
+            self._import = context.button(
+                "Import folder", self._import_folder, viser.Icon.FOLDER_SYMLINK, None
+            )
+            self._upload = gui.add_upload_button(
+                "Upload zip", icon=viser.Icon.UPLOAD, color="gray", mime_type=".zip"
+            )
             self._upload.on_upload(callback(self._import_zip))
         self._layout.on_change(callback(self._describe))
         self._describe()
@@ -65,7 +82,8 @@ class ImportInputs:
         self._size_hint.write(f"Default size: {empty}.", "dim")
 
     def _collect_options(self) -> dict[str, Any]:
-        """Return the import options that were entered: layout, role, projector, prefix, channel and codec."""
+        """Return the import options that were entered: layout, role, projector, prefix, channel and
+        codec."""
         chosen: dict[str, Any] = {"layout": self._layout.value or _DETECT, "role": self._role}
         for name, handle in (("projector", self._projector), ("prefix", self._prefix)):
             if handle.value.strip():

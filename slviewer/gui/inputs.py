@@ -1,4 +1,5 @@
-"""Inputs whose options come and go with the session, and handles that are updated only where something changed."""
+"""Inputs whose options come and go with the session, and handles that are updated only where
+something changed."""
 
 import math
 import threading
@@ -26,8 +27,9 @@ def change(handle: Any, **values: Any) -> None:
 class SessionValue:
     """Sets a handle's value only when the session's value changes.
 
-    A snapshot that is a moment older must not overwrite what was just entered. While somebody types, the first digits
-    are a value too; the session's answer to them waits until typing has stopped.
+    A snapshot that is a moment older must not overwrite what was just entered. While somebody
+    types, the first digits are a value too; the session's answer to them waits until typing has
+    stopped.
     """
 
     def __init__(self, handle: Any) -> None:
@@ -79,7 +81,8 @@ class Choice:
         self._names: dict[str, str] = {}
 
     def offer(self, things: Sequence[tuple[str, str]], preferred: str = "") -> None:
-        """Set the (name, text) options; the choice stays if possible, else it becomes `preferred` or the first one."""
+        """Set the (name, text) options; the choice stays if possible, else it becomes `preferred`
+        or the first one."""
         texts = tuple(text for _, text in things) or (NOTHING,)
         chosen = self.value
         self._names = {text: name for name, text in things}
@@ -115,7 +118,11 @@ class RestoreButton:
     def __init__(self, context: PanelContext) -> None:
         self._name = ""
         self._button = context.button(
-            "Restore", lambda: context.operator.undelete(self._name), viser.Icon.ARROW_BACK_UP, "orange", visible=False
+            "Restore",
+            lambda: context.operator.undelete(self._name),
+            viser.Icon.ARROW_BACK_UP,
+            "orange",
+            visible=False,
         )
 
     def offer(self, deleted: Sequence[str]) -> None:

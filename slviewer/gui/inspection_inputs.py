@@ -1,4 +1,5 @@
-"""Inspection plans in the step Measure: uploaded or made, run on scans, with the table of what passes."""
+"""Inspection plans in the step Measure: uploaded or made, run on scans, with the table of what
+passes."""
 
 import viser
 
@@ -20,7 +21,8 @@ TABLE_PX = 320
 
 
 class InspectionInputs:
-    """Inputs that run an inspection plan on the surface that is shown, or on every scan, and what came of it."""
+    """Inputs that run an inspection plan on the surface that is shown, or on every scan, and what
+    came of it."""
 
     def __init__(self, context: PanelContext) -> None:
         self._context = context
@@ -30,23 +32,35 @@ class InspectionInputs:
     def build(self) -> None:
         """Create the inputs."""
         gui, context, operator = self._context.gui, self._context, self._context.operator
-        with gui.add_folder("Inspection plan", visible=False, expand_by_default=False) as self._folder:
+        with gui.add_folder(
+            "Inspection plan", visible=False, expand_by_default=False
+        ) as self._folder:
             self._plan = Choice(gui, "Plan", "Make one from the results above, or upload one")
-            upload = gui.add_upload_button("Upload plan", icon=viser.Icon.UPLOAD, color="gray", mime_type=".toml")
-            upload.on_upload(context.callback(lambda: operator.upload_plan(upload.value.name, upload.value.content)))
+            upload = gui.add_upload_button(
+                "Upload plan", icon=viser.Icon.UPLOAD, color="gray", mime_type=".toml"
+            )
+            upload.on_upload(
+                context.callback(
+                    lambda: operator.upload_plan(upload.value.name, upload.value.content)
+                )
+            )
             self._parts = Choice(gui, "Parts")
             self._run = context.button("Run plan", self._request_run, viser.Icon.LIST_CHECK, None)
             self._result = Text(gui)
             self._files = Text(gui)
 
     def draw(self, snapshot: Snapshot, surface: str) -> None:
-        """Offer the session's plans for the shown surface and for all scans, and show the latest results."""
+        """Offer the session's plans for the shown surface and for all scans, and show the latest
+        results."""
         session = snapshot.session
         self._surface = surface
         change(self._folder, visible=bool(session and surface))
         if session is None:
             return
-        names = [(plan, "made here" if plan == OWN_PLAN else plan.partition("/")[2]) for plan in session.plans]
+        names = [
+            (plan, "made here" if plan == OWN_PLAN else plan.partition("/")[2])
+            for plan in session.plans
+        ]
         self._plan.offer(names)
         self._scans = tuple(scan.name for scan in session.scans if scan.cloud == "fresh")
         every = [(ALL, f"all {len(self._scans)} scans")] if len(self._scans) > 1 else []
@@ -56,7 +70,10 @@ class InspectionInputs:
         self._result.set("" if seen is None else inspection_html(seen))
         files = [each for each in session.exports if each.name in PARTS]
         self._files.set(
-            "".join(paragraph(link(self._context.offer(each.path), f"Download {each.name}")) for each in files)
+            "".join(
+                paragraph(link(self._context.offer(each.path), f"Download {each.name}"))
+                for each in files
+            )
             if seen is not None
             else ""
         )
@@ -70,9 +87,14 @@ class InspectionInputs:
 
 
 def inspection_html(seen: InspectionView) -> Html:
-    """Return how many parts pass, and a table of their characteristics with limits and decisions."""
+    """Return how many parts pass, and a table of their characteristics with limits and
+    decisions."""
     counts = {decision: sum(part.decision == decision for part in seen.parts) for decision in TONES}
-    said = ", ".join(coloured(f"{n} {decision}", TONES[decision], bold=True) for decision, n in counts.items() if n)
+    said = ", ".join(
+        coloured(f"{n} {decision}", TONES[decision], bold=True)
+        for decision, n in counts.items()
+        if n
+    )
     html = paragraph(Html(f"{coloured(seen.plan, 'plain', bold=True)}: {said}"))
     if seen.stale:
         html += alert("Out of date: a scan has changed since; run the plan again.", "warning")
@@ -82,13 +104,29 @@ def inspection_html(seen: InspectionView) -> Html:
             title = coloured(part.part, "dim") if i == 0 and len(seen.parts) > 1 else Html("")
             name = Html(f"{title}{'<br>' if title else ''}{coloured(result.name, 'plain')}")
             mark = coloured(result.decision, TONES[result.decision], bold=True)
-            rows.append((name, format_result(wanted, result), Html(f"{format_limits(wanted)}<br>{mark}")))
-    scrolled = f'<div style="max-height:{TABLE_PX}px;overflow-y:auto">{table(("", "Value ± U", "Limits"), rows)}</div>'
-    reasons = {f"{result.name}: {result.reason}" for part in seen.parts for result in part.results if result.reason}
-    notes = "".join(paragraph(coloured(f"Not measured: {reason}", "warning")) for reason in sorted(reasons))
+            rows.append(
+                (name, format_result(wanted, result), Html(f"{format_limits(wanted)}<br>{mark}"))
+            )
+    scrolled = (
+        "<div"
+        f' style="max-height:{TABLE_PX}px;overflow-y:auto">{table(("", "Value ± U", "Limits"), rows)}</div>'
+    )
+    reasons = {
+        f"{result.name}: {result.reason}"
+        for part in seen.parts
+        for result in part.results
+        if result.reason
+    }
+    notes = "".join(
+        paragraph(coloured(f"Not measured: {reason}", "warning")) for reason in sorted(reasons)
+    )
     if not all(result.whole for part in seen.parts for result in part.results):
-        notes += paragraph(coloured("Some U hold no part of the calibration's uncertainty: it is unknown.", "dim"))
-    return Html(html + scrolled + notes + paragraph(coloured(f"{RULE[:1].upper()}{RULE[1:]}.", "dim")))
+        notes += paragraph(
+            coloured("Some U hold no part of the calibration's uncertainty: it is unknown.", "dim")
+        )
+    return Html(
+        html + scrolled + notes + paragraph(coloured(f"{RULE[:1].upper()}{RULE[1:]}.", "dim"))
+    )
 
 
 def format_result(wanted: Characteristic, result: CharacteristicResult) -> Html:

@@ -1,4 +1,5 @@
-"""The links for other people and devices, shown to the operator's browser that requests them and to no other."""
+"""The links for other people and devices, shown to the operator's browser that requests them and to
+no other."""
 
 import base64
 import html
@@ -16,7 +17,8 @@ _QUIET_ZONE = 4
 
 
 def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable[[], None]) -> None:
-    """Open a dialog with the links in one browser; `replace()` is called when new ones are requested in it."""
+    """Open a dialog with the links in one browser; `replace()` is called when new ones are
+    requested in it."""
     origin = server.origin_of(client.client_id)
     is_own = origin is not None and urlsplit(origin).hostname in ("127.0.0.1", "localhost", "::1")
     if is_own and not server.loopback:
@@ -32,15 +34,18 @@ def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable
         gui = client.gui
         gui.add_html("".join(_link_html(what, link, others_reach) for what, link in rows))
         if not others_reach:
-            advice = "Only this computer reaches these links. For others, and phones, start slviewer with"
+            advice = (
+                "Only this computer reaches these links. For others, and phones, start slviewer"
+                " with"
+            )
             code = "<code style='white-space:nowrap'>--host 0.0.0.0 --tls</code>"
             gui.add_html(str(alert(Html(f"{advice} {code}."), "info")))
         gui.add_html(
             str(
                 paragraph(
                     Html(
-                        "<b>New links</b> closes every page that was opened by the present ones, those of projector "
-                        "and camera too. This page continues."
+                        "<b>New links</b> closes every page that was opened by the present ones,"
+                        " those of projector and camera too. This page continues."
                     )
                 )
             )
@@ -52,9 +57,11 @@ def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable
 
 
 def _link_html(what: str, link: str, qr_code: bool) -> Html:
-    """Return the HTML of one link, selected by a click to be copied, and its QR code for a phone."""
+    """Return the HTML of one link, selected by a click to be copied, and its QR code for a
+    phone."""
     style = (
-        "display:block;user-select:all;overflow-wrap:anywhere;padding:0.4em 0.6em;border-radius:4px;"
+        "display:block;user-select:all;overflow-wrap:anywhere;padding:0.4em"
+        " 0.6em;border-radius:4px;"
         "background:var(--mantine-color-gray-1);font-family:monospace;font-size:0.9em;flex:1"
     )
     code = f"<code style='{style}'>{html.escape(link)}</code>"
@@ -68,6 +75,8 @@ def _link_html(what: str, link: str, qr_code: bool) -> Html:
 def encode_qr_code(text: str) -> str:
     """Return the QR code of a text as the address of a PNG picture, a pixel a module."""
     modules = cv2.QRCodeEncoder.create().encode(text)
-    border = max(0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax()))  # OpenCV adds some of it
+    border = max(
+        0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax())
+    )  # OpenCV adds some of it
     modules = cv2.copyMakeBorder(modules, *(border,) * 4, cv2.BORDER_CONSTANT, value=255)
     return f"data:image/png;base64,{base64.b64encode(cv2.imencode('.png', modules)[1].tobytes()).decode()}"

@@ -15,7 +15,10 @@ from slviewer.wizard.live_scan import LiveCloud
 
 LAYER = "live"
 MOST_POINTS, FEWEST_POINTS = 60_000, 15_000
-_SLOW_S, _QUICK_S = 0.09, 0.05  # a browser that takes longer, or less, for a cloud is sent fewer points, or more
+_SLOW_S, _QUICK_S = (
+    0.09,
+    0.05,
+)  # a browser that takes longer, or less, for a cloud is sent fewer points, or more
 
 
 class LiveScreen:
@@ -39,7 +42,9 @@ class LiveScreen:
         with self._condition:
             self._cloud = cloud
             if self._thread is None:
-                self._thread = threading.Thread(target=self._serve, name="slviewer live screen", daemon=True)
+                self._thread = threading.Thread(
+                    target=self._serve, name="slviewer live screen", daemon=True
+                )
                 self._thread.start()
             self._condition.notify_all()
 
@@ -91,7 +96,9 @@ class LiveScreen:
             self._context.operator.count_live_shown(cloud)
         return True
 
-    def _send_cloud(self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float) -> None:
+    def _send_cloud(
+        self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float
+    ) -> None:
         """Send points (n, 3) mm with colours to one browser, as a new or an updated node."""
         number = client.client_id
         with client.atomic():
@@ -118,7 +125,8 @@ class LiveScreen:
         return False
 
     def _adapt_limit(self) -> None:
-        """Adapt the number of points to the slowest browser, and forget browsers that have disconnected."""
+        """Adapt the number of points to the slowest browser, and forget browsers that have
+        disconnected."""
         slowest = self._viewers.slowest_s()
         if slowest > _SLOW_S:
             self._limit = max(int(0.8 * self._limit), FEWEST_POINTS)

@@ -21,10 +21,13 @@ _EXTENT_MM = 15.0
 
 
 def format_quantity(quantity: Quantity) -> str:
-    """Format value ± U (k = 2) with the unit; a star where the calibration's part of U is unknown."""
+    """Format value ± U (k = 2) with the unit; a star where the calibration's part of U is
+    unknown."""
     digits = 1 if quantity.unit == "%" else 3
     unit = _UNITS.get(quantity.unit, f" {quantity.unit}")
-    value = f"{round(quantity.value, digits) + 0.0:.{digits}f}".replace("-", "−")  # no minus before nothing
+    value = f"{round(quantity.value, digits) + 0.0:.{digits}f}".replace(
+        "-", "−"
+    )  # no minus before nothing
     if quantity.U is None:
         return f"{value}{unit}"
     return f"{value} ± {quantity.U:.{digits}f}{unit}{'' if quantity.whole else '*'}"
@@ -36,13 +39,16 @@ def label(measured: Measurement) -> str:
         return measured.name
     first = measured.quantities[0]
     named = "" if measured.kind in ("distance", "relation") else f"{first.name} "
-    return f"{measured.name}: {named}{format_quantity(first)}" + (" (stale)" if measured.stale else "")
+    return f"{measured.name}: {named}{format_quantity(first)}" + (
+        " (stale)" if measured.stale else ""
+    )
 
 
 def drawn(
     measured: Measurement, others: Mapping[str, Measurement], lines: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Draw a measurement: ((n, 2, 3) segments, (3,) position of its label) mm; None where nothing can be drawn.
+    """Draw a measurement: ((n, 2, 3) segments, (3,) position of its label) mm; None where nothing
+    can be drawn.
 
     ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
     """
@@ -54,7 +60,9 @@ def drawn(
     if measured.kind == "relation":
         return _draw_relation([feature_of(others[each]) for each in measured.of if each in others])
     feature = feature_of(measured)
-    return None if feature is None else (_draw_outline(feature, _get_extent(measured)), feature.place)
+    return (
+        None if feature is None else (_draw_outline(feature, _get_extent(measured)), feature.place)
+    )
 
 
 def feature_of(measured: Measurement) -> Feature | None:
@@ -74,7 +82,10 @@ def _draw_section(plane: CutPlane, lines: Sequence[np.ndarray]) -> tuple[np.ndar
         return np.empty((0, 2, 3)), plane.origin
     off = _OFF * float(np.ptp(np.concatenate(lines)[:, 0]))
     cut = [lifted(plane, line + np.array([0.0, off])) for line in lines]
-    return np.concatenate([_join_segments(each) for each in cut]), cut[0][np.argmax(cut[0] @ plane.up)]
+    return (
+        np.concatenate([_join_segments(each) for each in cut]),
+        cut[0][np.argmax(cut[0] @ plane.up)],
+    )
 
 
 def _draw_relation(features: Sequence[Feature | None]) -> tuple[np.ndarray, np.ndarray] | None:
@@ -83,33 +94,45 @@ def _draw_relation(features: Sequence[Feature | None]) -> tuple[np.ndarray, np.n
     if len(ends) != 2:
         return None
     # outside of both; a point is on the surface already
-    clear = 0.0 if any(end.kind == "point" for end in ends) else 1.2 * max(end.radius or 0.0 for end in ends)
+    clear = (
+        0.0
+        if any(end.kind == "point" for end in ends)
+        else 1.2 * max(end.radius or 0.0 for end in ends)
+    )
     return _draw_dimension(ends[0].place, ends[1].place, clear)
 
 
 def _draw_outline(feature: Feature, extent: float) -> np.ndarray:
-    """Draw a feature as segments (n, 2, 3) mm: great circles, a disc with its normal, a cylinder's rings and axis."""
+    """Draw a feature as segments (n, 2, 3) mm: great circles, a disc with its normal, a cylinder's
+    rings and axis."""
     if feature.kind == "point":
         return _draw_cross(feature.place, 2.5)
     if feature.kind == "sphere":
         assert feature.radius is not None
-        circles = [_draw_circle(feature.place, axis, (1 + _OFF) * feature.radius) for axis in np.eye(3)]
+        circles = [
+            _draw_circle(feature.place, axis, (1 + _OFF) * feature.radius) for axis in np.eye(3)
+        ]
         return np.concatenate([*circles, _draw_cross(feature.place, 0.1 * feature.radius)])
     assert feature.direction is not None
     along = extent * feature.direction
     if feature.kind == "plane":
         normal = np.array([[feature.place, feature.place + 0.4 * along]])
-        return np.concatenate([_draw_circle(feature.place + _OFF * along, feature.direction, extent), normal])
+        return np.concatenate(
+            [_draw_circle(feature.place + _OFF * along, feature.direction, extent), normal]
+        )
     assert feature.radius is not None
     ends = [feature.place - along, feature.place + along]
     rings = [_draw_circle(end, feature.direction, (1 + _OFF) * feature.radius) for end in ends]
     return np.concatenate([*rings, np.array([ends])])
 
 
-def _draw_dimension(a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def _draw_dimension(
+    a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw a dimension line from `a` to `b`, offset towards the camera, with a leg to either end.
 
-    Returns ((3, 2, 3) segments, (3,) position of the label) mm; the legs are at least `clear_mm` long.
+    Returns ((3, 2, 3) segments, (3,) position of the label) mm; the legs are at least `clear_mm`
+    long.
     """
     middle = (a + b) / 2
     leg = max(_LEG * float(np.linalg.norm(b - a)), _SHORTEST_LEG_MM, clear_mm)
@@ -118,7 +141,8 @@ def _draw_dimension(a: np.ndarray, b: np.ndarray, clear_mm: float = 0.0) -> tupl
 
 
 def _draw_circle(centre: np.ndarray, axis: np.ndarray, radius: float) -> np.ndarray:
-    """Draw a circle as segments (n, 2, 3) mm around a centre (3,), perpendicular to an axis (3,)."""
+    """Draw a circle as segments (n, 2, 3) mm around a centre (3,), perpendicular to an axis
+    (3,)."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
@@ -127,7 +151,8 @@ def _draw_circle(centre: np.ndarray, axis: np.ndarray, radius: float) -> np.ndar
 
 
 def _draw_cross(centre: np.ndarray, half: float) -> np.ndarray:
-    """Draw a cross along the axes as segments (3, 2, 3) mm, `half` mm to either side of its centre."""
+    """Draw a cross along the axes as segments (3, 2, 3) mm, `half` mm to either side of its
+    centre."""
     return np.stack([centre - half * np.eye(3), centre + half * np.eye(3)], axis=1)
 
 

@@ -23,15 +23,27 @@ _PARTIAL = "*: without the unknown part of the calibration."
 _HIGH = 230
 
 
-def measurements_table(measured: Sequence[Measurement], chosen: str, labels: Mapping[str, str]) -> Html:
-    """Return a table of all measurements with kind and surface; ``labels``: {scan: the operator's name}."""
+def measurements_table(
+    measured: Sequence[Measurement], chosen: str, labels: Mapping[str, str]
+) -> Html:
+    """Return a table of all measurements with kind and surface; ``labels``: {scan: the operator's
+    name}."""
     rows: list[tuple[object, object, object]] = []
     for each in reversed(measured):
         name = coloured(each.name, "warning" if each.stale else "plain", bold=each.id == chosen)
         on = labels.get(each.source, each.source)
-        about = coloured(f"{each.kind} on {on}" + (", stale" if each.stale else ""), "warning" if each.stale else "dim")
+        about = coloured(
+            f"{each.kind} on {on}" + (", stale" if each.stale else ""),
+            "warning" if each.stale else "dim",
+        )
         for i, quantity in enumerate(each.quantities[: _HEADLINES.get(each.kind, 2)]):
-            rows.append((Html(f"{name}<br>{about}") if i == 0 else "", quantity.name, format_quantity(quantity)))
+            rows.append(
+                (
+                    Html(f"{name}<br>{about}") if i == 0 else "",
+                    quantity.name,
+                    format_quantity(quantity),
+                )
+            )
     return Html(table(("Result", "", "Value"), rows) + _format_notes(measured))
 
 
@@ -42,11 +54,17 @@ def measurement_html(measured: Measurement, labels: Mapping[str, str]) -> Html:
     about = f"{measured.kind} on {on}, by {measured.model}"
     if where := measured.data.get("where"):
         about += f"; {where}"
-    html = Html(table((measured.name, ""), rows) + paragraph(coloured(f"{about}.", "dim")) + _format_notes([measured]))
+    html = Html(
+        table((measured.name, ""), rows)
+        + paragraph(coloured(f"{about}.", "dim"))
+        + _format_notes([measured])
+    )
     for warning in measured.data.get("fit", {}).get("warnings", ()):
         html = Html(html + alert(f"{warning[:1].upper()}{warning[1:]}.", "warning"))
     if measured.stale:
-        html = Html(alert("Out of date: the measured surface has changed; measure again.", "warning") + html)
+        html = Html(
+            alert("Out of date: the measured surface has changed; measure again.", "warning") + html
+        )
     return html
 
 
@@ -70,8 +88,8 @@ def deviation_html(data: Mapping[str, Any]) -> Html:
         )
     excluded = numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
     about = (
-        f"{numbers['points']:,} points; {100 * excluded:.1f} % excluded: beyond {data['reach_mm']:.3g} mm, or facing "
-        "another direction."
+        f"{numbers['points']:,} points; {100 * excluded:.1f} % excluded: beyond"
+        f" {data['reach_mm']:.3g} mm, or facing another direction."
     )
     return Html(html + paragraph(coloured(about, "dim")))
 
@@ -79,10 +97,17 @@ def deviation_html(data: Mapping[str, Any]) -> Html:
 def deviation_bar(limit: float) -> Html:
     """Return the legend of a surface coloured by its deviation, ± `limit` mm."""
     title = "deviation; red: outside, blue: inside, grey: not measured"
-    return colour_bar(f"−{limit:.3g} mm", f"+{limit:.3g} mm", deviation_colours(np.linspace(-1, 1, 13), 1.0), title)
+    return colour_bar(
+        f"−{limit:.3g} mm",
+        f"+{limit:.3g} mm",
+        deviation_colours(np.linspace(-1, 1, 13), 1.0),
+        title,
+    )
 
 
-def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None) -> Figure:
+def deviation_figure(
+    name: str, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None
+) -> Figure:
     """Plot the histogram of the deviations: edges (n + 1,) mm and counts (n,)."""
     drawing = new_figure(PLOT_PX, _HIGH)
     axes = drawing.subplots()
@@ -96,9 +121,14 @@ def deviation_figure(name: str, edges: np.ndarray, counts: np.ndarray, limit: fl
 
 def _format_notes(measured: Sequence[Measurement]) -> str:
     """Return a note on the uncertainties of the measurements; empty where none is known."""
-    known = [quantity for each in measured for quantity in each.quantities if quantity.U is not None]
+    known = [
+        quantity for each in measured for quantity in each.quantities if quantity.U is not None
+    ]
     if not known:
         return ""
     return paragraph(
-        coloured(_COMPLETE if all(quantity.whole for quantity in known) else f"{_COMPLETE} {_PARTIAL}", "dim")
+        coloured(
+            _COMPLETE if all(quantity.whole for quantity in known) else f"{_COMPLETE} {_PARTIAL}",
+            "dim",
+        )
     )

@@ -1,4 +1,5 @@
-"""The measurements: drawn in 3D, listed, shown one by one, renamed, deleted, restored, written as a table."""
+"""The measurements: drawn in 3D, listed, shown one by one, renamed, deleted, restored, written as a
+table."""
 
 import threading
 from collections.abc import Callable
@@ -9,7 +10,12 @@ import viser
 
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.measure_html import deviation_figure, deviation_html, measurement_html, measurements_table
+from slviewer.gui.measure_html import (
+    deviation_figure,
+    deviation_html,
+    measurement_html,
+    measurements_table,
+)
 from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot
@@ -27,10 +33,15 @@ Lines = list[np.ndarray]
 
 
 class MeasurementList:
-    """List of measurements with a chosen one; ``changed(measured)`` is called when another one is chosen."""
+    """List of measurements with a chosen one; ``changed(measured)`` is called when another one is
+    chosen."""
 
     def __init__(
-        self, context: PanelContext, painter: Painter, layer: str, changed: Callable[[Measurement | None], None]
+        self,
+        context: PanelContext,
+        painter: Painter,
+        layer: str,
+        changed: Callable[[Measurement | None], None],
     ) -> None:
         self._context, self._painter, self._layer, self._changed = context, painter, layer, changed
         self._lock = threading.RLock()
@@ -54,15 +65,28 @@ class MeasurementList:
             self._rename_to = gui.add_text("New name", "")
             context.button("Rename", self._request_rename, viser.Icon.PENCIL)
             delete = lambda: operator.delete_measurement(self._choice.value)  # noqa: E731
-            context.button("Delete result", delete, viser.Icon.TRASH, "red", hint="Moves it to the session's trash")
+            context.button(
+                "Delete result",
+                delete,
+                viser.Icon.TRASH,
+                "red",
+                hint="Moves it to the session's trash",
+            )
         self._restore = context.button(
-            "Restore deleted", operator.undo_delete, viser.Icon.ARROW_BACK_UP, "orange", visible=False
+            "Restore deleted",
+            operator.undo_delete,
+            viser.Icon.ARROW_BACK_UP,
+            "orange",
+            visible=False,
         )
         with gui.add_folder("All results", visible=False) as self._table_folder:
             self._table = Text(gui)
             context.button("Write CSV", operator.export_measurements_table, viser.Icon.TABLE_EXPORT)
             context.button(
-                "Make plan", operator.make_inspection_plan, viser.Icon.REPEAT, hint="To repeat the fits on other scans"
+                "Make plan",
+                operator.make_inspection_plan,
+                viser.Icon.REPEAT,
+                hint="To repeat the fits on other scans",
             )
             self._file = Text(gui)
 
@@ -72,7 +96,8 @@ class MeasurementList:
         return next((each for each in self._measurements if each.id == self._choice.value), None)
 
     def draw(self, session: SessionView | None, on: str) -> list[Measurement]:
-        """Show the session's measurements, in 3D those on the surface ``on``; returns the new ones."""
+        """Show the session's measurements, in 3D those on the surface ``on``; returns the new
+        ones."""
         with self._lock:
             before, self._session, self._on = self._session, session, on
             measured = self._measurements
@@ -87,18 +112,28 @@ class MeasurementList:
             for folder in (self._chosen_folder, self._table_folder):
                 change(folder, visible=bool(measured))
             change(self._restore, visible=bool(session and session.deleted_measurements))
-            files = [each for each in session.exports if each.name in (TABLE, PLAN)] if session else []
-            links = [link(self._context.offer(each.path), f"Download {each.name}") for each in files]
+            files = (
+                [each for each in session.exports if each.name in (TABLE, PLAN)] if session else []
+            )
+            links = [
+                link(self._context.offer(each.path), f"Download {each.name}") for each in files
+            ]
             self._file.set("".join(map(paragraph, links)))
             self.refresh()
             return new
 
     def _offer_choice(self) -> None:
-        """Offer the measurements, the latest first, by their names; by their ids too where names occur twice."""
+        """Offer the measurements, the latest first, by their names; by their ids too where names
+        occur twice."""
         measured = self._measurements
         names = [each.name for each in measured]
-        texts = [each.name if names.count(each.name) == 1 else f"{each.name} ({each.id})" for each in measured]
-        self._choice.offer([(each.id, text) for each, text in zip(measured, texts, strict=True)][::-1])
+        texts = [
+            each.name if names.count(each.name) == 1 else f"{each.name} ({each.id})"
+            for each in measured
+        ]
+        self._choice.offer(
+            [(each.id, text) for each, text in zip(measured, texts, strict=True)][::-1]
+        )
 
     def change_surface(self, on: str) -> None:
         """Draw the measurements of another surface."""
@@ -133,7 +168,11 @@ class MeasurementList:
         if self._session is None:
             return {}
         merge = self._session.merge
-        merged = {} if merge is None else {f"merge/{merge.name}": f"merge of {len(merge.record.scans)} scans"}
+        merged = (
+            {}
+            if merge is None
+            else {f"merge/{merge.name}": f"merge of {len(merge.record.scans)} scans"}
+        )
         return {scan.name: scan.label for scan in self._session.scans} | merged
 
     def _clear_drawings(self) -> None:
@@ -165,7 +204,9 @@ class MeasurementList:
             """Plot the histogram of the deviation."""
             arrays = measurement_arrays(self._context.session, measured.id)
             limit = colour_limit(arrays["signed"], tolerance)
-            return deviation_figure(measured.name, arrays["edges"], arrays["counts"], limit, tolerance)
+            return deviation_figure(
+                measured.name, arrays["edges"], arrays["counts"], limit, tolerance
+            )
 
         self._painter.request("histogram", (measured.id, measured.name), make, self._histogram.set)
 
@@ -179,7 +220,11 @@ class MeasurementList:
             return
         plane, lines = self._lines[measured.id]
         self._section.set(measured.id, lines)
-        at, on, key = self._section.at, self._on, (measured.id, measured.name, self._section.at, self._on)
+        at, on, key = (
+            self._section.at,
+            self._on,
+            (measured.id, measured.name, self._section.at, self._on),
+        )
 
         def make() -> Any:
             """Plot the section; returns (figure, cursors (3, 2) mm)."""
@@ -199,15 +244,19 @@ class MeasurementList:
         self._painter.request("section", key, make, show)
 
     def _request_drawings(self, chosen: Measurement | None) -> None:
-        """Request the 3D drawings of all measurements on this surface; the lines of sections are read from disk."""
+        """Request the 3D drawings of all measurements on this surface; the lines of sections are
+        read from disk."""
         measured = self._measurements
         others = {each.id: each for each in measured}
         shown = [
             each
             for each in measured
-            if self._on == each.source or any(o in others and others[o].source == self._on for o in each.of)
+            if self._on == each.source
+            or any(o in others and others[o].source == self._on for o in each.of)
         ]
-        cut = [each.id for each in (*shown, *([chosen] if chosen else ())) if each.kind == "section"]
+        cut = [
+            each.id for each in (*shown, *([chosen] if chosen else ())) if each.kind == "section"
+        ]
         looks = {each.id: (each.name, each.stale, each is chosen) for each in shown}
 
         def make() -> dict[str, tuple[CutPlane, Lines]]:
@@ -232,10 +281,17 @@ class MeasurementList:
 
         self._painter.request("drawings", (self._on, tuple(looks.items()), tuple(cut)), make, show)
 
-    def _draw_one(self, measured: Measurement, others: dict[str, Measurement], chosen: bool) -> None:
-        """Draw one measurement in 3D with its label, coloured by whether it is stale, chosen or neither."""
-        lines = drawn(measured, others, self._lines[measured.id][1] if measured.kind == "section" else ())
+    def _draw_one(
+        self, measured: Measurement, others: dict[str, Measurement], chosen: bool
+    ) -> None:
+        """Draw one measurement in 3D with its label, coloured by whether it is stale, chosen or
+        neither."""
+        lines = drawn(
+            measured, others, self._lines[measured.id][1] if measured.kind == "section" else ()
+        )
         if lines is None:
             return
         colour = STALE if measured.stale else CHOSEN if chosen else OTHER
-        self._context.scene.drawing(self._layer, measured.id, lines[0], colour, lines[1], label(measured))
+        self._context.scene.drawing(
+            self._layer, measured.id, lines[0], colour, lines[1], label(measured)
+        )

@@ -20,7 +20,8 @@ _STEPS = 400
 
 
 class SectionPlot:
-    """Plot of a section, a slider per cursor, and the values at the cursors; hidden without a section.
+    """Plot of a section, a slider per cursor, and the values at the cursors; hidden without a
+    section.
 
     ``moved()`` is called whenever a cursor was moved.
     """
@@ -31,13 +32,16 @@ class SectionPlot:
         self._plot = Plot(context.gui)
         self._sliders: list[Any] = []
         for name in CURSORS:
-            slider = context.gui.add_slider(f"{name}, mm", 0.0, 1.0, 0.01, 0.0, visible=False, hint=f"Cursor {name}")
+            slider = context.gui.add_slider(
+                f"{name}, mm", 0.0, 1.0, 0.01, 0.0, visible=False, hint=f"Cursor {name}"
+            )
             slider.on_update(context.callback(moved))
             self._sliders.append(slider)
         self._values = Text(context.gui)
 
     def set(self, identity: str, lines: list[np.ndarray]) -> None:
-        """Place the cursors on a section's lines (k, 2) mm; they keep their positions on the same section."""
+        """Place the cursors on a section's lines (k, 2) mm; they keep their positions on the same
+        section."""
         if identity == self._id:
             return
         self._id, self._lines = identity, lines
@@ -71,7 +75,11 @@ def _round_range(along: np.ndarray) -> tuple[float, float, float]:
     low, high = float(along.min()), float(along.max())
     digits = int(np.clip(-np.floor(np.log10(max(high - low, 1e-6) / _STEPS)), 0, 5))
     step = 10.0**-digits
-    return round(np.ceil(low / step) * step, digits), round(np.floor(high / step) * step, digits), step
+    return (
+        round(np.ceil(low / step) * step, digits),
+        round(np.floor(high / step) * step, digits),
+        step,
+    )
 
 
 def cursor_points(lines: list[np.ndarray], at: tuple[float, ...]) -> np.ndarray:
@@ -83,7 +91,8 @@ def cursor_html(cursors: np.ndarray) -> Html:
     """Return a table of distances and radius at the cursors (3, 2) mm."""
     a, b, c = cursors
     rows: list[tuple[object, object]] = [
-        (f"{q.name.capitalize()} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−")) for q in measure_cursors(a, b)
+        (f"{q.name.capitalize()} A – B", f"{q.value:.3f} {q.unit}".replace("-", "−"))
+        for q in measure_cursors(a, b)
     ]
     try:
         rows.append(("Radius through A, C, B", f"{radius_through(a, c, b).value:.3f} mm"))

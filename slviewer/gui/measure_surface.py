@@ -23,9 +23,12 @@ DEVIATION = "deviation"
 
 
 class SurfaceView:
-    """View of the chosen surface; ``loaded()`` is called once another one is shown, on the painter's thread."""
+    """View of the chosen surface; ``loaded()`` is called once another one is shown, on the
+    painter's thread."""
 
-    def __init__(self, context: PanelContext, painter: Painter, layer: str, loaded: Callable[[], None]) -> None:
+    def __init__(
+        self, context: PanelContext, painter: Painter, layer: str, loaded: Callable[[], None]
+    ) -> None:
         self._context, self._painter, self._layer, self._loaded = context, painter, layer, loaded
         self._clicks = count()
         self._deviation: Measurement | None = None
@@ -54,7 +57,9 @@ class SurfaceView:
 
     def offer(self, session: SessionView | None) -> None:
         """Offer the surfaces that can be measured on, and draw the chosen one."""
-        scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
+        scans = (
+            [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
+        )
         offered = scan_options(scans)
         folder = session.folder if session else None
         cut = session.restriction if session else lambda _: (None, ())
@@ -86,7 +91,8 @@ class SurfaceView:
         self._show_view()
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, do: Callable[[Place], None]) -> None:
-        """Call ``do(place)`` later with the point that a ray meets; not called where it misses the surface."""
+        """Call ``do(place)`` later with the point that a ray meets; not called where it misses the
+        surface."""
         on, slot = self.on, f"click {next(self._clicks)}"
         if on is None:
             return
@@ -147,17 +153,30 @@ def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndar
         return on.points, on.texture, Html("")
     if colour == "uncertainty":
         sigma = on.sigma_mm if on.left_mm is None else np.hypot(on.sigma_mm, on.left_mm)
-        title = "uncertainty of z (1 sigma)" if on.organised else "uncertainty along the normal (1 sigma)"
+        title = (
+            "uncertainty of z (1 sigma)"
+            if on.organised
+            else "uncertainty along the normal (1 sigma)"
+        )
         title += "" if on.left_mm is not None else ", noise only"
         return on.points, *paint(np.where(on.measured, sigma, np.nan), "mm", 3, title)
     return on.points, *paint(on.points[..., 2], "mm", 1, "depth")
 
 
-def _colour_by_deviation(arrays: dict[str, np.ndarray], measured: Measurement) -> tuple[np.ndarray, np.ndarray, Html]:
-    """Colour a surface by a stored deviation: (points (n, 3) mm, colours (n, 3), legend); grey where not measured."""
+def _colour_by_deviation(
+    arrays: dict[str, np.ndarray], measured: Measurement
+) -> tuple[np.ndarray, np.ndarray, Html]:
+    """Colour a surface by a stored deviation: (points (n, 3) mm, colours (n, 3), legend); grey
+    where not measured."""
     verdict = measured.data["verdict"]
-    limit = colour_limit(arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"]))
+    limit = colour_limit(
+        arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"])
+    )
     uncovered = arrays["uncovered"].reshape(-1, 3)
     points = np.concatenate([arrays["points"], uncovered]).astype(np.float32)
     grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), uncovered.shape)
-    return points, np.concatenate([deviation_colours(arrays["signed"], limit), grey]), deviation_bar(limit)
+    return (
+        points,
+        np.concatenate([deviation_colours(arrays["signed"], limit), grey]),
+        deviation_bar(limit),
+    )

@@ -18,8 +18,8 @@ _WITHOUT_CLICKS = {
 
 
 class Tool:
-    """The chosen tool, its name empty for none, the points picked with it, and the box drawn for a fit: by a rectangle
-    where ``by_rectangle``, else fits use a ball about the picked point."""
+    """The chosen tool, its name empty for none, the points picked with it, and the box drawn for a
+    fit: by a rectangle where ``by_rectangle``, else fits use a ball about the picked point."""
 
     def __init__(self) -> None:
         self.name = ""
@@ -47,10 +47,11 @@ class Tool:
         return self.fits or self.name in _CLICKS
 
     def pick(self, place: Place) -> tuple[Place, ...] | None:
-        """Add a click on the surface; returns all points once the tool has enough, and starts again.
+        """Add a click on the surface; returns all points once the tool has enough, and starts
+        again.
 
-        A tool that fits replaces its point instead, until the operator accepts the region. The same point again, as by
-        a double click, is no second point.
+        A tool that fits replaces its point instead, until the operator accepts the region. The same
+        point again, as by a double click, is no second point.
         """
         if self.fits:
             self.picked = [place]
@@ -75,7 +76,10 @@ class Tool:
                 return f"Drag a rectangle over the {shape} alone{end}"
             if not self.picked:
                 return f"Click the centre of the {shape}."
-            return f"Set the radius so that the ball contains only the {shape}, then press Fit {shape}."
+            return (
+                f"Set the radius so that the ball contains only the {shape}, then press Fit"
+                f" {shape}."
+            )
         if self.name in _WITHOUT_CLICKS:
             return _WITHOUT_CLICKS[self.name]
         return _CLICKS[self.name][len(self.picked)]

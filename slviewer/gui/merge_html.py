@@ -19,17 +19,27 @@ def merge_html(merge: Stored[Merge], labels: Mapping[str, str]) -> Html:
 
 
 def merge_failure_html(
-    why: str, labels: Mapping[str, str], merge: Stored[Merge] | None = None, refusal: Reason | None = None
+    why: str,
+    labels: Mapping[str, str],
+    merge: Stored[Merge] | None = None,
+    refusal: Reason | None = None,
 ) -> Html:
-    """Describe why the last merge failed, with its ``refusal``; ``merge``: the previous one, which is still shown."""
+    """Describe why the last merge failed, with its ``refusal``; ``merge``: the previous one, which
+    is still shown."""
     still = "" if merge is None else " The previous merge is shown below."
     link = help_link(f"merge-{refusal}" if refusal else "merge")
-    return alert(Html(f"<b>Not merged.</b> {to_html(use_labels(why, labels) + still)} {link}"), "error")
+    return alert(
+        Html(f"<b>Not merged.</b> {to_html(use_labels(why, labels) + still)} {link}"), "error"
+    )
 
 
-def turntable_html(names: Sequence[str], table_deg: Sequence[float], labels: Mapping[str, str]) -> Html:
+def turntable_html(
+    names: Sequence[str], table_deg: Sequence[float], labels: Mapping[str, str]
+) -> Html:
     """List the turntable angle of each scan."""
-    turned = [f"{labels.get(name, name)} at {deg:g}°" for name, deg in zip(names, table_deg, strict=True)]
+    turned = [
+        f"{labels.get(name, name)} at {deg:g}°" for name, deg in zip(names, table_deg, strict=True)
+    ]
     if len(turned) > 4:
         turned = [*turned[:3], "…", turned[-1]]
     note = "Direction and axis of the turntable are estimated."
@@ -39,7 +49,11 @@ def turntable_html(names: Sequence[str], table_deg: Sequence[float], labels: Map
 def _letter_html(merge: Merge) -> Html:
     """Compare the point-to-point RMS with the Letter's for its own three scans."""
     theirs = " and ".join(f"{mm:.2f}" for mm in letter.EXPERIMENT_3_ICP_RMS_MM.values())
-    ours = [pair.point_to_point_rms_mm for pair in merge.registered if merge.reference in (pair.scan, pair.onto)]
+    ours = [
+        pair.point_to_point_rms_mm
+        for pair in merge.registered
+        if merge.reference in (pair.scan, pair.onto)
+    ]
     here = " and ".join(f"{mm:.2f}" for mm in ours if mm is not None)
     here = f"; here {here} mm" if here else ""
     return paragraph(coloured(f"Point-to-point RMS: {theirs} mm in the Letter{here}.", "dim"))

@@ -36,7 +36,8 @@ _BALL = 0.022
 
 @dataclass
 class _Picks:
-    """Pairs of points (3,) mm on a scan and on the reference, and a point without counterpart yet."""
+    """Pairs of points (3,) mm on a scan and on the reference, and a point without counterpart
+    yet."""
 
     versions: tuple[Any, Any]
     pairs: list[dict[Side, np.ndarray]] = field(default_factory=list)
@@ -59,13 +60,16 @@ class _Picks:
     @property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The points (n, 3) mm of the pairs, on the scan and on the reference."""
-        scan, onto = (np.array([pair[side] for pair in self.pairs]).reshape(-1, 3) for side in _SIDES)
+        scan, onto = (
+            np.array([pair[side] for pair in self.pairs]).reshape(-1, 3) for side in _SIDES
+        )
         return scan, onto
 
 
 @dataclass(frozen=True, eq=False)
 class _SideBySide:
-    """Two clouds (h, w, 3) mm in their cameras' frames, the shift that draws the scan beside, and the width."""
+    """Two clouds (h, w, 3) mm in their cameras' frames, the shift that draws the scan beside, and
+    the width."""
 
     pair: Pair
     clouds: Mapping[Side, np.ndarray]
@@ -80,12 +84,15 @@ class _SideBySide:
     @cached_property
     def points(self) -> np.ndarray:
         """Both clouds as they are drawn, (n, 3) mm, with a margin for narrow windows."""
-        points = np.concatenate([(self.clouds[side][::4, ::4] + self.offset(side)).reshape(-1, 3) for side in _SIDES])
+        points = np.concatenate(
+            [(self.clouds[side][::4, ::4] + self.offset(side)).reshape(-1, 3) for side in _SIDES]
+        )
         middle = np.nanmean(points, axis=0)
         return np.asarray(middle + _MARGIN * (points - middle), np.float32)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> tuple[Side, np.ndarray] | None:
-        """Return the cloud that a ray meets first, and the point (3,) mm on it; None where it misses both."""
+        """Return the cloud that a ray meets first, and the point (3,) mm on it; None where it
+        misses both."""
         met = []
         for side in _SIDES:
             index = nearest(self.clouds[side], origin - self.offset(side), direction)
@@ -98,7 +105,9 @@ class _SideBySide:
 class PointPicker:
     """Inputs and 3D view to pick points; ``changed()`` is called after every accepted click."""
 
-    def __init__(self, context: PanelContext, painter: Painter, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, context: PanelContext, painter: Painter, changed: Callable[[], None]
+    ) -> None:
         self._context, self._painter, self._changed = context, painter, changed
         self._lock = threading.RLock()
         self._clicks = count()
@@ -118,10 +127,15 @@ class PointPicker:
         self._scan.on_change(context.callback(self._changed))
         self._note = Text(gui)
         self._table = Text(gui)
-        self._undo = context.button("Undo last point", self._undo_point, viser.Icon.ARROW_BACK_UP, visible=False)
+        self._undo = context.button(
+            "Undo last point", self._undo_point, viser.Icon.ARROW_BACK_UP, visible=False
+        )
 
-    def offer(self, versions: Mapping[str, Any], reference: str, labels: Mapping[str, str], on: bool) -> None:
-        """Offer the scans to merge, {name: version of its cloud}; ``on``: show the inputs. Drops outdated points."""
+    def offer(
+        self, versions: Mapping[str, Any], reference: str, labels: Mapping[str, str], on: bool
+    ) -> None:
+        """Offer the scans to merge, {name: version of its cloud}; ``on``: show the inputs. Drops
+        outdated points."""
         with self._lock:
             self._labels, self._reference = labels, reference
             self._names = [name for name in versions if name != reference]
@@ -133,7 +147,9 @@ class PointPicker:
                 ):
                     self._picks.pop(pair)
             for name in self._names if reference else ():
-                self._picks.setdefault((name, reference), _Picks((versions[name], versions[reference])))
+                self._picks.setdefault(
+                    (name, reference), _Picks((versions[name], versions[reference]))
+                )
             self._scan.offer([(name, labels.get(name, name)) for name in self._names])
             self._scan.set_visible(on and len(self._names) > 1)
             self._offered = on
@@ -142,7 +158,9 @@ class PointPicker:
     def is_ready(self) -> bool:
         """Whether at least one scan has enough pairs, and none has too few."""
         counts = [len(picks.pairs) for picks in self._list_current_picks()]
-        return max(counts, default=0) >= LEAST_PICKS and not any(0 < n < LEAST_PICKS for n in counts)
+        return max(counts, default=0) >= LEAST_PICKS and not any(
+            0 < n < LEAST_PICKS for n in counts
+        )
 
     def picked(self) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
         """Return the points (n, 3) mm on the scan and on the reference, by pair."""
@@ -165,7 +183,10 @@ class PointPicker:
                 return
             key = (pair, self._picks[pair].versions)
             self._painter.request(
-                "picks", key, lambda: _load_side_by_side(self._context.session, pair), self._draw_clouds
+                "picks",
+                key,
+                lambda: _load_side_by_side(self._context.session, pair),
+                self._draw_clouds,
             )
             self._draw_marks()
             self._show_view()
@@ -185,7 +206,9 @@ class PointPicker:
         """List the picks of all offered scans with the current reference."""
         with self._lock:
             return [
-                self._picks[name, self._reference] for name in self._names if (name, self._reference) in self._picks
+                self._picks[name, self._reference]
+                for name in self._names
+                if (name, self._reference) in self._picks
             ]
 
     # drawing
@@ -195,7 +218,9 @@ class PointPicker:
         with self._lock:
             self._shown = shown
             for side in _SIDES:
-                self._context.scene.cloud(LAYER, side, shown.clouds[side] + shown.offset(side), shown.colours[side])
+                self._context.scene.cloud(
+                    LAYER, side, shown.clouds[side] + shown.offset(side), shown.colours[side]
+                )
             self._context.scene.show(LAYER, bool(self._on))
             self._draw_marks()
             self._show_view()
@@ -242,7 +267,10 @@ class PointPicker:
     def _format_instruction(self, pair: Pair, picks: _Picks) -> Html:
         """Describe the next click for a pair of scans."""
         names = {
-            side: f"{patch(_MARKS[side])} <b>{to_html(self._labels.get(name, name))}</b> {_WHERE[side]}"
+            side: (
+                f"{patch(_MARKS[side])} <b>{to_html(self._labels.get(name, name))}</b>"
+                f" {_WHERE[side]}"
+            )
             for side, name in zip(_SIDES, pair, strict=True)
         }
         number = f"Pair {len(picks.pairs) + 1}: "
@@ -264,7 +292,10 @@ class PointPicker:
         for name in self._names:
             n = len(self._picks[name, self._reference].pairs)
             counted = f"{n} pair{'s' * (n != 1)}" if n else "none (aligned by features)"
-            parts.append(f"{self._labels.get(name, name)}: {counted}" + (", too few" if 0 < n < LEAST_PICKS else ""))
+            parts.append(
+                f"{self._labels.get(name, name)}: {counted}"
+                + (", too few" if 0 < n < LEAST_PICKS else "")
+            )
         return paragraph(coloured("; ".join(parts), "dim"))
 
     # clicks
@@ -284,7 +315,9 @@ class PointPicker:
                 self._picks[shown.pair].add(*met)
             self._changed()
 
-        self._painter.request(slot, None, lambda: shown.hit(origin, direction / np.linalg.norm(direction)), add)
+        self._painter.request(
+            slot, None, lambda: shown.hit(origin, direction / np.linalg.norm(direction)), add
+        )
 
     def _undo_point(self) -> None:
         """Remove the last point or pair of the shown scans."""
@@ -308,12 +341,24 @@ def _residuals_html(picks: _Picks) -> Html:
 
 
 def _load_side_by_side(session: Session, pair: Pair) -> _SideBySide:
-    """Load two scans, the first moved to the left of the reference, at the same distance from the viewpoint."""
+    """Load two scans, the first moved to the left of the reference, at the same distance from the
+    viewpoint."""
     clouds: dict[Side, ScanCloud] = {
         side: load_scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)
     }
-    flat = {side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64) for side, cloud in clouds.items()}
-    wide = max(float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat.values())
-    shift = np.median(flat["onto"], axis=0) - np.median(flat["scan"], axis=0) - (1 + _APART) * wide * TO_THE_RIGHT
+    flat = {
+        side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64)
+        for side, cloud in clouds.items()
+    }
+    wide = max(
+        float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat.values()
+    )
+    shift = (
+        np.median(flat["onto"], axis=0)
+        - np.median(flat["scan"], axis=0)
+        - (1 + _APART) * wide * TO_THE_RIGHT
+    )
     painted = {side: cloud.texture for side, cloud in clouds.items()}
-    return _SideBySide(pair, {side: cloud.points for side, cloud in clouds.items()}, painted, shift, wide)
+    return _SideBySide(
+        pair, {side: cloud.points for side, cloud in clouds.items()}, painted, shift, wide
+    )

@@ -27,9 +27,11 @@ SHOWN = 60_000
 
 @dataclass(frozen=True, eq=False)
 class ColouredClouds:
-    """Clouds by name, points (..., 3) mm and colours each, with a legend; `view` changes with their positions.
+    """Clouds by name, points (..., 3) mm and colours each, with a legend; `view` changes with their
+    positions.
 
-    ``scans``: for clouds of scans, in the same order, what they were made from, and their poses (4, 4) in the view.
+    ``scans``: for clouds of scans, in the same order, what they were made from, and their poses (4,
+    4) in the view.
     """
 
     view: str
@@ -40,14 +42,24 @@ class ColouredClouds:
     @cached_property
     def points(self) -> np.ndarray | None:
         """All points (n, 3) mm; None where there are none."""
-        return np.concatenate([points.reshape(-1, 3) for points, _ in self.clouds.values()]) if self.clouds else None
+        return (
+            np.concatenate([points.reshape(-1, 3) for points, _ in self.clouds.values()])
+            if self.clouds
+            else None
+        )
 
 
 def colour_scans(
-    session: Session, names: Sequence[str], places: Mapping[str, np.ndarray], titles: Mapping[str, str]
+    session: Session,
+    names: Sequence[str],
+    places: Mapping[str, np.ndarray],
+    titles: Mapping[str, str],
 ) -> ColouredClouds:
-    """Load scans, each in a colour, at their ``places`` (4, 4), or as captured where they have none."""
-    scans = tuple((result_views.load_scan_cloud(session, name), places.get(name, np.eye(4))) for name in names)
+    """Load scans, each in a colour, at their ``places`` (4, 4), or as captured where they have
+    none."""
+    scans = tuple(
+        (result_views.load_scan_cloud(session, name), places.get(name, np.eye(4))) for name in names
+    )
     clouds: dict[str, tuple[np.ndarray, np.ndarray | Colour]] = {}
     for i, (cloud, T) in enumerate(scans):
         points = (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
@@ -57,7 +69,8 @@ def colour_scans(
 
 
 def colour_merge(session: Session, merge: str, view: str, titles: Sequence[str]) -> ColouredClouds:
-    """Load the surface of a merge, coloured by one of MERGED; ``titles`` are those of its scans, in order."""
+    """Load the surface of a merge, coloured by one of MERGED; ``titles`` are those of its scans, in
+    order."""
     surface = result_views.merged_cloud(session, merge)
     legend, painted = _colour_surface(surface, view, titles)
     return ColouredClouds("merged", {"merged": (surface.points, painted)}, legend)
@@ -68,27 +81,42 @@ def patch(colour: Colour) -> Html:
     return Html(f'<span style="color:rgb{colour};font-size:1.3em">■</span>')
 
 
-def _colour_surface(surface: Ply, view: str, titles: Sequence[str]) -> tuple[Html, np.ndarray | Colour]:
-    """Return (legend, colours (n, 3)) of a merged surface by texture, scan or uncertainty; grey where not stored."""
-    source, sigma, own = surface.scalars.get("source"), surface.scalars.get("sigma"), surface.colours
+def _colour_surface(
+    surface: Ply, view: str, titles: Sequence[str]
+) -> tuple[Html, np.ndarray | Colour]:
+    """Return (legend, colours (n, 3)) of a merged surface by texture, scan or uncertainty; grey
+    where not stored."""
+    source, sigma, own = (
+        surface.scalars.get("source"),
+        surface.scalars.get("sigma"),
+        surface.colours,
+    )
     if view == BY_SCAN and source is not None:
         palette = np.array(SCAN_COLOURS, np.uint8)
         return _format_patches(titles), palette[source.astype(np.int64) % len(palette)]
     if view == BY_SIGMA and sigma is not None:
         known = np.where(sigma > 0, sigma, np.nan)
-        title = "uncertainty along the normal (1 sigma)" + ("" if np.isfinite(known).all() else "; grey: unknown")
+        title = "uncertainty along the normal (1 sigma)" + (
+            "" if np.isfinite(known).all() else "; grey: unknown"
+        )
         painted, bar = paint(known, "mm", 3, title)
         return bar, painted
     if view == OWN and own is not None:
         return Html(""), own
-    missing = "Not stored with this merge: merge again." if view != OWN else "The scans have no texture."
+    missing = (
+        "Not stored with this merge: merge again." if view != OWN else "The scans have no texture."
+    )
     return paragraph(coloured(missing, "warning")), _GREY
 
 
 def _format_patches(titles: Sequence[str]) -> Html:
     """Return a legend with a coloured square and a title for each scan."""
     items = [
-        f"<span>{patch(SCAN_COLOURS[i % len(SCAN_COLOURS)])} {to_html(title)}</span>" for i, title in enumerate(titles)
+        f"<span>{patch(SCAN_COLOURS[i % len(SCAN_COLOURS)])} {to_html(title)}</span>"
+        for i, title in enumerate(titles)
     ]
-    row = f'<div style="display:flex;flex-wrap:wrap;gap:0 1em;align-items:center">{"".join(items)}</div>'
+    row = (
+        '<div style="display:flex;flex-wrap:wrap;gap:0'
+        f' 1em;align-items:center">{"".join(items)}</div>'
+    )
     return paragraph(Html(row)) if items else Html("")

@@ -1,4 +1,5 @@
-"""What every step's panel shares: its context, its buttons, and the callbacks that report failures."""
+"""What every step's panel shares: its context, its buttons, and the callbacks that report
+failures."""
 
 import threading
 from collections.abc import Callable
@@ -30,11 +31,12 @@ ButtonColour = Literal["gray", "red", "orange", "green", "teal", "cyan"]
 class PanelContext:
     """Services that a panel uses.
 
-    `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator` takes requests.
-    `offer(path)` returns the address at which a file of the session is downloaded; `notify(level, text)` shows a
-    notification in every browser; `go(key)` shows another step. `executor` runs one callback after the other.
-    `page_state(role)` returns the state of a device's page; None where none is served. `viewers(answered)` tracks
-    which browsers have drawn what they were sent. `show_links(client)` shows the links in one browser.
+    `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator`
+    takes requests. `offer(path)` returns the address at which a file of the session is downloaded;
+    `notify(level, text)` shows a notification in every browser; `go(key)` shows another step.
+    `executor` runs one callback after the other. `page_state(role)` returns the state of a device's
+    page; None where none is served. `viewers(answered)` tracks which browsers have drawn what they
+    were sent. `show_links(client)` shows the links in one browser.
     """
 
     gui: viser.GuiApi
@@ -57,12 +59,15 @@ class PanelContext:
             raise InputError("no session is open: open one first")
         return self.operator.session
 
-    def callback(self, do: Callable[[], Any], *, by_user: bool = False, at_once: bool = False) -> Callable[[Any], None]:
+    def callback(
+        self, do: Callable[[], Any], *, by_user: bool = False, at_once: bool = False
+    ) -> Callable[[Any], None]:
         """Wrap `do()` as a callback for viser; whatever it raises becomes a notification.
 
-        Viser calls back from a pool of threads, several events at a time: here they are queued, so that the board is
-        placed before it is captured by someone who clicks fast. `by_user`: only for changes made in a browser, not by
-        the program. `at_once`: for what must not wait, such as cancelling.
+        Viser calls back from a pool of threads, several events at a time: here they are queued, so
+        that the board is placed before it is captured by someone who clicks fast. `by_user`: only
+        for changes made in a browser, not by the program. `at_once`: for what must not wait, such
+        as cancelling.
         """
 
         def call() -> None:
@@ -101,7 +106,8 @@ class PanelContext:
         return handle
 
     def view_button(self, points: Callable[[], np.ndarray | None]) -> viser.GuiButtonHandle:
-        """Add a button that moves the clicking browser's view to the points (..., 3) mm, if there are any."""
+        """Add a button that moves the clicking browser's view to the points (..., 3) mm, if there
+        are any."""
 
         def look(event: Any) -> None:
             """Move the view of the browser that clicked to the points."""
@@ -115,7 +121,8 @@ class PanelContext:
 
 
 class StepPanel:
-    """Base of the steps' panels. Every method is called by the drawing thread; only changed handles are set."""
+    """Base of the steps' panels. Every method is called by the drawing thread; only changed handles
+    are set."""
 
     key: ClassVar[str]
     layers: ClassVar[tuple[str, ...]] = ()
@@ -138,14 +145,17 @@ class StepPanel:
     def _show_view(self) -> None:
         """Move the browsers' views to the panel's cloud, if it is visible."""
         if self._visible and self._cloud is not None:
-            self._context.viewpoints.show(f"{self.layers[0]} {self._cloud.name}", self._cloud.points)
+            self._context.viewpoints.show(
+                f"{self.layers[0]} {self._cloud.name}", self._cloud.points
+            )
 
     def build(self) -> None:
         """Create the handles; called once, inside the panel's own container."""
         raise NotImplementedError
 
     def draw(self, snapshot: Snapshot) -> None:
-        """Show a snapshot; called after each change while the panel is shown, and right after `show(True)`."""
+        """Show a snapshot; called after each change while the panel is shown, and right after
+        `show(True)`."""
         raise NotImplementedError
 
     def draw_preview(self, preview: PreviewView) -> None:

@@ -1,7 +1,7 @@
 """Plots and maps in a panel, and the thread that makes them.
 
-Whatever is slow (reading a cloud, a figure of matplotlib) is never done by the thread that draws panels: they request
-it from a `Painter`. The figures are those of the report, drawn narrower.
+Whatever is slow (reading a cloud, a figure of matplotlib) is never done by the thread that draws
+panels: they request it from a `Painter`. The figures are those of the report, drawn narrower.
 """
 
 import threading
@@ -15,13 +15,16 @@ from slviewer.gui.widgets import Text, coloured, paragraph
 from slviewer.report.page import Figure
 
 PLOT_PX = 440
-"""CSS px: as wide as the page's panel, so that letters in a figure are as large as the panel's own."""
+"""CSS px: as wide as the page's panel, so that letters in a figure are as large as the panel's
+own."""
 
 
 class Painter:
-    """Computes the pictures of one panel on a thread, by slots; a newer request for a slot replaces a waiting one.
+    """Computes the pictures of one panel on a thread, by slots; a newer request for a slot replaces
+    a waiting one.
 
-    `failed(error)` is called for failures. The thread begins with the first request, and ends with the program.
+    `failed(error)` is called for failures. The thread begins with the first request, and ends with
+    the program.
     """
 
     def __init__(self, failed: Callable[[BaseException], None]) -> None:
@@ -31,10 +34,14 @@ class Painter:
         self._waiting: dict[str, tuple[Hashable, Callable[[], Any], Callable[[Any], None]]] = {}
         self._thread: threading.Thread | None = None
 
-    def request(self, slot: str, key: Hashable, make: Callable[[], Any], show: Callable[[Any], None]) -> None:
-        """Call `show(make())` on the painter's thread, unless `slot` already shows or awaits the same `key`.
+    def request(
+        self, slot: str, key: Hashable, make: Callable[[], Any], show: Callable[[Any], None]
+    ) -> None:
+        """Call `show(make())` on the painter's thread, unless `slot` already shows or awaits the
+        same `key`.
 
-        `key` is what the picture depends on. `show` is not called if another request for the slot came meanwhile.
+        `key` is what the picture depends on. `show` is not called if another request for the slot
+        came meanwhile.
         """
         with self._condition:
             if slot in self._requested and self._requested[slot] == key:
@@ -42,7 +49,9 @@ class Painter:
             self._requested[slot] = key
             self._waiting[slot] = (key, make, show)
             if self._thread is None:
-                self._thread = threading.Thread(target=self._serve, name="slviewer painter", daemon=True)
+                self._thread = threading.Thread(
+                    target=self._serve, name="slviewer painter", daemon=True
+                )
                 self._thread.start()
             self._condition.notify_all()
 
@@ -84,7 +93,9 @@ class Plot:
             return
         self._image.image = figure.pixels
         self._image.visible = True
-        self._caption.set(paragraph(coloured(figure.caption if caption is None else caption, "dim")))
+        self._caption.set(
+            paragraph(coloured(figure.caption if caption is None else caption, "dim"))
+        )
 
     def hide(self) -> None:
         """Hide figure and caption."""

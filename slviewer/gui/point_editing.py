@@ -38,8 +38,9 @@ _SELECTION, _OUTLINE = "selection", "outline"
 
 @dataclass(eq=False)
 class _EditedScan:
-    """A scan that is shown, at ``T`` (4, 4) mm of the 3D view: its cloud with NaN for what edits and region removed,
-    its points (h, w, 3) mm in the view's frame, and masks (h, w) of those that are hidden and selected.
+    """A scan that is shown, at ``T`` (4, 4) mm of the 3D view: its cloud with NaN for what edits
+    and region removed, its points (h, w, 3) mm in the view's frame, and masks (h, w) of those that
+    are hidden and selected.
 
     ``plane``: what the selection is everything below of, where it is.
     """
@@ -55,7 +56,11 @@ class _EditedScan:
     def at(cls, cloud: ScanCloud, T: np.ndarray | None) -> "_EditedScan":
         """Return the scan of a cloud at T (4, 4); None: in its own frame."""
         pose = np.eye(4) if T is None else T
-        points = cloud.points if T is None else (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        points = (
+            cloud.points
+            if T is None
+            else (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        )
         none = np.zeros(cloud.points.shape[:2], bool)
         return cls(cloud, pose, points, none, none.copy())
 
@@ -67,20 +72,30 @@ class _EditedScan:
     @property
     def shown_points(self) -> np.ndarray:
         """The points (h, w, 3) mm in the view's frame, NaN where they are not shown."""
-        return np.where(self.hidden[..., None], np.float32(np.nan), self.points) if self.hidden.any() else self.points
+        return (
+            np.where(self.hidden[..., None], np.float32(np.nan), self.points)
+            if self.hidden.any()
+            else self.points
+        )
 
     def update(self, other: "_EditedScan") -> bool:
-        """Take over what was hidden and selected of the same scan before; returns whether it is the same."""
+        """Take over what was hidden and selected of the same scan before; returns whether it is the
+        same."""
         if other.cloud.name != self.cloud.name or other.points.shape != self.points.shape:
             return False
-        self.hidden, self.selected = other.hidden, other.selected & self.shown  # no plane: others may lie below it now
+        self.hidden, self.selected = (
+            other.hidden,
+            other.selected & self.shown,
+        )  # no plane: others may lie below it now
         return True
 
 
 class PointEditing:
-    """Inputs that select, hide and delete points of the scans that are shown, drawn in a layer of the scene.
+    """Inputs that select, hide and delete points of the scans that are shown, drawn in a layer of
+    the scene.
 
-    ``redraw()`` is called when other points are to be shown; ``pick`` gets clicks while nothing is being selected.
+    ``redraw()`` is called when other points are to be shown; ``pick`` gets clicks while nothing is
+    being selected.
     """
 
     def __init__(
@@ -102,7 +117,9 @@ class PointEditing:
         with gui.add_folder("Edit points", expand_by_default=False) as self._folder:
             self._mode = gui.add_dropdown("Select by", (OFF, RECTANGLE, LASSO, PART))
             self._hint = Text(gui)
-            self._close = context.button("Close outline", self._close_outline, viser.Icon.POLYGON, None, visible=False)
+            self._close = context.button(
+                "Close outline", self._close_outline, viser.Icon.POLYGON, None, visible=False
+            )
             context.button(
                 "Select support", self._select_support, viser.Icon.TABLE,
                 hint="The plane that the object stands on, and all below it",
@@ -111,13 +128,18 @@ class PointEditing:
             context.button("Select nothing", self._clear_selection, viser.Icon.X)
             self._status = Text(gui)
             self._hide = context.button("Hide selected", self._hide_selected, viser.Icon.EYE_OFF)
-            self._show = context.button("Show hidden", self._show_hidden, viser.Icon.EYE, visible=False)
+            self._show = context.button(
+                "Show hidden", self._show_hidden, viser.Icon.EYE, visible=False
+            )
             self._delete = context.button(
                 "Delete selected", self._delete_selected, viser.Icon.ERASER, "red",
                 hint="The scan on disk stays as it is: Undo brings the points back",
             )  # fmt: skip
             self._undo = context.button(
-                "Undo edit", lambda: operator.undo_edit(*self._names), viser.Icon.ARROW_BACK_UP, "orange"
+                "Undo edit",
+                lambda: operator.undo_edit(*self._names),
+                viser.Icon.ARROW_BACK_UP,
+                "orange",
             )
             self._redo = context.button(
                 "Redo edit", lambda: operator.redo_edit(*self._names), viser.Icon.ARROW_FORWARD_UP
@@ -132,15 +154,18 @@ class PointEditing:
         return [scan.cloud.name for scan in self._scans]
 
     def set_scans(self, scans: Sequence[tuple[ScanCloud, np.ndarray | None]]) -> list[np.ndarray]:
-        """Set the scans that are shown, with NaN for what edits and region removed, at T (4, 4) each (None: in its own
-        frame); returns the points (h, w, 3) mm to show of each, without hidden ones.
+        """Set the scans that are shown, with NaN for what edits and region removed, at T (4, 4)
+        each (None: in its own frame); returns the points (h, w, 3) mm to show of each, without
+        hidden ones.
 
         What was selected or hidden stays for the same scans.
         """
         with self._lock:
             before, self._scans = self._scans, [_EditedScan.at(cloud, T) for cloud, T in scans]
             same = len(before) == len(self._scans)
-            if not (same and all(now.update(old) for now, old in zip(self._scans, before, strict=True))):
+            if not (
+                same and all(now.update(old) for now, old in zip(self._scans, before, strict=True))
+            ):
                 for scan in self._scans:
                     scan.hidden[:] = scan.selected[:] = False
                 self._forget_selection()
@@ -148,7 +173,8 @@ class PointEditing:
             return [scan.shown_points for scan in self._scans]
 
     def draw(self, scans: Sequence[ScanView]) -> None:
-        """List the edits of scans, and offer to undo and redo them; without scans nothing is offered."""
+        """List the edits of scans, and offer to undo and redo them; without scans nothing is
+        offered."""
         change(self._folder, visible=bool(scans))
         change(self._undo, disabled=not any(scan.edits for scan in scans))
         change(self._redo, disabled=not any(scan.undone_edits for scan in scans))
@@ -168,7 +194,9 @@ class PointEditing:
 
     # what is selected
 
-    def _add(self, masks: Sequence[np.ndarray], what: str, planes: Sequence[SupportPlane] | None = None) -> None:
+    def _add(
+        self, masks: Sequence[np.ndarray], what: str, planes: Sequence[SupportPlane] | None = None
+    ) -> None:
         """Add pixels (h, w) of each scan to the selection, as far as their points are shown."""
         for i, (scan, mask) in enumerate(zip(self._scans, masks, strict=True)):
             is_all = not self._what and not scan.hidden.any()
@@ -206,8 +234,12 @@ class PointEditing:
         """State how many points are selected, and offer what can be done with them."""
         selected = sum(int(scan.selected.sum()) for scan in self._scans)
         total = sum(int(scan.shown.sum()) for scan in self._scans)
-        hidden = sum(int((scan.hidden & np.isfinite(scan.points[..., 2])).sum()) for scan in self._scans)
-        text = f"{selected:,} of {total:,} points selected" + (f", {hidden:,} hidden" if hidden else "")
+        hidden = sum(
+            int((scan.hidden & np.isfinite(scan.points[..., 2])).sum()) for scan in self._scans
+        )
+        text = f"{selected:,} of {total:,} points selected" + (
+            f", {hidden:,} hidden" if hidden else ""
+        )
         self._status.set(paragraph(coloured(text, "plain" if selected else "dim")) if total else "")
         change(self._delete, disabled=not selected)
         change(self._hide, disabled=not selected)
@@ -257,10 +289,13 @@ class PointEditing:
     def _take_rectangle(self, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> None:
         """Select what a rectangle, from its lowest to its highest corner (2,), holds in a view."""
         with self._lock:
-            self._select_outline(view, np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), RECTANGLE)
+            self._select_outline(
+                view, np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), RECTANGLE
+            )
 
     def _take_corner(self, view: ViewCamera, at: np.ndarray, ray: np.ndarray) -> None:
-        """Add a corner of the outline, at (2,) in a view along a ray (3,); begin again where the view has moved."""
+        """Add a corner of the outline, at (2,) in a view along a ray (3,); begin again where the
+        view has moved."""
         with self._lock:
             if self._view is not None and not self._view.is_near(view):
                 self._forget_outline()
@@ -270,7 +305,10 @@ class PointEditing:
             self._view = view
             self._corners.append((float(at[0]), float(at[1])))
             # drawn before the points, so that it stays visible
-            away = 0.5 * min(float(np.nanmin(np.linalg.norm(s.points - view.position, axis=-1))) for s in self._scans)
+            away = 0.5 * min(
+                float(np.nanmin(np.linalg.norm(s.points - view.position, axis=-1)))
+                for s in self._scans
+            )
             self._rays.append(view.position + away * ray / np.linalg.norm(ray))
             ends = np.array(self._rays)
             segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)

@@ -55,15 +55,32 @@ class PoseBoards:
         self._scene, self._layer, self._chosen = scene, layer, chosen
         self._drawn: dict[str, Any] = {}
 
-    def draw(self, poses: Sequence[PoseView], board: Board | None, camera: tuple[int, int] | None, chosen: str) -> None:
-        """Draw the boards of the poses whose position is known; the chosen one has a thicker outline."""
-        known = {pose.name: pose for pose in poses if pose.T_camera_board is not None} if board is not None else {}
+    def draw(
+        self,
+        poses: Sequence[PoseView],
+        board: Board | None,
+        camera: tuple[int, int] | None,
+        chosen: str,
+    ) -> None:
+        """Draw the boards of the poses whose position is known; the chosen one has a thicker
+        outline."""
+        known = (
+            {pose.name: pose for pose in poses if pose.T_camera_board is not None}
+            if board is not None
+            else {}
+        )
         for name in set(self._drawn) - set(known):
             self._scene.remove(self._layer, name)
             del self._drawn[name]
         for name, pose in known.items():
             assert pose.T_camera_board is not None and board is not None
-            key = (pose.state, pose.T_camera_board.tobytes(), bool(pose.thumbnail), name == chosen, str(board))
+            key = (
+                pose.state,
+                pose.T_camera_board.tobytes(),
+                bool(pose.thumbnail),
+                name == chosen,
+                str(board),
+            )
             if self._drawn.get(name) != key:
                 self._drawn[name] = key
                 self._scene.board(
@@ -80,7 +97,8 @@ class PoseBoards:
 
 
 def rectified(pose: PoseView, board: Board, camera: tuple[int, int] | None) -> np.ndarray | None:
-    """Cut the board's front (h, w, 3) uint8 out of a pose's thumbnail; None where either is unknown."""
+    """Cut the board's front (h, w, 3) uint8 out of a pose's thumbnail; None where either is
+    unknown."""
     if not pose.thumbnail or pose.board_px is None or camera is None:
         return None
     image = cv2.imdecode(np.frombuffer(pose.thumbnail, np.uint8), cv2.IMREAD_COLOR)

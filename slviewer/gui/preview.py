@@ -10,15 +10,21 @@ from slviewer.wizard.snapshot import PreviewView
 _DETECTED, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
 
 
-def draw_preview(preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None) -> np.ndarray:
-    """Draw the frame (h, w, 3) uint8 with saturated pixels, the detected board and the suggested outline marked.
+def draw_preview(
+    preview: PreviewView, board: Board | None = None, ghost_px: np.ndarray | None = None
+) -> np.ndarray:
+    """Draw the frame (h, w, 3) uint8 with saturated pixels, the detected board and the suggested
+    outline marked.
 
-    The board's features are joined row by row; `ghost_px` is the outline (4, 2) of the suggested pose, in camera px.
+    The board's features are joined row by row; `ghost_px` is the outline (4, 2) of the suggested
+    pose, in camera px.
     """
     picture = fitted(preview.image)
     clipped = preview.image >= 255
     if clipped.any():
-        mask = cv2.resize(clipped.astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        mask = cv2.resize(
+            clipped.astype(np.uint8), picture.shape[1::-1], interpolation=cv2.INTER_NEAREST
+        )
         picture[mask > 0] = _CLIPPED
     to_picture = preview.scale * PICTURE_PX / preview.image.shape[1]
     if ghost_px is not None and np.isfinite(ghost_px).all():
@@ -36,7 +42,9 @@ def exposure_html(preview: PreviewView) -> Html:
         share = 100 * preview.saturated
         return coloured(f"{share:.1f} % saturated (red): lower the exposure", "error", bold=True)
     if preview.brightness == "dim":
-        return coloured(f"Dim, peak at {100 * preview.brightest:.0f} %: raise the exposure", "warning")
+        return coloured(
+            f"Dim, peak at {100 * preview.brightest:.0f} %: raise the exposure", "warning"
+        )
     return coloured(f"Well exposed, peak at {100 * preview.brightest:.0f} %", "good")
 
 
@@ -63,7 +71,9 @@ def legend(preview: PreviewView, *lines: Html) -> Html:
 
 def histogram_chart(preview: PreviewView) -> Html:
     """Return a bar chart of the grey levels; the last bar is red: saturated pixels."""
-    shares = np.sqrt(preview.histogram / max(float(preview.histogram.max()), 1e-9))  # the few bright pixels matter most
+    shares = np.sqrt(
+        preview.histogram / max(float(preview.histogram.max()), 1e-9)
+    )  # the few bright pixels matter most
     bars = "".join(
         f'<rect x="{4 * k}" y="{40 - 40 * share:.1f}" width="3.4" height="{40 * share:.1f}" '
         f'fill="{"var(--mantine-color-red-6)" if k == len(shares) - 1 else "var(--mantine-color-blue-5)"}"/>'
@@ -75,10 +85,10 @@ def histogram_chart(preview: PreviewView) -> Html:
     )
     return paragraph(
         Html(
-            f'<svg viewBox="0 0 {4 * len(shares)} 40" preserveAspectRatio="none" '
-            f'style="width:100%;height:48px;display:block;border-bottom:1px solid var(--mantine-color-dimmed)">{bars}'
-            "</svg>"
-            f'<div style="display:flex;justify-content:space-between">{axis}</div>'
+            f'<svg viewBox="0 0 {4 * len(shares)} 40" preserveAspectRatio="none"'
+            ' style="width:100%;height:48px;display:block;border-bottom:1px solid'
+            f' var(--mantine-color-dimmed)">{bars}</svg><div'
+            f' style="display:flex;justify-content:space-between">{axis}</div>'
         )
     )
 

@@ -27,13 +27,22 @@ class RegionInputs:
         gui, operator = context.gui, context.operator
         with gui.add_folder("Region of interest", expand_by_default=False):
             self._text = Text(gui)
-            self._on = gui.add_checkbox("Use region", False, hint="Ignores all points outside of a box, in every scan")
-            self._automatic = context.button(
-                "Automatic region", lambda: operator.fit_region(self._scan), viser.Icon.BOX, hint="Box around this scan"
+            self._on = gui.add_checkbox(
+                "Use region", False, hint="Ignores all points outside of a box, in every scan"
             )
-            self._handles = gui.add_checkbox("Handles", False, hint="Arrows move the box in 3D, rings turn it")
+            self._automatic = context.button(
+                "Automatic region",
+                lambda: operator.fit_region(self._scan),
+                viser.Icon.BOX,
+                hint="Box around this scan",
+            )
+            self._handles = gui.add_checkbox(
+                "Handles", False, hint="Arrows move the box in 3D, rings turn it"
+            )
             self._centre = gui.add_vector3("Centre (mm)", (0.0, 0.0, 0.0), step=0.1)
-            self._size = gui.add_vector3("Size (mm)", (1.0, 1.0, 1.0), min=(0.1, 0.1, 0.1), step=0.1)
+            self._size = gui.add_vector3(
+                "Size (mm)", (1.0, 1.0, 1.0), min=(0.1, 0.1, 0.1), step=0.1
+            )
             self._turn = gui.add_vector3("Turn (°)", (0.0, 0.0, 0.0), step=0.1)
         self._on_value = SessionValue(self._on)
         self._on.on_update(context.callback(self._switch, by_user=True))
@@ -43,7 +52,8 @@ class RegionInputs:
         self._handles.on_update(context.callback(self._draw_box))
 
     def draw(self, session: SessionView | None, scan: str) -> None:
-        """Show the region of a session; ``scan``: the one that the automatic region is put around."""
+        """Show the region of a session; ``scan``: the one that the automatic region is put
+        around."""
         self._scan = scan
         self._region = region = session.region if session else None
         is_on = bool(session and session.region_is_on)
@@ -52,9 +62,13 @@ class RegionInputs:
             change(handle, visible=region is not None)
         change(self._automatic, disabled=not scan)
         if region is None:
-            self._text.write("All points are used. The automatic region is a box around this scan.", "dim")
+            self._text.write(
+                "All points are used. The automatic region is a box around this scan.", "dim"
+            )
         else:
-            for shown, value in zip(self._values, (region.centre_mm, region.size_mm, region.rotation_deg), strict=True):
+            for shown, value in zip(
+                self._values, (region.centre_mm, region.size_mm, region.rotation_deg), strict=True
+            ):
                 shown.update(tuple(round(number, 1) for number in value))
             self._text.write("" if is_on else "The region is off: all points are used.", "dim")
         self._draw_box(is_on)
@@ -91,7 +105,9 @@ class RegionInputs:
         """Request the region at T (4, 4), where its handle was dragged to."""
         region, operator = self._region, self._context.operator
         if region is not None:
-            self._context.callback(lambda: operator.set_region(RegionOfInterest.placed(T, region.size_mm)))(None)
+            self._context.callback(
+                lambda: operator.set_region(RegionOfInterest.placed(T, region.size_mm))
+            )(None)
 
     def _switch(self) -> None:
         """Switch the region on or off; without one, take the automatic one."""
@@ -103,7 +119,8 @@ class RegionInputs:
             operator.switch_region(bool(self._on.value))
 
     def _set_from_numbers(self) -> None:
-        """Request the region of the numbers that were entered; nothing happens while they are no box."""
+        """Request the region of the numbers that were entered; nothing happens while they are no
+        box."""
         try:
             region = RegionOfInterest(self._centre.value, self._size.value, self._turn.value)
         except InputError:

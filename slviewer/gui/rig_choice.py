@@ -41,17 +41,23 @@ class RigChoice:
         self._chosen_value = SessionValue(self._choice)
         self._choice.on_update(context.callback(self._request_choice, by_user=True))
         self._status = Text(gui)
-        self._retry = context.button("Try again", self._request_again, viser.Icon.REFRESH, None, visible=False)
+        self._retry = context.button(
+            "Try again", self._request_again, viser.Icon.REFRESH, None, visible=False
+        )
         with gui.add_folder("Devices", visible=False) as self._devices:
             self._cameras = _label_drivers([d for d in available() if d.camera])
             self._projectors = _label_drivers([d for d in available() if d.projector])
             self._camera = gui.add_dropdown("Camera", tuple(self._cameras))
             self._camera.on_update(context.callback(self._draw_devices))
-            self._source = gui.add_text("Camera ID", "", hint="Number of a webcam, file, address, or serial number")
+            self._source = gui.add_text(
+                "Camera ID", "", hint="Number of a webcam, file, address, or serial number"
+            )
             make_private(self._source)  # it may hold a password
             self._projector = gui.add_dropdown("Projector", tuple(self._projectors))
             self._projector.on_update(context.callback(self._draw_devices))
-            self._size = gui.add_text("Resolution", "", hint="For example 1920x1080; empty: that of its screen")
+            self._size = gui.add_text(
+                "Resolution", "", hint="For example 1920x1080; empty: that of its screen"
+            )
             self._missing = Text(gui)
             self._use = context.button(
                 "Use these devices",
@@ -66,13 +72,23 @@ class RigChoice:
             )
             context.button(
                 "Play back",
-                lambda: context.operator.choose_rig({"driver": "replay", "source": self._folder.value}),
+                lambda: context.operator.choose_rig(
+                    {"driver": "replay", "source": self._folder.value}
+                ),
                 viser.Icon.PLAYER_PLAY,
                 None,
             )
-        with gui.add_folder("Save this rig", visible=False, expand_by_default=False) as self._saving:
-            self._name = gui.add_text("Name", "", hint="The rig is then offered by this name, with its exposure")
-            context.button("Save", lambda: context.operator.save_rig(self._name.value), viser.Icon.DEVICE_FLOPPY)
+        with gui.add_folder(
+            "Save this rig", visible=False, expand_by_default=False
+        ) as self._saving:
+            self._name = gui.add_text(
+                "Name", "", hint="The rig is then offered by this name, with its exposure"
+            )
+            context.button(
+                "Save",
+                lambda: context.operator.save_rig(self._name.value),
+                viser.Icon.DEVICE_FLOPPY,
+            )
         self._needed_pages: tuple[PageRole, ...] = ()
         self._draw_devices()
         self._offer_rigs()
@@ -96,7 +112,9 @@ class RigChoice:
     def _offer_rigs(self) -> None:
         """Update the options from the rig presets; a choice that is no longer offered is reset."""
         session = self._context.operator.session
-        self._presets = {p.name: p for p in presets(session) if p.choice.get("driver") != "simulated"}
+        self._presets = {
+            p.name: p for p in presets(session) if p.choice.get("driver") != "simulated"
+        }
         options = (_CHOOSE, *SIMULATED, *self._presets, _CUSTOM)
         if tuple(self._choice.options) != options:
             value = self._choice.value
@@ -109,10 +127,15 @@ class RigChoice:
             return _CHOOSE
         if rig.choice.get("driver") == "simulated":
             scale = rig.choice.get("scale", 1.0)
-            return next((label for label, rig in SIMULATED.items() if rig["scale"] == scale), _CHOOSE)
+            return next(
+                (label for label, rig in SIMULATED.items() if rig["scale"] == scale), _CHOOSE
+            )
         if rig.choice.get("driver") == _REPLAY:
             return _REPLAY
-        return next((name for name, p in self._presets.items() if _is_same_rig(p.choice, rig.choice)), _CUSTOM)
+        return next(
+            (name for name, p in self._presets.items() if _is_same_rig(p.choice, rig.choice)),
+            _CUSTOM,
+        )
 
     def _request_choice(self) -> None:
         """Request the chosen rig; where it is refused, show the one in use again."""
@@ -146,7 +169,10 @@ class RigChoice:
 
     def _draw_pages(self) -> None:
         """Show the states of the pages that the rig needs, or the devices that are being chosen."""
-        own = {"camera": self._cameras[self._camera.value], "projector": self._projectors[self._projector.value]}
+        own = {
+            "camera": self._cameras[self._camera.value],
+            "projector": self._projectors[self._projector.value],
+        }
         for role, text in self._pages.items():
             is_chosen = self._choice.value == _CUSTOM and own[role].page
             needed = is_chosen or role in self._needed_pages
@@ -155,7 +181,9 @@ class RigChoice:
     def _draw_devices(self) -> None:
         """Show what the chosen drivers lack, and whether the camera needs an identifier."""
         chosen = (self._cameras[self._camera.value], self._projectors[self._projector.value])
-        missing = "; ".join(f"{d.name} cannot be used here, {d.missing}" for d in chosen if d.missing)
+        missing = "; ".join(
+            f"{d.name} cannot be used here, {d.missing}" for d in chosen if d.missing
+        )
         self._missing.write(missing, "warning")
         change(self._use, disabled=bool(missing))
         change(self._source, visible=_address_option(chosen[0]) is not None)
@@ -163,11 +191,16 @@ class RigChoice:
 
     def _read_entered(self) -> Choice:
         """Return the rig of the entered devices. Raises InputError for an invalid one."""
-        camera, projector = self._cameras[self._camera.value], self._projectors[self._projector.value]
+        camera, projector = (
+            self._cameras[self._camera.value],
+            self._projectors[self._projector.value],
+        )
         camera_choice: dict[str, Any] = {"driver": camera.name}
         option, address = _address_option(camera), self._source.value.strip()
         if option is not None and address:
-            camera_choice[option] = int(address) if address.isdecimal() and option == "source" else address
+            camera_choice[option] = (
+                int(address) if address.isdecimal() and option == "source" else address
+            )
         video = self._context.page_state("camera") if camera.page else None
         if video is not None and video.size is not None:  # saved, as the projector's
             camera_choice["size"] = list(video.size)
@@ -175,9 +208,15 @@ class RigChoice:
         page = self._context.page_state("projector") if projector.page else None
         if self._size.value.strip():
             projector_choice["size"] = _size(self._size.value)
-        elif page is not None and page.size is not None:  # saved, since the page may be opened after the session
+        elif (
+            page is not None and page.size is not None
+        ):  # saved, since the page may be opened after the session
             projector_choice["size"] = list(page.size)
-        choice = {"name": f"{camera.name} and {projector.name}", "camera": camera_choice, "projector": projector_choice}
+        choice = {
+            "name": f"{camera.name} and {projector.name}",
+            "camera": camera_choice,
+            "projector": projector_choice,
+        }
         check_choice(choice, "this rig")
         return choice
 
@@ -220,22 +259,33 @@ def _rig_html(rig: RigView) -> str:
         for what, size in (("camera", rig.camera), ("projector", rig.projector))
         if size is not None
     ]
-    html = paragraph(Html(f"{coloured('●', 'good')} {to_html(rig.name)} · {to_html(', '.join(sizes))}"))
+    html = paragraph(
+        Html(f"{coloured('●', 'good')} {to_html(rig.name)} · {to_html(', '.join(sizes))}")
+    )
     return html + "".join(alert(note, "warning") for note in rig.notes)
 
 
 _PAGE_USE: dict[PageRole, str] = {
-    "projector": "and move its window to the projector's screen; on another computer, open the link that Links shows.",
-    "camera": "where this computer's camera is used; on a phone, open the link that Links shows, which needs "
-    "<code style='white-space:nowrap'>slviewer --tls --host 0.0.0.0</code>.",
+    "projector": (
+        "and move its window to the projector's screen; on another computer, open the link that"
+        " Links shows."
+    ),
+    "camera": (
+        "where this computer's camera is used; on a phone, open the link that Links shows, which"
+        " needs <code style='white-space:nowrap'>slviewer --tls --host 0.0.0.0</code>."
+    ),
 }
 
 
 def _page_html(role: PageRole, standing: PageState | None) -> str:
-    """Describe the state of a device's page, and how to open it; viewers read this too, and may not."""
+    """Describe the state of a device's page, and how to open it; viewers read this too, and may
+    not."""
     if standing is None:
         return alert(f"This rig needs the {role} page, which is not served here.", "error")
-    how = f'<a href="{role}" target="_blank" rel="noopener">Open the {role} page</a> {_PAGE_USE[role]}'
+    how = (
+        f'<a href="{role}" target="_blank" rel="noopener">Open the {role} page</a>'
+        f" {_PAGE_USE[role]}"
+    )
     tone: Tone = {"waiting": "info", "refused": "warning", "ready": "good"}[standing.state]  # type: ignore[assignment]
     words = f"{role.capitalize()} page: {to_html(standing.words)}"
     return alert(Html(words if tone == "good" else f"{words}<br>{how}"), tone)

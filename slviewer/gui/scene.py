@@ -1,7 +1,8 @@
-"""The 3D view: named layers in the camera's frame, in mm, x to the right and y down as in the image.
+"""The 3D view: named layers in the camera's frame, in mm, x to the right and y down as in the
+image.
 
-A layer ("poses", "scan", …) belongs to a panel, which fills it, and shows or hides it as a whole. An object replaces
-that of the same name. Every method may be called from any thread.
+A layer ("poses", "scan", …) belongs to a panel, which fills it, and shows or hides it as a whole.
+An object replaces that of the same name. Every method may be called from any thread.
 """
 
 from collections.abc import Callable
@@ -72,9 +73,16 @@ class ViewerScene:
     # objects
 
     def device(
-        self, layer: str, name: str, K: np.ndarray, size: tuple[int, int], T_camera_device: np.ndarray, colour: Colour
+        self,
+        layer: str,
+        name: str,
+        K: np.ndarray,
+        size: tuple[int, int],
+        T_camera_device: np.ndarray,
+        colour: Colour,
     ) -> None:
-        """Draw a camera or projector as a frustum; K (3, 3) px, size (width, height) px, T (4, 4) mm."""
+        """Draw a camera or projector as a frustum; K (3, 3) px, size (width, height) px, T (4, 4)
+        mm."""
         width, height = size
         wxyz, position = _split_pose(T_camera_device)
         handle = self._api.add_camera_frustum(
@@ -104,17 +112,22 @@ class ViewerScene:
         on_click: Callable[[Any], None] | None = None,
         width_px: float = 2.0,
     ) -> None:
-        """Draw a board's outline (4, 3) mm at T_camera_board (4, 4), with its picture (h, w, 3) and name, if given.
+        """Draw a board's outline (4, 3) mm at T_camera_board (4, 4), with its picture (h, w, 3) and
+        name, if given.
 
-        The outline's corners go from the board's first feature along its first row and back around, as
-        `Board.outline` gives them; the picture's rows run along the board's.
+        The outline's corners go from the board's first feature along its first row and back around,
+        as `Board.outline` gives them; the picture's rows run along the board's.
         """
         path = self._make_path(layer, name)
         wxyz, position = _split_pose(T_camera_board)
-        nodes: list[Any] = [self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)]
+        nodes: list[Any] = [
+            self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)
+        ]
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1).astype(np.float32)
         nodes.append(
-            self._api.add_line_segments(f"{path}/outline", sides, colour, thickness=width_px, thickness_units="screen")
+            self._api.add_line_segments(
+                f"{path}/outline", sides, colour, thickness=width_px, thickness_units="screen"
+            )
         )
         middle = outline.mean(axis=0)
         if picture is not None:
@@ -122,14 +135,25 @@ class ViewerScene:
             turned = tf.SO3.from_x_radians(np.pi).wxyz
             size = np.ptp(outline, axis=0)
             image = self._api.add_image(
-                f"{path}/picture", picture, float(size[0]), float(size[1]), wxyz=turned, position=middle
+                f"{path}/picture",
+                picture,
+                float(size[0]),
+                float(size[1]),
+                wxyz=turned,
+                position=middle,
             )
             if on_click is not None:
                 image.on_click(on_click)
             nodes.append(image)
         if label:
             nodes.append(
-                self._api.add_label(f"{path}/label", label, position=outline[0], anchor="bottom-left", depth_test=True)
+                self._api.add_label(
+                    f"{path}/label",
+                    label,
+                    position=outline[0],
+                    anchor="bottom-left",
+                    depth_test=True,
+                )
             )
         self._store_nodes(layer, name, nodes)
 
@@ -143,7 +167,8 @@ class ViewerScene:
         *,
         scale_mm: float = 90.0,
     ) -> None:
-        """Add a handle to move and turn an object; both callbacks get T (4, 4) in the camera's frame."""
+        """Add a handle to move and turn an object; both callbacks get T (4, 4) in the camera's
+        frame."""
         wxyz, position = _split_pose(T)
         limits = ((-5000.0, 5000.0),) * 3
         handle = self._api.add_transform_controls(
@@ -180,8 +205,9 @@ class ViewerScene:
     ) -> int:
         """Draw a cloud (h, w, 3) or (n, 3) float32 mm; returns the number of points shown.
 
-        Colours are grey levels of its shape, (..., 3) uint8, or one colour. NaN points are skipped. It is evenly
-        thinned to about `limit` points, an organised cloud by rows and columns, so that no stripes appear.
+        Colours are grey levels of its shape, (..., 3) uint8, or one colour. NaN points are skipped.
+        It is evenly thinned to about `limit` points, an organised cloud by rows and columns, so
+        that no stripes appear.
         """
         shown, colours = thin(points, colours, limit)
         if not len(shown):
@@ -210,10 +236,16 @@ class ViewerScene:
     ) -> None:
         """Draw a point (3,) mm as a ball with a label."""
         path = self._make_path(layer, name)
-        ball = self._api.add_icosphere(path, radius=radius_mm, color=colour, position=np.asarray(point, float))
-        self._store_nodes(layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")])
+        ball = self._api.add_icosphere(
+            path, radius=radius_mm, color=colour, position=np.asarray(point, float)
+        )
+        self._store_nodes(
+            layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")]
+        )
 
-    def ball(self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour) -> None:
+    def ball(
+        self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour
+    ) -> None:
         """Draw a transparent ball around centre (3,) mm."""
         handle = self._api.add_icosphere(
             self._make_path(layer, name),
@@ -227,7 +259,13 @@ class ViewerScene:
         self._store_nodes(layer, name, [handle])
 
     def drawing(
-        self, layer: str, name: str, segments: np.ndarray, colour: Colour, place: np.ndarray, text: str
+        self,
+        layer: str,
+        name: str,
+        segments: np.ndarray,
+        colour: Colour,
+        place: np.ndarray,
+        text: str,
     ) -> None:
         """Draw segments (n, 2, 3) mm (n may be 0), and a label at place (3,) mm."""
         path = self._make_path(layer, name)
@@ -235,11 +273,17 @@ class ViewerScene:
         if len(segments):
             nodes.append(
                 self._api.add_line_segments(
-                    f"{path}/lines", np.asarray(segments, np.float32), colour, thickness=3.0, thickness_units="screen"
+                    f"{path}/lines",
+                    np.asarray(segments, np.float32),
+                    colour,
+                    thickness=3.0,
+                    thickness_units="screen",
                 )
             )
         nodes.append(
-            self._api.add_label(f"{path}/words", text, position=np.asarray(place, float), anchor="bottom-left")
+            self._api.add_label(
+                f"{path}/words", text, position=np.asarray(place, float), anchor="bottom-left"
+            )
         )
         self._store_nodes(layer, name, nodes)
 
@@ -254,21 +298,29 @@ class ViewerScene:
         )
         self._store_nodes(layer, name, [handle])
 
-    def on_view_click(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(view, at, direction)` for each click in place of `on_pick`: the browser's view, the place in it,
-        (2,) from 0 at its upper left to 1, and the ray (3,) through it; None: stop."""
+    def on_view_click(
+        self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None
+    ) -> None:
+        """Call `do(view, at, direction)` for each click in place of `on_pick`: the browser's view,
+        the place in it, (2,) from 0 at its upper left to 1, and the ray (3,) through it; None:
+        stop."""
         self.on_pick(None)
         if do is not None:
 
             def click(event: Any) -> None:
                 """Call `do` with the place and view of a click."""
-                do(read_view(event.client), np.array(event.screen_pos), np.array(event.ray_direction))
+                do(
+                    read_view(event.client),
+                    np.array(event.screen_pos),
+                    np.array(event.ray_direction),
+                )
 
             self._pick = self._api.on_click()(click)
 
     def on_rectangle(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(view, low, high)` for each rectangle that is dragged: the browser's view, and two corners, (2,) from
-        0 at its upper left to 1; dragging does not turn the view then. None: stop."""
+        """Call `do(view, low, high)` for each rectangle that is dragged: the browser's view, and
+        two corners, (2,) from 0 at its upper left to 1; dragging does not turn the view then. None:
+        stop."""
         if self._rectangle is not None:
             self._api.remove_rect_select_callback(self._rectangle)
             self._rectangle = None
@@ -281,7 +333,8 @@ class ViewerScene:
             self._rectangle = self._api.on_rect_select()(select)
 
     def on_pick(self, do: Callable[[np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the scene; None: stop."""
+        """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the
+        scene; None: stop."""
         if self._pick is not None:
             self._api.remove_click_callback(self._pick)
             self._pick = None
@@ -314,7 +367,9 @@ def read_view(client: viser.ClientHandle) -> ViewCamera:
     """Return the view of a browser."""
     camera = client.camera
     rotation = tf.SO3(np.asarray(camera.wxyz, float)).as_matrix()
-    return ViewCamera(np.asarray(camera.position, float), rotation, float(camera.fov), float(camera.aspect))
+    return ViewCamera(
+        np.asarray(camera.position, float), rotation, float(camera.fov), float(camera.aspect)
+    )
 
 
 def _split_pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -333,10 +388,11 @@ def _read_pose(handle: Any) -> np.ndarray:
 def thin(
     points: NDArray[np.float32], colours: NDArray[np.uint8] | Colour, limit: int
 ) -> tuple[NDArray[np.float32], Any]:
-    """Thin a cloud to about `limit` points: (points (n, 3), their colours (n, 3) or the one colour).
+    """Thin a cloud to about `limit` points: (points (n, 3), their colours (n, 3) or the one
+    colour).
 
-    An organised cloud (h, w, 3) is thinned by rows and columns, (n, 3) by points; NaN points are skipped, grey levels
-    become colours.
+    An organised cloud (h, w, 3) is thinned by rows and columns, (n, 3) by points; NaN points are
+    skipped, grey levels become colours.
     """
     valid = np.asarray(np.isfinite(points).all(axis=-1))
     excess = np.count_nonzero(valid) / limit
@@ -348,7 +404,11 @@ def thin(
     valid = valid[part]
     if isinstance(colours, np.ndarray) and colours.shape[: len(steps)] == points.shape[:-1]:
         colours = colours[part][valid]
-        colours = np.repeat(colours[:, None], 3, axis=1) if colours.ndim == 1 else np.ascontiguousarray(colours)
+        colours = (
+            np.repeat(colours[:, None], 3, axis=1)
+            if colours.ndim == 1
+            else np.ascontiguousarray(colours)
+        )
     return np.asarray(points[part][valid], np.float32), colours
 
 

@@ -1,4 +1,5 @@
-"""The frame of the page: the steps on the left, the current step on the right, and what is visible in every step.
+"""The frame of the page: the steps on the left, the current step on the right, and what is visible
+in every step.
 
 All browsers show the same step: an assistant sees the operator's step.
 """
@@ -21,7 +22,15 @@ from slviewer.gui.scene import CAMERA, PROJECTOR, ViewerScene
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, meter, paragraph, to_html
 from slviewer.session.atomic import format_bytes
 from slviewer.wizard.autopilot import Autopilot
-from slviewer.wizard.snapshot import CalibrationView, Level, Notice, PreviewView, SessionView, Snapshot, StepView
+from slviewer.wizard.snapshot import (
+    CalibrationView,
+    Level,
+    Notice,
+    PreviewView,
+    SessionView,
+    Snapshot,
+    StepView,
+)
 
 STEPS_PX, STEP_PX = 236, 452
 """Widths of the two panels: at 1280 px of page, the scene is as wide as the step."""
@@ -68,7 +77,9 @@ class DeviceLayer:
         if projector is not None and rig is not None:
             T_camera_projector = np.eye(4)  # the inverse of X_p = R X_c + t
             T_camera_projector[:3, :3], T_camera_projector[:3, 3] = rig.R.T, -rig.R.T @ rig.t
-            self._scene.device(DEVICES, "projector", rig.projector.K, projector, T_camera_projector, PROJECTOR)
+            self._scene.device(
+                DEVICES, "projector", rig.projector.K, projector, T_camera_projector, PROJECTOR
+            )
 
 
 class Shell:
@@ -78,7 +89,9 @@ class Shell:
         self._gui, self._context = context.gui, context
         self._devices = DeviceLayer(context.scene)
         self._panels: dict[str, StepPanel] = {
-            key: getattr(importlib.import_module(f"slviewer.gui.steps.{key}"), f"{key.title()}Panel")(context)
+            key: getattr(
+                importlib.import_module(f"slviewer.gui.steps.{key}"), f"{key.title()}Panel"
+            )(context)
             for key in (step.key for step in steps)
         }
         self._shown_key = self._autopilot_key = ""
@@ -101,22 +114,39 @@ class Shell:
         gui.main_panel.dock_left()
         gui.main_panel.set_width(STEPS_PX)
         self._step_buttons = {
-            step.key: context.button(f"{number}. {step.title}", partial(self.go, step.key), _ICONS[step.state])
+            step.key: context.button(
+                f"{number}. {step.title}", partial(self.go, step.key), _ICONS[step.state]
+            )
             for number, step in enumerate(steps, 1)
         }
         gui.add_divider()
         self._autopilot = context.button(
-            "Autopilot", self._toggle_autopilot, viser.Icon.PLAYER_PLAY, "teal", visible=False, at_once=True
+            "Autopilot",
+            self._toggle_autopilot,
+            viser.Icon.PLAYER_PLAY,
+            "teal",
+            visible=False,
+            at_once=True,
         )
         self._autopilot_status = Text(gui)
         with gui.add_folder("Session", expand_by_default=True):
             self._session = Text(gui)
-            self._path = gui.add_text("Folder", "", hint="Of another session; created if it does not exist")
-            context.button(
-                "Open session", lambda: context.operator.open_session(self._path.value), viser.Icon.FOLDER_OPEN
+            self._path = gui.add_text(
+                "Folder", "", hint="Of another session; created if it does not exist"
             )
-        links = gui.add_button("Links", icon=viser.Icon.LINK, color="gray", hint="For watching and for the projector")
-        links.on_click(lambda event: context.callback(partial(context.show_links, event.client), at_once=True)(event))
+            context.button(
+                "Open session",
+                lambda: context.operator.open_session(self._path.value),
+                viser.Icon.FOLDER_OPEN,
+            )
+        links = gui.add_button(
+            "Links", icon=viser.Icon.LINK, color="gray", hint="For watching and for the projector"
+        )
+        links.on_click(
+            lambda event: context.callback(partial(context.show_links, event.client), at_once=True)(
+                event
+            )
+        )
         with gui.add_folder("Messages", expand_by_default=True):
             self._busy = Text(gui)
             self._latest = Text(gui)
@@ -133,7 +163,12 @@ class Shell:
             self._problems = Text(gui)
             self._progress = Text(gui)
             self._cancel = context.button(
-                "Cancel", context.operator.cancel, viser.Icon.PLAYER_STOP, "red", visible=False, at_once=True
+                "Cancel",
+                context.operator.cancel,
+                viser.Icon.PLAYER_STOP,
+                "red",
+                visible=False,
+                at_once=True,
             )
             self._next = context.button(
                 "Continue", self._show_next_step, viser.Icon.ARROW_RIGHT, "green", visible=False
@@ -174,7 +209,9 @@ class Shell:
     def _follow_autopilot(self, snapshot: Snapshot) -> None:
         """Show the autopilot's step when it advances to another one."""
         key, keys = autopilot_step(snapshot), ["", *self._panels]
-        onward = keys.index(key) > keys.index(self._autopilot_key)  # between two of its acts it may seem to step back
+        onward = keys.index(key) > keys.index(
+            self._autopilot_key
+        )  # between two of its acts it may seem to step back
         if key != self._autopilot_key and (onward or not key):
             self._autopilot_key = key
             self.go(key)
@@ -195,12 +232,25 @@ class Shell:
         steps = list(snapshot.steps)
         at = next(i for i, step in enumerate(steps) if step.key == self._shown_key)
         step = steps[at]
-        state = {"done": coloured("done", "good"), "ready": "", "blocked": coloured("blocked", "warning")}[step.state]
-        title = f'<div style="font-size:1.25rem;font-weight:600">{at + 1}&ensp;{to_html(step.title)}&ensp;'
+        state = {
+            "done": coloured("done", "good"),
+            "ready": "",
+            "blocked": coloured("blocked", "warning"),
+        }[step.state]
+        title = (
+            "<div"
+            f' style="font-size:1.25rem;font-weight:600">{at + 1}&ensp;{to_html(step.title)}&ensp;'
+        )
         title += f'<span style="font-size:0.8rem">{state}</span>{step_help_link(step.key)}</div>'
-        self._heading.set(paragraph(Html(f"{title}<div style='margin-top:0.2em'>{to_html(step.instruction)}</div>")))
+        self._heading.set(
+            paragraph(
+                Html(f"{title}<div style='margin-top:0.2em'>{to_html(step.instruction)}</div>")
+            )
+        )
         blocked = alert(step.blocked_by, "warning") if step.blocked_by else ""
-        self._problems.set(blocked + "".join(_problem_html(step.key, sentence) for sentence in step.problems))
+        self._problems.set(
+            blocked + "".join(_problem_html(step.key, sentence) for sentence in step.problems)
+        )
         following = steps[at + 1] if at + 1 < len(steps) else None
         ready = step.state == "done" and following is not None and following.state != "blocked"
         if ready and following is not None:
@@ -211,33 +261,48 @@ class Shell:
         """Show the progress of capture and job, and whether it can be cancelled."""
         work = _running_work(snapshot)
         bars = "".join(
-            f'<div style="margin-bottom:0.3em">{to_html(text)}{meter(share, "info")}</div>' for text, share in work
+            f'<div style="margin-bottom:0.3em">{to_html(text)}{meter(share, "info")}</div>'
+            for text, share in work
         )
         self._progress.set(paragraph(Html(bars)) if bars else "")
         job = snapshot.job
         can_cancel = snapshot.rig.capture is not None or bool(job and job.can_cancel)
         change(self._cancel, visible=bool(work) and can_cancel)
-        # repeated beside every step: it must not scroll out of view, nor move what is about to be clicked
+        # repeated beside every step: it must not scroll out of view, nor move what is about to be
+        # clicked
         if bars:
             self._busy.set(paragraph(Html(bars)))
         else:
             self._busy.write(f"{job.stage or job.name} …" if job is not None else "Idle", "dim")
 
     def _draw_session(self, snapshot: Snapshot) -> None:
-        """Show the session's folder, contents and free space, the autopilot and the latest notices."""
+        """Show the session's folder, contents and free space, the autopilot and the latest
+        notices."""
         session, space = snapshot.session, snapshot.space
         if session is None:
-            self._session.set(alert("No session is open: enter a folder.", "warning") + _fault_alerts(snapshot))
+            self._session.set(
+                alert("No session is open: enter a folder.", "warning") + _fault_alerts(snapshot)
+            )
         else:
             lines = [
                 f"<b>{to_html(session.folder.name)}</b>",
                 f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}</span>',
-                f"{format_count(len(session.poses), 'pose')}, {format_count(len(session.scans), 'scan')}",
+                (
+                    f"{format_count(len(session.poses), 'pose')},"
+                    f" {format_count(len(session.scans), 'scan')}"
+                ),
             ]
             if space is not None:
-                needs = f"; a capture needs {format_bytes(space.capture_bytes)}" if space.capture_bytes else ""
+                needs = (
+                    f"; a capture needs {format_bytes(space.capture_bytes)}"
+                    if space.capture_bytes
+                    else ""
+                )
                 lines.append(
-                    coloured(f"{format_bytes(space.free_bytes)} free{needs}", "dim" if space.enough else "error")
+                    coloured(
+                        f"{format_bytes(space.free_bytes)} free{needs}",
+                        "dim" if space.enough else "error",
+                    )
                 )
             self._session.set(paragraph(Html("<br>".join(lines))) + _fault_alerts(snapshot))
         change(
@@ -247,10 +312,14 @@ class Shell:
             color="red" if snapshot.autopilot else "teal",
         )
         self._autopilot_status.set(alert(snapshot.autopilot, "info") if snapshot.autopilot else "")
-        latest = "".join(_notice_html(notice) for notice in reversed(snapshot.notices[-_MOST_NOTICES:]))
+        latest = "".join(
+            _notice_html(notice) for notice in reversed(snapshot.notices[-_MOST_NOTICES:])
+        )
         # as high as a small screen leaves, so that the panel itself does not scroll
         style = "max-height:max(6em, calc(100vh - 665px));overflow-y:auto;overflow-wrap:anywhere"
-        self._latest.set(f'<div style="{style}">{latest or paragraph(coloured("No messages.", "dim"))}</div>')
+        self._latest.set(
+            f'<div style="{style}">{latest or paragraph(coloured("No messages.", "dim"))}</div>'
+        )
 
     # requests
 
@@ -269,7 +338,8 @@ class Shell:
 
 
 def autopilot_step(snapshot: Snapshot) -> str:
-    """Return the key of the autopilot's step, from what it has done so far; empty while it is off."""
+    """Return the key of the autopilot's step, from what it has done so far; empty while it is
+    off."""
     session, world = snapshot.session, snapshot.world
     if not snapshot.autopilot or session is None or world is None:
         return ""
@@ -286,11 +356,16 @@ def autopilot_step(snapshot: Snapshot) -> str:
 
 
 def _object_step(session: SessionView) -> str:
-    """Return the key of the autopilot's step once an object is in place: scan, export or measure."""
+    """Return the key of the autopilot's step once an object is in place: scan, export or
+    measure."""
     latest = next((scan.name for scan in reversed(session.scans) if scan.purpose == "scan"), "")
     if session.merge is None or latest not in session.merge.record.scans:
         return "scan"
-    return "export" if any(measured.source == latest for measured in session.measurements) else "measure"
+    return (
+        "export"
+        if any(measured.source == latest for measured in session.measurements)
+        else "measure"
+    )
 
 
 def notify(client: viser.ClientHandle, level: Level, text: str) -> None:
@@ -321,9 +396,13 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
         work.append((text, capture.frame / max(capture.frames, 1)))
     if job is not None and not job.background:
         waiting = f", {job.waiting} waiting" if job.waiting else ""
-        work.append((f"{job.name}: {job.stage or 'starting'}{waiting} ({job.seconds:.0f} s)", job.share))
+        work.append(
+            (f"{job.name}: {job.stage or 'starting'}{waiting} ({job.seconds:.0f} s)", job.share)
+        )
     if snapshot.preparing is not None:
-        text = f"Preparing, {100 * snapshot.preparing:.0f} %: first steps may take longer until then"
+        text = (
+            f"Preparing, {100 * snapshot.preparing:.0f} %: first steps may take longer until then"
+        )
         work.append((text, snapshot.preparing))
     return work
 
@@ -332,7 +411,9 @@ def _fault_alerts(snapshot: Snapshot) -> str:
     """Return the HTML of what could not be read of the session, as alerts."""
     faults = list(snapshot.session.faults) if snapshot.session is not None else []
     if len(faults) > _MOST_FAULTS:
-        faults[_MOST_FAULTS:] = [f"{len(faults) - _MOST_FAULTS} more files are damaged: `slviewer inspect` lists them."]
+        faults[_MOST_FAULTS:] = [
+            f"{len(faults) - _MOST_FAULTS} more files are damaged: `slviewer inspect` lists them."
+        ]
     stated = [snapshot.read_failure, *faults] if snapshot.read_failure else faults
     return "".join(alert(fault, "error") for fault in stated)
 

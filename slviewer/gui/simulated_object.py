@@ -16,7 +16,8 @@ _GIZMO = "simulated object"
 
 
 class SimulatedObject:
-    """Inputs that place and move an object in front of the simulated rig; hidden with real devices."""
+    """Inputs that place and move an object in front of the simulated rig; hidden with real
+    devices."""
 
     def __init__(self, context: PanelContext, layer: str, things: Sequence[str]) -> None:
         self._context, self._layer, self._things = context, layer, tuple(things)
@@ -27,9 +28,13 @@ class SimulatedObject:
             self._note = Text(gui)
             self._thing: Any = gui.add_dropdown("Object", (_OTHER, *self._things))
             hint = "From the camera"
-            self._distance = gui.add_number("Depth, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0, hint=hint)
+            self._distance = gui.add_number(
+                "Depth, mm", 600.0, min=NEAREST_MM, max=FARTHEST_MM, step=5.0, hint=hint
+            )
             self._turn = gui.add_number("Turn, °", 0.0, min=-90.0, max=90.0, step=5.0)
-            self._handles = gui.add_checkbox("3D handles", False, hint="To move and turn it in the 3D view")
+            self._handles = gui.add_checkbox(
+                "3D handles", False, hint="To move and turn it in the 3D view"
+            )
         self._values = [SessionValue(each) for each in (self._thing, self._distance, self._turn)]
         self._thing.on_update(context.callback(self._request_choice, by_user=True))
         self._handles.on_update(context.callback(self._draw_handles))
@@ -45,7 +50,10 @@ class SimulatedObject:
             self._draw_handles()
             return
         fits = world.standing in self._things
-        self._note.write("" if fits else f"In view: the {world.standing}. Choose an object to capture.", "warning")
+        self._note.write(
+            "" if fits else f"In view: the {world.standing}. Choose an object to capture.",
+            "warning",
+        )
         for number in (self._distance, self._turn):
             change(number, disabled=not fits)
         self._standing, self._T = world.standing if fits else "", world.T_camera_object
@@ -79,12 +87,17 @@ class SimulatedObject:
             self._context.operator.place(self._thing.value)
 
     def _make_number_callback(self, number: Any, what: str) -> Callable[[Any], None]:
-        """Return a callback that moves the object by a number entered in a browser, if it is within its limits."""
+        """Return a callback that moves the object by a number entered in a browser, if it is within
+        its limits."""
 
         def changed(event: Any) -> None:
             """Move the object, if a browser has set a valid number."""
             if event.client_id is not None and number.min <= number.value <= number.max:
-                value = number.value  # read now: an older snapshot may be drawn over it before the callback's turn
-                self._context.callback(lambda: self._context.operator.move_object(**{what: value}))(event)
+                value = (
+                    number.value
+                )  # read now: an older snapshot may be drawn over it before the callback's turn
+                self._context.callback(lambda: self._context.operator.move_object(**{what: value}))(
+                    event
+                )
 
         return changed

@@ -6,11 +6,13 @@ import numpy as np
 import viser
 
 _FROM = np.array([-0.45, -0.35, -0.82])
-"""Viewing direction: from the upper left of the camera, so that depth is visible and nothing is upside down."""
+"""Viewing direction: from the upper left of the camera, so that depth is visible and nothing is
+upside down."""
 TO_THE_RIGHT = np.cross([0.0, 1.0, 0.0], -_FROM) / np.linalg.norm(_FROM[[0, 2]])
 """(3,): to the right in that view, at the same distance."""
 OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
-"""Camera position and target, mm: the rig and objects at its working distance, in a narrow window too."""
+"""Camera position and target, mm: the rig and objects at its working distance, in a narrow window
+too."""
 FIELD_OF_VIEW = 0.75  # rad
 
 
@@ -29,7 +31,8 @@ class Viewpoints:
                 _set_view(client, *(np.array(each) for each in OVERVIEW))
 
     def show(self, name: str, points: np.ndarray | None) -> None:
-        """Move all views to the points (..., 3) mm, unless those of the same `name` are shown already."""
+        """Move all views to the points (..., 3) mm, unless those of the same `name` are shown
+        already."""
         if points is None or name == self._shown:
             return
         self._shown = name
@@ -45,7 +48,9 @@ def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
         return
     low, high = np.percentile(flat, [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)  # the field of view is that of the height
+    away = max(
+        1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0
+    )  # the field of view is that of the height
     _set_view(client, middle + _FROM * away, middle)
 
 

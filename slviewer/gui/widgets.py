@@ -1,7 +1,7 @@
 """HTML for panels: coloured text, alerts, tables, pictures with a legend, colour scales.
 
-HTML uses viser's own colours, so that it is readable in the light and in the dark theme. Texts given to `to_html`,
-`table` and `Text.write` are escaped here; a `Html` is used as it is.
+HTML uses viser's own colours, so that it is readable in the light and in the dark theme. Texts
+given to `to_html`, `table` and `Text.write` are escaped here; a `Html` is used as it is.
 """
 
 import base64
@@ -28,7 +28,8 @@ PICTURE_PX = 720
 """Width at which pictures are sent: viser shrinks a picture to its panel but never enlarges it."""
 
 _UNIT = re.compile(
-    r"(?<=\d) (?=(?:mm|px|ms|µm|rad|ppm|kB|MB|GB|s|x \d|&#37;|&#176;|&#215;|&#181;m)(?![a-z]))|(?<=&#177;) (?=\d)"
+    r"(?<=\d) (?=(?:mm|px|ms|µm|rad|ppm|kB|MB|GB|s|x"
+    r" \d|&#37;|&#176;|&#215;|&#181;m)(?![a-z]))|(?<=&#177;) (?=\d)"
 )
 """The space between a figure and its unit, in escaped text."""
 
@@ -60,11 +61,16 @@ class Html(str):
 
 
 def to_html(text: object) -> Html:
-    """Escape any text as HTML, without line breaks between a figure and its unit; HTML stays as it is.
+    """Escape any text as HTML, without line breaks between a figure and its unit; HTML stays as it
+    is.
 
     Passwords in addresses are hidden: whoever watches reads this too.
     """
-    return text if isinstance(text, Html) else Html(_UNIT.sub("&#160;", escape(hide_passwords(str(text)))))
+    return (
+        text
+        if isinstance(text, Html)
+        else Html(_UNIT.sub("&#160;", escape(hide_passwords(str(text)))))
+    )
 
 
 def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
@@ -75,29 +81,43 @@ def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
 
 def paragraph(content: object) -> Html:
     """Return HTML with the margins of viser's inputs."""
-    return Html(f'<div style="padding:0 0.75em 0.5em;font-size:0.875em;line-height:1.45">{to_html(content)}</div>')
+    return Html(
+        '<div style="padding:0 0.75em'
+        f' 0.5em;font-size:0.875em;line-height:1.45">{to_html(content)}</div>'
+    )
 
 
 def alert(content: object, tone: Tone) -> Html:
     """Return a box in a tone's colour, for a message that must not be overlooked."""
-    style = f"background:{_BOXES[tone]};border-left:3px solid {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
+    style = (
+        f"background:{_BOXES[tone]};border-left:3px solid"
+        f" {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
+    )
     return paragraph(Html(f'<div style="{style}">{to_html(content)}</div>'))
 
 
-def table(titles: Sequence[object], rows: Sequence[Sequence[object]], aligned: Sequence[str] = ()) -> Html:
-    """Return a table: by default the first column left-aligned, the others right-aligned and without line breaks."""
+def table(
+    titles: Sequence[object], rows: Sequence[Sequence[object]], aligned: Sequence[str] = ()
+) -> Html:
+    """Return a table: by default the first column left-aligned, the others right-aligned and
+    without line breaks."""
 
     def line(tag: str, cells: Sequence[object], style: str) -> str:
         """Return one row of cells with this HTML tag and style."""
         sides = aligned or ["left", *["right"] * (len(cells) - 1)]
-        sides = [f"{side}{';white-space:nowrap' * (tag == 'td' and side == 'right')}" for side in sides]
+        sides = [
+            f"{side}{';white-space:nowrap' * (tag == 'td' and side == 'right')}" for side in sides
+        ]
         return "".join(
-            f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em 0.6em;{style}">{to_html(c)}</{tag}>'
+            f'<{tag} style="text-align:{side};padding:0.2em 0 0.2em'
+            f' 0.6em;{style}">{to_html(c)}</{tag}>'
             for side, c in zip(sides, cells, strict=True)
         )
 
     head = line("th", titles, f"color:{_TONES['dim']};font-weight:600;vertical-align:bottom")
-    rule = "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
+    rule = (
+        "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
+    )
     body = "".join(f"<tr>{line('td', row, rule)}</tr>" for row in rows)
     return paragraph(
         Html(f'<div style="overflow-x:auto"><table style="width:100%;border-collapse:collapse">'
@@ -109,10 +129,17 @@ def report_table(shown: Table) -> Html:
     """Return a table of figures without its details, with its notes."""
     tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
     shown = shown.select([column for column in shown.columns if not column.detail])
-    titles = [f"{c.title[:1].upper()}{c.title[1:]}{c.unit and f', {c.unit}'}" for c in shown.columns]
-    titles = [title.replace("-", NO_BREAK_HYPHEN) for title in titles]  # a line ends between words, in any font
+    titles = [
+        f"{c.title[:1].upper()}{c.title[1:]}{c.unit and f', {c.unit}'}" for c in shown.columns
+    ]
+    titles = [
+        title.replace("-", NO_BREAK_HYPHEN) for title in titles
+    ]  # a line ends between words, in any font
     rows = [
-        [coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong")) for _, text, mark in line]
+        [
+            coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))
+            for _, text, mark in line
+        ]
         for line in shown.format([*shown.rows, *shown.footer])
     ]
     caption = paragraph(coloured(shown.caption, "plain", bold=True)) if shown.caption else Html("")
@@ -122,10 +149,14 @@ def report_table(shown: Table) -> Html:
 
 
 def records_html(
-    found: Sequence[Stored[Any]], labels: Mapping[str, str] = MappingProxyType({}), *, named: bool = True
+    found: Sequence[Stored[Any]],
+    labels: Mapping[str, str] = MappingProxyType({}),
+    *,
+    named: bool = True,
 ) -> Html:
-    """Return the tables of records of one kind, with the operator's ``labels`` for names of captures; a warning names
-    those that are stale. Not ``named``: of one record, whose name stands above."""
+    """Return the tables of records of one kind, with the operator's ``labels`` for names of
+    captures; a warning names those that are stale. Not ``named``: of one record, whose name stands
+    above."""
     if not found:
         return Html("")
     tables = type(found[0].record).tables(name_records(found))
@@ -135,26 +166,36 @@ def records_html(
         tables = [replace(each.without_constant(), caption="") for each in tables]
     html = "".join(map(report_table, tables))
     if stale := ", ".join(each.label for each in found if each.stale):
-        html += paragraph(coloured(f"Out of date, made from what has changed since: {stale}.", "warning"))
+        html += paragraph(
+            coloured(f"Out of date, made from what has changed since: {stale}.", "warning")
+        )
     return Html(html)
 
 
 def relabel(shown: Table, labels: Mapping[str, str]) -> Table:
     """Return a table with the operator's labels for the names of captures."""
-    rows = [[use_labels(cell, labels) if isinstance(cell, str) else cell for cell in row] for row in shown.rows]
+    rows = [
+        [use_labels(cell, labels) if isinstance(cell, str) else cell for cell in row]
+        for row in shown.rows
+    ]
     return replace(shown, rows=rows, notes=[use_labels(note, labels) for note in shown.notes])
 
 
 def use_labels(sentence: str, labels: Mapping[str, str]) -> str:
     """Replace the captures' names in a sentence by the operator's labels."""
     names = [re.escape(name) for name, label in labels.items() if label != name]
-    return re.sub(rf"(?<![\w.-])({'|'.join(names)})(?![\w-])", lambda m: labels[m[1]], sentence) if names else sentence
+    return (
+        re.sub(rf"(?<![\w.-])({'|'.join(names)})(?![\w-])", lambda m: labels[m[1]], sentence)
+        if names
+        else sentence
+    )
 
 
 def link(address: str, text: str) -> Html:
     """Return a button-like link that downloads the file at this address of the server."""
     style = (
-        "display:inline-block;padding:0.35em 0.9em;border-radius:4px;text-decoration:none;font-weight:600;"
+        "display:inline-block;padding:0.35em"
+        " 0.9em;border-radius:4px;text-decoration:none;font-weight:600;"
         "background:var(--mantine-primary-color-filled);color:#fff"
     )
     return Html(f'<a href="{to_html(address)}" download style="{style}">{to_html(text)}</a>')
@@ -176,7 +217,8 @@ def meter(share: float, tone: Tone = "good") -> Html:
     width = 100 * min(max(share, 0.0), 1.0)
     return Html(
         '<div style="height:6px;border-radius:3px;background:var(--mantine-color-gray-light)">'
-        f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:{_TONES[tone]}"></div></div>'
+        "<div"
+        f' style="height:6px;border-radius:3px;width:{width:.0f}%;background:{_TONES[tone]}"></div></div>'
     )
 
 
@@ -196,7 +238,8 @@ class Text:
                 self._handle.visible = bool(content)
 
     def write(self, text: str, tone: Tone = "plain") -> None:
-        """Show a sentence, in a box where its tone requires attention; hide it where it is empty."""
+        """Show a sentence, in a box where its tone requires attention; hide it where it is
+        empty."""
         if not text:
             self.set("")
         elif tone in ("plain", "dim"):
@@ -208,14 +251,19 @@ class Text:
 class Picture:
     """An image in a panel with a legend below, hidden until there is one."""
 
-    def __init__(self, gui: viser.GuiApi, label: str | None = None, *, width_px: int = PICTURE_PX) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, label: str | None = None, *, width_px: int = PICTURE_PX
+    ) -> None:
         self._width = width_px
         empty = np.full((3 * width_px // 4, width_px, 3), 128, np.uint8)
-        self._image = gui.add_image(empty, label=label, format="jpeg", jpeg_quality=80, visible=False)
+        self._image = gui.add_image(
+            empty, label=label, format="jpeg", jpeg_quality=80, visible=False
+        )
         self._legend = Text(gui)
 
     def set(self, image: np.ndarray, legend: str = "") -> None:
-        """Show an image (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML, empty: none)."""
+        """Show an image (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML,
+        empty: none)."""
         self._image.image = fitted(image, self._width)
         if not self._image.visible:
             self._image.visible = True
@@ -229,7 +277,8 @@ class Picture:
 
 
 class Sound:
-    """Plays short tones in the browsers that show the page; silent until someone has clicked in them."""
+    """Plays short tones in the browsers that show the page; silent until someone has clicked in
+    them."""
 
     _TONES_HZ: ClassVar[dict[str, tuple[float, ...]]] = {
         "tick": (880.0,),
@@ -246,7 +295,9 @@ class Sound:
         """Play a tone once in every browser."""
         self._count += 1
         data = base64.b64encode(_encode_wav(self._TONES_HZ[name])).decode()
-        self._handle.content = f'<audio autoplay data-n="{self._count}" src="data:audio/wav;base64,{data}"></audio>'
+        self._handle.content = (
+            f'<audio autoplay data-n="{self._count}" src="data:audio/wav;base64,{data}"></audio>'
+        )
 
 
 def _encode_wav(tones_hz: Sequence[float]) -> bytes:
@@ -270,14 +321,19 @@ def fitted(image: np.ndarray, width_px: int = PICTURE_PX) -> np.ndarray:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     height, width = image.shape[:2]
     how = cv2.INTER_AREA if width > width_px else cv2.INTER_LINEAR
-    return cv2.resize(image, (width_px, max(1, round(height * width_px / width))), interpolation=how)
+    return cv2.resize(
+        image, (width_px, max(1, round(height * width_px / width))), interpolation=how
+    )
 
 
 _COLOUR_MAPS = {"value": "viridis", "error": "RdBu_r"}  # an error's: blue below, red above
 
 
 def colours(
-    values: NDArray[np.floating], low: float, high: float, scale: Literal["value", "error"] = "value"
+    values: NDArray[np.floating],
+    low: float,
+    high: float,
+    scale: Literal["value", "error"] = "value",
 ) -> NDArray[np.uint8]:
     """Map values (...) to colours (..., 3) uint8 RGB over low ... high; middle grey where NaN."""
     from matplotlib import colormaps
@@ -288,30 +344,39 @@ def colours(
 
 
 def colour_bar(
-    low: str, high: str, scale: Literal["value", "error"] | NDArray[np.uint8] = "value", title: str = ""
+    low: str,
+    high: str,
+    scale: Literal["value", "error"] | NDArray[np.uint8] = "value",
+    title: str = "",
 ) -> Html:
-    """Return the legend of a colour scale, that of `colours` or colours (n, 3), from `low` to `high` with units."""
+    """Return the legend of a colour scale, that of `colours` or colours (n, 3), from `low` to
+    `high` with units."""
     palette = colours(np.linspace(0, 1, 9), 0, 1, scale) if isinstance(scale, str) else scale
     stops = ",".join("rgb({},{},{})".format(*colour) for colour in palette)
     return paragraph(
         Html(
             f'<div style="display:flex;gap:0.6em;align-items:center"><span>{to_html(low)}</span>'
-            f'<div style="flex:1;height:10px;border-radius:3px;background:linear-gradient(90deg,{stops})"></div>'
+            "<div"
+            f' style="flex:1;height:10px;border-radius:3px;background:linear-gradient(90deg,{stops})"></div>'
             f"<span>{to_html(high)}</span></div>"
             + (f'<div style="text-align:center">{to_html(title)}</div>' if title else "")
         )
     )
 
 
-def paint(values: NDArray[np.floating], unit: str, digits: int, title: str) -> tuple[NDArray[np.uint8], Html]:
-    """Return (colours (..., 3) of values (...), their legend), from the 1st to the 99th percentile; grey where NaN."""
+def paint(
+    values: NDArray[np.floating], unit: str, digits: int, title: str
+) -> tuple[NDArray[np.uint8], Html]:
+    """Return (colours (..., 3) of values (...), their legend), from the 1st to the 99th percentile;
+    grey where NaN."""
     low, high = colour_range(values)
     bar = colour_bar(f"{low:.{digits}f} {unit}", f"{high:.{digits}f} {unit}", "value", title)
     return colours(values, low, high), bar
 
 
 def colour_range(values: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the limits of a colour scale: 1st and 99th percentile of the finite values; (0, 1) without any."""
+    """Return the limits of a colour scale: 1st and 99th percentile of the finite values; (0, 1)
+    without any."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 1.0

@@ -1,1 +1,2 @@
-"""Reading dimensions off a surface: fitted shapes, distances, sections, and deviation from a nominal model."""
+"""Reading dimensions off a surface: fitted shapes, distances, sections, and deviation from a
+nominal model."""

@@ -7,10 +7,19 @@ from slviewer.errors import InputError
 EXCLUDED_COLOUR = (150, 154, 160)
 _AT = np.array([-1.0, -0.6, -0.25, 0.0, 0.25, 0.6, 1.0])
 _RGB = np.array(
-    [(26, 54, 140), (48, 126, 208), (150, 205, 232), (236, 238, 226), (250, 205, 120), (232, 112, 52), (150, 18, 38)],
+    [
+        (26, 54, 140),
+        (48, 126, 208),
+        (150, 205, 232),
+        (236, 238, 226),
+        (250, 205, 120),
+        (232, 112, 52),
+        (150, 18, 38),
+    ],
     np.float64,
 )
-"""From too little (blue) through none (near white) to too much (red): distinguishable with any colour vision."""
+"""From too little (blue) through none (near white) to too much (red): distinguishable with any
+colour vision."""
 
 
 def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:
@@ -24,7 +33,8 @@ def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:
 
 
 def colour_limit(signed: np.ndarray, tolerance_mm: float | None = None) -> float:
-    """Return half the range of the colour scale, mm: the tolerance, or the value that contains 99.5 % of the points."""
+    """Return half the range of the colour scale, mm: the tolerance, or the value that contains 99.5
+    % of the points."""
     if tolerance_mm is not None:
         return tolerance_mm
     known = np.abs(signed[np.isfinite(signed)])

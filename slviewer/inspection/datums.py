@@ -1,4 +1,5 @@
-"""The 3-2-1 alignment: part coordinates from three features, with the uncertainty that these give them."""
+"""The 3-2-1 alignment: part coordinates from three features, with the uncertainty that these give
+them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,11 +18,13 @@ MIN_SINE = 0.17
 
 
 def datum_frame(features: Sequence[Feature]) -> np.ndarray:
-    """T_part_measured (4, 4) of three datums: the primary, a plane, is z = 0 with z along its normal.
+    """T_part_measured (4, 4) of three datums: the primary, a plane, is z = 0 with z along its
+    normal.
 
-    The secondary is a plane (x = 0, x along its normal), and then the tertiary a plane (y = 0) or a sphere or cylinder
-    (y = 0 through its place); or both are spheres or cylinders, and x runs from the secondary's place, the origin, to
-    the tertiary's. Raises InputError for others, or where they do not fix a frame.
+    The secondary is a plane (x = 0, x along its normal), and then the tertiary a plane (y = 0) or a
+    sphere or cylinder (y = 0 through its place); or both are spheres or cylinders, and x runs from
+    the secondary's place, the origin, to the tertiary's. Raises InputError for others, or where
+    they do not fix a frame.
     """
     primary, secondary, tertiary = features
     if primary.kind != "plane":
@@ -53,8 +56,8 @@ def datum_frame(features: Sequence[Feature]) -> np.ndarray:
 
 
 def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
-    """Covariance of the part coordinates of `datum_frame`, about ``middle`` (3,) mm in part coordinates; the errors of
-    the datums are taken as independent of each other."""
+    """Covariance of the part coordinates of `datum_frame`, about ``middle`` (3,) mm in part
+    coordinates; the errors of the datums are taken as independent of each other."""
     features = [fit.feature for fit in fits]
     T = datum_frame(features)
     back = np.linalg.inv(T)
@@ -63,7 +66,10 @@ def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
         columns = []
         for each in np.eye(fit.feature.parameters):
             step = 1e-6
-            moved = datum_frame([*features[:k], features[k].moved(step * each), *features[k + 1 :]]) @ back
+            moved = (
+                datum_frame([*features[:k], features[k].moved(step * each), *features[k + 1 :]])
+                @ back
+            )
             shift = move_points(moved, middle[None])[0] - middle
             turn = moved[[2, 0, 1], [1, 2, 0]] - moved[[1, 2, 0], [2, 0, 1]]
             columns.append(np.concatenate([turn / 2, shift]) / step)
@@ -73,11 +79,14 @@ def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
 
 
 def face_towards(fit: FeatureFit, side: np.ndarray) -> FeatureFit:
-    """The fit with a plane's normal turned to the half-space of a direction ``side`` (3,); others unchanged."""
+    """The fit with a plane's normal turned to the half-space of a direction ``side`` (3,); others
+    unchanged."""
     f = fit.feature
     if f.kind != "plane" or f.unit_direction @ side >= 0:
         return fit
-    sign = np.array([1.0, -1.0, -1.0])  # the second tangent stays, the first and the normal are reversed
+    sign = np.array(
+        [1.0, -1.0, -1.0]
+    )  # the second tangent stays, the first and the normal are reversed
     spread = fit.spread
     shared = None if spread.shared is None else spread.shared * sign
     turned = Spread(spread.scatter * np.outer(sign, sign), shared, spread.calibration)

@@ -17,28 +17,32 @@ from slviewer.registration.pairwise import Registration
 from slviewer.surface.shapes import Mesh
 
 REACH = 0.02
-"""Of the nominal's diagonal: scan points farther from it belong to something else, a table or a clamp."""
+"""Of the nominal's diagonal: scan points farther from it belong to something else, a table or a
+clamp."""
 NOISE_REACH = 10.0
 COVERAGE_SAMPLES = 20_000
 MAX_ALIGNED_POINTS = 60_000
 MAX_FEET = 400_000
 SPACINGS = 3.0
-"""A place on the nominal was measured if a scan point's foot is no farther than so many of their spacings."""
+"""A place on the nominal was measured if a scan point's foot is no farther than so many of their
+spacings."""
 MAX_ITERATIONS = 40
 MIN_NORMAL_COSINE = 0.5
-"""Cosine: a scan point whose normal is turned away further from the nominal's lies on something else there."""
+"""Cosine: a scan point whose normal is turned away further from the nominal's lies on something
+else there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Deviation:
     """A scan's points against a nominal model.
 
-    ``signed`` (n,) float32 mm: of each scan point, positive outside the nominal; NaN for points farther than
-    ``reach_mm``, or that face another way. ``T_nominal_scan`` (4, 4) is the best fit; ``normals`` (n, 3) the nominal's
-    where each point's nearest place is, in the scan's frame, NaN likewise. ``coverage``: share of the nominal's area
-    that was measured; ``uncovered`` (k, 3) mm: places of the rest, in the scan's frame. ``alignment_mm``: standard
-    uncertainty that the best fit adds to a point, RMS over the points; ``alignment_spread`` its covariance, in
-    the nominal's frame.
+    ``signed`` (n,) float32 mm: of each scan point, positive outside the nominal; NaN for points
+    farther than ``reach_mm``, or that face another way. ``T_nominal_scan`` (4, 4) is the best fit;
+    ``normals`` (n, 3) the nominal's where each point's nearest place is, in the scan's frame, NaN
+    likewise. ``coverage``: share of the nominal's area that was measured; ``uncovered`` (k, 3) mm:
+    places of the rest, in the scan's frame. ``alignment_mm``: standard uncertainty that the best
+    fit adds to a point, RMS over the points; ``alignment_spread`` its covariance, in the nominal's
+    frame.
     """
 
     signed: np.ndarray
@@ -57,9 +61,10 @@ class Deviation:
         return np.isfinite(self.signed)
 
     def statistics(self) -> dict[str, float]:
-        """Of the points that belong to the nominal, mm: ``mean``, ``rms``, ``sigma`` about the mean, ``within_95`` (95
-        % are off by less), ``lowest`` and ``highest``, and ``p_low``, ``p_high``, between which 99.7 % lie; and the
-        numbers of ``points`` used and ``left_out``."""
+        """Of the points that belong to the nominal, mm: ``mean``, ``rms``, ``sigma`` about the
+        mean, ``within_95`` (95 % are off by less), ``lowest`` and ``highest``, and ``p_low``,
+        ``p_high``, between which 99.7 % lie; and the numbers of ``points`` used and
+        ``left_out``."""
         values = self.signed[self.counted].astype(np.float64)
         low, high = np.percentile(values, [0.15, 99.85])
         return {
@@ -76,7 +81,8 @@ class Deviation:
         }
 
     def histogram(self, bins: int = 81) -> tuple[np.ndarray, np.ndarray]:
-        """Edges (bins + 1,) mm, symmetric about 0, and counts (bins,); values beyond 99.8 % are excluded."""
+        """Edges (bins + 1,) mm, symmetric about 0, and counts (bins,); values beyond 99.8 % are
+        excluded."""
         values = self.signed[self.counted]
         limit = max(float(np.percentile(np.abs(values), 99.8)), 1e-6)
         edges = np.linspace(-limit, limit, bins + 1)
@@ -105,15 +111,18 @@ def deviation(
 ) -> Deviation:
     """Align scan points (n, 3) mm with a nominal model, and return the signed distance of each.
 
-    ``normals`` (n, 3) of the scan, towards the camera, NaN where unknown: what faces another way than the nominal is
-    excluded by them. ``sigma_mm``: the expected error of one point. ``reach_mm``: points farther off the nominal
-    belong to something else; by default 2 % of its diagonal, never below ten times the noise. ``initial`` (4, 4) scan
-    to nominal: replaces the search. Raises SlviewerError where the two cannot be aligned with trust.
+    ``normals`` (n, 3) of the scan, towards the camera, NaN where unknown: what faces another way
+    than the nominal is excluded by them. ``sigma_mm``: the expected error of one point.
+    ``reach_mm``: points farther off the nominal belong to something else; by default 2 % of its
+    diagonal, never below ten times the noise. ``initial`` (4, 4) scan to nominal: replaces the
+    search. Raises SlviewerError where the two cannot be aligned with trust.
     """
     report = progress or (lambda share: None)
     points = np.asarray(points, np.float64)
     if not len(points) or not np.isfinite(points).all():
-        raise InputError("The scan has no points, or some that are not finite: give its measured points alone.")
+        raise InputError(
+            "The scan has no points, or some that are not finite: give its measured points alone."
+        )
     surface = NominalSurface(nominal)
     if reach_mm is None:
         reach_mm = max(REACH * surface.diagonal, NOISE_REACH * (sigma_mm or 0.0))
@@ -132,7 +141,8 @@ def deviation(
     counted = np.isfinite(signed)
     if not counted.any():
         raise InputError(
-            f"No point of the scan lies within {reach_mm:.3g} mm of the nominal model: does it show that part?"
+            f"No point of the scan lies within {reach_mm:.3g} mm of the nominal model: does it show"
+            " that part?"
         )
     report(0.95)
     feet = move_points(T, points[counted]) - signed[counted, None] * towards[counted]
@@ -153,9 +163,14 @@ def deviation(
 
 
 def _signed_distances(
-    points: np.ndarray, normals: np.ndarray | None, surface: NominalSurface, T: np.ndarray, reach: float
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    surface: NominalSurface,
+    T: np.ndarray,
+    reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to it."""
+    """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to
+    it."""
     away, towards = surface.signed(move_points(T, points))
     belongs = np.abs(away) <= reach
     if normals is not None:
@@ -174,8 +189,9 @@ def _refine_best_fit(
     reach: float,
     report: Callable[[float], None],
 ) -> tuple[np.ndarray, float, RigidSpread]:
-    """The pose of least squared distances of the points that belong to the nominal, by Gauss-Newton, the standard
-    uncertainty, mm, that its own gives the points, and its covariance."""
+    """The pose of least squared distances of the points that belong to the nominal, by
+    Gauss-Newton, the standard uncertainty, mm, that its own gives the points, and its
+    covariance."""
     step = -(-len(points) // MAX_ALIGNED_POINTS)
     points = points[::step]
     normals = None if normals is None else normals[::step]
@@ -186,8 +202,8 @@ def _refine_best_fit(
         counted = np.isfinite(away)
         if np.count_nonzero(counted) < 100:
             raise InputError(
-                f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of the nominal model: "
-                "does it show that part?"
+                f"Only {np.count_nonzero(counted)} points of the scan lie within {reach:.3g} mm of"
+                " the nominal model: does it show that part?"
             )
         moved = move_points(T, points[counted])
         middle = moved.mean(axis=0)
@@ -198,12 +214,16 @@ def _refine_best_fit(
         if np.abs(J @ change).max() < 1e-5:
             break
     covariance = scatter_covariance(moved, J, away[counted])
-    return T, float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean())), RigidSpread(middle, covariance)
+    return (
+        T,
+        float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean())),
+        RigidSpread(middle, covariance),
+    )
 
 
 def _measure_coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:
-    """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest. ``feet`` (n, 3): where
-    on the nominal the scan's points were measured."""
+    """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest.
+    ``feet`` (n, 3): where on the nominal the scan's points were measured."""
     places, _ = surface.sample(COVERAGE_SAMPLES, seed=1)
     thin = feet[:: -(-len(feet) // MAX_FEET)]
     tree = cKDTree(thin)

@@ -14,13 +14,14 @@ KINDS: tuple[Kind, ...] = ("point", "plane", "sphere", "cylinder")
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """A point (``place``); a plane (``place`` on it, in the middle of what was measured, unit normal ``direction``); a
-    sphere (centre, ``radius``); a cylinder (``place`` on its axis, in the middle of what was measured, unit
-    ``direction``, ``radius``). mm.
+    """A point (``place``); a plane (``place`` on it, in the middle of what was measured, unit
+    normal ``direction``); a sphere (centre, ``radius``); a cylinder (``place`` on its axis, in the
+    middle of what was measured, unit ``direction``, ``radius``). mm.
 
-    Its parameters, by which it can be ``moved``: of a point and a sphere the shift of ``place`` (3), of a sphere then
-    that of the radius; of a plane the tilt of its normal towards two directions across (rad) and its shift along the
-    normal; of a cylinder the tilts of its axis, its shifts across, and that of its radius.
+    Its parameters, by which it can be ``moved``: of a point and a sphere the shift of ``place``
+    (3), of a sphere then that of the radius; of a plane the tilt of its normal towards two
+    directions across (rad) and its shift along the normal; of a cylinder the tilts of its axis, its
+    shifts across, and that of its radius.
     """
 
     kind: Kind
@@ -29,8 +30,8 @@ class Feature:
     radius: float | None = None
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return distances (n,) mm of points (n, 3) from the feature: from a plane signed by the normal, else positive
-        outwards."""
+        """Return distances (n,) mm of points (n, 3) from the feature: from a plane signed by the
+        normal, else positive outwards."""
         offsets = np.asarray(points, np.float64) - self.place
         if self.kind == "plane":
             return offsets @ self.unit_direction
@@ -68,7 +69,9 @@ class Feature:
         if self.kind == "plane":
             return replace(self, place=self.place + step[2] * self.unit_direction, direction=tilted)
         assert self.radius is not None
-        return replace(self, place=self.place + step[2:4] @ e, direction=tilted, radius=self.radius + step[4])
+        return replace(
+            self, place=self.place + step[2:4] @ e, direction=tilted, radius=self.radius + step[4]
+        )
 
     @property
     def parameters(self) -> int:
@@ -83,7 +86,8 @@ class Feature:
         return self.direction
 
     def _across(self, offsets: np.ndarray) -> np.ndarray:
-        """Return the offsets (n, 3) from the feature's place, for a cylinder only their part across the axis."""
+        """Return the offsets (n, 3) from the feature's place, for a cylinder only their part across
+        the axis."""
         if self.kind != "cylinder":
             return offsets
         return offsets - (offsets @ self.unit_direction)[..., None] * self.unit_direction
@@ -96,6 +100,7 @@ class Feature:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross product (3,) of two vectors (3,); `numpy.cross` takes ten times as long for so few."""
+    """Return the cross product (3,) of two vectors (3,); `numpy.cross` takes ten times as long for
+    so few."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])

@@ -1,4 +1,5 @@
-"""Planes, spheres and cylinders fitted to a selected region, with their uncertainty, or refused where none fits."""
+"""Planes, spheres and cylinders fitted to a selected region, with their uncertainty, or refused
+where none fits."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,9 +27,11 @@ MAX_COMPARED_POINTS = 2_000
 MAX_EXCLUDED_SHARE = 0.4
 """Share of a region that may lie off the shape; beyond it the region holds something else."""
 MAX_RMS_RISE = 0.005
-"""Distance from a plane (1 sigma), as a share of the region's size, from which on a region that bends is no plane."""
+"""Distance from a plane (1 sigma), as a share of the region's size, from which on a region that
+bends is no plane."""
 RIVAL_RATIO = 2.0
-"""Another shape must leave this many times less before a region is said to hold that one instead."""
+"""Another shape must leave this many times less before a region is said to hold that one
+instead."""
 MAX_RADIUS_RATIO = 100.0
 """Times the region's size: a cylinder of a larger radius is a plane."""
 MAX_RADIUS_SIGMA = 0.1
@@ -39,8 +42,9 @@ MAX_RADIUS_SIGMA = 0.1
 class FeatureFit:
     """A fitted feature and its residuals, mm.
 
-    ``rms`` and ``maximum`` (signed, the one farthest off) over the points used; ``form``: width of the narrowest range
-    that holds 95 % of their deviations; ``used`` and ``left_out`` count points; ``warnings``: sentences.
+    ``rms`` and ``maximum`` (signed, the one farthest off) over the points used; ``form``: width of
+    the narrowest range that holds 95 % of their deviations; ``used`` and ``left_out`` count points;
+    ``warnings``: sentences.
     """
 
     feature: Feature
@@ -53,12 +57,15 @@ class FeatureFit:
     warnings: tuple[str, ...] = ()
 
     def quantities(self) -> list[Quantity]:
-        """Return radius, diameter, form error and residuals of the feature, with uncertainties where known."""
+        """Return radius, diameter, form error and residuals of the feature, with uncertainties
+        where known."""
         f, covariance = self.feature, self.spread.covariance
         known = self.spread.shared is not None
         listed: list[Quantity] = []
         if f.radius is not None:
-            sigma = propagate_covariance(lambda step: float(f.moved(step).radius or 0.0), covariance)
+            sigma = propagate_covariance(
+                lambda step: float(f.moved(step).radius or 0.0), covariance
+            )
             listed.append(Quantity("radius", f.radius, "mm", sigma, known))
             listed.append(Quantity("diameter", 2 * f.radius, "mm", 2 * sigma, known))
         listed.append(Quantity("form (95 %)", self.form, "mm"))
@@ -67,7 +74,8 @@ class FeatureFit:
         return listed
 
     def to_json(self) -> dict[str, Any]:
-        """The record of a measurement, without the part of the uncertainty that fits of one calibration share."""
+        """The record of a measurement, without the part of the uncertainty that fits of one
+        calibration share."""
         return {
             "feature": to_plain(self.feature),
             "scatter": self.spread.scatter,
@@ -82,17 +90,21 @@ class FeatureFit:
         }
 
 
-def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = "") -> FeatureFit:
-    """The shape of a region's points (n, 3) mm, by least squares of the distances, outliers excluded.
+def fit_feature(
+    kind: Kind, points: np.ndarray, shared: Shared | None = None, calibration: str = ""
+) -> FeatureFit:
+    """The shape of a region's points (n, 3) mm, by least squares of the distances, outliers
+    excluded.
 
-    ``shared``: what the calibration leaves uncertain at places, of the ``calibration`` of that name or hash. Raises
-    InputError where the region does not hold the shape.
+    ``shared``: what the calibration leaves uncertain at places, of the ``calibration`` of that name
+    or hash. Raises InputError where the region does not hold the shape.
     """
     points = np.asarray(points, np.float64)
     points = points[finite_rows(points)]
     if len(points) < LEAST_POINTS:
         raise InputError(
-            f"The region holds {len(points)} measured points: a {kind} needs {LEAST_POINTS}; select a wider region."
+            f"The region holds {len(points)} measured points: a {kind} needs {LEAST_POINTS}; select"
+            " a wider region."
         )
     if kind == "point":
         raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
@@ -122,7 +134,9 @@ def fit_feature(kind: Kind, points: np.ndarray, shared: Shared | None = None, ca
         )
     fitted = residuals[counted]
     farthest, form = float(fitted[np.argmax(np.abs(fitted))]), narrowest_range(fitted, 0.95)
-    return FeatureFit(feature, spread, rms(fitted), farthest, form, used, len(points) - used, tuple(warnings))
+    return FeatureFit(
+        feature, spread, rms(fitted), farthest, form, used, len(points) - used, tuple(warnings)
+    )
 
 
 def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feature:
@@ -146,29 +160,38 @@ def _fit_robustly(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
 
 
 def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
-    """The least-squares cylinder near a start; its place is next to the middle of the points. Raises InputError where
-    the radius diverges: the points are flat."""
+    """The least-squares cylinder near a start; its place is next to the middle of the points.
+    Raises InputError where the radius diverges: the points are flat."""
     solution = scipy.optimize.least_squares(
-        lambda step: start.moved(step).distance(points), np.zeros(start.parameters), method="lm", max_nfev=600
+        lambda step: start.moved(step).distance(points),
+        np.zeros(start.parameters),
+        method="lm",
+        max_nfev=600,
     )
     feature = start.moved(solution.x)
     if not 0 < (feature.radius or 0.0) < MAX_RADIUS_RATIO * diagonal(points):
-        raise InputError("No cylinder fits: its radius diverges; select a region that shows more of its curve.")
+        raise InputError(
+            "No cylinder fits: its radius diverges; select a region that shows more of its curve."
+        )
     axis = feature.unit_direction
     along = axis * np.sign(axis[np.argmax(np.abs(axis))])
     middle = feature.place + ((points.mean(axis=0) - feature.place) @ along) * along
     return Feature("cylinder", middle, along, feature.radius)
 
 
-def _estimate_spread(feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str) -> Spread:
-    """Estimate the covariance of a fitted feature: own scatter, and the errors shared through the calibration."""
+def _estimate_spread(
+    feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str
+) -> Spread:
+    """Estimate the covariance of a fitted feature: own scatter, and the errors shared through the
+    calibration."""
     J = feature.jacobian(points)
     own = scatter_covariance(points, J, feature.distance(points))
     if shared is None:
         return Spread(own)
     some = points[:: -(-len(points) // MAX_SHARED_POINTS)]
     J = feature.jacobian(some)
-    # a displacement of the points changes each distance by its part along the normal, and the fit makes up for it
+    # a displacement of the points changes each distance by its part along the normal, and the fit
+    # makes up for it
     answers = -np.linalg.pinv(J)[:, :, None] * feature.normals(some)[None]
     return Spread(own, shared(some, answers), calibration)
 
@@ -179,28 +202,31 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
     mine = robust_sigma(feature.distance(some))
     if kind == "plane":
         size = diagonal(some)
-        if mine > MAX_RMS_RISE * size and mine > RIVAL_RATIO * _residual_from_quadric(feature, some):
+        if mine > MAX_RMS_RISE * size and mine > RIVAL_RATIO * _residual_from_quadric(
+            feature, some
+        ):
             raise InputError(
-                f"The region bends: it rises {mine:.3g} mm off its best plane over {size:.3g} mm; fit a sphere or a "
-                "cylinder, or select a flatter region."
+                f"The region bends: it rises {mine:.3g} mm off its best plane over {size:.3g} mm;"
+                " fit a sphere or a cylinder, or select a flatter region."
             )
         return
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
     rival, flat = _residual_of(other, some), _residual_of("plane", some)
     if rival * RIVAL_RATIO < mine and rival * RIVAL_RATIO < flat:
         raise InputError(
-            f"The region is no {kind}: points lie {mine:.3g} mm off it, and {rival:.3g} mm off a {other} (1 sigma); "
-            f"fit a {other}, or select another region."
+            f"The region is no {kind}: points lie {mine:.3g} mm off it, and {rival:.3g} mm off a"
+            f" {other} (1 sigma); fit a {other}, or select another region."
         )
     if not flat > RIVAL_RATIO * mine:
         raise InputError(
-            f"The region is nearly flat: points lie {flat:.3g} mm off a plane, and {mine:.3g} mm off the {kind} (1 "
-            f"sigma); fit a plane, or select more of the {kind}'s curve."
+            f"The region is nearly flat: points lie {flat:.3g} mm off a plane, and {mine:.3g} mm"
+            f" off the {kind} (1 sigma); fit a plane, or select more of the {kind}'s curve."
         )
 
 
 def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
-    """Describe which other shape the region holds where the requested one could not be fitted at all."""
+    """Describe which other shape the region holds where the requested one could not be fitted at
+    all."""
     some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
     flat, rival = _residual_of("plane", some), _residual_of(other, some)
@@ -208,15 +234,14 @@ def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> 
     if not np.isfinite(residual):
         return error
     return InputError(
-        f"The region holds no {kind}, rather a {best}: points lie {residual:.3g} mm off that (1 sigma); "
-        f"fit a {best}, or "
-        f"select more of the {kind}'s curve."
+        f"The region holds no {kind}, rather a {best}: points lie {residual:.3g} mm off that (1"
+        f" sigma); fit a {best}, or select more of the {kind}'s curve."
     )
 
 
 def _residual_of(kind: Kind, points: np.ndarray) -> float:
-    """Return the robust sigma in mm of the points' distances from another shape; infinite where it does not fit at
-    all."""
+    """Return the robust sigma in mm of the points' distances from another shape; infinite where it
+    does not fit at all."""
     try:
         return robust_sigma(_fit_robustly(kind, points)[0].distance(points))
     except (InputError, np.linalg.LinAlgError):
@@ -224,7 +249,8 @@ def _residual_of(kind: Kind, points: np.ndarray) -> float:
 
 
 def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
-    """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed, noise remains."""
+    """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed,
+    noise remains."""
     normal = plane.unit_direction
     offsets = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets - (offsets @ normal)[:, None] * normal, full_matrices=False)
@@ -233,7 +259,8 @@ def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
     heights = plane.distance(points)
 
     def solve(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the heights (n,) mm of the weighted quadratic fit, as solution and as fitted values."""
+        """Return the heights (n,) mm of the weighted quadratic fit, as solution and as fitted
+        values."""
         root = np.sqrt(weights)
         fitted = basis @ np.linalg.lstsq(basis * root[:, None], heights * root, rcond=None)[0]
         return fitted, fitted
@@ -248,6 +275,6 @@ def _refuse_uncertain_radius(kind: Kind, feature: Feature, spread: Spread) -> No
     sigma = float(spread.sigmas[-1])
     if not sigma <= MAX_RADIUS_SIGMA * feature.radius:
         raise InputError(
-            f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the region shows too "
-            "little of its curve; select more of it."
+            f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the"
+            " region shows too little of its curve; select more of it."
         )

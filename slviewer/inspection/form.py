@@ -1,12 +1,15 @@
-"""Form, orientation, location and profile by ISO 1101: widths of tolerance zones, with their uncertainty.
+"""Form, orientation, location and profile by ISO 1101: widths of tolerance zones, with their
+uncertainty.
 
-Noise widens any range of measured points. A zone's width is therefore not read off the points, but estimated from the
-deviations' polynomials up to degree `DEGREE` across the region, as a filter's cutoff does in ISO 12181 and ISO 12781.
-The polynomials of one degree are taken for normally distributed with one variance, whose prior is half-Cauchy with the
-noise as its scale (Gelman 2006): degrees that show nothing but noise shrink, those that show form do not. The width is
-that of the mean of `DRAWS` draws of the polynomials, and the spread of the draws' widths is its uncertainty. Where the
-deviations as a whole are no larger than noise makes them, U is at least the width: a perfect part is covered too.
-Reference features are those of least squares (GG), whose zones are never narrower than the minimum zones of ISO 1101.
+Noise widens any range of measured points. A zone's width is therefore not read off the points, but
+estimated from the deviations' polynomials up to degree `DEGREE` across the region, as a filter's
+cutoff does in ISO 12181 and ISO 12781. The polynomials of one degree are taken for normally
+distributed with one variance, whose prior is half-Cauchy with the noise as its scale (Gelman 2006):
+degrees that show nothing but noise shrink, those that show form do not. The width is that of the
+mean of `DRAWS` draws of the polynomials, and the spread of the draws' widths is its uncertainty.
+Where the deviations as a whole are no larger than noise makes them, U is at least the width: a
+perfect part is covered too. Reference features are those of least squares (GG), whose zones are
+never narrower than the minimum zones of ISO 1101.
 """
 
 from collections.abc import Callable
@@ -26,7 +29,14 @@ from slviewer.geometry.vectors import finite_rows, unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.uncertainty import DRAWS, PATCHES, RigidSpread, Shared, draw_steps, joint_covariance
+from slviewer.inspection.uncertainty import (
+    DRAWS,
+    PATCHES,
+    RigidSpread,
+    Shared,
+    draw_steps,
+    joint_covariance,
+)
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
 OrientationKind = Literal["parallelism", "perpendicularity"]
@@ -35,20 +45,24 @@ DEGREE = 6
 MAX_DRAWN_POINTS = 5_000
 SPIKE_SIGMA = 5.0
 CELL_POINTS, MAX_CELLS, WINDOW = 5, 24, 5
-"""Of the estimate of the points' density: points a cell at least, cells along a region, and cells that are averaged."""
+"""Of the estimate of the points' density: points a cell at least, cells along a region, and cells
+that are averaged."""
 PATCH_SIGMA = 4.5
-"""Of the mean of a patch: one that is farther off the smooth part shows form that is too fine for it."""
+"""Of the mean of a patch: one that is farther off the smooth part shows form that is too fine for
+it."""
 SPAN_RATIO = 1e-4
-"""Directions of a basis with a smaller root mean square tell nothing: a short arc looks the same along them."""
+"""Directions of a basis with a smaller root mean square tell nothing: a short arc looks the same
+along them."""
 LEVEL = 0.95
 """Of the test whether noise alone explains the deviations."""
 BURN_IN, THINNING = 50, 3
-"""Of the draws of the polynomials' weights: steps before the first, and steps of which one is kept."""
+"""Of the draws of the polynomials' weights: steps before the first, and steps of which one is
+kept."""
 THIN = 0.01
 POINTS_PER_TERM = 10
 SECTION_SHARE = 0.1
-"""Thickness of the section whose roundness is measured, as a share of the region's length along the axis, or of a
-sphere's diameter."""
+"""Thickness of the section whose roundness is measured, as a share of the region's length along the
+axis, or of a sphere's diameter."""
 MAX_TILT_DEG = 10.0
 """Features farther from parallel or perpendicular than this are not meant to be so."""
 
@@ -57,10 +71,10 @@ MAX_TILT_DEG = 10.0
 class SmoothDeviations:
     """The smooth part of deviations (n,) mm at ``points`` (n, 3), along ``normals`` (n, 3).
 
-    ``basis @ draws``, (n, r) and (r, DRAWS), are draws of the smooth part; ``is_noise``: whether noise alone explains
-    it. ``noise_mm`` is the standard deviation of one point, and of each weight,
-    ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r, m) gives the weights by
-    displacements of the ``sampled`` points (m,) along their normals.
+    ``basis @ draws``, (n, r) and (r, DRAWS), are draws of the smooth part; ``is_noise``: whether
+    noise alone explains it. ``noise_mm`` is the standard deviation of one point, and of each
+    weight, ``unresolved_mm`` how far patches lie off the smooth part beyond noise; ``answer`` (r,
+    m) gives the weights by displacements of the ``sampled`` points (m,) along their normals.
     """
 
     points: np.ndarray
@@ -87,10 +101,11 @@ def smooth_deviations(
     fitted: np.ndarray,
     unrolled: np.ndarray | None = None,
 ) -> SmoothDeviations:
-    """Separate deviations (n,) mm into a smooth part, without what the columns of ``fitted`` (n, p) explain, and noise.
+    """Separate deviations (n,) mm into a smooth part, without what the columns of ``fitted`` (n, p)
+    explain, and noise.
 
-    ``coordinates`` (n, k): across the region, in about -1 to 1; ``unrolled`` (n, 1 or 2): others that are in proportion
-    to its area, by default the same. Raises InputError for too few points.
+    ``coordinates`` (n, k): across the region, in about -1 to 1; ``unrolled`` (n, 1 or 2): others
+    that are in proportion to its area, by default the same. Raises InputError for too few points.
     """
     step = -(-len(deviations) // MAX_FITTED_POINTS)
     d, points, normals = deviations[::step], points[::step], normals[::step]
@@ -102,8 +117,8 @@ def smooth_deviations(
         n, r = basis.shape
         if n < POINTS_PER_TERM * (r + removed.shape[1]):
             raise InputError(
-                f"The region holds {n} measured points: its form needs {POINTS_PER_TERM * (r + removed.shape[1])}; "
-                "select a wider region."
+                f"The region holds {n} measured points: its form needs"
+                f" {POINTS_PER_TERM * (r + removed.shape[1])}; select a wider region."
             )
         whole, residuals = _project_out(d[counted], removed, basis)
         reach = max(SPIKE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
@@ -111,7 +126,12 @@ def smooth_deviations(
         if within.all():
             break
         counted[np.flatnonzero(counted)[~within]] = False
-    d, points, normals, coordinates = d[counted], points[counted], normals[counted], coordinates[counted]
+    d, points, normals, coordinates = (
+        d[counted],
+        points[counted],
+        normals[counted],
+        coordinates[counted],
+    )
     if len(d) < n:
         removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
         whole, residuals = _project_out(d, removed, basis)
@@ -129,7 +149,9 @@ def smooth_deviations(
     draws = np.repeat(weights[:, None], DRAWS, axis=1)
     draws[removed.shape[1] :] = _draw_weights(form, degrees, noise, np.random.default_rng(0))
     is_noise = bool(form @ form <= noise**2 * chi2.ppf(LEVEL, max(len(form), 1)))
-    return SmoothDeviations(points, normals, smooth, draws, is_noise, noise, unresolved, answer, sampled)
+    return SmoothDeviations(
+        points, normals, smooth, draws, is_noise, noise, unresolved, answer, sampled
+    )
 
 
 def zone_width(
@@ -141,41 +163,62 @@ def zone_width(
 ) -> Quantity:
     """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
-    ``width``: of deviations (n, draws), for each draw; ``displaced``: draws of further deviations (n, draws) at points
-    (n, 3), as a datum's or an alignment's errors cause.
+    ``width``: of deviations (n, draws), for each draw; ``displaced``: draws of further deviations
+    (n, draws) at points (n, 3), as a datum's or an alignment's errors cause.
     """
     field = smooth.smooth
-    chosen = np.unique([*range(0, len(field), -(-len(field) // MAX_DRAWN_POINTS)), field.argmin(), field.argmax()])
+    chosen = np.unique(
+        [*range(0, len(field), -(-len(field) // MAX_DRAWN_POINTS)), field.argmin(), field.argmax()]
+    )
     drawn = smooth.basis[chosen] @ smooth.draws
     if displaced is not None:
         drawn = drawn + displaced(smooth.points[chosen])
     widths, value = width(drawn), float(width(field[:, None])[0])
     variance = float(widths.var()) + smooth.unresolved_mm**2
     if shared is not None:
-        # where the zone touches, its width answers to the deviations there; the rest of the field leaves it unchanged
+        # where the zone touches, its width answers to the deviations there; the rest of the field
+        # leaves it unchanged
         change = 1e-3 * smooth.noise_mm + 1e-9
         by_field = np.zeros(len(field))
         for k in (int(field.argmin()), int(field.argmax())):
             moved = field.copy()
             moved[k] += np.sign(field[k] - np.median(field)) * change
-            by_field[k] = (float(width(moved[:, None])[0]) - value) / change * np.sign(field[k] - np.median(field))
+            by_field[k] = (
+                (float(width(moved[:, None])[0]) - value)
+                / change
+                * np.sign(field[k] - np.median(field))
+            )
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
-        variance += float(np.sum(shared(smooth.points[places], answers[None, :, None] * smooth.normals[places]) ** 2))
-    # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have widened it
+        variance += float(
+            np.sum(
+                shared(smooth.points[places], answers[None, :, None] * smooth.normals[places]) ** 2
+            )
+        )
+    # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have
+    # widened it
     sigma = float(np.sqrt(variance + (widths.mean() - value) ** 2 / 3))
-    return Quantity(name, value, "mm", max(sigma, value / 2) if smooth.is_noise else sigma, shared is not None)
+    return Quantity(
+        name, value, "mm", max(sigma, value / 2) if smooth.is_noise else sigma, shared is not None
+    )
 
 
-def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shared | None = None) -> Quantity:
-    """Flatness of a plane, cylindricity of a cylinder, roundness of a section of a cylinder or a sphere, mm.
+def form_error(
+    kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shared | None = None
+) -> Quantity:
+    """Flatness of a plane, cylindricity of a cylinder, roundness of a section of a cylinder or a
+    sphere, mm.
 
-    ``points`` (n, 3) mm: of the region. A cylinder's section is perpendicular to its axis, in the middle; a sphere's
-    goes through its centre and the middle of what was measured. Raises InputError for another feature or for too few
-    points.
+    ``points`` (n, 3) mm: of the region. A cylinder's section is perpendicular to its axis, in the
+    middle; a sphere's goes through its centre and the middle of what was measured. Raises
+    InputError for another feature or for too few points.
     """
     f = fit.feature
-    wanted = {"flatness": ("plane",), "cylindricity": ("cylinder",), "roundness": ("sphere", "cylinder")}[kind]
+    wanted = {
+        "flatness": ("plane",),
+        "cylindricity": ("cylinder",),
+        "roundness": ("sphere", "cylinder"),
+    }[kind]
     if f.kind not in wanted:
         raise InputError(f"A {f.kind} has no {kind}: choose a {' or a '.join(wanted)}.")
     points = points[finite_rows(points)]
@@ -184,16 +227,22 @@ def form_error(kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shar
         normals = f.normals(points)
         across = normals - (normals @ axis)[:, None] * axis
         coordinates = unit_vectors(across)
-        fitted = np.column_stack([coordinates, np.ones(len(points))])  # a circle: a thin section shows no tilt
+        fitted = np.column_stack(
+            [coordinates, np.ones(len(points))]
+        )  # a circle: a thin section shows no tilt
         first = coordinates[0]
         unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
     else:
         normals = f.normals(points)
-        coordinates = _region_coordinates(points) if f.kind == "plane" else _cylinder_coordinates(f, points)
+        coordinates = (
+            _region_coordinates(points) if f.kind == "plane" else _cylinder_coordinates(f, points)
+        )
         fitted = f.jacobian(points)
         unrolled = coordinates
         if f.kind == "cylinder":
-            unrolled = np.column_stack([np.arctan2(coordinates[:, 1], coordinates[:, 0]), coordinates[:, 2]])
+            unrolled = np.column_stack(
+                [np.arctan2(coordinates[:, 1], coordinates[:, 0]), coordinates[:, 2]]
+            )
     smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
     return zone_width(kind, smooth, lambda d: np.ptp(d, axis=0), shared)
 
@@ -205,18 +254,23 @@ def orientation_error(
     datum: FeatureFit,
     shared: Shared | None = None,
 ) -> Quantity:
-    """Parallelism or perpendicularity, mm, of a plane (all its surface) or a cylinder (its axis) to a datum.
+    """Parallelism or perpendicularity, mm, of a plane (all its surface) or a cylinder (its axis) to
+    a datum.
 
-    ``points`` (n, 3) mm: of the toleranced region. Raises InputError where a feature has no direction, or is farther
-    than `MAX_TILT_DEG` from the requested orientation.
+    ``points`` (n, 3) mm: of the toleranced region. Raises InputError where a feature has no
+    direction, or is farther than `MAX_TILT_DEG` from the requested orientation.
     """
     f, d = fit.feature, datum.feature
-    # directions of a plane's normal and of an axis answer to each other as perpendicular and parallel
+    # directions of a plane's normal and of an axis answer to each other as perpendicular and
+    # parallel
     along = (kind == "parallelism") == (f.kind == d.kind)
     cosine = abs(float(f.unit_direction @ d.unit_direction))
     tilt = float(np.degrees(np.arccos(min(cosine, 1.0)) if along else np.arcsin(min(cosine, 1.0))))
     if tilt > MAX_TILT_DEG:
-        raise InputError(f"The {f.kind} is {tilt:.1f} degrees from the {kind} to the {d.kind}: choose another datum.")
+        raise InputError(
+            f"The {f.kind} is {tilt:.1f} degrees from the {kind} to the {d.kind}: choose another"
+            " datum."
+        )
     points = points[finite_rows(points)]
     if f.kind == "cylinder":
         return _axis_orientation(kind, fit, points, datum, along)
@@ -232,7 +286,11 @@ def orientation_error(
     normal = zone_normal(d.unit_direction)
     normals = np.broadcast_to(normal, points.shape)
     smooth = smooth_deviations(
-        (points - f.place) @ normal, points, normals, _region_coordinates(points), np.ones((len(points), 1))
+        (points - f.place) @ normal,
+        points,
+        normals,
+        _region_coordinates(points),
+        np.ones((len(points), 1)),
     )
     steps = draw_steps(datum.spread.covariance, np.random.default_rng(1))
     turned = np.stack([zone_normal(d.moved(step).unit_direction) for step in steps]) - normal
@@ -247,13 +305,15 @@ def orientation_error(
 def position_error(
     fit: FeatureFit, points: np.ndarray, nominal: Feature, alignment: RigidSpread | None = None
 ) -> Quantity:
-    """Position, mm: the diameter of the zone about the ``nominal`` place that holds a sphere's centre or a cylinder's
-    axis over its region, or the width of the zone that holds a plane.
+    """Position, mm: the diameter of the zone about the ``nominal`` place that holds a sphere's
+    centre or a cylinder's axis over its region, or the width of the zone that holds a plane.
 
     ``points`` (n, 3) mm of the region, like the ``nominal`` in part coordinates, as ``fit``.
     """
     if fit.feature.kind != nominal.kind:
-        raise InputError(f"The feature is a {fit.feature.kind}, its nominal a {nominal.kind}: choose one kind.")
+        raise InputError(
+            f"The feature is a {fit.feature.kind}, its nominal a {nominal.kind}: choose one kind."
+        )
     points = points[finite_rows(points)]
     f = fit.feature
     if f.direction is None:
@@ -273,12 +333,20 @@ def position_error(
             return 2 * float(np.linalg.norm(feature.place + moved - nominal.place))
         normal_or_axis = nominal.unit_direction
         if feature.kind == "cylinder":
-            ends = feature.place + (reached @ f.unit_direction)[:, None] * feature.unit_direction + moved
+            ends = (
+                feature.place
+                + (reached @ f.unit_direction)[:, None] * feature.unit_direction
+                + moved
+            )
             offsets = ends - nominal.place
-            return 2 * float(lengths(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis).max())
+            return 2 * float(
+                lengths(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis).max()
+            )
         # the plane's points under the measured ones
         heights = reached - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
-        return 2 * float(np.abs((feature.place + heights + moved - nominal.place) @ normal_or_axis).max())
+        return 2 * float(
+            np.abs((feature.place + heights + moved - nominal.place) @ normal_or_axis).max()
+        )
 
     shifts = np.zeros((DRAWS, len(reached), 3)) if moves is None else moves(f.place + reached)
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
@@ -292,13 +360,19 @@ def profile_error(
     alignment: RigidSpread | None = None,
     shared: Shared | None = None,
 ) -> Quantity:
-    """Profile of a surface, mm: twice the largest deviation (n,) mm of points (n, 3) from the nominal, whose normals
-    (n, 3) are given; NaN for points that do not belong to it. Raises InputError for too few points."""
+    """Profile of a surface, mm: twice the largest deviation (n,) mm of points (n, 3) from the
+    nominal, whose normals (n, 3) are given; NaN for points that do not belong to it. Raises
+    InputError for too few points.
+    """
     counted = np.isfinite(deviations) & finite_rows(normals)
-    points, deviations, normals = (np.asarray(each[counted], np.float64) for each in (points, deviations, normals))
+    points, deviations, normals = (
+        np.asarray(each[counted], np.float64) for each in (points, deviations, normals)
+    )
     if not len(points):
         raise InputError("No point of the region belongs to the nominal: select a region on it.")
-    coordinates = _region_coordinates(points - deviations[:, None] * normals, axes=3)  # on the nominal: without noise
+    coordinates = _region_coordinates(
+        points - deviations[:, None] * normals, axes=3
+    )  # on the nominal: without noise
     smooth = smooth_deviations(deviations, points, normals, coordinates, np.zeros((len(points), 0)))
     moves = None if alignment is None else alignment.draw(np.random.default_rng(3))
 
@@ -320,8 +394,8 @@ def profile_error(
 def _correct_for_noise(name: str, value: float, drawn: np.ndarray, whole: bool) -> Quantity:
     """Return a width (mm) less what noise adds to it, with that and the spread of the draws in U.
 
-    The measured width holds noise once, the ``drawn`` ones (draws,) twice: they are extrapolated to none by a line
-    (SIMEX, Cook and Stefanski 1994).
+    The measured width holds noise once, the ``drawn`` ones (draws,) twice: they are extrapolated to
+    none by a line (SIMEX, Cook and Stefanski 1994).
     """
     added = min(float(drawn.mean() - value), value)
     # where the width is no larger than what noise adds, all of it may be noise
@@ -330,11 +404,14 @@ def _correct_for_noise(name: str, value: float, drawn: np.ndarray, whole: bool) 
     return Quantity(name, max(value - added, 0.0), "mm", sigma, whole)
 
 
-def _draw_weights(weights: np.ndarray, degrees: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw what weights (r,), measured with ``noise``, are without it: (r, DRAWS), by Gibbs sampling.
+def _draw_weights(
+    weights: np.ndarray, degrees: np.ndarray, noise: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw what weights (r,), measured with ``noise``, are without it: (r, DRAWS), by Gibbs
+    sampling.
 
-    Weights of one of the ``degrees`` (r,) share a variance with a half-Cauchy prior of scale ``noise``, as a mixture of
-    inverse gamma distributions (Wand et al. 2011).
+    Weights of one of the ``degrees`` (r,) share a variance with a half-Cauchy prior of scale
+    ``noise``, as a mixture of inverse gamma distributions (Wand et al. 2011).
     """
     if not noise > 0 or not len(weights):
         return np.repeat(weights[:, None], DRAWS, axis=1)
@@ -355,15 +432,17 @@ def _draw_weights(weights: np.ndarray, degrees: np.ndarray, noise: float, rng: n
 def _axis_orientation(
     kind: OrientationKind, fit: FeatureFit, points: np.ndarray, datum: FeatureFit, along: bool
 ) -> Quantity:
-    """The orientation of a cylinder's axis over its region to a datum: the diameter of its zone where both directions
-    should agree (``along``), else its width."""
+    """The orientation of a cylinder's axis over its region to a datum: the diameter of its zone
+    where both directions should agree (``along``), else its width."""
     f, d = fit.feature, datum.feature
     length = float(np.ptp((points - f.place) @ f.unit_direction))
 
     def off(feature: Feature, reference: Feature) -> float:
         """How far the axis' ends lie apart across the requested direction."""
         axis, direction = feature.unit_direction, reference.unit_direction
-        return length * float(np.linalg.norm(np.cross(axis, direction)) if along else abs(axis @ direction))
+        return length * float(
+            np.linalg.norm(np.cross(axis, direction)) if along else abs(axis @ direction)
+        )
 
     steps = draw_steps(joint_covariance(fit.spread, datum.spread), np.random.default_rng(4))
     p = f.parameters
@@ -372,13 +451,17 @@ def _axis_orientation(
     return _correct_for_noise(kind, off(f, d), drawn, whole)
 
 
-def _smooth_basis(coordinates: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Orthonormal columns (n, q) of what was fitted, and (n, r) of the polynomials without that, by rising degree, with
-    the degree of each (r,)."""
+def _smooth_basis(
+    coordinates: np.ndarray, fitted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Orthonormal columns (n, q) of what was fitted, and (n, r) of the polynomials without that, by
+    rising degree, with the degree of each (r,)."""
     removed = _span(fitted / np.maximum(np.sqrt(np.mean(fitted**2, axis=0)), 1e-300))
     whole, degrees = removed, list[int]()
     for degree in range(DEGREE + 1):
-        powers = [e for e in product(range(degree + 1), repeat=coordinates.shape[1]) if sum(e) == degree]
+        powers = [
+            e for e in product(range(degree + 1), repeat=coordinates.shape[1]) if sum(e) == degree
+        ]
         terms = np.stack([np.prod(coordinates ** np.array(e), axis=1) for e in powers], axis=1)
         added = _span(terms, whole)
         whole = np.hstack([whole, added])
@@ -393,8 +476,8 @@ def _project_out(values: np.ndarray, *bases: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
-    """Orthonormal columns (n, r) that span those given, ``without`` what other orthonormal ones (n, q) span, and
-    without directions that rounding alone distinguishes."""
+    """Orthonormal columns (n, r) that span those given, ``without`` what other orthonormal ones (n,
+    q) span, and without directions that rounding alone distinguishes."""
     if not columns.shape[1]:
         return columns
     columns = columns / np.sqrt(len(columns))
@@ -406,22 +489,29 @@ def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
 
 
 def _even_weights(unrolled: np.ndarray) -> np.ndarray:
-    """Weights (n,) of points at coordinates (n, k) in proportion to area, so that equal areas weigh the same."""
+    """Weights (n,) of points at coordinates (n, k) in proportion to area, so that equal areas weigh
+    the same."""
     low, size = unrolled.min(axis=0), np.ptp(unrolled, axis=0)
     cells = int(np.clip((len(unrolled) / CELL_POINTS) ** (1 / unrolled.shape[1]), 1, MAX_CELLS))
-    place = tuple(np.minimum((unrolled - low) / np.where(size > 0, size, 1.0) * cells, cells - 1).astype(int).T)
+    place = tuple(
+        np.minimum((unrolled - low) / np.where(size > 0, size, 1.0) * cells, cells - 1)
+        .astype(int)
+        .T
+    )
     counts = np.zeros((cells,) * len(place))
     np.add.at(counts, place, 1)
     # means over the neighbourhood, which only cells with points count for
-    sums, occupied = (uniform_filter(each, WINDOW, mode="constant") for each in (counts, np.sign(counts)))
+    sums, occupied = (
+        uniform_filter(each, WINDOW, mode="constant") for each in (counts, np.sign(counts))
+    )
     return occupied[place] / sums[place]
 
 
 def _patch_misfit(
     residuals: np.ndarray, coordinates: np.ndarray, noise: float, n: int, columns: int
 ) -> tuple[float, float]:
-    """How many times larger than independent ones the patches' mean residuals are (at least 1), and by how much (mm)
-    some lie off what noise explains."""
+    """How many times larger than independent ones the patches' mean residuals are (at least 1), and
+    by how much (mm) some lie off what noise explains."""
     low = coordinates.min(axis=0)
     side = max(float(np.ptp(coordinates, axis=0).max()) / PATCHES, 1e-12)
     cubes, patch = occupied_cubes(_pad(coordinates - low), side)
@@ -433,7 +523,9 @@ def _patch_misfit(
         return 1.0, 0.0
     # the smooth part takes its share of the patches' freedom
     freedom = max(1 - columns / max(int(large.sum()), 1), 0.25)
-    factor = float(np.sqrt(max(float(np.mean((means[large] / expected[large]) ** 2)) / freedom, 1.0)))
+    factor = float(
+        np.sqrt(max(float(np.mean((means[large] / expected[large]) ** 2)) / freedom, 1.0))
+    )
     beyond = np.abs(means[large]) - PATCH_SIGMA * expected[large]
     worst = int(np.argmax(beyond))
     # a defect seldom fills its patch
@@ -446,8 +538,8 @@ def _pad(coordinates: np.ndarray) -> np.ndarray:
 
 
 def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
-    """Coordinates (n, axes) of points along their principal axes, each in -1 to 1; 0 along those in which the region is
-    thinner than `THIN` of its length."""
+    """Coordinates (n, axes) of points along their principal axes, each in -1 to 1; 0 along those in
+    which the region is thinner than `THIN` of its length."""
     offsets = points - points.mean(axis=0)
     _, directions = np.linalg.eigh(offsets.T @ offsets)
     along = offsets @ directions[:, ::-1][:, :axes]
@@ -463,7 +555,9 @@ def _cylinder_coordinates(f: Feature, points: np.ndarray) -> np.ndarray:
     first = np.linalg.svd(axis[None])[2][1]
     along = (points - f.place) @ axis
     middle, half = (along.max() + along.min()) / 2, max(float(np.ptp(along)) / 2, 1e-12)
-    return np.column_stack([normals @ first, normals @ np.cross(axis, first), (along - middle) / half])
+    return np.column_stack(
+        [normals @ first, normals @ np.cross(axis, first), (along - middle) / half]
+    )
 
 
 def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

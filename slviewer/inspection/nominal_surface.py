@@ -19,7 +19,8 @@ NEGLIGIBLE = 1e-4
 
 
 class NominalSurface:
-    """A mesh, closed or open, whose normals point outside. Distances are right within a micrometre."""
+    """A mesh, closed or open, whose normals point outside. Distances are right within a
+    micrometre."""
 
     def __init__(self, mesh: Mesh):
         import trimesh
@@ -33,27 +34,31 @@ class NominalSurface:
         if not self._mesh.area > 0:
             raise InputError("The nominal model's triangles have no area: give another file.")
         self._flat = np.asarray(self._mesh.face_normals)
-        # normals of the vertices weighted by the triangles' angles tell the side of a place (Bærentzen and Aanæs 2005)
+        # normals of the vertices weighted by the triangles' angles tell the side of a place
+        # (Bærentzen and Aanæs 2005)
         self._smooth = np.asarray(self._mesh.vertex_normals)
         self._faces = mesh.faces
         self._at_rim = _rim_vertices(mesh.faces, len(vertices))
         core = open3d().core
         self._scene: Any = open3d().t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            core.Tensor((vertices - self.middle).astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
+            core.Tensor((vertices - self.middle).astype(np.float32)),
+            core.Tensor(mesh.faces.astype(np.uint32)),
         )
 
     def signed(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open mesh; and the
-        surface's normals (n, 3) where each is nearest."""
+        """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open
+        mesh; and the surface's normals (n, 3) where each is nearest."""
         centred = points - self.middle
-        nearest = self._scene.compute_closest_points(open3d().core.Tensor(centred.astype(np.float32)))
+        nearest = self._scene.compute_closest_points(
+            open3d().core.Tensor(centred.astype(np.float32))
+        )
         face = nearest["primitive_ids"].numpy().astype(np.int64)
         s, t = nearest["primitive_uvs"].numpy().astype(np.float64).T
         offsets = centred - nearest["points"].numpy().astype(np.float64)
         normals = self._flat[face]
-        # inside a triangle its own plane says how far; at a side or corner the direction does, and the side of the
-        # surface follows from the normals of the vertices there
+        # inside a triangle its own plane says how far; at a side or corner the direction does, and
+        # the side of the surface follows from the normals of the vertices there
         at_side = (s < CORNER) | (t < CORNER) | (1 - s - t < CORNER)
         away = np.sum(normals * offsets, axis=1)
         if at_side.any():
@@ -69,18 +74,22 @@ class NominalSurface:
             away[np.flatnonzero(at_side)[beyond]] = np.inf
             normals = normals.copy()
             clear = gaps > 10 * NEGLIGIBLE
-            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(gaps, 1e-300))[clear, None] * offsets[
-                at_side
-            ][clear]
+            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(gaps, 1e-300))[
+                clear, None
+            ] * offsets[at_side][clear]
         return away, normals
 
-    def seen_from(self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float) -> np.ndarray:
-        """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in the direction ``view``
-        (3,); ``least``: cosine between the two. Returns (n,) bool."""
+    def seen_from(
+        self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float
+    ) -> np.ndarray:
+        """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in
+        the direction ``view`` (3,); ``least``: cosine between the two. Returns (n,) bool."""
         is_visible = facing @ view > least
         lift = 1e-4 * self.diagonal
         origins = (places[is_visible] - self.middle + lift * facing[is_visible]).astype(np.float32)
-        rays = np.concatenate([origins, np.broadcast_to(view, origins.shape)], axis=1).astype(np.float32)
+        rays = np.concatenate([origins, np.broadcast_to(view, origins.shape)], axis=1).astype(
+            np.float32
+        )
         is_visible[is_visible] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
         return is_visible
 
@@ -95,7 +104,9 @@ class NominalSurface:
 def _rim_vertices(faces: np.ndarray, count: int) -> np.ndarray:
     """Return the vertices (count,) bool at edges of one triangle alone."""
     half = half_edges(faces)
-    keys = half.min(axis=1).astype(np.int64) * count + half.max(axis=1)  # ten times as fast as unique rows
+    keys = half.min(axis=1).astype(np.int64) * count + half.max(
+        axis=1
+    )  # ten times as fast as unique rows
     edges, triangles = np.unique(keys, return_counts=True)
     is_rim = np.zeros(count, bool)
     for vertices in np.divmod(edges[triangles == 1], count):

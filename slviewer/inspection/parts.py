@@ -7,8 +7,8 @@ from slviewer.records.acceptance import Decision
 
 @dataclass(frozen=True)
 class CharacteristicResult:
-    """A characteristic of one part: its ``value`` and ``U`` (k = 2), and the ``decision``; or the ``reason`` why it
-    could not be measured. ``whole``: whether U holds the calibration's part."""
+    """A characteristic of one part: its ``value`` and ``U`` (k = 2), and the ``decision``; or the
+    ``reason`` why it could not be measured. ``whole``: whether U holds the calibration's part."""
 
     name: str
     value: float | None
@@ -29,4 +29,6 @@ class PartResult:
     def decision(self) -> Decision:
         """ "fail" where one characteristic fails, else "undecided" where one is, else "pass"."""
         decisions = [each.decision for each in self.results]
-        return "fail" if "fail" in decisions else "undecided" if "undecided" in decisions else "pass"
+        return (
+            "fail" if "fail" in decisions else "undecided" if "undecided" in decisions else "pass"
+        )

@@ -9,7 +9,12 @@ import numpy as np
 from slviewer.errors import SlviewerError
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.registration.pairwise import MOST_ATTEMPTS, Registration, register_prepared, search_starts
+from slviewer.registration.pairwise import (
+    MOST_ATTEMPTS,
+    Registration,
+    register_prepared,
+    search_starts,
+)
 from slviewer.registration.prepared import PreparedScan, prepare_scan
 from slviewer.registration.refusal import Refused
 
@@ -18,17 +23,20 @@ SAMPLES = 60_000
 MAX_POINTS = 40_000
 MIN_VISIBLE = 2_000
 GOOD_RMS = 0.002
-"""Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the noise, of most of
-the scan."""
+"""Of the nominal's diagonal: no better place is looked for than one that leaves less, or thrice the
+noise, of most of the scan."""
 GOOD_OVERLAP = 0.6
 LEAST_SCORE = 0.1
-"""Share of the scan that must lie on the nominal after the coarse search: from there on a pose is refined. The part
-itself reaches 0.5 and more, other parts below 0.15."""
+"""Share of the scan that must lie on the nominal after the coarse search: from there on a pose is
+refined. The part itself reaches 0.5 and more, other parts below 0.15."""
 VIEWS = [
     unit_vectors(np.array(view))
-    for view in sorted(product((-1, 0, 1), repeat=3), key=lambda v: (np.count_nonzero(v), -abs(v[2])))[1:]
+    for view in sorted(
+        product((-1, 0, 1), repeat=3), key=lambda v: (np.count_nonzero(v), -abs(v[2]))
+    )[1:]
 ]
-"""From where a model is looked at: its sides, from below and above first, then its edges, then its corners."""
+"""From where a model is looked at: its sides, from below and above first, then its edges, then its
+corners."""
 MIN_FACING_COSINE = 0.1
 AWAY = 3.0
 """Diagonals: from so far."""
@@ -44,12 +52,15 @@ def search_start(
 ) -> Registration:
     """The scan (n, 3) registered to the nominal.
 
-    A scan shows one side of a part: the nominal is tried as a camera sees it from each of ``views``, until one fits
-    well; else the best that is accepted. Raises the first refusal where none is.
+    A scan shows one side of a part: the nominal is tried as a camera sees it from each of
+    ``views``, until one fits well; else the best that is accepted. Raises the first refusal where
+    none is.
     """
     places, facing = surface.sample(SAMPLES)
     step = -(-len(points) // MAX_POINTS)
-    scan = prepare_scan("scan", points[::step], None if normals is None else normals[::step], sigma_mm)
+    scan = prepare_scan(
+        "scan", points[::step], None if normals is None else normals[::step], sigma_mm
+    )
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None
@@ -60,7 +71,9 @@ def search_start(
             continue
         camera = surface.middle + AWAY * surface.diagonal * view
         try:
-            result = _register_symmetric(scan, prepare_scan("nominal model", places[visible] - camera, facing[visible]))
+            result = _register_symmetric(
+                scan, prepare_scan("nominal model", places[visible] - camera, facing[visible])
+            )
         except SlviewerError as error:
             refusal = refusal or error
             continue
@@ -73,22 +86,27 @@ def search_start(
             break
     if best is None and isinstance(refusal, Refused):
         raise refusal.with_context(
-            "The scan could not be aligned to the nominal model: see that it shows this part, at this size, and that "
-            "little else is in view. One of the tries ended so:"
+            "The scan could not be aligned to the nominal model: see that it shows this part, at"
+            " this size, and that little else is in view. One of the tries ended so:"
         )
     if best is None:
-        raise refusal or SlviewerError("The nominal model shows no side that a scan could lie on: check the file.")
+        raise refusal or SlviewerError(
+            "The nominal model shows no side that a scan could lie on: check the file."
+        )
     return best
 
 
 def _register_symmetric(scan: PreparedScan, reference: PreparedScan) -> Registration:
-    """Register as ``register_prepared``; of a part with symmetries return the pose of least residuals: the choice among
-    them does not change the deviations."""
+    """Register as ``register_prepared``; of a part with symmetries return the pose of least
+    residuals: the choice among them does not change the deviations."""
     size = min(scan.size, reference.size)
     starts = search_starts(scan, reference, size)
     if not starts or starts[0].score < LEAST_SCORE:
         best = 100 * starts[0].score if starts else 0.0
-        raise Refused("overlap", f"At most {best:.0f} % of the scan lies on a side of the model, in any of its poses.")
+        raise Refused(
+            "overlap",
+            f"At most {best:.0f} % of the scan lies on a side of the model, in any of its poses.",
+        )
     try:
         return register_prepared(scan, reference, size=size, starts=starts)
     except Refused as error:

@@ -9,9 +9,9 @@ COVERAGE = 2.0
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measured value. ``sigma``: its standard uncertainty (k = 1) in ``unit``, None where it has none (a residual, a
-    count); ``U``: the expanded one (k = 2). ``whole``: whether they hold the calibration's part, which only the splined
-    model knows; without it they are too small."""
+    """A measured value. ``sigma``: its standard uncertainty (k = 1) in ``unit``, None where it has
+    none (a residual, a count); ``U``: the expanded one (k = 2). ``whole``: whether they hold the
+    calibration's part, which only the splined model knows; without it they are too small."""
 
     name: str
     value: float

@@ -16,7 +16,8 @@ MARGIN_MM = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The points within a ball (``size`` = (radius,)) or a box (``size`` = half sides) about ``centre`` (3,), mm.
+    """The points within a ball (``size`` = (radius,)) or a box (``size`` = half sides) about
+    ``centre`` (3,), mm.
 
     ``axes`` (3, 3): the directions of a box's sides, one a row; None: those of the coordinates.
     """
@@ -39,10 +40,16 @@ class Region:
 
     @classmethod
     def around(cls, points: np.ndarray, axes: np.ndarray) -> "Region":
-        """Return the smallest box with sides along the rows of ``axes`` (3, 3) that holds points (n, 3) mm."""
+        """Return the smallest box with sides along the rows of ``axes`` (3, 3) that holds points
+        (n, 3) mm."""
         along = points @ axes.T
         low, high = along.min(axis=0), along.max(axis=0)
-        return cls("box", _check_place((low + high) / 2 @ axes), _check_size((high - low) / 2 + MARGIN_MM), axes)
+        return cls(
+            "box",
+            _check_place((low + high) / 2 @ axes),
+            _check_size((high - low) / 2 + MARGIN_MM),
+            axes,
+        )
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """Bool like points (h, w, 3) or (n, 3) without their last axis; False for NaN."""
@@ -66,7 +73,8 @@ class Region:
 
 
 def _check_place(values: object) -> np.ndarray:
-    """Return a place (3,) float64 mm; InputError for another shape or values that are not finite."""
+    """Return a place (3,) float64 mm; InputError for another shape or values that are not
+    finite."""
     vector = np.asarray(values, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise InputError(f"{values!r} is no place: give x, y and z in mm.")

@@ -10,14 +10,14 @@ from slviewer.inspection.quantities import Quantity, Unit
 from slviewer.inspection.uncertainty import Spread, joint_covariance, propagate_covariance
 
 PARALLEL_DEG = 5.0
-"""Axes nearer to parallel than this are as far apart as they are in the measured region: where they would meet, if they
-do, is far away and means nothing."""
+"""Axes nearer to parallel than this are as far apart as they are in the measured region: where they
+would meet, if they do, is far away and means nothing."""
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """A quantity between two kinds of features, in words, and how it is computed; the first kind comes first in
-    ``features.KINDS``."""
+    """A quantity between two kinds of features, in words, and how it is computed; the first kind
+    comes first in ``features.KINDS``."""
 
     name: str
     unit: Unit
@@ -47,7 +47,8 @@ def _height(a: Feature, plane: Feature) -> float:
 
 
 def _plane_gap(a: Feature, b: Feature) -> float:
-    """Return the distance in mm of two nearly parallel planes: mean of each place's distance from the other."""
+    """Return the distance in mm of two nearly parallel planes: mean of each place's distance from
+    the other."""
     return 0.5 * (abs(_height(a, b)) + abs(_height(b, a)))
 
 
@@ -111,7 +112,8 @@ MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
 
 
 def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list[Quantity]:
-    """Compute all quantities between two features, in either order, with their uncertainty where it is known.
+    """Compute all quantities between two features, in either order, with their uncertainty where it
+    is known.
 
     The uncertainty that both share through one calibration counts once.
     """
@@ -128,11 +130,19 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
             """Return the quantity after the features' parameters change by a step (p + q,)."""
             return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
 
-        return Quantity(meaning.name, meaning.of(a, b), meaning.unit, propagate_covariance(moved, covariance), whole)
+        return Quantity(
+            meaning.name,
+            meaning.of(a, b),
+            meaning.unit,
+            propagate_covariance(moved, covariance),
+            whole,
+        )
 
     return [quantity(meaning) for meaning in MEANINGS[a.kind, b.kind]]
 
 
 def distance(a: np.ndarray, b: np.ndarray, a_spread: Spread, b_spread: Spread) -> Quantity:
     """Return the distance between two picked points (3,) mm, with its uncertainty."""
-    return relation(Feature("point", np.asarray(a)), a_spread, Feature("point", np.asarray(b)), b_spread)[0]
+    return relation(
+        Feature("point", np.asarray(a)), a_spread, Feature("point", np.asarray(b)), b_spread
+    )[0]

@@ -16,7 +16,8 @@ BAND = 12.0
 
 @dataclass(frozen=True, eq=False)
 class CutPlane:
-    """``origin`` (3,) mm, and the two unit axes (3,) of the drawing: ``along`` to the right, ``up``."""
+    """``origin`` (3,) mm, and the two unit axes (3,) of the drawing: ``along`` to the right,
+    ``up``."""
 
     origin: np.ndarray
     along: np.ndarray
@@ -24,8 +25,10 @@ class CutPlane:
 
     @classmethod
     def through(cls, a: np.ndarray, b: np.ndarray, up: np.ndarray) -> "CutPlane":
-        """Through two points (3,) mm, a at 0 and b to its right, with ``up`` (3,) in it as nearly as can be; for a scan
-        that is towards the camera, (0, 0, -1). Raises InputError for points that are one, or lie above one another."""
+        """Through two points (3,) mm, a at 0 and b to its right, with ``up`` (3,) in it as nearly
+        as can be; for a scan that is towards the camera, (0, 0, -1). Raises InputError for points
+        that are one, or lie above one another.
+        """
         a, b, up = (np.asarray(v, np.float64) for v in (a, b, up))
         along = b - a
         length = np.linalg.norm(along)
@@ -34,7 +37,9 @@ class CutPlane:
         along = along / length
         across = up - (up @ along) * along
         if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(up):
-            raise InputError("The section's two points lie above one another: pick one beside the other.")
+            raise InputError(
+                "The section's two points lie above one another: pick one beside the other."
+            )
         return cls(a, along, unit_vectors(across))
 
     @property
@@ -48,13 +53,16 @@ class CutPlane:
 
 
 def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np.ndarray]:
-    """The lines (k, 2) mm in the plane's drawing in which it cuts triangles ``faces`` (m, 3) over ``vertices`` (n, 3).
+    """The lines (k, 2) mm in the plane's drawing in which it cuts triangles ``faces`` (m, 3) over
+    ``vertices`` (n, 3).
 
-    Each line's points follow one another, a closed line ends where it began; the longest line first, open ones from
-    left to right. Raises InputError where nothing is cut.
+    Each line's points follow one another, a closed line ends where it began; the longest line
+    first, open ones from left to right. Raises InputError where nothing is cut.
     """
     heights = (np.asarray(vertices, np.float64) - plane.origin) @ plane.normal
-    above = heights >= 0  # what lies in the plane counts as above: every triangle is cut through two sides or none
+    above = (
+        heights >= 0
+    )  # what lies in the plane counts as above: every triangle is cut through two sides or none
     cut = faces[above[faces].any(axis=1) & ~above[faces].all(axis=1)]
     if not len(cut):
         raise InputError("The section's plane does not meet the surface: pick two points on it.")
@@ -71,16 +79,22 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     return sorted(lines, key=lambda line: -float(lengths(np.diff(line, axis=0)).sum()))
 
 
-def triangulate_near(points: np.ndarray, normals: np.ndarray, plane: CutPlane) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) and triangles (m, 3) between the points (k, 3) mm of a cloud near a plane, to cut them.
+def triangulate_near(
+    points: np.ndarray, normals: np.ndarray, plane: CutPlane
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (n, 3) and triangles (m, 3) between the points (k, 3) mm of a cloud near a
+    plane, to cut them.
 
-    Balls roll over the points on the side of their ``normals`` (k, 3), three and six of the points' spacings in radius,
-    so that wider gaps stay open (Bernardini et al. 1999). Raises InputError where no points lie near the plane.
+    Balls roll over the points on the side of their ``normals`` (k, 3), three and six of the points'
+    spacings in radius, so that wider gaps stay open (Bernardini et al. 1999). Raises InputError
+    where no points lie near the plane.
     """
     known = finite_rows(normals)
     points, normals = points[known].astype(np.float64), normals[known].astype(np.float64)
     some = points[:: max(1, len(points) // 2000)]
-    spacing = float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
+    spacing = (
+        float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
+    )
     near = np.abs((points - plane.origin) @ plane.normal) < BAND * spacing
     if np.count_nonzero(near) < 3:
         raise InputError("The section's plane does not meet the surface: pick two points on it.")
@@ -99,7 +113,8 @@ def _order_line(line: np.ndarray) -> np.ndarray:
 
 
 def _join_segments(segments: np.ndarray, count: int) -> list[list[int]]:
-    """Segments (m, 2) of numbered places as lines of places that follow one another; open ones first."""
+    """Segments (m, 2) of numbered places as lines of places that follow one another; open ones
+    first."""
     touching: list[list[int]] = [[] for _ in range(count)]
     for number, (a, b) in enumerate(segments.tolist()):
         touching[a].append(number)
@@ -136,8 +151,8 @@ def measure_cursors(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
 
 
 def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
-    """Return the radius of the circle through three cursors (2,) mm. Raises InputError for cursors on a straight
-    line."""
+    """Return the radius of the circle through three cursors (2,) mm. Raises InputError for cursors
+    on a straight line."""
     edges = np.stack([np.subtract(b, a), np.subtract(c, a)])
     area = abs(float(np.linalg.det(edges)))
     sides = [float(np.linalg.norm(v)) for v in (edges[0], edges[1], edges[1] - edges[0])]
@@ -147,8 +162,8 @@ def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
 
 
 def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None) -> np.ndarray:
-    """(2,) mm: where a cursor at ``x`` meets the section, at the line nearest to ``y`` or else the highest one; the
-    nearest point drawn where no line passes x."""
+    """(2,) mm: where a cursor at ``x`` meets the section, at the line nearest to ``y`` or else the
+    highest one; the nearest point drawn where no line passes x."""
     met = []
     for line in lines:
         left, right = line[:-1], line[1:]

@@ -18,10 +18,14 @@ NEAR = 2.5
 """Robust standard deviations: what lies nearer belongs to a hypothesis."""
 
 
-def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]) -> Feature:
-    """Estimate the shape that is closest to at least half of the points (n, 3); the same points give the same result.
+def estimate_start(
+    kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]
+) -> Feature:
+    """Estimate the shape that is closest to at least half of the points (n, 3); the same points
+    give the same result.
 
-    ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no sample holds a shape.
+    ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no
+    sample holds a shape.
     """
     rng = np.random.default_rng(0)
     sample = points[rng.choice(len(points), min(SAMPLE, len(points)), replace=False)]
@@ -50,13 +54,15 @@ def estimate_start(kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Fe
             if best is None or rating < best[0]:
                 best = rating, candidate
     if best is None:
-        raise refused or InputError(f"No {kind} passes through the {len(points)} points: select another region.")
+        raise refused or InputError(
+            f"No {kind} passes through the {len(points)} points: select another region."
+        )
     return best[1]
 
 
 def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(m, 3): unit normals at ``sample`` (m, 3), of either sign, from neighbours among ``points`` (n, 3): about a tenth
-    of the region across, so that the noise of a point does not tilt them."""
+    """(m, 3): unit normals at ``sample`` (m, 3), of either sign, from neighbours among ``points``
+    (n, 3): about a tenth of the region across, so that the noise of a point does not tilt them."""
     thin = points[:: max(1, len(points) // 6000)]
     count = int(np.clip(len(thin) // 100, *NEIGHBOURS))
     _, near = cKDTree(thin).query(sample, k=min(count, len(thin)))
@@ -65,7 +71,9 @@ def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0]
 
 
-def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator) -> Feature | None:
+def _fit_sample(
+    kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
+) -> Feature | None:
     """Return the shape through a minimal sample of points; None where they do not determine it."""
     if kind == "cylinder":
         assert normals is not None
@@ -75,12 +83,18 @@ def _fit_sample(kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng:
         plane = fit_plane(some)
         return Feature("plane", some.mean(axis=0), plane.normal)
     offset = _offset_of_centre(some, 1e-9)
-    return None if offset is None else Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
+    return (
+        None
+        if offset is None
+        else Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
+    )
 
 
-def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> Feature | None:
-    """Return the cylinder through a sample of three points with normals: two normals give the axis (Gauss map), and the
-    circle through the points, projected along it, the rest."""
+def _cylinder_through(
+    sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+) -> Feature | None:
+    """Return the cylinder through a sample of three points with normals: two normals give the axis
+    (Gauss map), and the circle through the points, projected along it, the rest."""
     i, j, k = rng.integers(0, len(sample), 3)
     axis = np.cross(normals[i], normals[j])
     length = np.linalg.norm(axis)
@@ -97,8 +111,8 @@ def _cylinder_through(sample: np.ndarray, normals: np.ndarray, rng: np.random.Ge
 
 
 def _offset_of_centre(points: np.ndarray, flattest: float) -> np.ndarray | None:
-    """Return the centre (k,) of the sphere (circle) through points (k + 1, k), relative to the first; None for points
-    that are flatter than the share ``flattest``."""
+    """Return the centre (k,) of the sphere (circle) through points (k + 1, k), relative to the
+    first; None for points that are flatter than the share ``flattest``."""
     edges = points[1:] - points[0]
     if abs(np.linalg.det(edges)) <= flattest * lengths(edges).prod():
         return None
@@ -111,7 +125,8 @@ def _median_distance(feature: Feature, points: np.ndarray) -> float:
 
 
 def fit_sphere_feature(points: np.ndarray) -> Feature:
-    """The least-squares sphere of points (n, 3). Raises InputError where they are too flat for one."""
+    """The least-squares sphere of points (n, 3). Raises InputError where they are too flat for
+    one."""
     sphere = fit_sphere(points)
     return Feature("sphere", sphere.centre, None, sphere.radius)
 

@@ -12,9 +12,9 @@ from slviewer.records.acceptance import Decision
 DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
 LIMITED = "deviation of 99.7 % of the points"
 RULE = (
-    "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points and their expanded "
-    "uncertainty (k = 2) together stay within the tolerance, fail if one exceeds it by more than the uncertainty, else "
-    "too close to tell"
+    "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points"
+    " and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
+    " exceeds it by more than the uncertainty, else too close to tell"
 )
 
 
@@ -22,9 +22,10 @@ RULE = (
 class ToleranceVerdict:
     """Deviations against plus and minus a tolerance, mm.
 
-    ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its decision; ``decision`` of
-    both. Percent of the points that lie ``within`` it, ``inside`` it by more than U, ``outside`` it by more than U, and
-    too ``close`` to tell. ``U_mm``: expanded uncertainty (k = 2) of a point, in the median.
+    ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its
+    decision; ``decision`` of both. Percent of the points that lie ``within`` it, ``inside`` it by
+    more than U, ``outside`` it by more than U, and too ``close`` to tell. ``U_mm``: expanded
+    uncertainty (k = 2) of a point, in the median.
     """
 
     tolerance_mm: float
@@ -38,8 +39,11 @@ class ToleranceVerdict:
     close: float
 
 
-def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: float) -> ToleranceVerdict:
-    """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the surface's normal."""
+def judge_deviation(
+    deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: float
+) -> ToleranceVerdict:
+    """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the
+    surface's normal."""
     if not tolerance_mm > 0:
         raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
     counted = deviation.counted
@@ -49,8 +53,12 @@ def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: fl
     off = np.abs(signed)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
     numbers = deviation.statistics()
-    ends = [make_length_error(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")]
-    decisions = [judge_property(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends]
+    ends = [
+        make_length_error(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")
+    ]
+    decisions = [
+        judge_property(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends
+    ]
     return ToleranceVerdict(
         tolerance_mm,
         typical,
@@ -65,8 +73,9 @@ def judge_deviation(deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: fl
 
 
 def judge_limits(value: float, U: float, lower: float | None, upper: float | None) -> Decision:
-    """Decide by guard bands whether a value of expanded uncertainty U (k = 2) lies between limits, of which one may be
-    absent: "pass" inside both by U, "fail" beyond one by more than U, else "undecided"."""
+    """Decide by guard bands whether a value of expanded uncertainty U (k = 2) lies between limits,
+    of which one may be absent: "pass" inside both by U, "fail" beyond one by more than U, else
+    "undecided"."""
     low, high = (-np.inf if lower is None else lower), (np.inf if upper is None else upper)
     if not (np.isfinite(value) and np.isfinite(U)):
         return "undecided"

@@ -1,4 +1,5 @@
-"""Uncertainty of fitted parameters: from the points' scatter, and from the calibration, which all fits share."""
+"""Uncertainty of fitted parameters: from the points' scatter, and from the calibration, which all
+fits share."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,11 +15,13 @@ from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.vectors import finite_rows
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p), whose product with
-itself is the parameters' covariance by errors that no averaging lessens. The k of two calls are the same errors."""
+"""Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p),
+whose product with itself is the parameters' covariance by errors that no averaging lessens. The k
+of two calls are the same errors."""
 
 PATCHES = 8
-"""Across a region: deviations within a patch are taken for one another's company, those of different patches not."""
+"""Across a region: deviations within a patch are taken for one another's company, those of
+different patches not."""
 
 DRAWS = 200
 """Of errors, where they are propagated by drawing them."""
@@ -26,9 +29,9 @@ DRAWS = 200
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Covariance of p parameters: ``scatter`` (p, p) of its own, and ``shared`` (k, p), the calibration's part, as
-    ``Shared`` gives it; None where that is not known. ``calibration``: by whose errors; only one calibration's are
-    the same."""
+    """Covariance of p parameters: ``scatter`` (p, p) of its own, and ``shared`` (k, p), the
+    calibration's part, as ``Shared`` gives it; None where that is not known. ``calibration``: by
+    whose errors; only one calibration's are the same."""
 
     scatter: np.ndarray
     shared: np.ndarray | None = None
@@ -47,7 +50,8 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class RigidSpread:
-    """Covariance (6, 6) of a rigid motion's rotation vector (rad) about ``middle`` (3,) mm, and its shift (mm)."""
+    """Covariance (6, 6) of a rigid motion's rotation vector (rad) about ``middle`` (3,) mm, and its
+    shift (mm)."""
 
     middle: np.ndarray
     covariance: np.ndarray
@@ -55,11 +59,14 @@ class RigidSpread:
     def draw(self, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
         """Draw `DRAWS` motions; returns what displaces points (n, 3): (draws, n, 3) mm."""
         steps = draw_steps(self.covariance, rng)
-        return lambda points: np.cross(steps[:, None, :3], points - self.middle) + steps[:, None, 3:]
+        return lambda points: (
+            np.cross(steps[:, None, :3], points - self.middle) + steps[:, None, 3:]
+        )
 
 
 def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
-    """(p + q, p + q): the covariance of two features' parameters; errors of a calibration that both have, are one."""
+    """(p + q, p + q): the covariance of two features' parameters; errors of a calibration that both
+    have, are one."""
     p = len(a.scatter)
     whole = np.zeros((p + len(b.scatter),) * 2)
     whole[:p, :p], whole[p:, p:] = a.covariance, b.covariance
@@ -78,8 +85,8 @@ def draw_steps(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
     """Return the standard deviation of f(step) at step 0, for steps (p,) of a covariance.
 
-    Along each principal direction f is asked one standard deviation to both sides, which also holds where f has a kink
-    there (an angle at zero, a distance at zero).
+    Along each principal direction f is asked one standard deviation to both sides, which also holds
+    where f has a kink there (an angle at zero, a distance at zero).
     """
     values, vectors = np.linalg.eigh(covariance)
     middle = f(np.zeros(len(values)))
@@ -90,11 +97,14 @@ def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarra
     return float(np.sqrt(variance))
 
 
-def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Return the covariance (p, p) of parameters fitted to points (n, 3) by least squares, from the fit's residuals.
+def scatter_covariance(
+    points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray
+) -> np.ndarray:
+    """Return the covariance (p, p) of parameters fitted to points (n, 3) by least squares, from the
+    fit's residuals.
 
-    The residuals (n,) of one patch count together: form and smooth errors do not average out over neighbours as noise
-    does. Never below what independent residuals would give.
+    The residuals (n,) of one patch count together: form and smooth errors do not average out over
+    neighbours as noise does. Never below what independent residuals would give.
     """
     n, p = jacobian.shape
     inverse = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
@@ -105,31 +115,38 @@ def scatter_covariance(points: np.ndarray, jacobian: np.ndarray, residuals: np.n
     count = len(cubes)
     if count <= 2 * p:
         return plain
-    sums = np.stack([np.bincount(patch, jacobian[:, k] * residuals, count) for k in range(p)], axis=1)
+    sums = np.stack(
+        [np.bincount(patch, jacobian[:, k] * residuals, count) for k in range(p)], axis=1
+    )
     together = inverse @ (sums.T @ sums) @ inverse * count / (count - p)
     # elementwise larger standard deviations, with the correlations of the patches
     ratio = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(together), 1e-300), 1.0))
     return together * np.outer(ratio, ratio)
 
 
-def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: float = 0.0) -> Shared:
-    """Return the function for the uncertainty that a splined calibration causes in points measured through one axis,
-    without the rigid motion of the working volume, so that distances and angles are not affected by it. ``scale``: by
-    what factor the points were enlarged after their reconstruction, and ``scale_sigma`` the standard uncertainty of
-    that factor."""
+def splined_shared(
+    bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: float = 0.0
+) -> Shared:
+    """Return the function for the uncertainty that a splined calibration causes in points measured
+    through one axis, without the rigid motion of the working volume, so that distances and angles
+    are not affected by it. ``scale``: by what factor the points were enlarged after their
+    reconstruction, and ``scale_sigma`` the standard uncertainty of that factor."""
     rig = bundle.state.rig
     reference = working_volume(rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
     motion = BestMotion.fit(reference.points)
     moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
 
     def shared(points: np.ndarray, answers: np.ndarray) -> np.ndarray:
-        """Return (k, p): the calibration's part of the parameters' covariance, as its square root."""
+        """Return (k, p): the calibration's part of the parameters' covariance, as its square
+        root."""
         places = np.asarray(points, np.float64) / scale
         pixels = _pixels(bundle, places)
         jacobian = bundle.point_jacobian(axis, pixels, places[:, 2])
         jacobian.data[~np.isfinite(jacobian.data)] = 0.0
         volume = Volume(pixels, places[:, 2], *view_pixels(rig, pixels, places[:, 2]))
-        weighed = (answers * (scale * extrapolation_factor(bundle, volume))[None, :, None]).reshape(len(answers), -1)
+        weighed = (answers * (scale * extrapolation_factor(bundle, volume))[None, :, None]).reshape(
+            len(answers), -1
+        )
         free = weighed @ jacobian - (weighed @ motion.displace(places)) @ moved
         larger = np.einsum("pni,ni->p", answers, scale_sigma * (places - motion.centre))
         return np.vstack([np.asarray(bundle.whiten(np.asarray(free)), np.float64), larger])
@@ -138,7 +155,8 @@ def splined_shared(bundle: Bundle, axis: Axis, scale: float = 1.0, scale_sigma: 
 
 
 def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
-    """Return the camera pixels (n, 2) of points (n, 3), by Newton steps on the rays of the pixels."""
+    """Return the camera pixels (n, 2) of points (n, 3), by Newton steps on the rays of the
+    pixels."""
     rig = bundle.state.rig
     width, height = (float(n) for n in rig.camera.size)
     # the rays of a coarse grid give a start that is linear in the normalised point

@@ -1,1 +1,2 @@
-"""The commands as Python functions, one module for each: `calibrate.py` holds `calibrate`. The wizard uses the same."""
+"""The commands as Python functions, one module for each: `calibrate.py` holds `calibrate`. The
+wizard uses the same."""

@@ -47,7 +47,8 @@ class AcceptSettings:
     """What a calibration is tested with.
 
     Args:
-        artefact: TOML file with the values of the certificate, the captures that show the artefact, and the limits.
+        artefact: TOML file with the values of the certificate, the captures that show the artefact,
+            and the limits.
         model: Which calibration to test; by default the best one available.
         still: Captures (ten) of one still object, for the repeatability.
         apply_scale: Record the measured scale as a correction of later clouds.
@@ -61,7 +62,8 @@ class AcceptSettings:
 
 @operation("accept", AcceptanceTest, AcceptSettings)
 def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]]:
-    """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the operator's limits.
+    """Test a calibration with a ball bar, a sphere or a plane that has a certificate, against the
+    operator's limits.
 
     The result stays in the session as ``acceptance/1``, ``acceptance/2``, ...
     """
@@ -72,14 +74,18 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
     chosen, factor = load_model(store, name), scale_factor(store, name)
     warn_if_stale(store, job.warn)
     if settings.apply_scale and certified.kind == "plane":
-        raise InputError("the scale cannot be measured on a plane: apply that of a ball bar or a sphere")
+        raise InputError(
+            "the scale cannot be measured on a plane: apply that of a ball bar or a sphere"
+        )
     captures = _match_captures(store, certified)
     check_capture_sizes(store, [*captures, *still])
     positions = _measure_positions(job, certified, chosen, captures, 0.5 if still else 0.9)
     test = conclude_test(certified, name, positions)
     repeated = None
     if still:
-        repeated = repeatability(_list_depths(replace(job, progress=part(job.progress, 0.5, 0.95)), chosen, still))
+        repeated = repeatability(
+            _list_depths(replace(job, progress=part(job.progress, 0.5, 0.95)), chosen, still)
+        )
     checks = load_drift_history(store)
     applied = record_scale(store, test) if settings.apply_scale else None
     found = AcceptanceTest(
@@ -104,7 +110,8 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
 def _measure_positions(
     job: Job, certified: Artefact, chosen: Model, captures: Mapping[str, str], end: float
 ) -> list[PositionErrors]:
-    """Measure the artefact at each position, {capture: position}; ``end``: share of the work that is done then."""
+    """Measure the artefact at each position, {capture: position}; ``end``: share of the work that
+    is done then."""
     store, positions = job.store, list[PositionErrors]()
     depth_range = load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), job.warn)):
@@ -114,13 +121,19 @@ def _measure_positions(
         if certified.kind == "plane" and shot.role == "calibration":
             plate = segment_board(store, shot, capture_texture(shot, frames), job.warn)
         try:
-            positions.append(measure_artefact(certified, cloud, captures[shot.name], shot.name, depth_range, plate))
+            positions.append(
+                measure_artefact(
+                    certified, cloud, captures[shot.name], shot.name, depth_range, plate
+                )
+            )
         except InputError as error:
             raise InputError(f"{shot.name}: {error}") from error
     return positions
 
 
-def _list_depths(job: Job, chosen: Model, still: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _list_depths(
+    job: Job, chosen: Model, still: Sequence[str]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield depth and its standard deviation (h, w) mm of each capture of the still object."""
     for i, (shot, _, phases) in enumerate(decode_captures(job.store, list(still))):
         job.progress(i / len(still), f"repeating {shot.name}")
@@ -146,8 +159,11 @@ def _match_captures(store: Session, artefact: Artefact) -> dict[str, str]:
     return positions
 
 
-def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Drift]) -> ErrorBudget | None:
-    """Error budget of the artefact's length from the test and the drift checks; None where no length was measured."""
+def _length_budget(
+    test: Acceptance, applied: float | None, checks: Sequence[Drift]
+) -> ErrorBudget | None:
+    """Error budget of the artefact's length from the test and the drift checks; None where no
+    length was measured."""
     scale = test.scale
     if scale is None:
         return None
@@ -156,7 +172,9 @@ def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Dri
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
     noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
     scatter = None if len(errors) < 2 else float(np.sqrt(max(errors.var(ddof=1) - noise**2, 0.0)))
-    uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0  # known, not removed
+    uncorrected_ppm = (
+        abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0
+    )  # known, not removed
     board = mm * 1e-6 * float(np.hypot(scale.u_ppm, uncorrected_ppm))
     warmth = mm * 1e-6 * artefact.expansion.ppm_per_kelvin * artefact.temperature.U_kelvin / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
@@ -168,14 +186,21 @@ def _length_budget(test: Acceptance, applied: float | None, checks: Sequence[Dri
         mm,
         [
             Contribution("phase noise", noise, "A", "the scatter of the points about their fits"),
-            Contribution("calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"),
+            Contribution(
+                "calibration", scatter, "A", f"the errors' scatter over {len(errors)} places"
+            ),
             Contribution(
                 "board scale",
                 board,
                 "B",
                 "this test's scale" + (", which was left uncorrected" if uncorrected_ppm else ""),
             ),
-            Contribution("temperature", warmth, "B", f"{artefact.expansion.ppm_per_kelvin:g} ppm/K of the artefact"),
+            Contribution(
+                "temperature",
+                warmth,
+                "B",
+                f"{artefact.expansion.ppm_per_kelvin:g} ppm/K of the artefact",
+            ),
             Contribution("drift", drift, "B", since),
         ],
     )

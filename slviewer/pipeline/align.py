@@ -1,7 +1,8 @@
 """Scans aligned one after the other while they are captured, each to those before it.
 
-Each scan that could be aligned has a result ``placement/NAME``, which says where it is in the frame of the first one;
-one that could not has the reason. A merge of all starts from there, and closes the loops.
+Each scan that could be aligned has a result ``placement/NAME``, which says where it is in the frame
+of the first one; one that could not has the reason. A merge of all starts from there, and closes
+the loops.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,9 +43,10 @@ _REACH = 2.5  # spacings of the shown points
 
 @dataclass(frozen=True, eq=False)
 class AlignedScans:
-    """What the aligned scans show together: points (n, 3) float32 mm in the frame of the first one, and how many of
-    the scans see each of them, (n,) uint8. ``facing`` (n,) float32: cosine of the angle between the surface's normal
-    and the view of its scan. ``names``: the scans, in the order in which they were captured."""
+    """What the aligned scans show together: points (n, 3) float32 mm in the frame of the first one,
+    and how many of the scans see each of them, (n,) uint8. ``facing`` (n,) float32: cosine of the
+    angle between the surface's normal and the view of its scan. ``names``: the scans, in the order
+    in which they were captured."""
 
     names: tuple[str, ...]
     points: NDArray[np.float32]
@@ -62,8 +64,8 @@ class AlignSettings:
     """Which scans are aligned.
 
     Args:
-        captures: Names of the captures, in the order in which they were captured; by default all scans that are not in
-            place yet.
+        captures: Names of the captures, in the order in which they were captured; by default all
+            scans that are not in place yet.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     ``only_reconstructed``: skip scans that were not reconstructed.
@@ -77,13 +79,17 @@ class AlignSettings:
 
 @operation("align", Placement, AlignSettings)
 def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
-    """Align scans one after the other, each to those before it, as the wizard does while they are captured.
+    """Align scans one after the other, each to those before it, as the wizard does while they are
+    captured.
 
-    A scan that cannot be aligned is kept apart, with the reason. `merge` then starts from the places found.
+    A scan that cannot be aligned is kept apart, with the reason. `merge` then starts from the
+    places found.
     """
     store = job.store
     check_accepted(store, settings.accept_rejected)
-    names = list(settings.captures) or [name for name in list_scans(store) if load_placement(store, name) is None]
+    names = list(settings.captures) or [
+        name for name in list_scans(store) if load_placement(store, name) is None
+    ]
     if settings.only_reconstructed:
         names = [name for name in names if store.state_of(f"clouds/{name}") == "fresh"]
     placed, clouds = load_placements(store), dict[str, Cloud]()
@@ -94,19 +100,25 @@ def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
         if found.T_first_scan is not None:
             placed[name] = found
         if i == len(names) - 1 and len(placed) > 1:
-            found = msgspec.structs.replace(found, seen_again=view_places(placed, clouds, store).share_seen_again)
+            found = msgspec.structs.replace(
+                found, seen_again=view_places(placed, clouds, store).share_seen_again
+            )
         yield Found(name, found)
     job.progress(1.0, "aligned")
 
 
-def _align_scan(job: Job, name: str, placed: Mapping[str, Placement], clouds: dict[str, Cloud]) -> Placement:
+def _align_scan(
+    job: Job, name: str, placed: Mapping[str, Placement], clouds: dict[str, Cloud]
+) -> Placement:
     """Align one scan to those in place; clouds that are reconstructed are added to ``clouds``.
 
     It is stale with the scan that it was aligned to, and with all that this was aligned by.
     """
     store, refusals = job.store, list[str]()
     cloud = _load_cloud(store, name, clouds, job.warn)
-    inputs = store.input_hashes(name, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")))
+    inputs = store.input_hashes(
+        name, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}"))
+    )
     if not placed:
         return Placement(T_first_scan=to_matrix(np.eye(4)), inputs=inputs)
     for onto in [*reversed(list(placed))][:MOST_TRIED]:
@@ -128,19 +140,26 @@ def _align_scan(job: Job, name: str, placed: Mapping[str, Placement], clouds: di
 
 
 def remove_placement(store: Session, name: str) -> None:
-    """Move the placement of a scan to the trash: it is no longer shown with the others, and can be aligned again."""
+    """Move the placement of a scan to the trash: it is no longer shown with the others, and can be
+    aligned again."""
     if store.has_result(f"{FOLDER}/{name}"):
         store.trash_result(f"{FOLDER}/{name}")
 
 
 def list_scans(store: Session) -> list[str]:
-    """Names of the captures of objects, in the order in which they were captured; no planes and spheres."""
-    scans = [c for c in store.captures("scan") if c.meta.get("settings", {}).get("purpose", "scan") == "scan"]
+    """Names of the captures of objects, in the order in which they were captured; no planes and
+    spheres."""
+    scans = [
+        c
+        for c in store.captures("scan")
+        if c.meta.get("settings", {}).get("purpose", "scan") == "scan"
+    ]
     return [scan.name for scan in sorted(scans, key=lambda scan: str(scan.meta.get("created", "")))]
 
 
 def load_placement(store: Session, name: str) -> Placement | None:
-    """The placement of a scan; None where it has none, or one that a newer calibration or capture has outdated."""
+    """The placement of a scan; None where it has none, or one that a newer calibration or capture
+    has outdated."""
     fresh = store.state_of(f"{FOLDER}/{name}") == "fresh"
     return load_record(store, Placement, name) if fresh else None
 
@@ -148,7 +167,11 @@ def load_placement(store: Session, name: str) -> Placement | None:
 def load_placements(store: Session) -> dict[str, Placement]:
     """The placement of every scan that has its place, in the order in which they were captured."""
     placements = {name: load_placement(store, name) for name in list_scans(store)}
-    return {name: each for name, each in placements.items() if each is not None and each.T_first_scan is not None}
+    return {
+        name: each
+        for name, each in placements.items()
+        if each is not None and each.T_first_scan is not None
+    }
 
 
 def load_places(store: Session) -> dict[str, Floats]:
@@ -161,7 +184,9 @@ def view_aligned(store: Session) -> AlignedScans:
     return view_places(load_placements(store), {}, store)
 
 
-def view_places(placed: Mapping[str, Placement], clouds: dict[str, Cloud], store: Session) -> AlignedScans:
+def view_places(
+    placed: Mapping[str, Placement], clouds: dict[str, Cloud], store: Session
+) -> AlignedScans:
     """Scans in their places, thinned, with the number of scans that see each point; ``clouds``:
     those that were loaded before."""
     thinned, facing = {}, [np.zeros(0)]
@@ -173,11 +198,14 @@ def view_places(placed: Mapping[str, Placement], clouds: dict[str, Cloud], store
         thinned[name] = move_points(np.array(each.T_first_scan), points)
         facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
     together, seen_by = count_views(thinned)
-    return AlignedScans(tuple(thinned), together, seen_by, np.nan_to_num(np.concatenate(facing)).astype(np.float32))
+    return AlignedScans(
+        tuple(thinned), together, seen_by, np.nan_to_num(np.concatenate(facing)).astype(np.float32)
+    )
 
 
 def count_views(scans: Mapping[str, Floats]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return all points (n, 3) mm of scans in one frame, and for each how many of the scans have a point near it."""
+    """Return all points (n, 3) mm of scans in one frame, and for each how many of the scans have a
+    point near it."""
     trees = {name: cKDTree(points) for name, points in scans.items()}
     spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees.values()]
     reach = _REACH * max(spacing, default=0.0)
@@ -185,7 +213,9 @@ def count_views(scans: Mapping[str, Floats]) -> tuple[NDArray[np.float32], NDArr
     for name in trees:
         seen = np.ones(trees[name].n, np.uint8)
         for other in trees.keys() - {name}:
-            seen += np.isfinite(trees[other].query(trees[name].data, distance_upper_bound=reach, workers=-1)[0])
+            seen += np.isfinite(
+                trees[other].query(trees[name].data, distance_upper_bound=reach, workers=-1)[0]
+            )
         counts.append(seen)
     points = [tree.data for tree in trees.values()]
     return (
@@ -195,7 +225,8 @@ def count_views(scans: Mapping[str, Floats]) -> tuple[NDArray[np.float32], NDArr
 
 
 def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn) -> Cloud:
-    """The cloud of a scan, of at most `_PIXELS` pixels: the saved one where it is fresh, else reconstructed."""
+    """The cloud of a scan, of at most `_PIXELS` pixels: the saved one where it is fresh, else
+    reconstructed."""
     if name not in clouds:
         if store.state_of(f"clouds/{name}") == "fresh":
             meta, arrays = store.load_result(f"clouds/{name}", only=("points", "sigma_z"))

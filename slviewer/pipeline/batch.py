@@ -1,4 +1,5 @@
-"""Many captures at once, on Dask's distributed scheduler: a cluster of this machine's own cores, or one given."""
+"""Many captures at once, on Dask's distributed scheduler: a cluster of this machine's own cores, or
+one given."""
 
 import os
 import secrets
@@ -39,12 +40,14 @@ import signal
 def dask_setup(worker):
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 """
-"""A terminal's Ctrl-C reaches workers too: they leave it to the process that started them, which ends them."""
+"""A terminal's Ctrl-C reaches workers too: they leave it to the process that started them, which
+ends them."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The result of every capture, in the order of the sessions. ``broken``: {session: why} of those without any."""
+    """The result of every capture, in the order of the sessions. ``broken``: {session: why} of
+    those without any."""
 
     done: tuple[TaskResult, ...]
     broken: Mapping[str, str]
@@ -53,19 +56,29 @@ class Batch:
     @property
     def failed(self) -> dict[str, str]:
         """{session, or session and capture: why}."""
-        failed = {f"{done.session} {done.capture}": done.failed for done in self.done if done.failed}
+        failed = {
+            f"{done.session} {done.capture}": done.failed for done in self.done if done.failed
+        }
         return {**self.broken, **failed}
 
     @property
     def failure(self) -> str:
         """How many captures and sessions failed; empty where none did."""
-        return f"{len(self.failed)} of the batch failed: the summary names them, and why" if self.failed else ""
+        return (
+            f"{len(self.failed)} of the batch failed: the summary names them, and why"
+            if self.failed
+            else ""
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the published values of ``batch --json``."""
-        sessions: dict[str, Any] = {address: {"failed": why, "captures": {}} for address, why in self.broken.items()}
+        sessions: dict[str, Any] = {
+            address: {"failed": why, "captures": {}} for address, why in self.broken.items()
+        }
         for done in self.done:
-            captures = sessions.setdefault(done.session, {"failed": None, "captures": {}})["captures"]
+            captures = sessions.setdefault(done.session, {"failed": None, "captures": {}})[
+                "captures"
+            ]
             captures[done.capture] = {
                 **done.figures,
                 "failed": done.failed or None,
@@ -77,9 +90,17 @@ class Batch:
         """Return a report for the terminal: a table per session, then what failed and why."""
         blocks = []
         for address in dict.fromkeys(done.session for done in self.done):
-            rows = [{"capture": d.capture, **d.figures} for d in self.done if d.session == address and not d.failed]
+            rows = [
+                {"capture": d.capture, **d.figures}
+                for d in self.done
+                if d.session == address and not d.failed
+            ]
             if rows:
-                wrote = f" -> exports/{verification_file(self.task)}" if self.task.do == "verify" else ""
+                wrote = (
+                    f" -> exports/{verification_file(self.task)}"
+                    if self.task.do == "verify"
+                    else ""
+                )
                 blocks.append(f"{address}{wrote}\n{render(rows)}\n")
         failed = self.failed
         blocks += [f"failed: {what}: {why}" for what, why in failed.items()]
@@ -100,10 +121,11 @@ def batch(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Batch:
-    """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask cluster.
+    """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask
+    cluster.
 
-    What it makes is what each command makes alone, in each session's exports. A capture that fails is named in the end,
-    with status 1, and stops no other.
+    What it makes is what each command makes alone, in each session's exports. A capture that fails
+    is named in the end, with status 1, and stops no other.
 
     Args:
         sessions: Session folders that all workers see, or addresses such as s3://bucket/session.
@@ -111,15 +133,20 @@ def batch(
         captures: Their names, or patterns such as 'plane_*'; by default all scans.
         shape: What the captures show, with --do verify.
         radius: Nominal radius of the spheres, mm, with --do verify.
-        model: Which calibration to use; by default each session's best one, and all there are with --do verify.
-        scheduler: Address of a Dask scheduler, such as tcp://host:8786; by default a cluster of this machine's cores.
+        model: Which calibration to use; by default each session's best one, and all there are with
+            --do verify.
+        scheduler: Address of a Dask scheduler, such as tcp://host:8786; by default a cluster of
+            this machine's cores.
         accept_rejected: Use calibrations although their verdict rejects them.
 
-    Captures are read, and files written, where the workers are; a capture whose worker dies is done again by another.
-    Raises SlviewerError without ``distributed``, or where no scheduler answers or it has no workers.
+    Captures are read, and files written, where the workers are; a capture whose worker dies is done
+    again by another. Raises SlviewerError without ``distributed``, or where no scheduler answers or
+    it has no workers.
     """
     if do == "verify" and shape is None:
-        raise UsageError("what the captures show is not known: give --shape plane or --shape sphere")
+        raise UsageError(
+            "what the captures show is not known: give --shape plane or --shape sphere"
+        )
     if do != "verify" and (shape is not None or radius is not None):
         raise UsageError(f"--shape and --radius belong to --do verify, not to --do {do}")
     addresses = list(dict.fromkeys(absolute_address(session) for session in sessions))
@@ -129,10 +156,15 @@ def batch(
     progress(0.0, f"looking into {len(addresses)} sessions")
     try:
         with _start_cluster() if scheduler is None else connect(scheduler) as client:
-            listing = {address: (list_captures, address, tuple(captures), task.version) for address in addresses}
+            listing = {
+                address: (list_captures, address, tuple(captures), task.version)
+                for address in addresses
+            }
             plans = _gather_results(client, listing, ignore_progress, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
-            wanted = [(a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan]
+            wanted = [
+                (a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan
+            ]
             done = _run_tasks(client, wanted, task, progress, warn)
             broken |= _write_verifications(client, done, task, warn)
             progress(1.0, "done")
@@ -146,31 +178,45 @@ def _run_tasks(
     client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
 ) -> tuple[TaskResult, ...]:
     """Run the task for each (session, capture); return the results in their order."""
-    outcomes = _gather_results(client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn)
+    outcomes = _gather_results(
+        client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn
+    )
     done = tuple(
         came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came)
         for (a, name), came in outcomes.items()
     )
-    for sentence in dict.fromkeys(f"{one.session}: {words}" for one in done for words in one.warnings):
+    for sentence in dict.fromkeys(
+        f"{one.session}: {words}" for one in done for words in one.warnings
+    ):
         warn(sentence)
     return done
 
 
-def _write_verifications(client: Any, done: Sequence[TaskResult], task: Task, warn: Warn) -> dict[str, str]:
+def _write_verifications(
+    client: Any, done: Sequence[TaskResult], task: Task, warn: Warn
+) -> dict[str, str]:
     """Have each session's verifications written; {session: why it could not be done}."""
     parts: dict[str, dict[str, Verification]] = {}
     for one in done:
         if one.verification is not None:
             parts.setdefault(one.session, {})[one.capture] = one.verification
-    writing = {address: (write_verification, address, verified, task) for address, verified in parts.items()}
-    return {address: why for address, why in _gather_results(client, writing, ignore_progress, warn).items() if why}
+    writing = {
+        address: (write_verification, address, verified, task)
+        for address, verified in parts.items()
+    }
+    return {
+        address: why
+        for address, why in _gather_results(client, writing, ignore_progress, warn).items()
+        if why
+    }
 
 
 @contextmanager
 def connect(scheduler: str, timeout_s: float = CONNECT_TIMEOUT_S) -> Iterator[Any]:
     """Yield a client of a running scheduler that has a worker.
 
-    Raises SlviewerError where the scheduler does not answer in ``timeout_s``, or then has no worker for as long.
+    Raises SlviewerError where the scheduler does not answer in ``timeout_s``, or then has no worker
+    for as long.
     """
     _check_installed()
     from distributed import Client
@@ -179,15 +225,16 @@ def connect(scheduler: str, timeout_s: float = CONNECT_TIMEOUT_S) -> Iterator[An
         client = Client(scheduler, timeout=timeout_s, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise SlviewerError(
-            f"no Dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave "
-            "--scheduler out to use this machine's cores"
+            f"no Dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`,"
+            " or leave --scheduler out to use this machine's cores"
         ) from error
     with client:
         try:
             client.wait_for_workers(1, timeout=timeout_s)
         except TimeoutError as error:
             raise SlviewerError(
-                f"the scheduler at {scheduler} has no workers: start some with `dask worker {scheduler}`"
+                f"the scheduler at {scheduler} has no workers: start some with `dask worker"
+                f" {scheduler}`"
             ) from error
         yield client
 
@@ -204,7 +251,10 @@ def _start_cluster() -> Iterator[Any]:
     workers = max(1, min(CPU_COUNT, MEMORY_LIMIT // BYTES_PER_WORKER))
     threads = str(max(1, CPU_COUNT // workers))
     libraries = ("OMP", "OPENBLAS", "MKL", "NUMBA")
-    environ = {f"{library}_NUM_THREADS": os.environ.get(f"{library}_NUM_THREADS", threads) for library in libraries}
+    environ = {
+        f"{library}_NUM_THREADS": os.environ.get(f"{library}_NUM_THREADS", threads)
+        for library in libraries
+    }
     with (
         dask.config.set({"distributed.nanny.pre-spawn-environ": environ}),
         LocalCluster(
@@ -213,7 +263,8 @@ def _start_cluster() -> Iterator[Any]:
             memory_limit=MEMORY_LIMIT // workers,
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             preload=_IGNORE_INTERRUPT,
-            security=True,  # whoever reaches a scheduler runs what they like as its user; others share this machine
+            # whoever reaches a scheduler runs what they like as its user; others share this machine
+            security=True,
             silence_logs="ERROR",
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
@@ -225,13 +276,16 @@ def _check_installed() -> None:
     """Raise SlviewerError where a package that batches need is not installed."""
     for package in ("distributed", "fsspec", "cryptography"):
         if find_spec(package) is None:
-            raise SlviewerError(f"a batch needs the package {package}, which is missing: {INSTALL_COMMAND}")
+            raise SlviewerError(
+                f"a batch needs the package {package}, which is missing: {INSTALL_COMMAND}"
+            )
 
 
 def _gather_results(
     client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn
 ) -> dict[Any, Any]:
-    """What each call (function, arguments ...) returned, in their order; the reason as text where a worker could not.
+    """What each call (function, arguments ...) returned, in their order; the reason as text where a
+    worker could not.
 
     The remaining calls are cancelled if this raises.
     """
@@ -261,7 +315,8 @@ def _gather_results(
 
 
 def _result_or_error(future: Any) -> Any:
-    """Return the result of a finished future, or the reason as text where the worker could not compute it."""
+    """Return the result of a finished future, or the reason as text where the worker could not
+    compute it."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker
@@ -273,6 +328,8 @@ def _result_or_error(future: Any) -> Any:
     except CancelledError:
         return "the scheduler was lost, or gave the work up"
     except ImportError as error:
-        raise InputError(f"the workers cannot run slviewer ({error}): install it where they are") from error
+        raise InputError(
+            f"the workers cannot run slviewer ({error}): install it where they are"
+        ) from error
     except Exception as error:  # whatever a worker met with ends that capture alone
         return describe_error(error)

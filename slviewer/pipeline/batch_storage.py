@@ -1,4 +1,5 @@
-"""Where the sessions of a batch are: folders that every worker sees, or addresses that fsspec understands."""
+"""Where the sessions of a batch are: folders that every worker sees, or addresses that fsspec
+understands."""
 
 import contextlib
 import os
@@ -27,14 +28,16 @@ def absolute_address(session: Path | str) -> str:
 
 @contextmanager
 def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
-    """Yield a folder with the session and the named capture's frames. Raises SessionError where it is missing.
+    """Yield a folder with the session and the named capture's frames. Raises SessionError where it
+    is missing.
 
     From an fsspec address it is copied, with the calibrations, and removed when the block ends.
     """
     if not is_remote(address):
         if not is_session(address):
             raise SessionError(
-                f"{address} is no session folder where the worker is: give one that all workers share, or an address"
+                f"{address} is no session folder where the worker is: give one that all workers"
+                " share, or an address"
             )
         yield Path(address)
         return
@@ -50,9 +53,13 @@ def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     fs.get_file(path, str(target))
         except OSError as error:
-            raise SessionError(f"{address} cannot be read ({error}): check the address and its permissions") from error
+            raise SessionError(
+                f"{address} cannot be read ({error}): check the address and its permissions"
+            ) from error
         if not is_session(folder):
-            raise SessionError(f"{address} is no session (it holds no session.json): check the address")
+            raise SessionError(
+                f"{address} is no session (it holds no session.json): check the address"
+            )
         for inner in ("captures", "results"):
             Path(folder, inner).mkdir(exist_ok=True)
         yield Path(folder)
@@ -60,9 +67,11 @@ def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
 
 @contextmanager
 def export_folder(address: str, batch: str) -> Iterator[Path]:
-    """Yield a folder whose files are moved to the session's exports when the block ends; none if it fails.
+    """Yield a folder whose files are moved to the session's exports when the block ends; none if it
+    fails.
 
-    They replace files of their names. ``remove_leftovers`` removes what a killed worker leaves behind.
+    They replace files of their names. ``remove_leftovers`` removes what a killed worker leaves
+    behind.
     """
     fs, root = _file_system(address)
     with tempfile.TemporaryDirectory(prefix="slviewer-") as folder:
@@ -75,8 +84,8 @@ def export_folder(address: str, batch: str) -> Iterator[Path]:
                 fs.mv(arriving, f"{root}/exports/{path.name}")
         except FileNotFoundError as error:
             raise SessionError(
-                f"a file for {address} disappeared while it was delivered ({error}): the batch was ended meanwhile, or "
-                "another program removes files there; run the batch again"
+                f"a file for {address} disappeared while it was delivered ({error}): the batch was"
+                " ended meanwhile, or another program removes files there; run the batch again"
             ) from error
         except OSError as error:
             raise SessionError(
@@ -85,7 +94,8 @@ def export_folder(address: str, batch: str) -> Iterator[Path]:
 
 
 def remove_leftovers(address: str, batch: str) -> None:
-    """Remove what killed or cancelled workers of a batch did not finish, as far as it can be reached from here."""
+    """Remove what killed or cancelled workers of a batch did not finish, as far as it can be
+    reached from here."""
     with contextlib.suppress(OSError, InputError):
         fs, root = _file_system(address)
         for path in fs.ls(f"{root}/exports", detail=False):

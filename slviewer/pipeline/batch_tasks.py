@@ -1,4 +1,5 @@
-"""The tasks that a worker of a batch runs: the commands' own functions, on one capture at a time."""
+"""The tasks that a worker of a batch runs: the commands' own functions, on one capture at a
+time."""
 
 import json
 import threading
@@ -26,13 +27,14 @@ from slviewer.session.store import Session
 Do = Literal["reconstruct", "verify", "mesh"]
 
 _TASK_LOCK = threading.Lock()
-"""A process works on one capture at a time, however many threads its worker has: the kernels use its cores already, and
-each capture more would need as much memory again."""
+"""A process works on one capture at a time, however many threads its worker has: the kernels use
+its cores already, and each capture more would need as much memory again."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """The same work for all captures of a batch. ``batch``: its name, ``version``: the submitting program's."""
+    """The same work for all captures of a batch. ``batch``: its name, ``version``: the submitting
+    program's."""
 
     do: Do
     batch: str
@@ -59,8 +61,8 @@ class TaskResult:
 
 
 def list_captures(address: str, patterns: Sequence[str], version: str) -> list[str]:
-    """Names of a session's captures that match any of the patterns, of its scans where there is none. Raises
-    SlviewerError where there are none."""
+    """Names of a session's captures that match any of the patterns, of its scans where there is
+    none. Raises SlviewerError where there are none."""
     _check_version(version)
     with fetch_session(address) as folder, Session.open(folder) as store:
         if not patterns:
@@ -70,7 +72,10 @@ def list_captures(address: str, patterns: Sequence[str], version: str) -> list[s
         there = store.capture_names()
         names = [name for name in there if any(fnmatchcase(name, pattern) for pattern in patterns)]
         if not names:
-            raise InputError(f"no capture is called {' or '.join(patterns)}: there are {', '.join(there) or 'none'}")
+            raise InputError(
+                f"no capture is called {' or '.join(patterns)}: there are"
+                f" {', '.join(there) or 'none'}"
+            )
         return names
 
 
@@ -89,13 +94,17 @@ def run_task(address: str, capture: str, task: Task) -> TaskResult:
     except Exception as error:  # any error ends this capture alone
         return TaskResult(address, capture, warnings=tuple(warnings), failed=describe_error(error))
     figures = done.figures | {"s": round(time.perf_counter() - started, 1)}
-    return replace(done, session=address, capture=capture, figures=figures, warnings=tuple(warnings))
+    return replace(
+        done, session=address, capture=capture, figures=figures, warnings=tuple(warnings)
+    )
 
 
 def write_verification(address: str, records: Mapping[str, Verification], task: Task) -> None:
     """Write the verifications of one session, by capture, as ``verify --json`` does."""
     with export_folder(address, task.batch) as made:
-        text = json.dumps(Findings(Verification, records).to_json(), indent=2, default=to_plain) + "\n"
+        text = (
+            json.dumps(Findings(Verification, records).to_json(), indent=2, default=to_plain) + "\n"
+        )
         write_bytes(made / verification_file(task), text.encode())
 
 
@@ -110,12 +119,17 @@ def describe_error(error: Exception) -> str:
 
 
 def _check_version(version: str) -> None:
-    """Raise InputError where the batch was submitted by another version of slviewer than the worker's."""
+    """Raise InputError where the batch was submitted by another version of slviewer than the
+    worker's."""
     if version != __version__:
-        raise InputError(f"the worker runs slviewer {__version__}, the batch {version}: install the same on both")
+        raise InputError(
+            f"the worker runs slviewer {__version__}, the batch {version}: install the same on both"
+        )
 
 
-def _reconstruct(store: Session, capture: str, task: Task, made: Path, warnings: list[str]) -> TaskResult:
+def _reconstruct(
+    store: Session, capture: str, task: Task, made: Path, warnings: list[str]
+) -> TaskResult:
     """Reconstruct a capture to a cloud or mesh in the folder ``made``, and return its figures."""
     settings = ReconstructSettings(
         capture,
@@ -136,7 +150,11 @@ def _verify(store: Session, capture: str, task: Task, warnings: list[str]) -> Ta
     assert task.shape is not None
     models = (task.model,) if task.model else ()
     settings = VerifySettings(
-        (capture,), task.shape, models=models, radius=task.radius, accept_rejected=task.accept_rejected
+        (capture,),
+        task.shape,
+        models=models,
+        radius=task.radius,
+        accept_rejected=task.accept_rejected,
     )
     found = verify.run(store, settings, warn=warnings.append)[capture]
     figures = {f"{model} RMS mm": fit.rms_mm for model, fit in found.models.items()}

@@ -30,15 +30,21 @@ def calibrate_camera_alone(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> CameraCalibration:
-    """Calibrate the camera from a folder of pictures, or from the target poses of a session; a session stays as it is.
+    """Calibrate the camera from a folder of pictures, or from the target poses of a session; a
+    session stays as it is.
 
-    ``poses``, ``exclude``: names or patterns of pictures. ``out``: .yml, .xml or .json for OpenCV. Pictures in which
-    the board is not detected are excluded with the reason. Raises CalibrationRejected for fewer than three.
+    ``poses``, ``exclude``: names or patterns of pictures. ``out``: .yml, .xml or .json for OpenCV.
+    Pictures in which the board is not detected are excluded with the reason. Raises
+    CalibrationRejected for fewer than three.
     """
     board, source = Board.parse(target), Path(source)
     names = _list_pictures(source)
     without = match_names(names, exclude, "picture")
-    chosen = [name for name in (match_names(names, poses, "picture") if poses else names) if name not in without]
+    chosen = [
+        name
+        for name in (match_names(names, poses, "picture") if poses else names)
+        if name not in without
+    ]
     detections: dict[str, Detection] = {}
     excluded: dict[str, str] = {}
     size: tuple[int, int] | None = None
@@ -47,7 +53,10 @@ def calibrate_camera_alone(
         image = _read_picture(source, name)
         height, width = image.shape[:2]
         if size is not None and size != (width, height):
-            raise InputError(f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}: use pictures of one size")
+            raise InputError(
+                f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}: use pictures of"
+                " one size"
+            )
         size = width, height
         try:
             detections[name] = detect(board, image)
@@ -69,7 +78,9 @@ def _list_pictures(source: Path) -> list[str]:
         with Session.open(source) as store:
             return store.capture_names("calibration")
     if not source.is_dir():
-        raise InputError(f"{source} is no folder: give a folder of pictures of the board, or a session")
+        raise InputError(
+            f"{source} is no folder: give a folder of pictures of the board, or a session"
+        )
     return [path.name for path in images_by_name(source)]
 
 
@@ -84,7 +95,9 @@ def _read_picture(source: Path, name: str) -> np.ndarray:
 
 
 _MEANINGS = {
-    "camera_size": "width and height of the image, px; pixel (0, 0) is the centre of the top left one",
+    "camera_size": (
+        "width and height of the image, px; pixel (0, 0) is the centre of the top left one"
+    ),
     "K_camera": "intrinsics: fx 0 cx, 0 fy cy, 0 0 1, px",
     "D_camera": "distortion: k1 k2 p1 p2 k3, as OpenCV orders them",
     "focal_sigma_px": "standard deviations of fx and fy, px",

@@ -1,4 +1,5 @@
-"""The verdict on a session's calibration: made and stored with it, and checked before it is used."""
+"""The verdict on a session's calibration: made and stored with it, and checked before it is
+used."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +30,8 @@ def calibrate_with_evidence(
     excluded: Mapping[str, str],
     progress: Progress,
 ) -> DiagnosedCalibration:
-    """Read and examine the target poses, calibrate stereo from them, and judge it. ``excluded``: {pose: why}."""
+    """Read and examine the target poses, calibrate stereo from them, and judge it. ``excluded``:
+    {pose: why}."""
     sequence = store.load_capture(names[0]).sequence
     poses = read_stored_poses(store, names, board, smoothing, examine=True)
     return calibrate_poses_with_evidence(poses, len(names), sequence, board, excluded, progress)
@@ -43,7 +45,8 @@ def calibrate_poses_with_evidence(
     excluded: Mapping[str, str],
     progress: Progress,
 ) -> DiagnosedCalibration:
-    """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``: {pose: why}."""
+    """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``:
+    {pose: why}."""
     if contradiction := describe_period_conflict(sequence):
         evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
         return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(excluded))
@@ -58,14 +61,17 @@ def calibrate_poses_with_evidence(
             observations.append(pose.observation)
         if pose.evidence is not None:
             evidence_of_poses.append(pose.evidence)
-    result = calibrate_with_diagnosis(observations, evidence_of_poses, sequence.projector, board, refused)
+    result = calibrate_with_diagnosis(
+        observations, evidence_of_poses, sequence.projector, board, refused
+    )
     if result.stereo is None:
         return result
     return replace(result, stereo=replace(result.stereo, excluded=result.excluded))
 
 
 def describe_period_conflict(sequence: PatternSequence) -> str:
-    """Describe why the fringe periods and the Gray code of a sequence conflict; empty where they do not."""
+    """Describe why the fringe periods and the Gray code of a sequence conflict; empty where they do
+    not."""
     for axis in sequence.axes:
         if sequence.periods_px(axis) and sequence.find("gray", axis):
             try:
@@ -76,9 +82,14 @@ def describe_period_conflict(sequence: PatternSequence) -> str:
 
 
 def save_rejected(
-    store: Session, stereo: StereoModel, settings: Mapping[str, Any], verdict: Verdict, poses: Sequence[str]
+    store: Session,
+    stereo: StereoModel,
+    settings: Mapping[str, Any],
+    verdict: Verdict,
+    poses: Sequence[str],
 ) -> None:
-    """Save a rejected calibration from these poses for inspection; the models before it are moved to the trash."""
+    """Save a rejected calibration from these poses for inspection; the models before it are moved
+    to the trash."""
     with store.together():
         trash_models(store, available_models(store))
         save_stereo(store, stereo, store.input_hashes(*stereo.poses), settings, verdict)
@@ -87,18 +98,24 @@ def save_rejected(
 
 def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
     """Save the verdict on an attempt to calibrate from these poses, whether or not it succeeded."""
-    store.save_result(VERDICT, {"verdict": verdict.to_json(), "inputs": store.input_hashes(*poses)}, {})
+    store.save_result(
+        VERDICT, {"verdict": verdict.to_json(), "inputs": store.input_hashes(*poses)}, {}
+    )
 
 
 def load_last_verdict(store: Session) -> Verdict | None:
-    """Load the verdict on the last attempt to calibrate, also a failed one; None before the first."""
+    """Load the verdict on the last attempt to calibrate, also a failed one; None before the
+    first."""
     if not store.has_result(VERDICT):
         return None
-    return store.decode_result(VERDICT, lambda meta, _: from_plain(meta["verdict"], Verdict), only=())
+    return store.decode_result(
+        VERDICT, lambda meta, _: from_plain(meta["verdict"], Verdict), only=()
+    )
 
 
 def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:
-    """Return the error to raise for a rejected calibration; ``is_saved``: the session holds it for inspection."""
+    """Return the error to raise for a rejected calibration; ``is_saved``: the session holds it for
+    inspection."""
     first, more = verdict.findings[0], len(verdict.findings) - 1
     others = f" (and {more} more finding{'s' * (more != 1)})" if more else ""
     saved_note = "; the calibration is saved for inspection, and not used" if is_saved else ""

@@ -1,4 +1,5 @@
-"""Captures without a browser: show the patterns, capture the frames, save them, as the wizard does."""
+"""Captures without a browser: show the patterns, capture the frames, save them, as the wizard
+does."""
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,12 @@ from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
-from slviewer.pipeline.suggest_exposure import BUDGET_S, MAX_SUGGESTED, apply_suggestion, suggest_exposure
+from slviewer.pipeline.suggest_exposure import (
+    BUDGET_S,
+    MAX_SUGGESTED,
+    apply_suggestion,
+    suggest_exposure,
+)
 from slviewer.records.plain import to_plain
 from slviewer.session.atomic import format_bytes
 from slviewer.session.capture import Capture, Role, TurnStep
@@ -38,7 +44,8 @@ from slviewer.session.store import Session
 from slviewer.target.board import Board
 
 DEFAULT_PATTERNS = "complementary"
-"""The sequence used by default: its codes forgive blurred edges, and it is shorter than the Letter's."""
+"""The sequence used by default: its codes forgive blurred edges, and it is shorter than the
+Letter's."""
 
 Purpose = Literal["pose", "scan", "plane", "sphere"]
 """What a capture is made for: all but target poses are scans."""
@@ -72,29 +79,36 @@ def capture(
         rig: A TOML file that describes the rig, or the name of one that `slviewer devices` lists.
         role: calibration for a target pose, scan for anything else.
         board: What the target is, circles:21x16:9 and the like; by default as the session knows it.
-        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light themselves); by default the
-            session's, else complementary.
+        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light
+            themselves); by default the session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
-        exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the longest that does not
-            clip it.
+        exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the
+            longest that does not clip it.
         gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
-        auto_exposure: Choose one to four exposures, and the gain, that measure as much of the scene as possible.
-        region: With --auto-exposure: x, y, width and height, px, of the part of the image that matters; by default all.
+        auto_exposure: Choose one to four exposures, and the gain, that measure as much of the scene
+            as possible.
+        region: With --auto-exposure: x, y, width and height, px, of the part of the image that
+            matters; by default all.
         budget_s: With --auto-exposure: what the capture may last, s.
         force: Replace a capture of that name (the old one goes to the session's trash).
 
-    ``warn`` is called with what the camera could not be set to, and with frames that contradict the others; `say` with
-    the exposures that were chosen. Raises InputError, DeviceError, SessionError, and whatever `progress` raises before
-    the capture is saved; nothing is saved then.
+    ``warn`` is called with what the camera could not be set to, and with frames that contradict the
+    others; `say` with the exposures that were chosen. Raises InputError, DeviceError, SessionError,
+    and whatever `progress` raises before the capture is saved; nothing is saved then.
     """
     if (exposure_ms is not None) + bool(exposures_ms) + auto_exposure > 1:
-        raise InputError("the exposure was given in several ways: give one, several, or let it be chosen")
+        raise InputError(
+            "the exposure was given in several ways: give one, several, or let it be chosen"
+        )
     exposures = check_exposures(exposures_ms) if exposures_ms else []
     target = None if board is None else Board.parse(board)
     new_name(name)
     with opened_or_made(session) as store:
         if name in store.taken_names() and not force:
-            raise InputError(f"there is a capture {name!r} already: choose another name, or replace it with --force")
+            raise InputError(
+                f"there is a capture {name!r} already: choose another name, or replace it with"
+                " --force"
+            )
         choice = load_rig(rig, store)
         target = target or (Board.parse(known) if (known := store.decision("target")) else None)
         camera_settings(choice, exposure_ms, gain)  # refused before anything is opened
@@ -109,7 +123,11 @@ def capture(
             set_camera(devices, choice, exposure_ms, gain, warn)
             if auto_exposure:
                 suggested = suggest_exposure(
-                    devices, sequence, budget_s=budget_s, region=region, progress=part(progress, 0.0, begin)
+                    devices,
+                    sequence,
+                    budget_s=budget_s,
+                    region=region,
+                    progress=part(progress, 0.0, begin),
                 )
                 say(suggested.text())
                 exposures = apply_suggestion(devices, suggested)
@@ -117,10 +135,14 @@ def capture(
                 devices,
                 sequence,
                 exposures,
-                progress=lambda done, n: progress(begin + (0.95 - begin) * done / n, f"{name}: frame {done} of {n}"),
+                progress=lambda done, n: progress(
+                    begin + (0.95 - begin) * done / n, f"{name}: frame {done} of {n}"
+                ),
             )
         for wanted_ms, applied_ms in zip(exposures, captured.exposures_ms, strict=True):
-            for note in list_changed_settings(devices.camera, CameraSettings(wanted_ms), CameraSettings(applied_ms)):
+            for note in list_changed_settings(
+                devices.camera, CameraSettings(wanted_ms), CameraSettings(applied_ms)
+            ):
                 warn(note)
         progress(0.95, "saving")
         if role == "calibration":
@@ -133,7 +155,8 @@ def capture(
 
 
 def _check_saved(store: Session, saved: Capture, captured: CapturedFrames, warn: Warn) -> None:
-    """Warn where the frames of a saved capture contradict each other, or are too bright or too dark."""
+    """Warn where the frames of a saved capture contradict each other, or are too bright or too
+    dark."""
     name, sequence = saved.name, captured.sequence
     try:
         for sentence in save_check(store, saved).warnings():
@@ -145,9 +168,11 @@ def _check_saved(store: Session, saved: Capture, captured: CapturedFrames, warn:
         warn(f"{name} is saved, and its frames could not be checked: {error}")
 
 
-def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn) -> None:
-    """Set the open rig's camera to the requested values, else to those of its choice; warns of those refused or
-    changed."""
+def set_camera(
+    rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn
+) -> None:
+    """Set the open rig's camera to the requested values, else to those of its choice; warns of
+    those refused or changed."""
     wanted = applied = camera_settings(choice, exposure_ms, gain)
     with report_driver_faults(rig.camera):
         if wanted != CameraSettings():
@@ -157,15 +182,18 @@ def set_camera(rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, g
         warn(note)
 
 
-def camera_settings(choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None) -> CameraSettings:
-    """Return the requested settings, else those of the choice. Raises InputError for impossible ones."""
+def camera_settings(
+    choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None
+) -> CameraSettings:
+    """Return the requested settings, else those of the choice. Raises InputError for impossible
+    ones."""
     exposure_ms = choice.get("exposure_ms") if exposure_ms is None else exposure_ms
     return CameraSettings(exposure_ms, choice.get("gain") if gain is None else gain)
 
 
 def choose_patterns(store: Session, choice: Mapping[str, Any], patterns: str | None) -> str:
-    """Return the name of the sequence to show, by default the session's. Raises InputError for an unknown one, unless
-    the rig plays back its own."""
+    """Return the name of the sequence to show, by default the session's. Raises InputError for an
+    unknown one, unless the rig plays back its own."""
     patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
     if choice.get("driver") != "replay":
         _check_patterns(patterns)
@@ -179,7 +207,8 @@ def _check_patterns(patterns: str) -> None:
 
 
 def choose_sequence(bench: RigSetup, patterns: str) -> PatternSequence:
-    """Return the sequence to capture: the one of that name for the rig's devices, or the rig's only one."""
+    """Return the sequence to capture: the one of that name for the rig's devices, or the rig's only
+    one."""
     if bench.reel is not None:
         return bench.reel.sequence
     _check_patterns(patterns)
@@ -203,7 +232,8 @@ def save_frames(
     turn_step: TurnStep | None = None,
     force: bool = False,
 ) -> Capture:
-    """Save captured frames with their sequence, settings and texture; returns the stored capture."""
+    """Save captured frames with their sequence, settings and texture; returns the stored
+    capture."""
     turned = {} if turn_step is None else {"turntable": to_plain(turn_step)}
     exposure = {} if captured.exposures_ms else {"exposure_ms": captured.settings.exposure_ms}
     return store.save_capture(
@@ -222,14 +252,16 @@ def save_frames(
 
 @dataclass(frozen=True)
 class Space:
-    """Free space on a session's disk, and what the frames to be captured need; None where that is unknown."""
+    """Free space on a session's disk, and what the frames to be captured need; None where that is
+    unknown."""
 
     free_bytes: int
     capture_bytes: int | None
 
     @property
     def enough(self) -> bool:
-        """Whether twice the frames fit: what is computed from a capture takes about as much again."""
+        """Whether twice the frames fit: what is computed from a capture takes about as much
+        again."""
         return self.capture_bytes is None or self.free_bytes > 2 * self.capture_bytes
 
 
@@ -246,6 +278,7 @@ def check_space(store: Session, camera: Camera, frames: int, name: str) -> None:
     space = measure_space(store, camera, frames)
     if not space.enough:
         raise SessionError(
-            f"{name} needs {format_bytes(space.capture_bytes or 0)}, and as much again for its results, and "
-            f"{format_bytes(space.free_bytes)} are free on {store.folder}: free some space first"
+            f"{name} needs {format_bytes(space.capture_bytes or 0)}, and as much again for its"
+            f" results, and {format_bytes(space.free_bytes)} are free on {store.folder}: free some"
+            " space first"
         )

@@ -16,27 +16,40 @@ from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.frame_check import FrameCheck, describe_contradictions, load_check, load_or_save_check
+from slviewer.pipeline.frame_check import (
+    FrameCheck,
+    describe_contradictions,
+    load_check,
+    load_or_save_check,
+)
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
 MANY_SATURATED = 0.05
 """Share of the illuminated pixels: highlights saturate fewer, an exposure that is too long more."""
 NEAR_DARK = 2.0
-"""A median modulation within this factor of the least that is decoded: much of the scene lies below it."""
+"""A median modulation within this factor of the least that is decoded: much of the scene lies below
+it."""
 MIN_DECODED = 0.05
-"""Share of the illuminated pixels that must decode: of sound captures, also cluttered ones, half and more do."""
+"""Share of the illuminated pixels that must decode: of sound captures, also cluttered ones, half
+and more do."""
 _REASONS = {
     Reason.SATURATED: ("are saturated", "lower the exposure or the gain, and capture again"),
     Reason.INCONSISTENT: (
         "contradict themselves or their neighbours",
-        "keep the scene and the light still, raise the exposure, and check the description of the frames",
+        (
+            "keep the scene and the light still, raise the exposure, and check the description of"
+            " the frames"
+        ),
     ),
     Reason.INDIRECT: (
         "receive much light from other surfaces or through the material",
         "use the patterns micro, and see docs/howto/difficult-surfaces.md",
     ),
-    Reason.OUTSIDE: ("lie outside the projector", "check the size of the projector and the periods"),
+    Reason.OUTSIDE: (
+        "lie outside the projector",
+        "check the size of the projector and the periods",
+    ),
 }
 """Why illuminated pixels do not decode, and what to do."""
 
@@ -53,10 +66,11 @@ def decode_capture(
     for axis, phase in phases.items():
         if phase.is_relative and not relative:
             raise InputError(
-                f"{capture.name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g} px of the projector, "
-                "so that it gives no projector coordinate: `slviewer reconstruct --depth-range NEAR FAR` measures a "
-                "scan whose depths are known, `slviewer decode` writes the phase as it is; calibrate with patterns "
-                "that cover the projector"
+                f"{capture.name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g}"
+                " px of the projector, so that it gives no projector coordinate: `slviewer"
+                " reconstruct --depth-range NEAR FAR` measures a scan whose depths are known,"
+                " `slviewer decode` writes the phase as it is; calibrate with patterns that cover"
+                " the projector"
             )
     return phases
 
@@ -78,11 +92,15 @@ def check_capture(
     check: FrameCheck | None = None,
     files: Sequence[str] = (),
 ) -> None:
-    """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing of them decodes.
+    """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing
+    of them decodes.
 
-    ``check``: of these frames; without it, their description is compared here. ``files``: names of the frames' files.
+    ``check``: of these frames; without it, their description is compared here. ``files``: names of
+    the frames' files.
     """
-    contradictions = check.contradictions if check else describe_contradictions(sequence, frames, files)
+    contradictions = (
+        check.contradictions if check else describe_contradictions(sequence, frames, files)
+    )
     if contradictions:
         first, *others = contradictions
         alternatives = "".join(f". Or else: {c.message}" for c in others if c.axis == first.axis)
@@ -93,76 +111,97 @@ def check_capture(
             continue
         if illuminated:
             share = (
-                f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f} %) give a coordinate"
+                f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f}"
+                " %) give a coordinate"
             )
             shares = [np.mean(phase.reason[phase.illuminated] == reason) for reason in _REASONS]
             worst = int(np.argmax(shares))
             symptom, cure = list(_REASONS.values())[worst]
-            raise InputError(f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {symptom}: {cure}")
+            raise InputError(
+                f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {symptom}:"
+                f" {cure}"
+            )
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
             raise InputError(
-                f"{name}: no pixel carries a readable {axis} pattern: {describe_disturbance(unexplained)[1]}"
+                f"{name}: no pixel carries a readable {axis} pattern:"
+                f" {describe_disturbance(unexplained)[1]}"
             )
         middle = float(np.median(phase.modulation))
         raise InputError(
-            f"{name}: no pixel carries a readable {axis} pattern (the modulation is {middle:.1f} grey levels in the "
-            "median): raise the exposure or the projector's brightness"
+            f"{name}: no pixel carries a readable {axis} pattern (the modulation is {middle:.1f}"
+            " grey levels in the median): raise the exposure or the projector's brightness"
         )
 
 
-def loss_warnings(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> list[str]:
-    """Return warnings where saturation or weak fringes mask many pixels of a decoded capture (n, h, w)."""
+def loss_warnings(
+    sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+) -> list[str]:
+    """Return warnings where saturation or weak fringes mask many pixels of a decoded capture (n, h,
+    w)."""
     messages = []
     reasons = [phase.reason[phase.illuminated] for phase in phases.values()]
-    saturated = max((float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0)
+    saturated = max(
+        (float(np.mean(each == Reason.SATURATED)) for each in reasons if each.size), default=0.0
+    )
     if saturated > MANY_SATURATED:
         messages.append(
-            f"{100 * saturated:.0f} % of the illuminated pixels are saturated and masked: lower the exposure or the "
-            "gain until white stays below the camera's full scale"
+            f"{100 * saturated:.0f} % of the illuminated pixels are saturated and masked: lower the"
+            " exposure or the gain until white stays below the camera's full scale"
         )
     for axis, phase in phases.items():
         if not (phase.steps and phase.mask.any()):
             continue
-        modulation, background = (float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background))
+        modulation, background = (
+            float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background)
+        )
         white = white_level(sequence, frames, sequence.select(axis))
         least = dark_limit(
-            np.array([background], np.float32), phase.noise, white, dark_sigmas(axis_layout(sequence, axis))
+            np.array([background], np.float32),
+            phase.noise,
+            white,
+            dark_sigmas(axis_layout(sequence, axis)),
         )
         if modulation < NEAR_DARK * float(least[0]):
             if unexplained := estimate_frame_light(sequence, frames).unexplained:
                 cause = describe_disturbance(unexplained)[1]
-                messages.append(f"{cause}; pixels of a modulation below {float(least[0]):.1f} are masked")
+                messages.append(
+                    f"{cause}; pixels of a modulation below {float(least[0]):.1f} are masked"
+                )
                 break
             messages.append(
-                f"the {axis} fringes are weak for the noise of these frames: their modulation is {modulation:.0f} grey "
-                f"levels in the median, and pixels below {float(least[0]):.1f} are masked; make the patterns brighter "
-                "(longer exposure, wider aperture, nearer projector, darker room)"
+                f"the {axis} fringes are weak for the noise of these frames: their modulation is"
+                f" {modulation:.0f} grey levels in the median, and pixels below"
+                f" {float(least[0]):.1f} are masked; make the patterns brighter (longer exposure,"
+                " wider aperture, nearer projector, darker room)"
             )
             break
     return messages + scatter_warnings(phases)
 
 
 def scatter_warnings(phases: Mapping[Axis, PhaseMap]) -> list[str]:
-    """Return warnings where neighbouring pixels scatter more than the camera's noise explains: by how much, and what to
-    do."""
+    """Return warnings where neighbouring pixels scatter more than the camera's noise explains: by
+    how much, and what to do."""
     worst = max(phases.values(), key=lambda phase: phase.sigma_scale, default=None)
     if worst is None or worst.sigma_scale <= SIGNIFICANT:
         return []
     if measure_scatter(worst).is_compressed:
-        cause, cure = "the images were compressed (JPEG blocks of 8 x 8 pixels)", "record PNG, TIFF or raw images"
+        cause, cure = (
+            "the images were compressed (JPEG blocks of 8 x 8 pixels)",
+            "record PNG, TIFF or raw images",
+        )
     else:
         cause, cure = "sharpening or compression may be the cause", "switch them off in the camera"
     return [
-        f"{cause}: along {worst.axis} neighbouring pixels scatter {worst.sigma_scale:.1f} times as much as the "
-        f"camera's noise explains, and the stated uncertainty includes this; {cure}"
+        f"{cause}: along {worst.axis} neighbouring pixels scatter {worst.sigma_scale:.1f} times as"
+        f" much as the camera's noise explains, and the stated uncertainty includes this; {cure}"
     ]
 
 
 def capture_texture(capture: Capture, frames: np.ndarray, *, stretch: bool = True) -> np.ndarray:
     """Return the image of the scene under white light, (h, w) or (h, w, 3) uint8.
 
-    ``stretch``: as `convert_to_8bit` does, in which boards are detected whatever the exposure; else 255 is the camera's
-    full scale where it is known, as for display.
+    ``stretch``: as `convert_to_8bit` does, in which boards are detected whatever the exposure; else
+    255 is the camera's full scale where it is known, as for display.
     """
     colour = capture.texture
     image = texture(capture.sequence, frames) if colour is None else colour
@@ -170,7 +209,9 @@ def capture_texture(capture: Capture, frames: np.ndarray, *, stretch: bool = Tru
     if colour is None and choice is not None:
         return toned(radiance(image, choice, capture.exposures_ms))
     full_scale = capture.sequence.full_scale
-    return convert_to_8bit(image if stretch or full_scale is None else to_eight_bits(image, full_scale))
+    return convert_to_8bit(
+        image if stretch or full_scale is None else to_eight_bits(image, full_scale)
+    )
 
 
 def texture_8bit(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
@@ -186,18 +227,29 @@ def convert_to_8bit(image: np.ndarray) -> np.ndarray:
 
 
 def decode_captures(
-    session: Session, names: Sequence[str], warn: Warn = ignore_warnings, *, relative: bool = False, check: bool = True
+    session: Session,
+    names: Sequence[str],
+    warn: Warn = ignore_warnings,
+    *,
+    relative: bool = False,
+    check: bool = True,
 ) -> Iterator[tuple[Capture, np.ndarray, dict[Axis, PhaseMap]]]:
-    """Captures with their frames and phases, in order; the next one's frames are read while one is processed.
+    """Captures with their frames and phases, in order; the next one's frames are read while one is
+    processed.
 
-    ``warn`` is called with frames that contradict the others, and with the reasons why many pixels are masked;
-    ``relative`` as in `decode_capture`. ``check``: compare the frames of captures that have no saved comparison.
+    ``warn`` is called with frames that contradict the others, and with the reasons why many pixels
+    are masked; ``relative`` as in `decode_capture`. ``check``: compare the frames of captures that
+    have no saved comparison.
     """
     for capture, reading in read_ahead([session.load_capture(name) for name in names]):
         frames = reading.result()
         phases = decode_capture(capture, frames, relative=relative)
         if warn is not ignore_warnings:
-            compared = load_or_save_check(session, capture, frames) if check else load_check(session, capture.name)
+            compared = (
+                load_or_save_check(session, capture, frames)
+                if check
+                else load_check(session, capture.name)
+            )
             for message in compared.warnings() if compared else ():
                 warn(f"{capture.name}: {message}")
             for message in loss_warnings(capture.sequence, frames, phases):
@@ -206,7 +258,8 @@ def decode_captures(
 
 
 def read_ahead(captures: Sequence[Capture]) -> Iterator[tuple[Capture, Future[np.ndarray]]]:
-    """Yield captures with their frames, whose `result()` may raise; the next one's are read while one is processed."""
+    """Yield captures with their frames, whose `result()` may raise; the next one's are read while
+    one is processed."""
     with ThreadPoolExecutor(1) as reader:
         ahead = [reader.submit(capture.stack) for capture in captures[:1]]
         for i, capture in enumerate(captures):

@@ -1,6 +1,8 @@
-"""What a report was made from, kept in it, and whether its figures follow from the session's frames.
+"""What a report was made from, kept in it, and whether its figures follow from the session's
+frames.
 
-A certificate names the hash of every frame, capture and result and the versions of the software, and holds the figures.
+A certificate names the hash of every frame, capture and result and the versions of the software,
+and holds the figures.
 """
 
 import html
@@ -52,14 +54,21 @@ from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import NOMINALS, read_nominal
 from slviewer.session.reading import MAX_JSON_BYTES, expand_user, read_file
-from slviewer.session.scan_edits import load_edits, load_region, restriction_inputs, save_edits, save_region
+from slviewer.session.scan_edits import (
+    load_edits,
+    load_region,
+    restriction_inputs,
+    save_edits,
+    save_region,
+)
 from slviewer.session.store import Session
 
 SCHEMA = 1
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba", "trimesh")
 """Whose versions a certificate names, besides Python's and our own."""
 RELATIVE = 1e-3
-"""Difference of a figure, as a share of it, up to which it is the same: other processors round otherwise."""
+"""Difference of a figure, as a share of it, up to which it is the same: other processors round
+otherwise."""
 ABSOLUTE = 2e-6
 """... and in the figure's own unit, mm or px."""
 _MAX_REPORT_BYTES = 1 << 28
@@ -86,8 +95,8 @@ class CertifiedCapture(TypedDict):
 
 
 class Certificate(msgspec.Struct, frozen=True):
-    """What a report was made from. ``captures`` by name; ``results``: {name: hash}; ``page``: digest of the page
-    without this certificate and its date."""
+    """What a report was made from. ``captures`` by name; ``results``: {name: hash}; ``page``:
+    digest of the page without this certificate and its date."""
 
     schema: int
     session: str
@@ -125,9 +134,16 @@ class ReportCheck:
 
     def text(self) -> str:
         """Return the result as a report for the terminal."""
-        frames = [check for check in self.checks if check.what.startswith(FRAMES) and check.state == "same"]
+        frames = [
+            check
+            for check in self.checks
+            if check.what.startswith(FRAMES) and check.state == "same"
+        ]
         shown = [check for check in self.checks if check not in frames]
-        lines = [f"{check.what}: {IN_WORDS[check.state]}{check.detail and f' ({check.detail})'}" for check in shown]
+        lines = [
+            f"{check.what}: {IN_WORDS[check.state]}{check.detail and f' ({check.detail})'}"
+            for check in shown
+        ]
         if frames:
             lines.insert(1, f"frames of {format_count(len(frames), 'capture')}: as they were")
         left = sum(check.state == "not recomputed" for check in self.checks)
@@ -136,13 +152,16 @@ class ReportCheck:
 
 
 def make_certificate(store: Session) -> Certificate:
-    """Return the certificate of a session as it is, without the digest of a page; reads every frame."""
+    """Return the certificate of a session as it is, without the digest of a page; reads every
+    frame."""
     captures: dict[str, CertifiedCapture] = {
         capture.name: {"role": capture.role, "hash": capture.hash, "frames": capture.verify()}
         for capture in store.captures()
     }
     results = {name: store.input_hashes(name)[name] for name in store.result_names()}
-    return Certificate(SCHEMA, store.folder.name, _software(), captures, results, collect_figures(store))
+    return Certificate(
+        SCHEMA, store.folder.name, _software(), captures, results, collect_figures(store)
+    )
 
 
 def collect_figures(store: Session) -> Figures:
@@ -161,15 +180,17 @@ def collect_figures(store: Session) -> Figures:
     return figures
 
 
-def verify_report(session: SessionLike, report: Path | str, *, progress: Progress = ignore_progress) -> ReportCheck:
+def verify_report(
+    session: SessionLike, report: Path | str, *, progress: Progress = ignore_progress
+) -> ReportCheck:
     """Recompute a report's figures from the raw frames of a session, and compare.
 
     Args:
         session: Session folder with the captures that the report was made from.
         report: The .html file that `report` wrote.
 
-    The page, every frame, calibration, record and measurement is checked; what cannot be recomputed (measurements on
-    merges, and models whose file is gone) is listed. The session is not changed.
+    The page, every frame, calibration, record and measurement is checked; what cannot be recomputed
+    (measurements on merges, and models whose file is gone) is listed. The session is not changed.
     """
     page, certificate = read_certificate(expand_user(report))
     with opened(session) as store:
@@ -180,7 +201,10 @@ def verify_report(session: SessionLike, report: Path | str, *, progress: Progres
             return ReportCheck(tuple(checks))
         with tempfile.TemporaryDirectory(prefix="slviewer-") as folder:
             made, why = _recompute(store, certificate, Path(folder, "session"), progress)
-        checks += [_compare(name, given, made.get(name), why) for name, given in certificate.figures.items()]
+        checks += [
+            _compare(name, given, made.get(name), why)
+            for name, given in certificate.figures.items()
+        ]
     progress(1.0, "compared")
     return ReportCheck(tuple(checks))
 
@@ -190,16 +214,25 @@ def read_certificate(path: Path) -> tuple[str, Certificate]:
     try:
         page = read_file(path, _MAX_REPORT_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}): give a report that slviewer wrote") from error
+        raise InputError(
+            f"{path} cannot be read ({error}): give a report that slviewer wrote"
+        ) from error
     _, content, _ = split_page(page, CERTIFICATE)
     if content is None:
-        raise InputError(f"{path.name} holds no certificate: write the report again with this version of slviewer")
+        raise InputError(
+            f"{path.name} holds no certificate: write the report again with this version of"
+            " slviewer"
+        )
     if len(content) > MAX_JSON_BYTES:
-        raise InputError(f"the certificate in {path.name} is longer than any: write the report again")
+        raise InputError(
+            f"the certificate in {path.name} is longer than any: write the report again"
+        )
     try:
         certificate = msgspec.json.decode(html.unescape(content), type=Certificate)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise InputError(f"the certificate in {path.name} is damaged ({error}): write the report again") from error
+        raise InputError(
+            f"the certificate in {path.name} is damaged ({error}): write the report again"
+        ) from error
     if certificate.schema > SCHEMA:
         raise InputError(f"{path.name} was written by a newer slviewer: update slviewer")
     return page, certificate
@@ -207,36 +240,49 @@ def read_certificate(path: Path) -> tuple[str, Certificate]:
 
 def _software() -> dict[str, str]:
     """Return the versions of Python, slviewer and what it computes with."""
-    return {"slviewer": __version__, "python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    return {"slviewer": __version__, "python": platform.python_version()} | {
+        name: version(name) for name in PACKAGES
+    }
 
 
 def _calibration_figures(store: Session, name: str) -> dict[str, float]:
     """Return the figures of one of the session's calibrations."""
     model = load_model(store, name)
     if isinstance(model, PixelwiseModel):
-        return {f"median RMS in z along {axis}, mm": float(np.nanmedian(f.rms_mm[0])) for axis, f in model.fits.items()}
+        return {
+            f"median RMS in z along {axis}, mm": float(np.nanmedian(f.rms_mm[0]))
+            for axis, f in model.fits.items()
+        }
     if name == "splined":
         assert isinstance(model, SplinedModel)
         summary = model.summary()
         noise = {f"noise {place}, px": value for place, value in summary["noise_px"].items()}
-        return noise | {f"residuals over noise {axis}": v for axis, v in summary["residuals_over_noise"].items()}
+        return noise | {
+            f"residuals over noise {axis}": v for axis, v in summary["residuals_over_noise"].items()
+        }
     stereo = load_stereo_if_complete(store)
     assert stereo is not None
-    figures = {f"reprojection RMS {device}, px": rms for device, rms in stereo.reprojection_rms_px.items()}
+    figures = {
+        f"reprojection RMS {device}, px": rms for device, rms in stereo.reprojection_rms_px.items()
+    }
     return figures | {"baseline, mm": stereo.baseline_mm}
 
 
 def _measurement_figures(measured: Measurement) -> dict[str, float]:
     """Return a measurement's values and uncertainties."""
     values = {f"{q.name}, {q.unit}": q.value for q in measured.quantities}
-    return values | {f"U of {q.name}, {q.unit}": q.U for q in measured.quantities if q.U is not None}
+    return values | {
+        f"U of {q.name}, {q.unit}": q.U for q in measured.quantities if q.U is not None
+    }
 
 
 def _check_page(page: str, certificate: Certificate) -> CheckedItem:
     """Return whether the page is the one that was written with its certificate."""
     if page_digest(page) == certificate.page:
         return CheckedItem("page", "same", "as it was written")
-    return CheckedItem("page", "differs", "its text, pictures or numbers were changed after it was written")
+    return CheckedItem(
+        "page", "differs", "its text, pictures or numbers were changed after it was written"
+    )
 
 
 def _check_versions(certificate: Certificate) -> list[CheckedItem]:
@@ -256,7 +302,9 @@ def _check_frames(store: Session, certificate: Certificate) -> list[CheckedItem]
     for name, given in certificate.captures.items():
         what = f"{FRAMES}{name}"
         if name not in captures:
-            checks.append(CheckedItem(what, "missing", "the session has no such capture, or it is damaged"))
+            checks.append(
+                CheckedItem(what, "missing", "the session has no such capture, or it is damaged")
+            )
             continue
         try:
             now = captures[name].verify()
@@ -275,7 +323,8 @@ def _check_frames(store: Session, certificate: Certificate) -> list[CheckedItem]
 def _recompute(
     store: Session, certificate: Certificate, folder: Path, progress: Progress
 ) -> tuple[Figures, dict[str, str]]:
-    """Compute what the report shows from the frames alone, in a session of its own; second, {result: why not}."""
+    """Compute what the report shows from the frames alone, in a session of its own; second,
+    {result: why not}."""
     why: dict[str, str] = {}
     with Session.create(folder) as fresh:
         for name in certificate.captures:
@@ -301,12 +350,17 @@ def _link(folder: Path, place: Path) -> None:
 
 
 def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> None:
-    """Calibrate a session from the frames with the settings of another's calibration, and take over its scale."""
+    """Calibrate a session from the frames with the settings of another's calibration, and take over
+    its scale."""
     models = available_models(store)
-    stereo, meta = load_stereo_if_complete(store), store.load_result("calibration/stereo", only=())[0]
+    stereo, meta = (
+        load_stereo_if_complete(store),
+        store.load_result("calibration/stereo", only=())[0],
+    )
     if stereo is None or "settings" not in meta:
         why |= {
-            f"calibration/{name}": "it was imported: its figures are not from the session's frames" for name in models
+            f"calibration/{name}": "it was imported: its figures are not from the session's frames"
+            for name in models
         }
         for name in models:
             saved, arrays = store.load_result(f"calibration/{name}")
@@ -325,11 +379,20 @@ def _without_own(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _repeat_calibration(
-    stereo: StereoModel, settings: Mapping[str, Any], models: Sequence[str], fresh: Session, why: dict[str, str]
+    stereo: StereoModel,
+    settings: Mapping[str, Any],
+    models: Sequence[str],
+    fresh: Session,
+    why: dict[str, str],
 ) -> None:
-    """Calibrate from the frames of the poses that a stereo model was made from, with its settings."""
+    """Calibrate from the frames of the poses that a stereo model was made from, with its
+    settings."""
     excluded = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
-    poses = [name for name in (*stereo.poses, *stereo.excluded) if name not in excluded and name in fresh.taken_names()]
+    poses = [
+        name
+        for name in (*stereo.poses, *stereo.excluded)
+        if name not in excluded and name in fresh.taken_names()
+    ]
     with _note_failure(why, *(f"calibration/{name}" for name in models)):
         calibrate(
             fresh,
@@ -343,9 +406,14 @@ def _repeat_calibration(
 
 
 def _run_again(
-    store: Session, fresh: Session, certificate: Certificate, why: dict[str, str], progress: Progress
+    store: Session,
+    fresh: Session,
+    certificate: Certificate,
+    why: dict[str, str],
+    progress: Progress,
 ) -> Figures:
-    """Run the operations that found the session's records again, with their settings; return the figures."""
+    """Run the operations that found the session's records again, with their settings; return the
+    figures."""
     runs: dict[tuple[str, bytes], list[str]] = {}
     for result in certificate.figures:
         kind, _, name = result.partition("/")
@@ -354,14 +422,22 @@ def _run_again(
         with _note_failure(why, result):
             record = load_record(store, RECORDS[kind], name)
             if record.operation not in OPERATIONS:
-                raise InputError("an older version of slviewer made it: make it again, and write the report again")
+                raise InputError(
+                    "an older version of slviewer made it: make it again, and write the report"
+                    " again"
+                )
             runs.setdefault((record.operation, to_json(record.settings)), []).append(result)
     figures: Figures = {}
     for k, ((name, settings), results) in enumerate(runs.items()):
         progress(0.6 + 0.2 * k / len(runs), f"repeating {name}")
         operation = OPERATIONS[name]
-        with _note_failure(why, *results), Session.open(fresh.folder) as reading:  # nothing needs to be stored
-            for found in operation.find(Job(reading), operation.settings(**msgspec.json.decode(settings))):
+        with (
+            _note_failure(why, *results),
+            Session.open(fresh.folder) as reading,
+        ):  # nothing needs to be stored
+            for found in operation.find(
+                Job(reading), operation.settings(**msgspec.json.decode(settings))
+            ):
                 # a number here may be another than that of before
                 names = results if found.name.isdecimal() else [f"{found.record.kind}/{found.name}"]
                 figures |= dict.fromkeys(names, found.record.figures())
@@ -369,9 +445,14 @@ def _run_again(
 
 
 def _measure_again(
-    store: Session, fresh: Session, certificate: Certificate, why: dict[str, str], progress: Progress
+    store: Session,
+    fresh: Session,
+    certificate: Certificate,
+    why: dict[str, str],
+    progress: Progress,
 ) -> Figures:
-    """Make the session's measurements again on scans that are reconstructed anew; return their figures."""
+    """Make the session's measurements again on scans that are reconstructed anew; return their
+    figures."""
     surface = cache(lambda source, model: load_surface(fresh, source, model=model))
     again: dict[str, str] = {}
     figures: Figures = {}
@@ -391,7 +472,8 @@ def _measure_again(
 
 
 def _check_restrictions(store: Session, measured: Measurement) -> None:
-    """Raise InputError where the edits and the region that a measurement was made with are not the session's."""
+    """Raise InputError where the edits and the region that a measurement was made with are not the
+    session's."""
     if measured.kind == "relation":
         return
     used = store.load_result(f"measurements/{measured.id}", only=())[0]["inputs"]
@@ -409,7 +491,8 @@ def _repeat(
     surface: Callable[[str, str], Any],
     again: Mapping[str, str],
 ) -> Measurement:
-    """Make one measurement of a session again in another. Raises SlviewerError where that is not possible."""
+    """Make one measurement of a session again in another. Raises SlviewerError where that is not
+    possible."""
     if measured.kind == "relation":
         if missing := [each for each in measured.of if each not in again]:
             raise InputError(f"{', '.join(missing)} could not be measured again")
@@ -461,7 +544,11 @@ def _compare(
 ) -> CheckedItem:
     """Return whether a result's figures are those that were computed again."""
     if made is None:
-        return CheckedItem(name, "not recomputed", why.get(name, "the session no longer holds what it was made with"))
+        return CheckedItem(
+            name,
+            "not recomputed",
+            why.get(name, "the session no longer holds what it was made with"),
+        )
     for key, value in given.items():
         now = made.get(key, np.nan)
         if not np.isclose(now, value, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
@@ -477,10 +564,21 @@ def certify_page(certificate: Certificate, page: str) -> str:
 def certificate_section(certificate: Certificate) -> Section:
     """Return what a certificate names, as a section of the report."""
     captures = Table(
-        [Column("capture", align="left"), Column("role", align="left"), Column("frames"), Column("hash", align="left")],
-        [[name, c["role"], str(len(c["frames"])), c["hash"]] for name, c in certificate.captures.items()],
+        [
+            Column("capture", align="left"),
+            Column("role", align="left"),
+            Column("frames"),
+            Column("hash", align="left"),
+        ],
+        [
+            [name, c["role"], str(len(c["frames"])), c["hash"]]
+            for name, c in certificate.captures.items()
+        ],
         "Captures",
-        ["BLAKE2b, 160 bits, of frames and description; the hash of every single frame is kept in this file."],
+        [
+            "BLAKE2b, 160 bits, of frames and description; the hash of every single frame is kept"
+            " in this file."
+        ],
     )
     results = Table(
         [Column("result", align="left"), Column("hash", align="left")],
@@ -493,7 +591,9 @@ def certificate_section(certificate: Certificate) -> Section:
         "Software",
     )
     text = (
-        "What the figures were computed from. `slviewer verify-report` reads this file and the session, computes the "
-        "figures again from the frames, and says whether they agree."
+        "What the figures were computed from. `slviewer verify-report` reads this file and the"
+        " session, computes the figures again from the frames, and says whether they agree."
     )
-    return Section("Certificate", text, [item for item in (captures, results, software) if item.rows])
+    return Section(
+        "Certificate", text, [item for item in (captures, results, software) if item.rows]
+    )

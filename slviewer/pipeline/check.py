@@ -1,4 +1,5 @@
-"""Is the saved calibration still good? One capture of its board answers, and the session remembers."""
+"""Is the saved calibration still good? One capture of its board answers, and the session
+remembers."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -40,17 +41,20 @@ class CheckSettings:
 
 @operation("check", Drift, CheckSettings)
 def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
-    """Determine from one capture of the board whether the saved calibration is still good, and why if it is not.
+    """Determine from one capture of the board whether the saved calibration is still good, and why
+    if it is not.
 
-    The session stores the answer as ``drift/1``, ``drift/2``, ... Raises DetectionError where the capture does not show
-    the board, InputError where the calibration has too few poses for a decision, or was made elsewhere.
+    The session stores the answer as ``drift/1``, ``drift/2``, ... Raises DetectionError where the
+    capture does not show the board, InputError where the calibration has too few poses for a
+    decision, or was made elsewhere.
     """
     store, capture = job.store, settings.capture
     stereo = load_stereo(store)
     if not stereo.poses:
         raise InputError(
-            f"the calibration of {store.folder} was made elsewhere and has no poses: a drift check needs them "
-            "to know how well one board determines the projector's pose; run `slviewer calibrate` first"
+            f"the calibration of {store.folder} was made elsewhere and has no poses: a drift check"
+            " needs them to know how well one board determines the projector's pose; run `slviewer"
+            " calibrate` first"
         )
     warn_if_stale(store, job.warn)
     shot = store.load_capture(capture)
@@ -60,10 +64,15 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     check_capture(capture, shot.sequence, frames, phases, files=shot.files)
     check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
     board = Board.parse(stereo.board)
-    detection, smoothing = detect(board, capture_texture(shot, frames)), _calibration_smoothing(store)
+    detection, smoothing = (
+        detect(board, capture_texture(shot, frames)),
+        _calibration_smoothing(store),
+    )
     observation = observe(capture, board, detection, phases, smoothing)
     job.progress(0.3, "fitting the calibration's own poses")
-    drift = check_drift(_drift_reference(store, stereo, capture), DriftView.from_observation(observation))
+    drift = check_drift(
+        _drift_reference(store, stereo, capture), DriftView.from_observation(observation)
+    )
     before = load_drift_history(store)
     found = msgspec.structs.replace(
         drift,
@@ -77,13 +86,18 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
 
 
 def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
-    """Load or build the drift reference from the calibration's poses except the capture; stored, as it is slow."""
+    """Load or build the drift reference from the calibration's poses except the capture; stored, as
+    it is slow."""
     if capture not in stereo.poses:
-        saved = store.decode_fresh(REFERENCE, lambda _, arrays: DriftReference.from_arrays(stereo.rig, arrays))
+        saved = store.decode_fresh(
+            REFERENCE, lambda _, arrays: DriftReference.from_arrays(stereo.rig, arrays)
+        )
         if saved is not None:
             return saved
     poses = [name for name in stereo.poses if name != capture]
-    reference = build_reference(stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)])
+    reference = build_reference(
+        stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)]
+    )
     if capture not in stereo.poses and store.is_writable:
         meta = {"inputs": store.input_hashes("calibration/stereo", *poses)}
         store.save_result(REFERENCE, meta, reference.to_arrays())

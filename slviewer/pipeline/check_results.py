@@ -17,8 +17,8 @@ _WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check: the finding in a ``sentence``; the ``remedy``, empty where none is needed; and the
-    ``figures`` that it is based on, whose names contain their units.
+    """The result of one check: the finding in a ``sentence``; the ``remedy``, empty where none is
+    needed; and the ``figures`` that it is based on, whose names contain their units.
     """
 
     name: CheckName
@@ -32,9 +32,10 @@ class Check:
 class Preflight:
     """All checks of one rig, and what follows from them for its captures.
 
-    ``settle_ms``: what `Rig.settle_ms` should be, None where it could not be measured. ``levels``: the table for
-    `PatternSequence.levels` that makes the light proportional, None where it was not measured. ``exposure_ms``: the
-    exposure to set, None where the one that is set is right, or unknown. ``seconds``: how long it took.
+    ``settle_ms``: what `Rig.settle_ms` should be, None where it could not be measured. ``levels``:
+    the table for `PatternSequence.levels` that makes the light proportional, None where it was not
+    measured. ``exposure_ms``: the exposure to set, None where the one that is set is right, or
+    unknown. ``seconds``: how long it took.
     """
 
     checks: tuple[Check, ...]

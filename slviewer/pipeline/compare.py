@@ -31,9 +31,9 @@ SCALARS = "deviation"
 
 @dataclass(frozen=True, eq=False)
 class NominalComparison:
-    """A scan against a nominal model: the ``found`` deviation, the ``verdict`` where a tolerance was given, the noise
-    that the scan alone has along the nominal's normals (RMS, ``noise_mm``), and where it went: ``ply``, and the
-    ``measurement`` that the session keeps."""
+    """A scan against a nominal model: the ``found`` deviation, the ``verdict`` where a tolerance
+    was given, the noise that the scan alone has along the nominal's normals (RMS, ``noise_mm``),
+    and where it went: ``ply``, and the ``measurement`` that the session keeps."""
 
     scan: str
     model: str
@@ -71,23 +71,24 @@ class NominalComparison:
         lines.append(render(_figure_rows(numbers, self.noise_mm)))
         share = 100 * numbers["left_out"] / (numbers["points"] + numbers["left_out"])
         lines.append(
-            f"{numbers['points']:,} points; {numbers['left_out']:,} ({share:.1f} %) lie farther than "
-            f"{self.found.reach_mm:.3g} mm from the nominal or face another way, and are excluded"
+            f"{numbers['points']:,} points; {numbers['left_out']:,} ({share:.1f} %) lie farther"
+            f" than {self.found.reach_mm:.3g} mm from the nominal or face another way, and are"
+            " excluded"
         )
         lines.append(
-            f"{100 * self.found.coverage:.1f} % of the nominal's area was measured; the best fit adds "
-            f"{self.found.alignment_mm:.4f} mm (1 sigma)"
+            f"{100 * self.found.coverage:.1f} % of the nominal's area was measured; the best fit"
+            f" adds {self.found.alignment_mm:.4f} mm (1 sigma)"
         )
         if self.verdict is not None:
             v = self.verdict
             lines.append(
-                f"tolerance ± {v.tolerance_mm:g} mm: {v.within:.2f} % of the points within; by more than U = "
-                f"{v.U_mm:.4f} mm (k = 2) {v.inside:.2f} % inside and {v.outside:.2f} % outside, {v.close:.2f} % too "
-                "close to tell"
+                f"tolerance ± {v.tolerance_mm:g} mm: {v.within:.2f} % of the points within; by more"
+                f" than U = {v.U_mm:.4f} mm (k = 2) {v.inside:.2f} % inside and {v.outside:.2f} %"
+                f" outside, {v.close:.2f} % too close to tell"
             )
             lines.append(
-                f"lowest {v.lowest[0]:+.4f} mm: {DECIDED[v.lowest[1]]}; highest {v.highest[0]:+.4f} mm: "
-                f"{DECIDED[v.highest[1]]} (99.7 % of the points)"
+                f"lowest {v.lowest[0]:+.4f} mm: {DECIDED[v.lowest[1]]}; highest {v.highest[0]:+.4f}"
+                f" mm: {DECIDED[v.highest[1]]} (99.7 % of the points)"
             )
             lines.append(f"{DECIDED[v.decision].upper()}: {RULE}")
         if self.ply is not None:
@@ -109,29 +110,38 @@ def compare(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> NominalComparison:
-    """Compare a scan with a nominal model after best-fit alignment: figures, coloured points, pictures in the report.
+    """Compare a scan with a nominal model after best-fit alignment: figures, coloured points,
+    pictures in the report.
 
     Args:
         session: Session folder.
         scan: Name of the capture, or merge/1 and the like for a merge of the session.
         nominal: STL, PLY, OBJ, STEP or 3MF file of the part as it should be.
         tolerance: Plus and minus, mm; the answer is pass, fail, or too close to tell.
-        units: What the file's numbers are; required where its size does not fit the scan's. STEP and 3MF state theirs.
-        reach: Points farther than this from the nominal, mm, belong to something else (a table, a clamp); by default
-            2 % of the nominal's diagonal.
-        out: PLY file, the deviation as a scalar and as colours; by default in the session's exports.
+        units: What the file's numbers are; required where its size does not fit the scan's. STEP
+            and 3MF state theirs.
+        reach: Points farther than this from the nominal, mm, belong to something else (a table, a
+            clamp); by default 2 % of the nominal's diagonal.
+        out: PLY file, the deviation as a scalar and as colours; by default in the session's
+            exports.
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     The session stores the result as a measurement.
     """
     if out is not None and Path(out).suffix.lower() != ".ply":
-        raise UsageError(f"coloured points are written as .ply, not as {Path(out).name}: end its name so")
+        raise UsageError(
+            f"coloured points are written as .ply, not as {Path(out).name}: end its name so"
+        )
     ideal = read_nominal(nominal, units)  # a wrong file is refused before minutes of work
     with opened(session, write=True) as store:
         reading = part(progress, 0.0, 0.4)
-        on = load_surface(store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn)
-        default = store.exports / f"{_safe_name(scan)}_{_safe_name(Path(ideal.name).stem)}_deviation.ply"
+        on = load_surface(
+            store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn
+        )
+        default = (
+            store.exports / f"{_safe_name(scan)}_{_safe_name(Path(ideal.name).stem)}_deviation.ply"
+        )
         return compare_surface(
             store,
             on,
@@ -155,8 +165,8 @@ def compare_surface(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> NominalComparison:
-    """As ``compare``, of a surface that is there already, in a session open for writing. Without ``out`` no file
-    is written."""
+    """As ``compare``, of a surface that is there already, in a session open for writing. Without
+    ``out`` no file is written."""
     measured = on.measured
     points = on.points[measured].astype(np.float64)
     check_size(nominal, points)
@@ -172,12 +182,23 @@ def compare_surface(
         progress=stage(progress, 0.0, 0.85, "aligning"),
     )
     if result.coverage < LIKELY_COVERAGE:
-        warn(f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is the same part")
+        warn(
+            f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is"
+            " the same part"
+        )
     towards = np.nan_to_num(result.normals.astype(np.float64))
     along = on.sigma_along(towards)
     counted = result.counted
-    noise = float(np.sqrt(np.nanmean(along[counted] ** 2))) if np.isfinite(along[counted]).any() else float("nan")
-    verdict = None if tolerance is None else judge_deviation(result, on.sigma_along(towards, whole=True), tolerance)
+    noise = (
+        float(np.sqrt(np.nanmean(along[counted] ** 2)))
+        if np.isfinite(along[counted]).any()
+        else float("nan")
+    )
+    verdict = (
+        None
+        if tolerance is None
+        else judge_deviation(result, on.sigma_along(towards, whole=True), tolerance)
+    )
     progress(0.9, "writing")
     ply = None
     if out is not None:
@@ -206,9 +227,11 @@ def _figure_rows(numbers: dict[str, float], noise: float) -> list[Row]:
     ]
 
 
-def _write_points(ply: Path, on: MeasuredSurface, result: Deviation, nominal: Nominal, tolerance: float | None) -> None:
-    """The points that belong to the nominal, with their deviation as a scalar and as colours, and the triangles between
-    them where there are any."""
+def _write_points(
+    ply: Path, on: MeasuredSurface, result: Deviation, nominal: Nominal, tolerance: float | None
+) -> None:
+    """The points that belong to the nominal, with their deviation as a scalar and as colours, and
+    the triangles between them where there are any."""
     counted = result.counted
     signed = result.signed[counted]
     limit = colour_limit(signed, tolerance)
@@ -224,7 +247,10 @@ def _write_points(ply: Path, on: MeasuredSurface, result: Deviation, nominal: No
         normals=None if on.normals is None else on.normals[on.measured][counted],
         scalars={SCALARS: signed},
         faces=faces,
-        notes=[f"{on.source} against {nominal.name}", f"colours from {-limit:.4g} to {limit:.4g} mm"],
+        notes=[
+            f"{on.source} against {nominal.name}",
+            f"colours from {-limit:.4g} to {limit:.4g} mm",
+        ],
     )
 
 
@@ -281,5 +307,6 @@ def _save_comparison(
 
 
 def _safe_name(name: str) -> str:
-    """Return a file name that is valid on every system: ASCII letters, digits, '-' and '_', 60 at most."""
+    """Return a file name that is valid on every system: ASCII letters, digits, '-' and '_', 60 at
+    most."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)[:60]

@@ -1,7 +1,8 @@
-"""Tests of plugins: does a device, an importer, a board or an exporter keep what slviewer relies on?
+"""Tests of plugins: does a device, an importer, a board or an exporter keep what slviewer relies
+on?
 
-Each function returns one line per fault, an empty list where there is none, so that a package's test reads
-``assert check_camera(MyCamera()) == []``.
+Each function returns one line per fault, an empty list where there is none, so that a package's
+test reads ``assert check_camera(MyCamera()) == []``.
 """
 
 import shutil
@@ -14,7 +15,13 @@ from typing import Any, ParamSpec
 
 import numpy as np
 
-from slviewer.devices.protocols import Camera, CameraSettings, Projector, Turntable, stated_full_scale
+from slviewer.devices.protocols import (
+    Camera,
+    CameraSettings,
+    Projector,
+    Turntable,
+    stated_full_scale,
+)
 from slviewer.errors import Cancelled, DetectionError, DeviceError, InputError, SlviewerError
 from slviewer.fringe.presets import complementary, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
@@ -33,8 +40,8 @@ P = ParamSpec("P")
 
 
 def _listed(inspect: Callable[P, Iterator[str]]) -> Callable[P, list[str]]:
-    """Decorate what yields the faults of a plugin: they are returned as a list, with the exception that ends it early,
-    if one does."""
+    """Decorate what yields the faults of a plugin: they are returned as a list, with the exception
+    that ends it early, if one does."""
 
     @wraps(inspect)
     def collect(*arguments: P.args, **options: P.kwargs) -> list[str]:
@@ -53,7 +60,8 @@ def _listed(inspect: Callable[P, Iterator[str]]) -> Callable[P, list[str]]:
 
 @_listed
 def check_camera(camera: Camera) -> Iterator[str]:
-    """List what a closed camera does against the protocol `Camera`. It is opened, grabs some frames, and is closed."""
+    """List what a closed camera does against the protocol `Camera`. It is opened, grabs some
+    frames, and is closed."""
     yield from _check_size(camera)
     if not isinstance(camera.dtype, np.dtype) or camera.dtype not in (np.uint8, np.uint16):
         yield f"dtype is {camera.dtype!r}: it must be np.dtype(np.uint8) or np.dtype(np.uint16)"
@@ -63,29 +71,52 @@ def check_camera(camera: Camera) -> Iterator[str]:
     yield from _check_opening(camera, lambda: camera.grab(frame))
     camera.open()
     try:
-        frames = [np.full((height, width), level, camera.dtype) for level in (_SEEN_LEVEL, _OTHER_LEVEL)]
+        frames = [
+            np.full((height, width), level, camera.dtype) for level in (_SEEN_LEVEL, _OTHER_LEVEL)
+        ]
         for each in frames:
             camera.grab(each)
         untouched = (frames[0] == _SEEN_LEVEL) & (frames[1] == _OTHER_LEVEL)
         if np.count_nonzero(untouched) > frame.size // 1000:  # some may have these levels in truth
-            yield f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill them all"
+            yield (
+                f"grab left {np.count_nonzero(untouched)} of {frame.size} pixels as they were: fill"
+                " them all"
+            )
         largest, stated = int(np.max(frames)), stated_full_scale(camera)
         if stated is None and camera.dtype == np.uint16:
-            yield "full_scale is missing: state the grey level at which the camera clips, such as 4095"
+            yield (
+                "full_scale is missing: state the grey level at which the camera clips, such as"
+                " 4095"
+            )
         if stated is not None and not largest <= stated <= np.iinfo(camera.dtype).max:
-            yield f"full_scale is {stated}, and {camera.dtype} frames reach {largest}: state where they clip"
+            yield (
+                f"full_scale is {stated}, and {camera.dtype} frames reach {largest}: state where"
+                " they clip"
+            )
         wrong = np.zeros((height + 1, width), camera.dtype)
-        yield from _expect(InputError, lambda: camera.grab(wrong), "grab into an array of another shape")
+        yield from _expect(
+            InputError, lambda: camera.grab(wrong), "grab into an array of another shape"
+        )
         other = np.zeros((height, width), np.float32)
-        yield from _expect(InputError, lambda: camera.grab(other), "grab into an array of another type")
-        for name, call in (("settings", camera.settings), ("apply", lambda: camera.apply(CameraSettings()))):
+        yield from _expect(
+            InputError, lambda: camera.grab(other), "grab into an array of another type"
+        )
+        for name, call in (
+            ("settings", camera.settings),
+            ("apply", lambda: camera.apply(CameraSettings())),
+        ):
             if not isinstance(call(), CameraSettings):
                 yield f"{name} does not return CameraSettings"
         exposure = camera.settings().exposure_ms
         applied = camera.apply(CameraSettings(exposure_ms=exposure)).exposure_ms
         if applied != camera.settings().exposure_ms:
-            yield f"apply returns {applied} ms, and settings {camera.settings().exposure_ms} ms after it"
-        if exposure is not None and (applied is None or not np.isclose(applied, exposure, rtol=0.05)):
+            yield (
+                f"apply returns {applied} ms, and settings {camera.settings().exposure_ms} ms"
+                " after it"
+            )
+        if exposure is not None and (
+            applied is None or not np.isclose(applied, exposure, rtol=0.05)
+        ):
             yield f"apply of the present exposure, {exposure:g} ms, leaves {applied} ms"
     finally:
         camera.close()
@@ -93,17 +124,24 @@ def check_camera(camera: Camera) -> Iterator[str]:
 
 @_listed
 def check_projector(projector: Projector) -> Iterator[str]:
-    """List what a closed projector does against the protocol `Projector`. It is opened, shows a sequence, and is
-    closed."""
+    """List what a closed projector does against the protocol `Projector`. It is opened, shows a
+    sequence, and is closed."""
     yield from _check_size(projector)
     yield from _check_opening(projector, lambda: projector.show_level(0))
     projector.open()
     try:
         yield from _expect(DeviceError, lambda: projector.show(0), "show before load")
         width, height = projector.size
-        frames = (Frame("white"), Frame("black"), *phase_steps("x", 3, 16.0), *phase_steps("y", 3, 16.0))
+        frames = (
+            Frame("white"),
+            Frame("black"),
+            *phase_steps("x", 3, 16.0),
+            *phase_steps("y", 3, 16.0),
+        )
         other = PatternSequence((width + 1, height), frames)
-        yield from _expect(InputError, lambda: projector.load(other), "load of patterns of another size")
+        yield from _expect(
+            InputError, lambda: projector.load(other), "load of patterns of another size"
+        )
         for sequence in (complementary((width, height)), PatternSequence((width, height), frames)):
             projector.load(sequence)
             for index in (0, len(sequence.frames) - 1):
@@ -113,15 +151,22 @@ def check_projector(projector: Projector) -> Iterator[str]:
         for level in (0, 128, 255, None):
             projector.show_level(level)
         for level in (-1, 256):
-            yield from _expect(InputError, partial(projector.show_level, level), f"show_level of {level}")
-        yield from _expect(None, lambda: projector.show(0), "show after show_level, where the sequence stays loaded,")
+            yield from _expect(
+                InputError, partial(projector.show_level, level), f"show_level of {level}"
+            )
+        yield from _expect(
+            None,
+            lambda: projector.show(0),
+            "show after show_level, where the sequence stays loaded,",
+        )
     finally:
         projector.close()
 
 
 @_listed
 def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> Iterator[str]:
-    """List what a closed turntable does against the protocol `Turntable`. It turns by an angle and back."""
+    """List what a closed turntable does against the protocol `Turntable`. It turns by an angle and
+    back."""
     if not (turntable.name):
         yield "name is empty"
     yield from _check_opening(turntable, turntable.position_deg)
@@ -129,18 +174,26 @@ def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> Iterator[str
     try:
         start = turntable.position_deg()
         limits = turntable.limits_deg
-        to = start - turn_deg if limits is not None and start + turn_deg > limits[1] else start + turn_deg
+        to = (
+            start - turn_deg
+            if limits is not None and start + turn_deg > limits[1]
+            else start + turn_deg
+        )
         for angle in (to, start):
             turntable.turn_to(angle)
             if abs(turntable.position_deg() - angle) > _ANGLE_TOLERANCE_DEG:
                 yield f"after turn_to({angle:g}) it stands at {turntable.position_deg():g} degrees"
         if limits is not None:
-            yield from _expect(InputError, lambda: turntable.turn_to(limits[1] + 1), "turn_to beyond the limits")
+            yield from _expect(
+                InputError, lambda: turntable.turn_to(limits[1] + 1), "turn_to beyond the limits"
+            )
 
         def cancel() -> None:
             raise Cancelled("cancelled")
 
-        yield from _expect(Cancelled, lambda: turntable.turn_to(to, cancel), "turn_to with a check that raises")
+        yield from _expect(
+            Cancelled, lambda: turntable.turn_to(to, cancel), "turn_to with a check that raises"
+        )
         turntable.turn_to(start)
     finally:
         turntable.close()
@@ -148,11 +201,12 @@ def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> Iterator[str
 
 @_listed
 def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Iterator[str]:
-    """List what a layout does wrong with a folder that holds one capture; ``options`` are those of its ``read``.
+    """List what a layout does wrong with a folder that holds one capture; ``options`` are those of
+    its ``read``.
 
-    Its frames are decoded and compared with their description, as an import does: use a sound capture, recorded or
-    rendered. A copy of the folder without its first image, and an empty folder, must be refused or skipped with a
-    reason.
+    Its frames are decoded and compared with their description, as an import does: use a sound
+    capture, recorded or rendered. A copy of the folder without its first image, and an empty
+    folder, must be refused or skipped with a reason.
     """
     if not layout.is_capture(capture):
         yield f"is_capture is False for {capture}"
@@ -167,7 +221,9 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Itera
             continue
         try:
             new = recording.read()
-            check_imported_capture(replace(new, frames=new.merged_frames(), exposures_ms=()), ignore_warnings)
+            check_imported_capture(
+                replace(new, frames=new.merged_frames(), exposures_ms=()), ignore_warnings
+            )
         except InputError as error:
             yield str(error)
     with tempfile.TemporaryDirectory() as folder:
@@ -175,7 +231,9 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Itera
         empty.mkdir()
         if layout.is_capture(empty):
             yield "is_capture is True for an empty folder"
-        yield from _expect(InputError, lambda: layout.read(empty, **options), "read of an empty folder")
+        yield from _expect(
+            InputError, lambda: layout.read(empty, **options), "read of an empty folder"
+        )
         shorter = Path(folder) / "captures" / capture.name
         shutil.copytree(capture, shorter)
         missing = imports.recordings[0].files[0].resolve().relative_to(capture.resolve())
@@ -191,7 +249,8 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Itera
 
 @_listed
 def check_board(notation: str) -> Iterator[str]:
-    """List what is wrong with the board of an installed plugin, by a notation such as its example."""
+    """List what is wrong with the board of an installed plugin, by a notation such as its
+    example."""
     board = Board.parse(notation)
     if Board.parse(str(board)) != board:
         yield f"{board} is another board than {notation}"
@@ -200,12 +259,15 @@ def check_board(notation: str) -> Iterator[str]:
         yield "some features have the same coordinates"
     for level in (0, 128, 255):
         blank = np.full((480, 640), level, np.uint8)
-        yield from _expect(DetectionError, partial(detect, board, blank), "detection in an empty image")
+        yield from _expect(
+            DetectionError, partial(detect, board, blank), "detection in an empty image"
+        )
 
 
 @_listed
 def check_exporter(exporter: Exporter) -> Iterator[str]:
-    """List what is wrong with a file format: it must encode small shapes with and without normals and colours."""
+    """List what is wrong with a file format: it must encode small shapes with and without normals
+    and colours."""
     rng = np.random.default_rng(0)
     points = rng.normal(0, 10, (4, 3)).astype(np.float32)
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
@@ -230,13 +292,18 @@ def _check_size(device: Camera | Projector) -> list[str]:
     """List what is wrong with the name and the size of a closed device."""
     faults = [] if isinstance(device.name, str) and device.name else ["name is empty"]
     size = device.size
-    if not isinstance(size, tuple) or len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
+    if (
+        not isinstance(size, tuple)
+        or len(size) != 2
+        or not all(isinstance(side, int) and side > 0 for side in size)
+    ):
         faults.append(f"size is {size!r}: it must be a tuple of two int, (width, height) px")
     return faults
 
 
 def _check_opening(device: Camera | Projector | Turntable, use: Callable[[], object]) -> list[str]:
-    """List faults of `open` and `close`: using a closed device is an error, closing it twice and reopening are not."""
+    """List faults of `open` and `close`: using a closed device is an error, closing it twice and
+    reopening are not."""
     faults = _expect(DeviceError, use, "use before open")
     faults += _expect(None, device.close, "close before open")
     device.open()

@@ -1,4 +1,5 @@
-"""Example data by name: a small set that ships with slviewer, and a larger one that is attached to its releases."""
+"""Example data by name: a small set that ships with slviewer, and a larger one that is attached to
+its releases."""
 
 import hashlib
 import json
@@ -19,7 +20,8 @@ _TIMEOUT_S = 30.0
 
 @dataclass(frozen=True)
 class Dataset:
-    """A zip of captures as images, its hash, and where it is: below assets, or at the address of a release."""
+    """A zip of captures as images, its hash, and where it is: below assets, or at the address of a
+    release."""
 
     sha256: str
     archive: str = ""
@@ -27,12 +29,16 @@ class Dataset:
     bytes: int = 0
 
 
-SAMPLE = Dataset("97c69a2d436351e9d8096a9afaa5b0a17a919a358f9ed0b9039709fe03f95514", archive="datasets/sample.zip")
+SAMPLE = Dataset(
+    "97c69a2d436351e9d8096a9afaa5b0a17a919a358f9ed0b9039709fe03f95514",
+    archive="datasets/sample.zip",
+)
 """Six target poses, a plane, a sphere and an object, simulated at 240x180 px."""
 
 
 def datasets() -> dict[str, Dataset]:
-    """Return {name: data set}: the sample, and what was attached to the release that is installed."""
+    """Return {name: data set}: the sample, and what was attached to the release that is
+    installed."""
     known = {"sample": SAMPLE}
     try:
         released = asset("datasets/released.json").read_text(encoding="utf-8")
@@ -41,21 +47,31 @@ def datasets() -> dict[str, Dataset]:
     return known | {name: Dataset(**each) for name, each in json.loads(released).items()}
 
 
-def fetch(name: str = "sample", folder: Path | str | None = None, progress: Progress = ignore_progress) -> Path:
+def fetch(
+    name: str = "sample", folder: Path | str | None = None, progress: Progress = ignore_progress
+) -> Path:
     """Copy a data set into a folder.
 
     Args:
-        name: Name of the data set: sample, which ships with slviewer, or letter (larger, downloaded, of releases).
-        folder: Folder to make. Without it, the data set's folder in the user's cache, made when it is first used.
+        name: Name of the data set: sample, which ships with slviewer, or letter (larger,
+            downloaded, of releases).
+        folder: Folder to make. Without it, the data set's folder in the user's cache, made when it
+            is first used.
 
-    Returns the folder; its subfolders hold images in a known layout: poses, scan, sphere and object of the sample;
-    poses, planes, spheres and objects of letter. A download is kept in the user's cache, and ``progress`` may cancel
-    it. Raises `InputError` for an unknown name, a download that fails, a damaged archive, or an existing folder.
+    Returns the folder; its subfolders hold images in a known layout: poses, scan, sphere and object
+    of the sample; poses, planes, spheres and objects of letter. A download is kept in the user's
+    cache, and ``progress`` may cancel it. Raises `InputError` for an unknown name, a download that
+    fails, a damaged archive, or an existing folder.
     """
     known = datasets()
     if name not in known:
-        also = "; letter is attached to releases, and this is no release: make it by assets/make_sample_data.py letter"
-        raise InputError(f"no data set is called {name!r}: use {' or '.join(known)}{also * (name == 'letter')}")
+        also = (
+            "; letter is attached to releases, and this is no release: make it by"
+            " assets/make_sample_data.py letter"
+        )
+        raise InputError(
+            f"no data set is called {name!r}: use {' or '.join(known)}{also * (name == 'letter')}"
+        )
     dataset = known[name]
     if folder is None:
         target = _cache_folder() / f"{name}-{dataset.sha256[:12]}"
@@ -70,10 +86,17 @@ def fetch(name: str = "sample", folder: Path | str | None = None, progress: Prog
     else:
         source = asset(dataset.archive)
         if hashlib.sha256(source.read_bytes()).hexdigest() != dataset.sha256:
-            raise InputError(f"{source} is not the data set {name!r}: its hash differs; install slviewer again")
+            raise InputError(
+                f"{source} is not the data set {name!r}: its hash differs; install slviewer again"
+            )
     target.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch, source.open("rb") as archive:
-        unpacked, _ = unpack(archive, Path(scratch), lambda done: progress(0.8 + 0.2 * done, "unpacking"))
+    with (
+        TemporaryDirectory(dir=target.parent, prefix=".fetch-") as scratch,
+        source.open("rb") as archive,
+    ):
+        unpacked, _ = unpack(
+            archive, Path(scratch), lambda done: progress(0.8 + 0.2 * done, "unpacking")
+        )
         try:
             unpacked.rename(target)
         except OSError:
@@ -83,7 +106,8 @@ def fetch(name: str = "sample", folder: Path | str | None = None, progress: Prog
 
 
 def _download(name: str, dataset: Dataset, progress: Progress) -> Path:
-    """Return the archive of a data set in the cache, downloaded if it is not there or not what it should be."""
+    """Return the archive of a data set in the cache, downloaded if it is not there or not what it
+    should be."""
     import pooch
     import requests
 
@@ -99,11 +123,13 @@ def _download(name: str, dataset: Dataset, progress: Progress) -> Path:
         )
     except requests.RequestException as error:
         raise InputError(
-            f"{dataset.url} was not downloaded ({type(error).__name__}): check the network, or download it elsewhere "
-            "and unpack it; the data set 'sample' needs no network"
+            f"{dataset.url} was not downloaded ({type(error).__name__}): check the network, or"
+            " download it elsewhere and unpack it; the data set 'sample' needs no network"
         ) from error
     except ValueError as error:  # pooch: the hash differs
-        raise InputError(f"what {dataset.url} returned is not the data set {name!r}: its hash differs") from error
+        raise InputError(
+            f"what {dataset.url} returned is not the data set {name!r}: its hash differs"
+        ) from error
     return Path(path)
 
 

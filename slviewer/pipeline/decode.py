@@ -21,9 +21,14 @@ from slviewer.session.exr import write_exr
 MapFormat = Literal["npy", "exr"]
 REASONS = {
     Reason.VALID: "the phase is valid",
-    Reason.DARK: "too little modulation for the noise: shadow, black surface, or outside of the projector's light",
+    Reason.DARK: (
+        "too little modulation for the noise: shadow, black surface, or outside of the projector's"
+        " light"
+    ),
     Reason.SATURATED: "the camera clipped the patterns",
-    Reason.INCONSISTENT: "a bit could not be decided, or the fringe order contradicts the phase or the neighbourhood",
+    Reason.INCONSISTENT: (
+        "a bit could not be decided, or the fringe order contradicts the phase or the neighbourhood"
+    ),
     Reason.OUTSIDE: "the coordinate lies outside of the projector",
     Reason.INDIRECT: "much of the light came by way of other surfaces or through the material",
 }
@@ -45,14 +50,27 @@ class DecodedFiles:
             "capture": self.capture,
             "files": dict(self.files),
             "units": {
-                "phase": "rad, 2 pi u / period_px, 0 at the centre of projector column (row) 0; NaN: masked",
-                "coordinate": "projector px, 0 at the centre of column (row) 0; modulo unambiguous_px where that is a "
-                "number; NaN: masked",
-                "sigma": "projector px, standard deviation of the coordinate by the camera's noise; NaN: masked",
-                "modulation": "grey levels, amplitude of the fringes; of Gray code alone half its contrast",
+                "phase": (
+                    "rad, 2 pi u / period_px, 0 at the centre of projector column (row) 0; NaN:"
+                    " masked"
+                ),
+                "coordinate": (
+                    "projector px, 0 at the centre of column (row) 0; modulo unambiguous_px where"
+                    " that is a number; NaN: masked"
+                ),
+                "sigma": (
+                    "projector px, standard deviation of the coordinate by the camera's noise; NaN:"
+                    " masked"
+                ),
+                "modulation": (
+                    "grey levels, amplitude of the fringes; of Gray code alone half its contrast"
+                ),
                 "reason": "uint8 code, see reasons",
             },
-            "reasons": {str(int(reason)): f"{REASON_LABELS[reason]}: {words}" for reason, words in REASONS.items()},
+            "reasons": {
+                str(int(reason)): f"{REASON_LABELS[reason]}: {words}"
+                for reason, words in REASONS.items()
+            },
             "axes": {axis: axis_figures(phase) for axis, phase in self.phases.items()},
         }
 
@@ -61,7 +79,9 @@ class DecodedFiles:
         lines = []
         for axis, phase in self.phases.items():
             figures = axis_figures(phase)
-            shares = ", ".join(f"{name} {100 * share:.1f} %" for name, share in figures["shares"].items())
+            shares = ", ".join(
+                f"{name} {100 * share:.1f} %" for name, share in figures["shares"].items()
+            )
             lines.append(f"{self.capture}, axis {axis}: {shares}")
             if not phase.mask.any():
                 continue
@@ -70,28 +90,40 @@ class DecodedFiles:
             if phase.is_relative:
                 what += f", known only modulo {phase.unambiguous_px:g} px"
             lines.append(
-                f"  {what}: coordinates {figures['coordinate_px'][0]:.1f}-{figures['coordinate_px'][1]:.1f} px, "
-                f"modulation {figures['median_modulation']:.1f} and noise {figures['noise_levels']:.2f} grey levels, "
-                f"sigma {figures['median_sigma_px']:.4f} px (medians)"
+                f"  {what}: coordinates"
+                f" {figures['coordinate_px'][0]:.1f}-{figures['coordinate_px'][1]:.1f} px,"
+                f" modulation {figures['median_modulation']:.1f} and noise"
+                f" {figures['noise_levels']:.2f} grey levels, sigma"
+                f" {figures['median_sigma_px']:.4f} px (medians)"
             )
         lines.append(f"{len(self.files)} files -> {self.folder}; decoded.json explains them")
         return "\n".join(lines)
 
 
 def axis_figures(phase: PhaseMap) -> dict[str, Any]:
-    """Shares of the pixels by reason, and medians over the valid ones; None where no pixel is valid.
+    """Shares of the pixels by reason, and medians over the valid ones; None where no pixel is
+    valid.
 
-    ``noise_levels`` is the standard deviation of one frame at the median background, in grey levels.
+    ``noise_levels`` is the standard deviation of one frame at the median background, in grey
+    levels.
     """
     valid = phase.mask
-    shares = {REASON_LABELS[reason]: round(share, 6) for reason, share in reason_shares(phase).items()}
+    shares = {
+        REASON_LABELS[reason]: round(share, 6) for reason, share in reason_shares(phase).items()
+    }
     figures: dict[str, Any] = {
         "period_px": phase.period_px,
         "steps": phase.steps,
         "unambiguous_px": phase.unambiguous_px if phase.is_relative else None,
         "shares": shares,
     }
-    names = ("coordinate_px", "median_modulation", "median_background", "noise_levels", "median_sigma_px")
+    names = (
+        "coordinate_px",
+        "median_modulation",
+        "median_background",
+        "noise_levels",
+        "median_sigma_px",
+    )
     if not valid.any():
         return figures | dict.fromkeys(names)
     coordinate = phase.coordinate[valid]
@@ -116,7 +148,8 @@ def write_decoded(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> DecodedFiles:
-    """Decode a capture: absolute phase and projector coordinate of each pixel, the mask with its reasons, a picture.
+    """Decode a capture: absolute phase and projector coordinate of each pixel, the mask with its
+    reasons, a picture.
 
     Args:
         session: Session folder.
@@ -124,9 +157,9 @@ def write_decoded(
         out: Folder for the files; made if it does not exist. decoded.json in it explains them.
         file_format: npy (NumPy) or exr (OpenEXR) for the maps, float32, NaN where masked.
 
-    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey levels, not masked)
-    as (h, w) maps, and ``reason``, uint8 codes, as .npy or .png; the picture is ``decoded.png``. Files of the same
-    names are replaced. Raises InputError like `decode_capture`.
+    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey
+    levels, not masked) as (h, w) maps, and ``reason``, uint8 codes, as .npy or .png; the picture is
+    ``decoded.png``. Files of the same names are replaced. Raises InputError like `decode_capture`.
     """
     if file_format not in ("npy", "exr"):
         raise InputError(f"maps cannot be written as '{file_format}': use npy or exr")

@@ -26,7 +26,8 @@ _LARGEST_OVERLAY_PX = 1600
 class BoardImageResult:
     """A photograph, and the board in it: ``detection``, or None and the reason (``refusal``).
 
-    ``rms_px`` (NaN without a detection): how far the features lie from the smooth map of a flat grid behind a lens.
+    ``rms_px`` (NaN without a detection): how far the features lie from the smooth map of a flat
+    grid behind a lens.
     """
 
     path: Path
@@ -37,7 +38,8 @@ class BoardImageResult:
 
 @dataclass(frozen=True, eq=False)
 class BoardsDetected:
-    """What ``detect_board`` returns: ``board`` and one result for each photograph, in the order of ``images``."""
+    """What ``detect_board`` returns: ``board`` and one result for each photograph, in the order of
+    ``images``."""
 
     board: Board
     images: tuple[BoardImageResult, ...]
@@ -51,10 +53,15 @@ class BoardsDetected:
     def failure(self) -> str:
         """In how many photographs the board was not detected; empty where it was in all."""
         missing = len(self.images) - self.detected
-        return f"{self.board} not detected in {missing} of {len(self.images)} images" if missing else ""
+        return (
+            f"{self.board} not detected in {missing} of {len(self.images)} images"
+            if missing
+            else ""
+        )
 
     def rows(self) -> list[tuple[str, int, float, float, float, float]]:
-        """The table: image, index of the feature, its place on the board in mm, and in the image in px."""
+        """The table: image, index of the feature, its place on the board in mm, and in the image in
+        px."""
         return [
             (image.path.name, int(index), x, y, u, v)
             for image in self.images
@@ -72,7 +79,10 @@ class BoardsDetected:
         lines = [_describe_result(self.board, image) for image in self.images]
         if len(self.images) == 1 and self.detected:
             lines.append(f"{'index':>5} {'x mm':>9} {'y mm':>9} {'u px':>10} {'v px':>10}")
-            lines += [f"{index:5d} {x:9.2f} {y:9.2f} {u:10.3f} {v:10.3f}" for _, index, x, y, u, v in self.rows()]
+            lines += [
+                f"{index:5d} {x:9.2f} {y:9.2f} {u:10.3f} {v:10.3f}"
+                for _, index, x, y, u, v in self.rows()
+            ]
         elif len(self.images) > 1:
             lines.append(f"{self.board} detected in {self.detected} of {len(self.images)} images")
         return "\n".join(lines)
@@ -103,19 +113,22 @@ def detect_board(
     out: Path | str | None = None,
     csv_out: Path | str | None = None,
 ) -> BoardsDetected:
-    """Detect a calibration board in photographs: where its circles or corners are, or why it cannot be measured.
+    """Detect a calibration board in photographs: where its circles or corners are, or why it cannot
+    be measured.
 
     Ends with status 1 where the board is not detected in every image.
 
     Args:
         images: Image files, or folders of them.
-        target: circles:21x16:9 (columns x rows : pitch mm), acircles:..., chessboard:9x7:75 (inner corners : square
-            mm), charuco:....
-        out: The picture with numbered features and the board's axes; a folder where there are several images.
-        csv_out: Table of all features: image, index, place on the board in mm, place in the image in px.
+        target: circles:21x16:9 (columns x rows : pitch mm), acircles:..., chessboard:9x7:75 (inner
+            corners : square mm), charuco:....
+        out: The picture with numbered features and the board's axes; a folder where there are
+            several images.
+        csv_out: Table of all features: image, index, place on the board in mm, place in the image
+            in px.
 
-    A photograph that cannot be read, or in which the board is not detected, is a result with its reason. Raises
-    InputError where there is no photograph at all.
+    A photograph that cannot be read, or in which the board is not detected, is a result with its
+    reason. Raises InputError where there is no photograph at all.
     """
     board = Board.parse(target)
     paths = _list_photographs([Path(image) for image in images])
@@ -129,7 +142,10 @@ def detect_board(
             continue
         results.append(result)
         if out is not None:
-            _write_picture(_overlay_path(Path(out), path, len(paths)), draw_detection(board, picture, result.detection))
+            _write_picture(
+                _overlay_path(Path(out), path, len(paths)),
+                draw_detection(board, picture, result.detection),
+            )
     detected = BoardsDetected(board, tuple(results))
     if csv_out is not None:
         _write_csv(Path(csv_out), detected)
@@ -137,12 +153,16 @@ def detect_board(
 
 
 def draw_detection(board: Board, image: np.ndarray, detection: Detection | None) -> np.ndarray:
-    """(h, w, 3) uint8 BGR: the photograph with each feature marked and numbered, and the board's axes (x red, y green);
-    enlarged or reduced to a width at which the numbers can be read."""
+    """(h, w, 3) uint8 BGR: the photograph with each feature marked and numbered, and the board's
+    axes (x red, y green); enlarged or reduced to a width at which the numbers can be read."""
     image = to_eight_bits(image)
-    picture = np.ascontiguousarray(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    picture = np.ascontiguousarray(
+        image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    )
     scale = _LARGEST_OVERLAY_PX / max(picture.shape[:2])
-    picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else 1)
+    picture = cv2.resize(
+        picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else 1
+    )
     if detection is None:
         return picture
     pixels = (detection.pixels + 0.5) * scale - 0.5
@@ -153,9 +173,20 @@ def draw_detection(board: Board, image: np.ndarray, detection: Detection | None)
     for index, place in zip(detection.ids.tolist(), places, strict=True):
         cv2.drawMarker(picture, place, _BLUE, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
         for colour, width in ((_BLACK, 3), (_BLUE, 1)):
-            cv2.putText(picture, str(index), (place[0] + 4, place[1] - 4), 0, size, colour, width, cv2.LINE_AA)
+            cv2.putText(
+                picture,
+                str(index),
+                (place[0] + 4, place[1] - 4),
+                0,
+                size,
+                colour,
+                width,
+                cv2.LINE_AA,
+            )
     to_px = fit_grid_map(board.points[detection.ids][:, :2] / board.pitch_mm, pixels)
-    axes = to_px.to_image(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) * (2 if board.kind == "acircles" else 1))
+    axes = to_px.to_image(
+        np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) * (2 if board.kind == "acircles" else 1)
+    )
     origin, *tips = [(round(float(u)), round(float(v))) for u, v in axes]
     for tip, colour, name in zip(tips, (_RED, _GREEN), "xy", strict=True):
         cv2.arrowedLine(picture, origin, tip, colour, 3, cv2.LINE_AA, tipLength=0.25)
@@ -164,13 +195,18 @@ def draw_detection(board: Board, image: np.ndarray, detection: Detection | None)
 
 
 def _list_photographs(given: list[Path]) -> list[Path]:
-    """Return the given image files and the images in given folders; InputError for a missing path."""
+    """Return the given image files and the images in given folders; InputError for a missing
+    path."""
     paths: list[Path] = []
     for path in given:
         if path.is_dir():
-            inside = sorted(each for each in path.iterdir() if each.suffix.lower() in IMAGE_SUFFIXES)
+            inside = sorted(
+                each for each in path.iterdir() if each.suffix.lower() in IMAGE_SUFFIXES
+            )
             if not inside:
-                raise InputError(f"{path} holds no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files")
+                raise InputError(
+                    f"{path} holds no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files"
+                )
             paths += inside
         elif path.exists():
             paths.append(path)
@@ -187,7 +223,9 @@ def _detect_board_in(board: Board, path: Path, picture: np.ndarray) -> BoardImag
         detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
     except DetectionError as error:
         return BoardImageResult(path, None, str(error))
-    residuals = fit_grid_map(board.points[detection.ids][:, :2] / board.pitch_mm, detection.pixels).residuals
+    residuals = fit_grid_map(
+        board.points[detection.ids][:, :2] / board.pitch_mm, detection.pixels
+    ).residuals
     return BoardImageResult(path, detection, rms_px=float(np.sqrt((residuals**2).sum(1).mean())))
 
 
@@ -198,14 +236,19 @@ def _describe_result(board: Board, image: BoardImageResult) -> str:
     features = "circles" if board.kind in ("circles", "acircles") else "corners"
     mark = ", numbered from the board's mark" if image.detection.marked else ""
     return (
-        f"{image.path.name}: {len(image.detection.ids)} of {len(board.points)} {features} detected, "
-        f"{image.rms_px:.3f} px RMS from a flat grid{mark}"
+        f"{image.path.name}: {len(image.detection.ids)} of {len(board.points)} {features} detected,"
+        f" {image.rms_px:.3f} px RMS from a flat grid{mark}"
     )
 
 
 def _overlay_path(out: Path, photograph: Path, count: int) -> Path:
-    """Return the file for a photograph's overlay: ``out`` itself for a single image, else a PNG in that folder."""
-    return out if count == 1 and out.suffix.lower() in IMAGE_SUFFIXES else out / f"{photograph.stem}_board.png"
+    """Return the file for a photograph's overlay: ``out`` itself for a single image, else a PNG in
+    that folder."""
+    return (
+        out
+        if count == 1 and out.suffix.lower() in IMAGE_SUFFIXES
+        else out / f"{photograph.stem}_board.png"
+    )
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:
@@ -213,12 +256,16 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(path.suffix, picture)
     if not done:
-        raise InputError(f"{path.name} cannot be written as an image: give a name that ends in .png")
+        raise InputError(
+            f"{path.name} cannot be written as an image: give a name that ends in .png"
+        )
     path.write_bytes(data.tobytes())
 
 
 def _write_csv(path: Path, detected: BoardsDetected) -> None:
     """Write the detected features of all photographs as CSV, one row each."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = ((name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in detected.rows())
+    rows = (
+        (name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in detected.rows()
+    )
     path.write_text(format_csv([COLUMNS, *rows]), encoding="utf-8", newline="")

@@ -1,4 +1,5 @@
-"""Setting the region of interest of a session, and deleting points of a scan so that they can be brought back."""
+"""Setting the region of interest of a session, and deleting points of a scan so that they can be
+brought back."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,13 @@ from slviewer.session.scan_edits import list_edits, load_edits, load_region, sav
 from slviewer.session.store import Session
 from slviewer.surface.point_edits import Edit, make_edit
 from slviewer.surface.region_of_interest import RegionOfInterest
-from slviewer.surface.selection import Mask, SupportPlane, select_connected, select_polygon, select_support
+from slviewer.surface.selection import (
+    Mask,
+    SupportPlane,
+    select_connected,
+    select_polygon,
+    select_support,
+)
 
 SUPPORT = "support and below"
 """How the points of a support are said to be selected."""
@@ -25,8 +32,8 @@ SUPPORT = "support and below"
 
 @dataclass(frozen=True)
 class ScanEdits:
-    """The edits of a scan that are in effect, in words, how many were undone, and how many points remain, where that
-    was computed."""
+    """The edits of a scan that are in effect, in words, how many were undone, and how many points
+    remain, where that was computed."""
 
     scan: str
     edits: tuple[str, ...]
@@ -35,11 +42,18 @@ class ScanEdits:
 
     def to_json(self) -> dict[str, Any]:
         """The contract of ``edit --json``."""
-        return {"scan": self.scan, "edits": list(self.edits), "undone": self.undone, "remaining": self.remaining}
+        return {
+            "scan": self.scan,
+            "edits": list(self.edits),
+            "undone": self.undone,
+            "remaining": self.remaining,
+        }
 
     def text(self) -> str:
         """List the edits, numbered in their order."""
-        lines = [f"{i}. {words}" for i, words in enumerate(self.edits, 1)] or [f"{self.scan} has no edits in effect"]
+        lines = [f"{i}. {words}" for i, words in enumerate(self.edits, 1)] or [
+            f"{self.scan} has no edits in effect"
+        ]
         if self.remaining is not None:
             lines.append(f"{self.remaining} points remain")
         if self.undone:
@@ -63,17 +77,21 @@ def edit_scan(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> ScanEdits:
-    """Delete points of a scan, undo and redo that, or list what was deleted; the scan itself stays as it was captured.
+    """Delete points of a scan, undo and redo that, or list what was deleted; the scan itself stays
+    as it was captured.
 
-    What is deleted is not used by reconstruct, merge, mesh, measure and export, with any later calibration too.
+    What is deleted is not used by reconstruct, merge, mesh, measure and export, with any later
+    calibration too.
 
     Args:
         session: Session folder.
         scan: Name of the capture.
-        polygon: Delete what the camera sees within this polygon: u v of three or more pixels (column, row).
+        polygon: Delete what the camera sees within this polygon: u v of three or more pixels
+            (column, row).
         part: Delete the connected part of the surface that this pixel, u v, belongs to.
         support: Delete the plane that the object stands on, and all below it.
-        margin: Millimetres above that plane that belong to it; by default three times the scatter of its points.
+        margin: Millimetres above that plane that belong to it; by default three times the scatter
+            of its points.
         invert: Delete everything else instead.
         undo: Undo so many edits, the last first.
         redo: Bring so many undone edits back.
@@ -84,7 +102,9 @@ def edit_scan(
     if chosen + bool(undo) + bool(redo) > 1:
         raise UsageError("do one thing at a time: --polygon, --part, --support, --undo or --redo")
     if (invert and not chosen) or (margin is not None and not support):
-        raise UsageError("--invert needs --polygon, --part or --support, and --margin needs --support")
+        raise UsageError(
+            "--invert needs --polygon, --part or --support, and --margin needs --support"
+        )
     if not chosen and not undo and not redo:
         with opened(session) as store:
             store.load_capture(scan)
@@ -100,12 +120,19 @@ def edit_scan(
             (plane, selected), what = select_support(cloud.points, cloud.sigma_z, margin), SUPPORT
         elif part:
             if len(part) != 2:
-                raise UsageError(f"--part has {len(part)} numbers: give u v of one pixel, such as --part 180 150")
+                raise UsageError(
+                    f"--part has {len(part)} numbers: give u v of one pixel, such as --part 180 150"
+                )
             selected, what = select_connected(cloud.points, (part[0], part[1])), "connected part"
         else:
             if len(polygon) % 2 or len(polygon) < 6:
-                raise UsageError(f"--polygon has {len(polygon)} numbers: give u v of three or more pixels")
-            selected, what = select_polygon(cloud.sigma_z.shape, np.reshape(polygon, (-1, 2))), "polygon"
+                raise UsageError(
+                    f"--polygon has {len(polygon)} numbers: give u v of three or more pixels"
+                )
+            selected, what = (
+                select_polygon(cloud.sigma_z.shape, np.reshape(polygon, (-1, 2))),
+                "polygon",
+            )
         if invert:
             selected, what, plane = ~selected, f"all but {what}", None
         delete_points(store, [Selection(scan, cloud.points, selected, plane)], what)
@@ -116,8 +143,8 @@ def edit_scan(
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Points of a scan that are to be deleted: the ``selected`` (h, w) of its ``points`` (h, w, 3) mm, and the
-    ``plane`` that they all lie below of, where they do."""
+    """Points of a scan that are to be deleted: the ``selected`` (h, w) of its ``points`` (h, w, 3)
+    mm, and the ``plane`` that they all lie below of, where they do."""
 
     scan: str
     points: np.ndarray
@@ -126,8 +153,8 @@ class Selection:
 
 
 def delete_points(store: Session, selections: Sequence[Selection], what: str) -> dict[str, int]:
-    """Delete what is selected of one or several scans, in one step: {scan: points deleted}. ``what``: how it was
-    selected. Scans of which nothing is selected stay as they are.
+    """Delete what is selected of one or several scans, in one step: {scan: points deleted}.
+    ``what``: how it was selected. Scans of which nothing is selected stay as they are.
 
     InputError where nothing is selected at all, or nothing would remain of a scan.
     """
@@ -139,7 +166,9 @@ def delete_points(store: Session, selections: Sequence[Selection], what: str) ->
             continue
         edit = make_edit(each.points, each.selected, what, each.plane, made)
         if edit.points == (total := int(np.count_nonzero(measured))):
-            raise InputError(f"all {total} points of {each.scan} are selected: select fewer, or delete the scan")
+            raise InputError(
+                f"all {total} points of {each.scan} are selected: select fewer, or delete the scan"
+            )
         edits[each.scan] = edit
     if not edits:
         raise InputError("no point is selected: select some first")
@@ -156,7 +185,8 @@ def change_history(store: Session, scan: str, *, undo: int = 0, redo: int = 0) -
 
 
 def undo_last(store: Session, scans: Sequence[str]) -> None:
-    """Undo the last edit among those of several scans, of all scans that it was made of. InputError where none is."""
+    """Undo the last edit among those of several scans, of all scans that it was made of. InputError
+    where none is."""
     made = {scan: edits[-1].made for scan in scans if (edits := load_edits(store, scan).active)}
     _change_together(store, made, max(made.values(), default=""), undo=1)
 
@@ -167,9 +197,11 @@ def redo_next(store: Session, scans: Sequence[str]) -> None:
     _change_together(store, made, min(made.values(), default=""), redo=1)
 
 
-def _change_together(store: Session, made: Mapping[str, str], when: str, *, undo: int = 0, redo: int = 0) -> None:
-    """Undo or redo an edit of each of the scans whose edit was ``made`` at that time; the first one's where none is
-    known. InputError without scans."""
+def _change_together(
+    store: Session, made: Mapping[str, str], when: str, *, undo: int = 0, redo: int = 0
+) -> None:
+    """Undo or redo an edit of each of the scans whose edit was ``made`` at that time; the first
+    one's where none is known. InputError without scans."""
     scans = [scan for scan, time in made.items() if time == when][: None if when else 1]
     if not scans:
         raise InputError(f"no edit can be {'undone' if undo else 'redone'}: there is none")
@@ -188,20 +220,25 @@ def set_region(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> str:
-    """Set the region of interest of a session, or show it: points of scans outside of it are ignored.
+    """Set the region of interest of a session, or show it: points of scans outside of it are
+    ignored.
 
-    It holds for reconstruct, merge, mesh, measure and export, unless their own --roi states another one.
+    It holds for reconstruct, merge, mesh, measure and export, unless their own --roi states another
+    one.
 
     Args:
         session: Session folder.
-        roi: The box: x0,x1,y0,y1,z0,z1 in mm in the camera's frame (x right, y down, z away), or a TOML file with
-            centre_mm, size_mm and rotation_deg; off switches it off, on switches the last one on.
+        roi: The box: x0,x1,y0,y1,z0,z1 in mm in the camera's frame (x right, y down, z away), or a
+            TOML file with centre_mm, size_mm and rotation_deg; off switches it off, on switches the
+            last one on.
         around: A scan: the box around all of its points.
         model: Which calibration to use for that scan; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
     if roi and around:
-        raise UsageError("state the region with --roi, or take it from a scan with --around: one of both")
+        raise UsageError(
+            "state the region with --roi, or take it from a scan with --around: one of both"
+        )
     if not roi and not around:
         with opened(session) as store:
             return describe_region(store)
@@ -213,7 +250,9 @@ def set_region(
         else:
             known = load_region(store, even_if_off=True)
             if roi == "on" and known is None:
-                raise InputError("the session has no region of interest yet: state its box, or use --around SCAN")
+                raise InputError(
+                    "the session has no region of interest yet: state its box, or use --around SCAN"
+                )
             save_region(store, known if roi in (OFF, "on") else parse_region(roi), roi != OFF)
         return describe_region(store)
 

@@ -1,4 +1,5 @@
-"""Files for other programs, of everything that a session holds. The wizard's step Export and the command call this."""
+"""Files for other programs, of everything that a session holds. The wizard's step Export and the
+command call this."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +19,32 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.session.atomic import format_bytes
-from slviewer.session.mesh_files import IN_WORDS, estimated_bytes, exporters, mesh_formats, point_formats, write_shape
+from slviewer.session.mesh_files import (
+    IN_WORDS,
+    estimated_bytes,
+    exporters,
+    mesh_formats,
+    point_formats,
+    write_shape,
+)
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 from slviewer.surface.meshing import MeshingPlan
 
-What = Literal["cloud", "mesh", "merge", "merged-mesh", "calibration", "coefficients", "poses", "report", "table"]
-"""A scan's points, its mesh, the points of a merge, one mesh through them, the calibration, the coefficients of each
-pixel, poses of devices, boards and scans, the report, the figures of all records."""
+What = Literal[
+    "cloud",
+    "mesh",
+    "merge",
+    "merged-mesh",
+    "calibration",
+    "coefficients",
+    "poses",
+    "report",
+    "table",
+]
+"""A scan's points, its mesh, the points of a merge, one mesh through them, the calibration, the
+coefficients of each pixel, poses of devices, boards and scans, the report, the figures of all
+records."""
 _DOCUMENT_FORMATS: dict[str, tuple[str, ...]] = {
     "calibration": ("yml", "xml", "json"),
     "coefficients": ("npz",),
@@ -46,7 +65,8 @@ _ALIASES = {"yaml": "yml", "htm": "html"}
 
 
 def formats(what: What) -> tuple[str, ...]:
-    """Return the formats of an export; the first is the default. Raises InputError for what cannot be exported."""
+    """Return the formats of an export; the first is the default. Raises InputError for what cannot
+    be exported."""
     if what not in get_args(What):
         raise InputError(f"{what!r} cannot be exported: choose one of {', '.join(get_args(What))}")
     if what in ("cloud", "merge"):
@@ -79,11 +99,13 @@ def describe_format(file_format: str) -> str:
 def estimate_file_bytes(
     what: What, file_format: str, points: int, model: str = "", triangles: int | None = None
 ) -> int | None:
-    """About how large a file of a scan or a merge of so many points becomes, thinned to ``triangles`` where that is
-    wanted; None where it is not known before."""
+    """About how large a file of a scan or a merge of so many points becomes, thinned to
+    ``triangles`` where that is wanted; None where it is not known before."""
     if what in ("cloud", "merge"):
         return estimated_bytes(file_format, points, scalars=3 if model == "splined" else 1)
-    faces = 2 * points if what == "mesh" else None  # between neighbouring pixels, all but those at borders
+    faces = (
+        2 * points if what == "mesh" else None
+    )  # between neighbouring pixels, all but those at borders
     if triangles is not None:
         faces = triangles if faces is None else min(triangles, faces)
     return None if faces is None else estimated_bytes(file_format, faces // 2, faces, scalars=1)
@@ -98,8 +120,16 @@ def check_export(what: What, file_format: str) -> None:
 
 def default_file_name(what: What, name: str, file_format: str) -> str:
     """The default name of an exported file, such as ``object_1_mesh.stl``."""
-    stems = {"cloud": f"{name}_cloud", "mesh": f"{name}_mesh", "merge": f"merged_{name}", "table": "figures"}
-    stems |= {"merged-mesh": f"merged_{name}_mesh", "coefficients": f"coefficients_{name}" if name else "coefficients"}
+    stems = {
+        "cloud": f"{name}_cloud",
+        "mesh": f"{name}_mesh",
+        "merge": f"merged_{name}",
+        "table": "figures",
+    }
+    stems |= {
+        "merged-mesh": f"merged_{name}_mesh",
+        "coefficients": f"coefficients_{name}" if name else "coefficients",
+    }
     return f"{stems.get(what, what)}.{file_format}"
 
 
@@ -117,20 +147,27 @@ def export(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Exported:
-    """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57), calibration, poses.
+    """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57),
+    calibration, poses.
 
     Args:
         session: Session folder.
-        what: cloud and mesh of a scan; merge (the points) and merged-mesh; calibration for OpenCV or as JSON;
-            coefficients of each pixel as .npz; poses of camera, projector, target and scans as 4x4 matrices; report as
-            HTML; table of the figures of verifications, clouds and merges as CSV.
-        name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model of coefficients.
-        out: The file, whose suffix selects the format, or a folder; by default the session's exports.
-        file_format: ply, stl, obj, glb, 3mf, xyz, e57, yml, xml, json, ..., where --out is a folder or not given.
-        model: Which calibration to make a cloud with, by default the one of the stored cloud, or the best; or which to
-            write (of splined the pinhole and Brown lenses that come nearest, and their remaining error).
-        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
-            (x right, y down, z away), a TOML file, or off; by default the session's. A merge was cut when it was made.
+        what: cloud and mesh of a scan; merge (the points) and merged-mesh; calibration for OpenCV
+            or as JSON; coefficients of each pixel as .npz; poses of camera, projector, target and
+            scans as 4x4 matrices; report as HTML; table of the figures of verifications, clouds and
+            merges as CSV.
+        name: The scan of a cloud or a mesh; the number of a merge, by default the last; the model
+            of coefficients.
+        out: The file, whose suffix selects the format, or a folder; by default the session's
+            exports.
+        file_format: ply, stl, obj, glb, 3mf, xyz, e57, yml, xml, json, ..., where --out is a folder
+            or not given.
+        model: Which calibration to make a cloud with, by default the one of the stored cloud, or
+            the best; or which to write (of splined the pinhole and Brown lenses that come nearest,
+            and their remaining error).
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the
+            camera's frame (x right, y down, z away), a TOML file, or off; by default the session's.
+            A merge was cut when it was made.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     The file is written whole or not at all.
@@ -142,7 +179,12 @@ def export(
         target = _output_path(store, what, name, out, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accept_rejected)
-        if what not in ("report", "table", "merge", "merged-mesh"):  # reading a merge warns by itself
+        if what not in (
+            "report",
+            "table",
+            "merge",
+            "merged-mesh",
+        ):  # reading a merge warns by itself
             warn_if_stale(store, warn)
         plan, making = (plan or MeshingPlan()) if "mesh" in what else None, part(progress, 0, 0.8)
         if what in ("cloud", "mesh"):
@@ -169,10 +211,14 @@ def _write_shape(shape: DescribedShape, target: Path, progress: Progress) -> str
 
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
-    """Write a calibration, coefficients, poses or the table, and return a description of what was written."""
+    """Write a calibration, coefficients, poses or the table, and return a description of what was
+    written."""
     if what == "calibration":
         chosen = model or preferred_model(store)
-        return f"{chosen} calibration of camera and projector, {write_calibration_file(store, target, chosen)}"
+        return (
+            f"{chosen} calibration of camera and projector,"
+            f" {write_calibration_file(store, target, chosen)}"
+        )
     if what == "coefficients":
         return f"coefficients of each pixel by the {write_coefficients(store, name, target)} model"
     if what == "poses":
@@ -192,11 +238,17 @@ def _resolve_name(store: Session, what: What, name: str) -> str:
         return store.load_capture(name).name
     scans = store.capture_names("scan")
     if len(scans) != 1:
-        raise InputError(f"which scan? name one of {', '.join(scans)}" if scans else "there is no scan: capture one")
+        raise InputError(
+            f"which scan? name one of {', '.join(scans)}"
+            if scans
+            else "there is no scan: capture one"
+        )
     return scans[0]
 
 
-def _output_path(store: Session, what: What, name: str, out: Path | str | None, chosen: str) -> Path:
+def _output_path(
+    store: Session, what: What, name: str, out: Path | str | None, chosen: str
+) -> Path:
     """Return the path of the file to write, with a suffix that fits the format."""
     given = None if out is None else expand_user(out)
     if given is None or given.is_dir():

@@ -1,4 +1,5 @@
-"""Scans and merges as shapes for other programs: those stored in the session, or computed from its frames."""
+"""Scans and merges as shapes for other programs: those stored in the session, or computed from its
+frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,8 +26,8 @@ from slviewer.surface.shapes import Mesh, PointSet
 
 @dataclass(frozen=True, eq=False)
 class DescribedShape:
-    """A shape, whose it is, values of its points by name, the comments of its file, and of these what was done
-    to make a mesh."""
+    """A shape, whose it is, values of its points by name, the comments of its file, and of these
+    what was done to make a mesh."""
 
     shape: PointSet | Mesh
     whose: str
@@ -51,11 +52,15 @@ def scan_shape(
     accept_rejected: bool = False,
     roi: str = "",
 ) -> DescribedShape:
-    """A scan's measured points with normals, colours and sigmas, or where there is a ``plan`` a mesh of them."""
+    """A scan's measured points with normals, colours and sigmas, or where there is a ``plan`` a
+    mesh of them."""
     cloud = scan_cloud(store, name, model, part(progress, 0, 0.5), warn, accept_rejected, roi)
     mask = cloud.mask
     if not mask.any():
-        raise InputError(f"{name}: no pixel was measured: does the calibration belong to this camera and projector?")
+        raise InputError(
+            f"{name}: no pixel was measured: does the calibration belong to this camera and"
+            " projector?"
+        )
     frame = f"frame: {frame_of(store, cloud.model)}, x right, y down, z away"
     restrictions = restriction_notes(store, [name], resolve_region(store, roi))
     notes = (f"scan {name}, {frame}", *_model_notes(store, cloud.model), *restrictions)
@@ -66,7 +71,9 @@ def scan_shape(
     if colours is not None and colours.ndim == 1:
         colours = np.repeat(colours[:, None], 3, axis=1)
     note = "sigma: expected error of the depth, mm"
-    return DescribedShape(PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, note))
+    return DescribedShape(
+        PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, note)
+    )
 
 
 def scan_cloud(
@@ -78,22 +85,31 @@ def scan_cloud(
     accept_rejected: bool = False,
     roi: str = "",
 ) -> Cloud:
-    """A capture's cloud: the stored one where it is up to date and of the requested model, else reconstructed; without
-    what was deleted from it, and what lies outside of the region ``roi``, as `resolve_region` reads it."""
+    """A capture's cloud: the stored one where it is up to date and of the requested model, else
+    reconstructed; without what was deleted from it, and what lies outside of the region ``roi``, as
+    `resolve_region` reads it.
+    """
     region = resolve_region(store, roi)
     cloud = _whole_cloud(store, name, model, progress, warn, accept_rejected)
     return restrict_cloud(store, name, cloud, region)
 
 
 def _whole_cloud(
-    store: Session, name: str, model: str | None, progress: Progress, warn: Warn, accept_rejected: bool
+    store: Session,
+    name: str,
+    model: str | None,
+    progress: Progress,
+    warn: Warn,
+    accept_rejected: bool,
 ) -> Cloud:
     """Return a capture's cloud as `scan_cloud`, with all of its points."""
     capture, model, stored = store.load_capture(name), model or None, f"clouds/{name}"
     if store.has_result(stored) and is_up_to_date(store, stored):
         meta = store.load_result(stored, only=())[0]
         if model in (None, meta["model"]):
-            names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"} & set(meta["arrays"])
+            names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"} & set(
+                meta["arrays"]
+            )
             arrays = store.load_result(stored, only=names)[1]
             return Cloud(axis=meta["axis"], model=meta["model"], **arrays)
     fitted = load_model(store, model)
@@ -102,11 +118,14 @@ def _whole_cloud(
     _, frames, phases = next(decode_captures(store, [name], warn))
     progress(0.4, f"reconstructing {name}")
     texture = capture_texture(capture, frames, stretch=False)
-    return capture_cloud(store, fitted, capture, phases, texture=texture, accept_rejected=accept_rejected, warn=warn)
+    return capture_cloud(
+        store, fitted, capture, phases, texture=texture, accept_rejected=accept_rejected, warn=warn
+    )
 
 
 def merge_name(store: Session, name: str) -> str:
-    """The merge of that number, or the last one where none is named; raises InputError where it does not exist."""
+    """The merge of that number, or the last one where none is named; raises InputError where it
+    does not exist."""
     there = [result.removeprefix("merge/") for result in numbered_results(store, "merge")]
     if not there:
         raise InputError("there is no merge yet: merge scans first")
@@ -115,14 +134,19 @@ def merge_name(store: Session, name: str) -> str:
     return name or there[-1]
 
 
-def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: Progress, warn: Warn) -> DescribedShape:
+def merge_shape(
+    store: Session, name: str, plan: MeshingPlan | None, progress: Progress, warn: Warn
+) -> DescribedShape:
     """The points of a merge, or where there is a ``plan`` one mesh through them."""
     name = merge_name(store, name)
     progress(0.1, "reading the merged points")
     meta, merged = read_merge(store, f"merge/{name}", warn)
     model = str(meta.get("model", ""))
     notes = (
-        f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at {meta['reference']}",
+        (
+            f"merge {name} of {', '.join(meta['scans'])}, frame: {frame_of(store, model)}, at"
+            f" {meta['reference']}"
+        ),
         *_model_notes(store, model),
         *meta.get("restrictions", ()),
     )
@@ -131,17 +155,21 @@ def merge_shape(store: Session, name: str, plan: MeshingPlan | None, progress: P
         points = PointSet(merged.points, merged.normals, merged.colours)
         return DescribedShape(points, f"merge {name}", merged.scalars, (*notes, note))
     return _describe_mesh(
-        f"merge {name}", build_mesh(_points_with_normals(merged), plan, part(progress, 0.1, 1)), notes
+        f"merge {name}",
+        build_mesh(_points_with_normals(merged), plan, part(progress, 0.1, 1)),
+        notes,
     )
 
 
 def merged_points(store: Session, name: str, warn: Warn) -> PointSet:
-    """The points of a merge whose normals are known, to make a mesh of; of the last one where none is named."""
+    """The points of a merge whose normals are known, to make a mesh of; of the last one where none
+    is named."""
     return _points_with_normals(read_merge(store, f"merge/{merge_name(store, name)}", warn)[1])
 
 
 def read_merge(store: Session, result: str, warn: Warn) -> tuple[dict[str, Any], Ply]:
-    """The record and the points of a merge that the session stores as ``merge/<number>``; warns of a stale one."""
+    """The record and the points of a merge that the session stores as ``merge/<number>``; warns of
+    a stale one."""
     if not is_up_to_date(store, result):
         warn(f"{result} came from scans or a calibration that have changed since: merge again")
     meta = store.load_result(result, only=())[0]
@@ -166,10 +194,13 @@ def _points_with_normals(merged: Ply) -> PointSet:
 def _describe_mesh(whose: str, made: BuiltMesh, notes: tuple[str, ...]) -> DescribedShape:
     """Return a built mesh with its owner, file comments, and the lines on how it was made."""
     done = tuple(made.text().splitlines())
-    return DescribedShape(made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done)
+    return DescribedShape(
+        made.mesh, whose, {}, (*notes, "sigma: expected error along the normal, mm", *done), done
+    )
 
 
 def _model_notes(store: Session, model: str) -> tuple[str, ...]:
-    """Return file comments that name the calibration and its scale correction; empty without a model."""
+    """Return file comments that name the calibration and its scale correction; empty without a
+    model."""
     scale = describe_scale(store, model) if model else ""
     return (f"calibration {model}", *((scale,) if scale else ())) if model else ()

@@ -17,35 +17,69 @@ WEAK, TOO_WEAK = 0.4, 0.12
 """Of full scale, that the brightest illuminated pixels should reach: below, a warning, and bad."""
 
 
-def check_capture_exposure(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
-    """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see the patterns."""
+def check_capture_exposure(
+    sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+) -> Check:
+    """Whether the frames (n, h, w) of a capture are too bright or too dark, by the pixels that see
+    the patterns."""
     full = white_level(sequence, frames, range(len(frames)))
     illuminated = np.logical_or.reduce([phase.illuminated for phase in phases.values()])
     if not illuminated.any():
-        return Check("exposure", "bad", "No pixel sees the patterns.", "Raise the exposure, or open the aperture.", {})
+        return Check(
+            "exposure",
+            "bad",
+            "No pixel sees the patterns.",
+            "Raise the exposure, or open the aperture.",
+            {},
+        )
     rows = select_rows(*frames.shape[1:])
     coded = [i for i, frame in enumerate(sequence.frames) if frame.kind != "texture"]
     brightest = np.max([frames[i][rows] for i in coded], axis=0)
     levels = brightest[illuminated[rows]] if illuminated[rows].any() else brightest.ravel()
     bright = float(np.quantile(levels, 0.995))
-    clipped = max(float(np.mean(phase.reason[phase.illuminated] == Reason.SATURATED)) for phase in phases.values())
-    figures = {"bright_share_of_full_scale": round(bright / full, 3), "saturated_share": round(clipped, 4)}
+    clipped = max(
+        float(np.mean(phase.reason[phase.illuminated] == Reason.SATURATED))
+        for phase in phases.values()
+    )
+    figures = {
+        "bright_share_of_full_scale": round(bright / full, 3),
+        "saturated_share": round(clipped, 4),
+    }
     if clipped > CLIPPED:
         sentence = f"{100 * clipped:.1f} % of the illuminated pixels are saturated."
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         remedy = "Lower the exposure, or capture with two exposures."
         return Check("exposure", verdict, sentence, remedy, figures)
-    sentence = f"The brightest of the scene reaches {100 * bright / full:.0f} % of the camera's range"
+    sentence = (
+        f"The brightest of the scene reaches {100 * bright / full:.0f} % of the camera's range"
+    )
     if bright < WEAK * full:
         verdict = "bad" if bright < TOO_WEAK * full else "warning"
-        return Check("exposure", verdict, f"{sentence}.", "Raise the exposure, or open the aperture.", figures)
-    return Check("exposure", "good", f"{sentence}; {100 * clipped:.1f} % of the pixels are saturated.", "", figures)
+        return Check(
+            "exposure",
+            verdict,
+            f"{sentence}.",
+            "Raise the exposure, or open the aperture.",
+            figures,
+        )
+    return Check(
+        "exposure",
+        "good",
+        f"{sentence}; {100 * clipped:.1f} % of the pixels are saturated.",
+        "",
+        figures,
+    )
 
 
 def warn_of_exposure(
-    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap], warn: Warn
+    name: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    phases: Mapping[Axis, PhaseMap],
+    warn: Warn,
 ) -> None:
-    """Warn, with the capture's name, where `check_capture_exposure` finds it too bright or too dark."""
+    """Warn, with the capture's name, where `check_capture_exposure` finds it too bright or too
+    dark."""
     exposure = check_capture_exposure(sequence, frames, phases)
     if exposure.verdict != "good":
         warn(f"{name}: {exposure.sentence} {exposure.remedy}")

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 
 Progress = Callable[[float, str], None]
-"""Called with the share done (0 to 1) and what is being done; it may raise Cancelled to stop the work."""
+"""Called with the share done (0 to 1) and what is being done; it may raise Cancelled to stop the
+work."""
 
 Warn = Callable[[str], None]
 """Called with one sentence that the operator should know of."""
@@ -18,7 +19,8 @@ def ignore_warnings(message: str) -> None:
 
 
 def part(progress: Progress, start: float, end: float, label: str = "") -> Progress:
-    """Map the progress 0 to 1 of a stage to ``start`` to ``end`` of the whole; ``label``: a prefix."""
+    """Map the progress 0 to 1 of a stage to ``start`` to ``end`` of the whole; ``label``: a
+    prefix."""
 
     def report(done: float, doing: str) -> None:
         """Report the share ``done`` (0 to 1) of the stage as a share of the whole."""

@@ -1,4 +1,5 @@
-"""Making a calibration from elsewhere the session's own, once it agrees with itself and with the session's captures."""
+"""Making a calibration from elsewhere the session's own, once it agrees with itself and with the
+session's captures."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,12 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import available_models, load_stereo, save_imported_stereo, trash_models
+from slviewer.pipeline.models import (
+    available_models,
+    load_stereo,
+    save_imported_stereo,
+    trash_models,
+)
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.importers import opencv_calibration
@@ -38,17 +44,21 @@ def import_opencv_calibration(
     Args:
         file: The .yml, .xml or .json file.
         session: Session folder; made if it does not exist.
-        keys: The file's names for the matrices K_camera D_camera K_projector D_projector R T; R and T (mm) map camera
-            to projector. By default the common names are recognised, and those used are printed.
-        projector: Width x height of the projector, px; by default what the file states, else the session's captures.
-        camera: Width x height of the camera, px; by default what the file states, else the session's captures.
+        keys: The file's names for the matrices K_camera D_camera K_projector D_projector R T; R and
+            T (mm) map camera to projector. By default the common names are recognised, and those
+            used are printed.
+        projector: Width x height of the projector, px; by default what the file states, else the
+            session's captures.
+        camera: Width x height of the camera, px; by default what the file states, else the
+            session's captures.
         force: Replace the session's stereo calibration (the old one goes to the session's trash).
 
-    Returns the model, or None while nothing states a size. The session's other calibrations go to the trash with the
-    stereo one that they were made from.
+    Returns the model, or None while nothing states a size. The session's other calibrations go to
+    the trash with the stereo one that they were made from.
 
-    Raises InputError, and replaces nothing, where sizes contradict each other, and where the patterns of a capture in
-    the session contradict the calibration: R and T inverted, matrices exchanged or at another pixel scale, another rig.
+    Raises InputError, and replaces nothing, where sizes contradict each other, and where the
+    patterns of a capture in the session contradict the calibration: R and T inverted, matrices
+    exchanged or at another pixel scale, another rig.
     """
     path = Path(file)
     storage = read_storage(path)
@@ -63,9 +73,15 @@ def import_opencv_calibration(
             )
         captures = store.captures()
         sizes = {
-            "camera": _resolve_size(path, "camera", camera, stated, {capture.size for capture in captures}),
+            "camera": _resolve_size(
+                path, "camera", camera, stated, {capture.size for capture in captures}
+            ),
             "projector": _resolve_size(
-                path, "projector", projector, stated, {capture.sequence.projector_size for capture in captures} - {None}
+                path,
+                "projector",
+                projector,
+                stated,
+                {capture.sequence.projector_size for capture in captures} - {None},
             ),
         }
         for device, size in sizes.items():  # raises what a lens cannot have
@@ -81,7 +97,8 @@ def import_opencv_calibration(
 
 
 def identify_calibration_keys(file: Path | str) -> dict[str, str]:
-    """{entry: the file's name for it}, as ``import_opencv_calibration`` takes them by default. Raises InputError."""
+    """{entry: the file's name for it}, as ``import_opencv_calibration`` takes them by default.
+    Raises InputError."""
     keys = opencv_calibration.identify_keys(read_storage(Path(file)))
     return dict(zip(opencv_calibration.ENTRIES, keys, strict=True))
 
@@ -93,20 +110,27 @@ def _resolve_size(
     stated: dict[str, tuple[tuple[int, int], str]],
     captured: set[Any],
 ) -> tuple[int, int] | None:
-    """The size that is given, else stated in the file, else the captures'; InputError where these differ."""
+    """The size that is given, else stated in the file, else the captures'; InputError where these
+    differ."""
     sources = {f"--{device}": parse_size(given)} if given is not None else {}
     if device in stated:
         sources[f"{path.name}: {stated[device][1]}"] = stated[device][0]
     if len(captured) == 1:
         sources["the session's captures"] = next(iter(captured))
     if len(set(sources.values())) > 1:
-        conflict = ", ".join(f"{width}x{height} px by {source}" for source, (width, height) in sources.items())
+        conflict = ", ".join(
+            f"{width}x{height} px by {source}" for source, (width, height) in sources.items()
+        )
         raise InputError(
-            f"the {device} has {conflict}: the calibration does not belong to these captures, or one size is wrong"
+            f"the {device} has {conflict}: the calibration does not belong to these captures, or"
+            " one size is wrong"
         )
     size = next(iter(sources.values()), None)
     if len(captured) > 1 and size not in captured:
-        raise InputError(f"the session's captures have several {device} sizes: give the calibrated one with --{device}")
+        raise InputError(
+            f"the session's captures have several {device} sizes: give the calibrated one with"
+            f" --{device}"
+        )
     return size
 
 
@@ -116,8 +140,8 @@ def _is_confirmed_by_captures(
     sizes: dict[str, tuple[int, int] | None],
     warn: Warn,
 ) -> bool:
-    """Whether a capture with both axes confirms the calibration; False without such a capture. Raises InputError
-    where one contradicts it."""
+    """Whether a capture with both axes confirms the calibration; False without such a capture.
+    Raises InputError where one contradicts it."""
     camera, projector = sizes["camera"], sizes["projector"]
     if camera is None or projector is None:
         return False
@@ -128,7 +152,10 @@ def _is_confirmed_by_captures(
         matrices["T"],
     )
     for capture in store.captures():
-        if len(capture.sequence.axes) < 2 or (capture.size, capture.sequence.projector_size) != (camera, projector):
+        if len(capture.sequence.axes) < 2 or (capture.size, capture.sequence.projector_size) != (
+            camera,
+            projector,
+        ):
             continue
         check = check_phases(capture.name, decode_capture(capture), StereoModel.from_rig(rig))
         for message in check.warnings:
@@ -139,11 +166,13 @@ def _is_confirmed_by_captures(
 
 
 def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], warn: Warn) -> None:
-    """Warn where the optical axis is outside of the image: a shifted lens, or another pixel scale."""
+    """Warn where the optical axis is outside of the image: a shifted lens, or another pixel
+    scale."""
     (width, height), (cx, cy) = size, K[:2, 2]
     if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
         warn(
-            f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its {width}x{height} px: the lens is "
-            "shifted, or the calibration was made at another pixel scale; import a capture with patterns along both "
-            "axes, and the calibration after it: the patterns then tell"
+            f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its"
+            f" {width}x{height} px: the lens is shifted, or the calibration was made at another"
+            " pixel scale; import a capture with patterns along both axes, and the calibration"
+            " after it: the patterns then tell"
         )

@@ -1,8 +1,9 @@
 """Bringing captures that other tools made into a session.
 
-Of a folder of captures, those that can be read and decoded are saved in one step, and a warning names each other with
-its reason; with `strict`, one fault refuses the folder. Those that the session has already, with the same content, are
-skipped: an import that was interrupted continues when it is repeated.
+Of a folder of captures, those that can be read and decoded are saved in one step, and a warning
+names each other with its reason; with `strict`, one fault refuses the folder. Those that the
+session has already, with the same content, are skipped: an import that was interrupted continues
+when it is repeated.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,12 @@ from slviewer.session.importers import guessed_description
 from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
-from slviewer.session.importers.layouts import LAYOUT_PLUGINS, detect_layout, find_description, layouts
+from slviewer.session.importers.layouts import (
+    LAYOUT_PLUGINS,
+    detect_layout,
+    find_description,
+    layouts,
+)
 from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
@@ -57,20 +63,23 @@ def import_captures(
         session: Session folder; made if it does not exist.
         role: calibration for target poses, scan for anything else.
         prefix: Put before each capture's name: planes gives planes_pose_03.
-        projector: Width x height of the projector, px; by default what the layout or the images' TOML states, else
-            what the session knows.
+        projector: Width x height of the projector, px; by default what the layout or the images'
+            TOML states, else what the session knows.
         channel: Of colour images; green where nothing states it.
         force: Replace captures of the same name (the old ones go to the session's trash).
-        strict: Import nothing where one capture cannot be used, instead of skipping it with a warning.
+        strict: Import nothing where one capture cannot be used, instead of skipping it with a
+            warning.
 
-    ``layout`` is one of `layouts.layouts()`, or "detect": the one that the file names show. Captures are named after
-    their folders. ``sequence`` is the TOML of the layout frames, by default the one in ``source``; where Gray code 0
-    begins is estimated from the images if it does not state that. ``origin`` is recorded as where the captures come
-    from, by default their folders. ``options`` are those of the layout's `read`.
+    ``layout`` is one of `layouts.layouts()`, or "detect": the one that the file names show.
+    Captures are named after their folders. ``sequence`` is the TOML of the layout frames, by
+    default the one in ``source``; where Gray code 0 begins is estimated from the images if it does
+    not state that. ``origin`` is recorded as where the captures come from, by default their
+    folders. ``options`` are those of the layout's `read`.
 
-    Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason. Raises InputError where
-    none is left, or, with ``strict``, for the first of them; nothing is saved then. Captures that are there already,
-    equal in every frame, stay as they are, with a warning; one whose stored frames are damaged is replaced.
+    Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason.
+    Raises InputError where none is left, or, with ``strict``, for the first of them; nothing is
+    saved then. Captures that are there already, equal in every frame, stay as they are, with a
+    warning; one whose stored frames are damaged is replaced.
     """
     imports = find_captures(
         source,
@@ -101,7 +110,8 @@ def import_captures(
             warn(message)
 
     def read() -> Iterator[NewCapture]:
-        """Yield the checked captures one by one; one that cannot be used is a warning, or raises with ``strict``."""
+        """Yield the checked captures one by one; one that cannot be used is a warning, or raises
+        with ``strict``."""
         for i, recording in enumerate(imports.recordings):
             progress(i / len(imports), f"reading {recording.name}")
             try:
@@ -117,13 +127,18 @@ def import_captures(
             for message in _list_assumptions(recording, capture):
                 warn_once(message)
             names.append(capture.name)
-            capture = replace(capture, sequence=checked_capture.sequence, source=origin or capture.source)
+            capture = replace(
+                capture, sequence=checked_capture.sequence, source=origin or capture.source
+            )
             comparison = store.compare_capture(capture, role)
             if comparison == "same":
                 unchanged.append(capture.name)
                 continue
             if comparison == "damaged":
-                warn(f"{capture.name}: its stored frames are damaged: the capture is replaced, and now in the trash")
+                warn(
+                    f"{capture.name}: its stored frames are damaged: the capture is replaced, and"
+                    " now in the trash"
+                )
                 damaged.add(capture.name)
             yield capture
         if len(skipped) == len(imports.skipped) + len(imports.recordings):
@@ -134,7 +149,10 @@ def import_captures(
         for each in skipped:
             warn(f"not imported: {each}")
         if unchanged:
-            warn(f"already in the session with the same content, and not imported again: {', '.join(unchanged)}")
+            warn(
+                "already in the session with the same content, and not imported again:"
+                f" {', '.join(unchanged)}"
+            )
         for name in names:
             progress(1.0, f"looking at {name}")
             for sentence in load_or_save_check(store, store.load_capture(name)).warnings():
@@ -153,15 +171,20 @@ def read_captures(
     warn: Warn = ignore_warnings,
     **options: Any,
 ) -> list[NewCapture]:
-    """Read a folder of captures of any known layout into memory, as ``import_captures`` does; nothing is saved.
+    """Read a folder of captures of any known layout into memory, as ``import_captures`` does;
+    nothing is saved.
 
-    Of several exposures each pixel comes from the longest that did not clip it. Raises InputError where an image cannot
-    be used; captures that are incomplete are skipped with a warning.
+    Of several exposures each pixel comes from the longest that did not clip it. Raises InputError
+    where an image cannot be used; captures that are incomplete are skipped with a warning.
     """
-    imports = find_captures(source, layout, sequence, projector=projector, channel=channel, warn=warn, **options)
+    imports = find_captures(
+        source, layout, sequence, projector=projector, channel=channel, warn=warn, **options
+    )
     for message in (*imports.warnings, *map(str, imports.skipped)):
         warn(message)
-    return [replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in imports]
+    return [
+        replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in imports
+    ]
 
 
 def find_captures(
@@ -176,21 +199,25 @@ def find_captures(
     warn: Warn = ignore_warnings,
     **options: Any,
 ) -> Imports:
-    """The captures of a folder, not yet read; ``session`` knows the projector's size where it is not stated."""
+    """The captures of a folder, not yet read; ``session`` knows the projector's size where it is
+    not stated."""
     source = expand_user(source)
     if layout == "detect":
         layout = "frames" if sequence is not None else detect_layout(source)
     known = layouts()
     if layout not in known:
         raise InputError(
-            f"the layout {layout!r} is unknown: use {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
+            f"the layout {layout!r} is unknown: use"
+            f" {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
         )
     size = known[layout].projector if projector is None else parse_size(projector)
     assumed = None
     if layout == "frames":
         toml = sequence or find_description(source)
         if toml is None:
-            raise InputError(f"{source} holds no TOML that describes the images: add one, or give --sequence")
+            raise InputError(
+                f"{source} holds no TOML that describes the images: add one, or give --sequence"
+            )
         options["toml"] = Path(toml)
     elif size is None and session is not None:
         assumed = _known_projector_size(session)
@@ -203,24 +230,37 @@ def find_captures(
     if assumed in sizes:  # a layout that states the size itself does not use it
         _warn_of_assumed_size(assumed, warn)
     if channel is not None:
-        imports = replace(imports, recordings=[replace(recording, channel=channel) for recording in imports.recordings])
+        imports = replace(
+            imports,
+            recordings=[replace(recording, channel=channel) for recording in imports.recordings],
+        )
     return imports
 
 
 def guess_description(
     folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
 ) -> GuessedDescription:
-    """The TOML of a capture without a description, from its images; ``doubts`` name what stays open. Nothing is saved.
+    """The TOML of a capture without a description, from its images; ``doubts`` name what stays
+    open. Nothing is saved.
 
-    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to one capture.
+    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to
+    one capture.
     """
-    return guessed_description.guess_toml(Path(folder), None if projector is None else parse_size(projector), channel)
+    return guessed_description.guess_toml(
+        Path(folder), None if projector is None else parse_size(projector), channel
+    )
 
 
 def describe_import(names: Sequence[str], role: Role) -> str:
     """Return what was imported, as the operator reads it."""
-    one, several = ("a target pose", "target poses") if role == "calibration" else ("a scan", "scans")
-    count = f"1 capture imported as {one}" if len(names) == 1 else f"{len(names)} captures imported as {several}"
+    one, several = (
+        ("a target pose", "target poses") if role == "calibration" else ("a scan", "scans")
+    )
+    count = (
+        f"1 capture imported as {one}"
+        if len(names) == 1
+        else f"{len(names)} captures imported as {several}"
+    )
     return f"{count}: {', '.join(names)}"
 
 
@@ -228,12 +268,14 @@ def _warn_of_assumed_size(size: tuple[int, int] | None, warn: Warn) -> None:
     """Warn that the projector's size was taken from the session, if it was."""
     if size is not None:
         warn(
-            f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session: --projector for another size"
+            f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session:"
+            " --projector for another size"
         )
 
 
 def _known_projector_size(session: SessionLike) -> tuple[int, int] | None:
-    """The projector's size by the session's captures, else by its imported calibration; None where both are missing."""
+    """The projector's size by the session's captures, else by its imported calibration; None where
+    both are missing."""
     if not isinstance(session, Session) and not is_session(expand_user(session)):
         return None
     with opened(session) as store:
@@ -249,21 +291,31 @@ def _list_assumptions(recording: ImportableRecording, capture: NewCapture) -> It
     used = capture.settings.get("channel")
     if used and recording.channel is None:
         others = ", ".join(channel for channel in get_args(Channel) if channel != used)
-        yield f"the frames are in colour: their {used} channel was used (--channel, or channel in the TOML: {others})"
+        yield (
+            f"the frames are in colour: their {used} channel was used (--channel, or channel in the"
+            f" TOML: {others})"
+        )
     if capture.sequence.projector_size is None:
         yield (
-            "the size of the projector is not stated: the captures can be decoded, and to calibrate or reconstruct "
-            'them import them again with projector = "912x1140" in the TOML, or --projector'
+            "the size of the projector is not stated: the captures can be decoded, and to calibrate"
+            ' or reconstruct them import them again with projector = "912x1140" in the TOML, or'
+            " --projector"
         )
 
 
 def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
-    """The capture, with its Gray origin estimated if it was not given; InputError where its frames contradict its
-    description.
+    """The capture, with its Gray origin estimated if it was not given; InputError where its frames
+    contradict its description.
     """
     sequence = capture.sequence
-    if not capture.settings.get("gray_origin_given", True) and any(f.kind == "gray" for f in sequence.frames):
-        axes = [axis for axis in sequence.axes if sequence.periods_px(axis) and sequence.find("gray", axis)]
+    if not capture.settings.get("gray_origin_given", True) and any(
+        f.kind == "gray" for f in sequence.frames
+    ):
+        axes = [
+            axis
+            for axis in sequence.axes
+            if sequence.periods_px(axis) and sequence.find("gray", axis)
+        ]
         try:
             origins = {axis: estimate_gray_origin(sequence, capture.frames, axis) for axis in axes}
         except InputError:
@@ -275,7 +327,9 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             raise
         if origins:
             first = next(iter(origins.values()))
-            sequence = replace(sequence, gray_origin_px=PerAxis(origins.get("x", first), origins.get("y", first)))
+            sequence = replace(
+                sequence, gray_origin_px=PerAxis(origins.get("x", first), origins.get("y", first))
+            )
             listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
             warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
     phases = decode_frames(capture.name, sequence, capture.frames)

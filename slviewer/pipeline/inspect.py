@@ -17,13 +17,15 @@ from slviewer.session.results import verify_result
 from slviewer.session.store import Session
 
 
-def inspect(session: SessionLike, *, check: bool = False, progress: Progress = ignore_progress) -> str:
+def inspect(
+    session: SessionLike, *, check: bool = False, progress: Progress = ignore_progress
+) -> str:
     """List what a session holds, and what is stale or damaged.
 
     Args:
         session: Session folder.
-        check: Read every capture and result, and compare it with the hash that it was saved with; ends with status 1
-            where anything is damaged.
+        check: Read every capture and result, and compare it with the hash that it was saved with;
+            ends with status 1 where anything is damaged.
     """
     with opened(session) as store:
         if check:
@@ -31,7 +33,10 @@ def inspect(session: SessionLike, *, check: bool = False, progress: Progress = i
         captures, faults = store.read_captures()
         damage = [*faults.values(), *store.decision_faults()]
         lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]
-        lines += [f"  {name} was complete, and not yet in its place: it is now" for name in store.recovered]
+        lines += [
+            f"  {name} was complete, and not yet in its place: it is now"
+            for name in store.recovered
+        ]
         parts: list[Callable[[], Iterable[str]]] = [
             partial(_describe_captures, store, captures),
             *(partial(_describe_calibration, store, name) for name in available_models(store)),
@@ -50,10 +55,13 @@ def inspect(session: SessionLike, *, check: bool = False, progress: Progress = i
 
 
 def _check(store: Session, progress: Progress) -> str:
-    """Read everything, and describe what was compared. Raises DamagedError that lists what is damaged, if anything."""
+    """Read everything, and describe what was compared. Raises DamagedError that lists what is
+    damaged, if anything."""
     (captures, faults), results = store.read_captures(), store.result_names()
     damage = [*faults.values(), *store.decision_faults()]
-    checks: list[tuple[str, Callable[[], object]]] = [(capture.name, capture.verify) for capture in captures]
+    checks: list[tuple[str, Callable[[], object]]] = [
+        (capture.name, capture.verify) for capture in captures
+    ]
     checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
     for i, (name, verify) in enumerate(checks):
         progress(i / len(checks), f"checking {name}")
@@ -64,7 +72,9 @@ def _check(store: Session, progress: Progress) -> str:
     progress(1.0, "checked")
     counts = f"{len(captures)} captures and {len(results)} results"
     if damage:
-        raise DamagedError("\n  ".join([f"{store.folder}: {counts} were read, and this is damaged:", *damage]))
+        raise DamagedError(
+            "\n  ".join([f"{store.folder}: {counts} were read, and this is damaged:", *damage])
+        )
     return f"{store.folder}: {counts} are what was saved"
 
 
@@ -76,11 +86,16 @@ def _describe_captures(store: Session, captures: Iterable[Capture]) -> list[str]
 
 
 def _describe_calibration(store: Session, name: str) -> list[str]:
-    """One model of the session's calibration, by name: what it was made from, its state, its accuracy."""
+    """One model of the session's calibration, by name: what it was made from, its state, its
+    accuracy."""
     state = store.state_of(f"calibration/{name}")
     meta = store.load_result(f"calibration/{name}", only=())[0]
     mark = ", the default" if name == preferred_model(store) else ""
-    made = f"imported from {meta['source']}" if "imported" in meta else f"from {len(meta['inputs'])} poses"
+    made = (
+        f"imported from {meta['source']}"
+        if "imported" in meta
+        else f"from {len(meta['inputs'])} poses"
+    )
     lines = [f"calibration {name}: {made}, {state}{mark}"]
     if "imported" in meta:
         lines += _describe_imported_calibration(meta)
@@ -121,7 +136,8 @@ def summarise_capture(capture: Capture) -> str:
     """A capture in one line: sizes, axes, frames, and the finest pattern of each axis."""
     sequence, (width, height) = capture.sequence, capture.size
     patterns = ", ".join(
-        f"{axis} {'period' if sequence.periods_px(axis) else 'Gray cell'} {sequence.period_px(axis):g} px"
+        f"{axis} {'period' if sequence.periods_px(axis) else 'Gray cell'}"
+        f" {sequence.period_px(axis):g} px"
         for axis in sequence.axes
     )
     size = sequence.projector_size

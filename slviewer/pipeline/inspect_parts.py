@@ -1,4 +1,5 @@
-"""An inspection plan on many parts: the table of part by characteristic, capability, and the files of both."""
+"""An inspection plan on many parts: the table of part by characteristic, capability, and the files
+of both."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,10 +27,22 @@ from slviewer.session.nominal import read_nominal
 from slviewer.session.store import Session
 
 RULE = (
-    "decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty U (k = 2) stay "
-    "within the limits, fail where the value is beyond one by more than U, else undecided"
+    "decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
+    " U (k = 2) stay within the limits, fail where the value is beyond one by more than U, else"
+    " undecided"
 )
-COLUMNS = ("part", "characteristic", "kind", "value", "U (k = 2)", "unit", "nominal", "lower", "upper", "decision")
+COLUMNS = (
+    "part",
+    "characteristic",
+    "kind",
+    "value",
+    "U (k = 2)",
+    "unit",
+    "nominal",
+    "lower",
+    "upper",
+    "decision",
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +61,9 @@ class Inspection:
             return ""
         listed = [f"{len(failed)} fail ({', '.join(failed)})"] if failed else []
         listed += [f"{len(undecided)} undecided ({', '.join(undecided)})"] if undecided else []
-        return f"of {len(self.parts)} parts {', '.join(listed)}: the table names the characteristics"
+        return (
+            f"of {len(self.parts)} parts {', '.join(listed)}: the table names the characteristics"
+        )
 
     def parts_that(self, decision: Decision) -> list[str]:
         """The names of the parts of that decision."""
@@ -71,7 +86,9 @@ class Inspection:
         return {
             "plan": self.plan.name,
             "rule": RULE,
-            "characteristics": [to_plain(each) | {"capability": to_plain(c)} for each, c in characteristics],
+            "characteristics": [
+                to_plain(each) | {"capability": to_plain(c)} for each, c in characteristics
+            ],
             "parts": [to_plain(each) | {"decision": each.decision} for each in self.parts],
         }
 
@@ -80,14 +97,20 @@ class Inspection:
         rows: list[Iterable[object]] = [(*COLUMNS, "reason")]
         for each in self.parts:
             for wanted, result in zip(self.plan.characteristic, each.results, strict=True):
-                limits = ["" if v is None else f"{v:g}" for v in (wanted.nominal, wanted.lower, wanted.upper)]
+                limits = [
+                    "" if v is None else f"{v:g}"
+                    for v in (wanted.nominal, wanted.lower, wanted.upper)
+                ]
                 value, U = ("" if v is None else f"{v:.6f}" for v in (result.value, result.U))
                 judged = (result.decision, result.reason)
-                rows.append([each.part, wanted.name, wanted.kind, value, U, wanted.unit, *limits, *judged])
+                rows.append(
+                    [each.part, wanted.name, wanted.kind, value, U, wanted.unit, *limits, *judged]
+                )
         return format_csv(rows)
 
     def text(self) -> str:
-        """Return the table for the terminal, then what could not be measured, capability, and the files."""
+        """Return the table for the terminal, then what could not be measured, capability, and the
+        files."""
         rows: list[Row] = []
         for each in self.parts:
             row: Row = {"part": each.part}
@@ -112,7 +135,9 @@ class Inspection:
 def describe_capability(c: Capability) -> str:
     """Cp and Cpk with their confidence intervals, in one line."""
     listed = [("Cp", c.cp), ("Cpk", c.cpk)]
-    figures = [f"{name} {v[0]:.2f} (95 %: {v[1]:.2f} to {v[2]:.2f})" for name, v in listed if v is not None]
+    figures = [
+        f"{name} {v[0]:.2f} (95 %: {v[1]:.2f} to {v[2]:.2f})" for name, v in listed if v is not None
+    ]
     return f"{', '.join(figures)} of {c.parts} parts"
 
 
@@ -127,14 +152,17 @@ def inspect_parts(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Inspection:
-    """Inspect many parts by one plan: a table of part by characteristic, trends and capability as HTML, CSV and JSON.
+    """Inspect many parts by one plan: a table of part by characteristic, trends and capability as
+    HTML, CSV and JSON.
 
-    Ends with status 1 where a part fails or is undecided. What cannot be measured is named, and stops no other.
+    Ends with status 1 where a part fails or is undecided. What cannot be measured is named, and
+    stops no other.
 
     Args:
         plan: The inspection plan, a TOML file; `slviewer plan` makes one.
         sessions: Session folders, or folders that hold some.
-        scans: The scans that each show a part, or patterns such as 'part_*', or merge/1; by default every scan.
+        scans: The scans that each show a part, or patterns such as 'part_*', or merge/1; by default
+            every scan.
         out: Folder of the results; by default one beside the plan, named after it.
         model: Which calibration to use; by default each session's best one.
         accept_rejected: Use calibrations although their verdict rejects them.
@@ -145,7 +173,9 @@ def inspect_parts(
 
     def load(folder: Path, scan: str, report: Progress) -> MeasuredSurface:
         """Load one part's surface."""
-        return load_surface(folder, scan, model=model, accept_rejected=accept_rejected, progress=report, warn=warn)
+        return load_surface(
+            folder, scan, model=model, accept_rejected=accept_rejected, progress=report, warn=warn
+        )
 
     for folder in folders:
         try:
@@ -165,12 +195,14 @@ def inspect_surfaces(
     sources: Sequence[tuple[str, Callable[[Progress], MeasuredSurface]]],
     progress: Progress = ignore_progress,
 ) -> Inspection:
-    """Inspect parts, each a name and what loads its surface. Raises SlviewerError where the plan's nominal model cannot
-    be read."""
+    """Inspect parts, each a name and what loads its surface. Raises SlviewerError where the plan's
+    nominal model cannot be read."""
     nominal = None if plan.alignment.nominal is None else read_nominal(plan.alignment.nominal)
     results = []
     for k, (name, load) in enumerate(sources):
-        report = part(progress, k / len(sources), (k + 1) / len(sources), f"{k + 1} of {len(sources)}, {name}")
+        report = part(
+            progress, k / len(sources), (k + 1) / len(sources), f"{k + 1} of {len(sources)}, {name}"
+        )
         report(0.0, "loading")
         try:
             results.append(inspect_part(name, plan, load(report), nominal))
@@ -183,7 +215,8 @@ def inspect_surfaces(
 
 
 def save_inspection(store: Session, inspection: Inspection, inputs: Mapping[str, str]) -> None:
-    """Save the results as `inspection/<number>`, which is stale once one of the ``inputs``, {name: hash}, changes."""
+    """Save the results as `inspection/<number>`, which is stale once one of the ``inputs``, {name:
+    hash}, changes."""
     meta = {
         "plan": inspection.plan.name,
         "characteristic": to_plain(inspection.plan.characteristic),
@@ -203,12 +236,19 @@ def write_inspection(inspection: Inspection, folder: Path) -> Inspection:
 
 
 def list_sessions(folders: Sequence[Path]) -> list[Path]:
-    """The sessions among folders, and those in folders that are none. Raises UsageError where there is none."""
+    """The sessions among folders, and those in folders that are none. Raises UsageError where there
+    is none."""
     listed: list[Path] = []
     for folder in folders:
-        inner = [folder] if is_session(folder) else sorted(p for p in folder.glob("*") if p.is_dir() and is_session(p))
+        inner = (
+            [folder]
+            if is_session(folder)
+            else sorted(p for p in folder.glob("*") if p.is_dir() and is_session(p))
+        )
         if not inner:
-            raise UsageError(f"{folder} is no session and holds none: give session folders, or a folder of them")
+            raise UsageError(
+                f"{folder} is no session and holds none: give session folders, or a folder of them"
+            )
         listed += inner
     if not listed:
         raise UsageError("no session named: give the folders of one or more")

@@ -12,7 +12,13 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
 from slviewer.pipeline.export_shapes import read_merge, scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.models import Model, check_accepted, load_model, preferred_model, warn_if_stale
+from slviewer.pipeline.models import (
+    Model,
+    check_accepted,
+    load_model,
+    preferred_model,
+    warn_if_stale,
+)
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import load_scale_correction, scale_factor, scale_sigma
 from slviewer.pipeline.scan_edits import refuse_region
@@ -22,19 +28,22 @@ from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 
 MERGED = "merge/"
-"""What the name of a merge that the session keeps begins with; its number follows, for meshes nothing for the last."""
+"""What the name of a merge that the session keeps begins with; its number follows, for meshes
+nothing for the last."""
 Place = tuple[int, int] | int
 """A point of a surface: pixel (u, v) of a scan, or the index of a merged surface's point."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurface:
-    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was measured.
+    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was
+    measured.
 
-    ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along ``normals`` for a
-    merged surface; ``left_mm`` likewise: standard deviation from the calibration, where known. ``faces`` (m, 3):
-    of a merged mesh. ``source`` is the capture or result that it came from, ``model`` the calibration, ``inputs`` the
-    hashes of both; ``shared``: the covariance of errors of that ``calibration``, by its hash, where known.
+    ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along
+    ``normals`` for a merged surface; ``left_mm`` likewise: standard deviation from the calibration,
+    where known. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or result that it
+    came from, ``model`` the calibration, ``inputs`` the hashes of both; ``shared``: the covariance
+    of errors of that ``calibration``, by its hash, where known.
     """
 
     points: np.ndarray
@@ -70,30 +79,40 @@ class MeasuredSurface:
         return float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("inf")
 
     def picked(self, place: Place) -> tuple[Feature, Spread]:
-        """The point at a pixel or index, and its uncertainty. Raises InputError where nothing was measured there."""
+        """The point at a pixel or index, and its uncertainty. Raises InputError where nothing was
+        measured there."""
         if self.organised != isinstance(place, tuple):
             raise InputError(
-                f"{place} is no place on {self.source}: give {'pixel (u, v)' if self.organised else 'an index'}"
+                f"{place} is no place on {self.source}: give"
+                f" {'pixel (u, v)' if self.organised else 'an index'}"
             )
         index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
         if not all(0 <= i < n for i, n in zip(index, self.points.shape, strict=False)):
             raise InputError(f"{place} lies outside {self.source}: pick a point of it")
         point = np.asarray(self.points[index], np.float64)
         if not np.isfinite(point).all():
-            raise InputError(f"nothing was measured at {place} of {self.source}: pick another point")
+            raise InputError(
+                f"nothing was measured at {place} of {self.source}: pick another point"
+            )
         sigma = float(np.nan_to_num(self.sigma_mm[index]))
         if self.organised:
             away = sigma * point / point[2]
         else:
-            away = np.zeros(3) if self.normals is None else sigma * np.asarray(self.normals[index], np.float64)
+            away = (
+                np.zeros(3)
+                if self.normals is None
+                else sigma * np.asarray(self.normals[index], np.float64)
+            )
         feature = Feature("point", point)
         if self.shared is None:
             return feature, Spread(np.outer(away, away))
-        return feature, Spread(np.outer(away, away), self.shared(point[None], np.eye(3)[:, None]), self.calibration)
+        return feature, Spread(
+            np.outer(away, away), self.shared(point[None], np.eye(3)[:, None]), self.calibration
+        )
 
     def sigma_along(self, normals: np.ndarray, whole: bool = False) -> np.ndarray:
-        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise alone, or on the
-        ``whole``, with what the calibration leaves uncertain."""
+        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise
+        alone, or on the ``whole``, with what the calibration leaves uncertain."""
         sigma = self.sigma_mm[self.measured].astype(np.float64)
         if whole and self.left_mm is not None:
             sigma = np.hypot(sigma, self.left_mm[self.measured])
@@ -113,15 +132,17 @@ def load_surface(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> MeasuredSurface:
-    """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``; ``roi`` as in
-    `resolve_region`, for captures alone."""
+    """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``;
+    ``roi`` as in `resolve_region`, for captures alone."""
     with opened(session) as store:
         if scan.startswith(MERGED):
             refuse_region(scan, roi)
             return load_merged_surface(store, scan, warn)
         check_accepted(store, accept_rejected)
         warn_if_stale(store, warn)
-        cloud = scan_cloud(store, scan, model or preferred_model(store), progress, warn, accept_rejected, roi)
+        cloud = scan_cloud(
+            store, scan, model or preferred_model(store), progress, warn, accept_rejected, roi
+        )
         fitted = load_model(store, cloud.model)
         measured_surface = surface_from_cloud(store, scan, cloud, fitted, with_region=not roi)
         progress(1.0, "reconstructed")
@@ -159,7 +180,9 @@ def surface_from_cloud(
     )
 
 
-def load_merged_surface(store: Session, merge: str, warn: Warn = ignore_warnings) -> MeasuredSurface:
+def load_merged_surface(
+    store: Session, merge: str, warn: Warn = ignore_warnings
+) -> MeasuredSurface:
     """A stored merge ``merge/<number>``, in the frame of its reference's camera."""
     meta, points = read_merge(store, merge, warn)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))

@@ -1,6 +1,7 @@
 """Measurements on scans: made, saved with the session, listed, written as CSV.
 
-Every function takes a session's folder or one that is open, and saves what it makes; the browser calls the same.
+Every function takes a session's folder or one that is open, and saves what it makes; the browser
+calls the same.
 """
 
 from collections.abc import Iterable
@@ -38,20 +39,36 @@ from slviewer.session.store import Session
 Shape = Literal["plane", "sphere", "cylinder"]
 MAX_RMS_TO_NOISE = 5.0
 """Times the points' noise: a fit with a larger RMS gets a warning."""
-COLUMNS = ("id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U", "state", "time")
+COLUMNS = (
+    "id",
+    "name",
+    "kind",
+    "scan",
+    "quantity",
+    "value",
+    "unit",
+    "U (k = 2)",
+    "calibration in U",
+    "state",
+    "time",
+)
 
 
 def add_point(session: SessionLike, on: MeasuredSurface, at: Place, name: str = "") -> Measurement:
     """Save a picked point as a measurement, to relate it with fits."""
     feature, spread = on.picked(at)
-    x, y, z = (Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True))
+    x, y, z = (
+        Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True)
+    )
     data = {"at": at, "feature": feature, "scatter": spread.scatter, "calibration": on.calibration}
     arrays = {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
     with opened(session, write=True) as store:
         return _save_measurement(store, on, "point", [x, y, z], data, arrays, name)
 
 
-def add_distance(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
+def add_distance(
+    session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = ""
+) -> Measurement:
     """Measure and save the distance between two picked points."""
     (first, first_spread), (second, second_spread) = on.picked(a), on.picked(b)
     length = distance(first.place, second.place, first_spread, second_spread)
@@ -60,13 +77,17 @@ def add_distance(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, 
         return _save_measurement(store, on, "distance", [length], data, {}, name)
 
 
-def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Region, name: str = "") -> Measurement:
-    """Fit a plane, sphere or cylinder to a region, and save it. Raises InputError where the region has none."""
+def add_fit(
+    session: SessionLike, on: MeasuredSurface, shape: Shape, region: Region, name: str = ""
+) -> Measurement:
+    """Fit a plane, sphere or cylinder to a region, and save it. Raises InputError where the region
+    has none."""
     fit = fit_feature(shape, on.within(region), on.shared, on.calibration)
     noise = on.noise(region)
     if fit.rms > MAX_RMS_TO_NOISE * noise:
         warning = (
-            f"points lie {fit.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm: see what it shows"
+            f"points lie {fit.rms:.3g} mm (RMS) off the {shape}, and their noise is {noise:.2g} mm:"
+            " see what it shows"
         )
         fit = replace(fit, warnings=(*fit.warnings, warning))
     arrays = {} if fit.spread.shared is None else {"shared": fit.spread.shared.astype(np.float32)}
@@ -77,18 +98,24 @@ def add_fit(session: SessionLike, on: MeasuredSurface, shape: Shape, region: Reg
 
 
 def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measurement:
-    """Angles and distances between two points or fits, by their ids. Raises InputError where one is neither, is stale,
-    or is in another camera's frame."""
+    """Angles and distances between two points or fits, by their ids. Raises InputError where one is
+    neither, is stale, or is in another camera's frame."""
     with opened(session, write=True) as store:
         first, second = (load_measurement(store, each) for each in (a, b))
         if a == b:
             raise InputError(f"{first.name} was chosen twice: choose two measurements")
         for each in (first, second):
             if _is_stale(store, each):
-                raise InputError(f"{each.name} is stale, what it was measured on has changed: measure it again")
-        (one, one_spread), (other, other_spread) = (load_feature(store, each) for each in (first, second))
+                raise InputError(
+                    f"{each.name} is stale, what it was measured on has changed: measure it again"
+                )
+        (one, one_spread), (other, other_spread) = (
+            load_feature(store, each) for each in (first, second)
+        )
         _check_frames(store, first, second)
-        source = first.source if first.source == second.source else f"{first.source}, {second.source}"
+        source = (
+            first.source if first.source == second.source else f"{first.source}, {second.source}"
+        )
         quantities = relation(one, one_spread, other, other_spread)
         model = first.model if first.model == second.model else f"{first.model}, {second.model}"
         return save_measurement(
@@ -104,9 +131,11 @@ def add_relation(session: SessionLike, a: str, b: str, name: str = "") -> Measur
         )
 
 
-def add_section(session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = "") -> Measurement:
-    """Add a section: the surface cut along a line between two picked points, as nearly parallel to the camera's viewing
-    direction as possible."""
+def add_section(
+    session: SessionLike, on: MeasuredSurface, a: Place, b: Place, name: str = ""
+) -> Measurement:
+    """Add a section: the surface cut along a line between two picked points, as nearly parallel to
+    the camera's viewing direction as possible."""
     ends = [on.picked(place)[0].place for place in (a, b)]
     middle = (ends[0] + ends[1]) / 2
     plane = CutPlane.through(ends[0], ends[1], -middle)
@@ -136,14 +165,17 @@ def section_lines(session: SessionLike, identity: str) -> tuple[CutPlane, list[n
     with opened(session) as store:
         measured = load_measurement(store, identity)
         if measured.kind != "section":
-            raise InputError(f"{measured.name} is a {measured.kind}, not a section: choose a section")
+            raise InputError(
+                f"{measured.name} is a {measured.kind}, not a section: choose a section"
+            )
         arrays = measurement_arrays(store, identity)
     lines = np.split(arrays["lines"].astype(np.float64), np.cumsum(arrays["lengths"])[:-1])
     return from_plain(measured.data["plane"], CutPlane), lines
 
 
 def load_measurements(session: SessionLike) -> list[Measurement]:
-    """Load all measurements, in the order in which they were made; stale where their inputs have changed."""
+    """Load all measurements, in the order in which they were made; stale where their inputs have
+    changed."""
     with opened(session) as store:
         return [replace(each, stale=_is_stale(store, each)) for each in list_measurements(store)]
 
@@ -204,11 +236,15 @@ def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
 def load_feature(store: Session, measured: Measurement) -> tuple[Feature, Spread]:
     """Load the point, plane, sphere or cylinder of a measurement, and its uncertainty."""
     if measured.kind not in ("point", "plane", "sphere", "cylinder"):
-        raise InputError(f"{measured.name} is a {measured.kind}: choose a point, plane, sphere or cylinder")
+        raise InputError(
+            f"{measured.name} is a {measured.kind}: choose a point, plane, sphere or cylinder"
+        )
     shared = measurement_arrays(store, measured.id).get("shared")
     shared = None if shared is None else shared.astype(np.float64)
     record = measured.data if measured.kind == "point" else measured.data["fit"]
-    return from_plain(record["feature"], Feature), Spread(np.array(record["scatter"]), shared, record["calibration"])
+    return from_plain(record["feature"], Feature), Spread(
+        np.array(record["scatter"]), shared, record["calibration"]
+    )
 
 
 def _save_measurement(
@@ -220,7 +256,8 @@ def _save_measurement(
     arrays: dict[str, np.ndarray],
     name: str,
 ) -> Measurement:
-    """Save a measurement on a surface with its quantities, data and arrays, and the hashes of its inputs."""
+    """Save a measurement on a surface with its quantities, data and arrays, and the hashes of its
+    inputs."""
     return save_measurement(
         store,
         kind,
@@ -244,12 +281,13 @@ def _is_stale(store: Session, measured: Measurement) -> bool:
 
 
 def _check_frames(store: Session, a: Measurement, b: Measurement) -> None:
-    """Two scans are in one frame only while camera and calibration are the same; a merged surface has its own."""
+    """Two scans are in one frame only while camera and calibration are the same; a merged surface
+    has its own."""
     if a.source == b.source:
         return
     captures = set(store.capture_names())
     if a.model != b.model or not {a.source, b.source} <= captures:
         raise InputError(
-            f"{a.name} was measured on {a.source} with {a.model}, {b.name} on {b.source} with {b.model}: they do not "
-            "lie in one frame; measure both on one surface"
+            f"{a.name} was measured on {a.source} with {a.model}, {b.name} on {b.source} with"
+            f" {b.model}: they do not lie in one frame; measure both on one surface"
         )

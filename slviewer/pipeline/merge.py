@@ -30,9 +30,21 @@ from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.records.merge import ContradictingPair, LoopClosure, MarkerPair, Merge, RefusedPair, Registered
+from slviewer.records.merge import (
+    ContradictingPair,
+    LoopClosure,
+    MarkerPair,
+    Merge,
+    RefusedPair,
+    Registered,
+)
 from slviewer.records.record import to_matrix, to_vector
-from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
+from slviewer.registration.markers import (
+    MeasuredMarkers,
+    fit_marker_pose,
+    marker_notes,
+    measure_markers,
+)
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.picked import fit_picked_start
@@ -47,9 +59,11 @@ from slviewer.surface.fuse import Fused, fuse
 from slviewer.surface.region_of_interest import RegionOfInterest
 
 MAX_CONTRADICTION_SHARE = 0.01
-"""Share of contradicting points from which on a pair is warned about: noise alone has fewer than one in a million."""
+"""Share of contradicting points from which on a pair is warned about: noise alone has fewer than
+one in a million."""
 MAT_MARKERS, MAT_TURN_DEG = 3, 3.0
-"""Markers in common from which on a turntable's mat is used, and how far its turn may be from the table's."""
+"""Markers in common from which on a turntable's mat is used, and how far its turn may be from the
+table's."""
 StartKind = Literal["features", "turntable", "identity", "placed", "markers"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
@@ -59,8 +73,8 @@ Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 class MergedScans:
     """Scans aligned to one of them, the surface that they were fused to, and the record of it.
 
-    In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the one that its place
-    comes from, 0 for the first of ``fused.names``.
+    In the file ``seen_by`` counts the scans that a point is the mean of, and ``source`` numbers the
+    one that its place comes from, 0 for the first of ``fused.names``.
     """
 
     alignment: MultiwayAlignment
@@ -86,24 +100,26 @@ class MergeSettings:
     Args:
         captures: Names of the captures, in the order in which they were captured.
         reference: The capture whose frame the merged cloud takes.
-        out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh, compare, measure and
-            export, and its file is in the session's exports.
-        start: Initial alignment: features estimates it from the scans; turntable uses the angles of the turntable,
-            and the markers of a mat on it where the scans show them;
-            identity assumes that the scans are nearly aligned already; placed takes the places that `align` found;
-            markers takes coded markers (`slviewer target markers:0-23:20`) that the scans show, which also hold what
-            the shape leaves open.
-        angle: Degrees that the turntable turns from each capture to the next, with --start turntable; by default as
-            stored with the captures of `slviewer turn`.
+        out: PLY file. Without it the session stores the merge as merge/1 and so on, for mesh,
+            compare, measure and export, and its file is in the session's exports.
+        start: Initial alignment: features estimates it from the scans; turntable uses the angles of
+            the turntable, and the markers of a mat on it where the scans show them; identity
+            assumes that the scans are nearly aligned already; placed takes the places that `align`
+            found; markers takes coded markers (`slviewer target markers:0-23:20`) that the scans
+            show, which also hold what the shape leaves open.
+        angle: Degrees that the turntable turns from each capture to the next, with --start
+            turntable; by default as stored with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
-        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
-            of each scan (x right, y down, z away), a TOML file, or off; by default the session's.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the
+            camera's frame of each scan (x right, y down, z away), a TOML file, or off; by default
+            the session's.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    Python alone: ``axis`` of the turntable, estimated where it is not given; ``poses`` (4, 4) by name, the initial
-    alignment with "identity"; ``picked``, for a pair (scan, onto), three or more points (n, 3) mm on either, in their
-    cameras' frames, that these pairs start from. The static background is separated from the moving object
-    and excluded from the surface, unless ``keep_background``.
+    Python alone: ``axis`` of the turntable, estimated where it is not given; ``poses`` (4, 4) by
+    name, the initial alignment with "identity"; ``picked``, for a pair (scan, onto), three or more
+    points (n, 3) mm on either, in their cameras' frames, that these pairs start from. The static
+    background is separated from the moving object and excluded from the surface, unless
+    ``keep_background``.
     """
 
     UNRECORDED: ClassVar = ("out", "axis", "poses", "picked")
@@ -125,10 +141,14 @@ class MergeSettings:
             raise UsageError(f"only {self.reference} was named: name the scans to merge with it")
         if self.out is not None and Path(self.out).suffix.lower() != ".ply":
             name = Path(self.out).name
-            raise UsageError(f"merged points are written as .ply, not as {name}: a mesh goes into other files too")
+            raise UsageError(
+                f"merged points are written as .ply, not as {name}: a mesh goes into other"
+                " files too"
+            )
         if self.angle is not None and self.start != "turntable":
             raise UsageError(
-                "an angle from scan to scan is that of a turntable: give --start turntable too, or neither"
+                "an angle from scan to scan is that of a turntable: give --start turntable too, or"
+                " neither"
             )
 
         self.fit_picks()
@@ -139,7 +159,8 @@ class MergeSettings:
         for (scan, onto), (there, here) in (self.picked or {}).items():
             if not {scan, onto} <= set(self.names):
                 raise UsageError(
-                    f"points were picked on {scan} and {onto}, which are not both among the scans to merge"
+                    f"points were picked on {scan} and {onto}, which are not both among the scans"
+                    " to merge"
                 )
             picks[scan, onto] = fit_picked_start(there, here)
         return picks
@@ -155,7 +176,8 @@ class MergeSettings:
 def merge(job: Job, settings: MergeSettings) -> Iterator[Found[Merge]]:
     """Register scans to a reference scan, close their loops, and fuse them into one surface.
 
-    Reports the uncertainty of each registered pair, how well loops close, and what was excluded, and why.
+    Reports the uncertainty of each registered pair, how well loops close, and what was excluded,
+    and why.
     """
     with _merging(job, settings) as merged:
         yield merged.found  # and its file appears once that is stored
@@ -169,10 +191,13 @@ def merge_scans(job: Job, settings: MergeSettings) -> MergedScans:
 
 @contextmanager
 def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
-    """Context manager: registered and fused scans; the file of the merge gets its place at the end."""
+    """Context manager: registered and fused scans; the file of the merge gets its place at the
+    end."""
     store, names, warn = job.store, settings.names, job.warn
     if settings.out is not None:
-        Path(settings.out).parent.mkdir(parents=True, exist_ok=True)  # or it fails now, not after minutes
+        Path(settings.out).parent.mkdir(
+            parents=True, exist_ok=True
+        )  # or it fails now, not after minutes
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(store, settings, table_deg, warn)
     check_accepted(store, settings.accept_rejected)
@@ -185,10 +210,16 @@ def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
         starts = replace(starts, markers=_measure_markers(clouds, warn))
     elif table_deg is not None:
         starts = replace(starts, markers=_measure_mat(clouds, table_deg, warn))
-    registered = register_object(clouds, settings.reference, starts, stage(job.progress, 0.4, 0.75, "registering"))
+    registered = register_object(
+        clouds, settings.reference, starts, stage(job.progress, 0.4, 0.75, "registering")
+    )
     alignment = registered.alignment
     moved, background = _list_moved_markers(alignment), settings.keep_background
-    for why in [*moved, *alignment.dropped.values(), *_scene_warnings(clouds, registered, background)]:
+    for why in [
+        *moved,
+        *alignment.dropped.values(),
+        *_scene_warnings(clouds, registered, background),
+    ]:
         warn(why)
     clouds = clouds if background else dict(registered.clouds)
     left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
@@ -201,7 +232,8 @@ def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
 
 @dataclass(frozen=True)
 class _Cuts:
-    """What scans are restricted by: the region, edits and region in words, and their hashes, as inputs."""
+    """What scans are restricted by: the region, edits and region in words, and their hashes, as
+    inputs."""
 
     region: RegionOfInterest | None
     notes: tuple[str, ...]
@@ -215,29 +247,42 @@ def _list_cuts(store: Session, settings: MergeSettings) -> _Cuts:
     return _Cuts(region, restriction_notes(store, names, region), inputs)
 
 
-def _reconstruct_scans(job: Job, settings: MergeSettings, fitted: Model, cuts: _Cuts) -> dict[str, Cloud]:
+def _reconstruct_scans(
+    job: Job, settings: MergeSettings, fitted: Model, cuts: _Cuts
+) -> dict[str, Cloud]:
     """Return the cloud of each scan without what edits and region remove."""
     store, names, clouds = job.store, settings.names, {}
     for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn)):
         job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
         texture = capture_texture(shot, frames, stretch=False)
         accepted = settings.accept_rejected
-        cloud = capture_cloud(store, fitted, shot, phases, texture=texture, accept_rejected=accepted, warn=job.warn)
+        cloud = capture_cloud(
+            store, fitted, shot, phases, texture=texture, accept_rejected=accepted, warn=job.warn
+        )
         clouds[shot.name] = restrict_cloud(store, shot.name, cloud, cuts.region)
     return clouds
 
 
 @contextmanager
 def _write_merge(
-    store: Session, settings: MergeSettings, model: str, registered: ObjectAlignment, fused: Fused, cuts: _Cuts
+    store: Session,
+    settings: MergeSettings,
+    model: str,
+    registered: ObjectAlignment,
+    fused: Fused,
+    cuts: _Cuts,
 ) -> Iterator[Found[Merge]]:
-    """Context manager: the record of a merge, to be stored unless its PLY has a place of its own, which it gets at the
-    end."""
+    """Context manager: the record of a merge, to be stored unless its PLY has a place of its own,
+    which it gets at the end."""
     surface = fused.surface
     scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
     scalars |= {"seen_by": fused.seen_by, "source": fused.source}
     frame = f"{frame_of(store, model)}, at {settings.reference}"
-    notes = (f"scans {', '.join(settings.names)}, frame: {frame}", f"calibration {model}", *cuts.notes)
+    notes = (
+        f"scans {', '.join(settings.names)}, frame: {frame}",
+        f"calibration {model}",
+        *cuts.notes,
+    )
     number = next_number(store, "merge") if settings.out is None else 0
     with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
         write_ply(written, surface.points, surface.colours, surface.normals, scalars, notes=notes)
@@ -258,12 +303,16 @@ def _write_merge(
             f"{record.points:,} points -> {path}",
         ]
         if number:
-            said.append(f"the session stores it as merge/{number}: mesh, compare and measure accept that name")
+            said.append(
+                f"the session stores it as merge/{number}: mesh, compare and measure accept that"
+                " name"
+            )
         yield Found(str(number or path.stem), record, {}, (path,), tuple(said), stored=bool(number))
 
 
 def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, MeasuredMarkers]:
-    """Measure the coded markers on the scans; raises InputError where no two scans show the same one."""
+    """Measure the coded markers on the scans; raises InputError where no two scans show the same
+    one."""
     measured = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     for note in marker_notes(measured):
         warn(note)
@@ -271,9 +320,9 @@ def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, Measu
     if not any(one & other for i, one in enumerate(numbers) for other in numbers[:i]):
         counts = ", ".join(f"{name} {len(markers.ids)}" for name, markers in measured.items())
         raise InputError(
-            f"no two scans show the same marker (measured: {counts}): print some by `slviewer target markers:0-23:20`, "
-            "put them on or beside the object so that neighbouring scans share three or more, and scan again; or start "
-            "from features"
+            f"no two scans show the same marker (measured: {counts}): print some by `slviewer"
+            " target markers:0-23:20`, put them on or beside the object so that neighbouring scans"
+            " share three or more, and scan again; or start from features"
         )
     return measured
 
@@ -281,8 +330,8 @@ def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, Measu
 def _measure_mat(
     clouds: Mapping[str, Cloud], table_deg: Mapping[str, float], warn: Warn
 ) -> dict[str, MeasuredMarkers] | None:
-    """Measure the markers on a turntable, from which its axis follows; None where there are none, or where they do not
-    turn with it."""
+    """Measure the markers on a turntable, from which its axis follows; None where there are none,
+    or where they do not turn with it."""
     measured = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     compared = []
     for a, b in pairwise(name for name in clouds if name in table_deg):
@@ -297,8 +346,8 @@ def _measure_mat(
         return None
     if max(compared) > MAT_TURN_DEG:
         warn(
-            f"coded markers are in view, and they turn by {max(compared):.1f} degrees more or less than the table: "
-            "they are ignored; put them on the table, or check its angles"
+            f"coded markers are in view, and they turn by {max(compared):.1f} degrees more or less"
+            " than the table: they are ignored; put them on the table, or check its angles"
         )
         return None
     return measured
@@ -307,22 +356,27 @@ def _measure_mat(
 def _list_moved_markers(alignment: MultiwayAlignment) -> list[str]:
     """A sentence for each pair between whose scans markers have moved."""
     return [
-        f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is ignored: "
-        "glue it on, or take it away"
+        f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is"
+        " ignored: glue it on, or take it away"
         for (a, b), pose in alignment.markers.items()
         if pose.moved
     ]
 
 
 def _load_places(store: Session, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The poses (4, 4) of scans that are in place, all in one frame; InputError where some are not."""
+    """The poses (4, 4) of scans that are in place, all in one frame; InputError where some are
+    not."""
     places = load_places(store)
     if missing := [name for name in names if name not in places]:
-        raise InputError(f"{' and '.join(missing)} were not aligned: align them first, or start from features")
+        raise InputError(
+            f"{' and '.join(missing)} were not aligned: align them first, or start from features"
+        )
     return {name: places[name] for name in names}
 
 
-def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool) -> list[str]:
+def _scene_warnings(
+    clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool
+) -> list[str]:
     """Warnings of points that are not the object, or contradict another scan, with the remedy."""
     messages = []
     still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
@@ -330,15 +384,21 @@ def _scene_warnings(clouds: Mapping[str, Cloud], registered: ObjectAlignment, ke
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
         messages.append(
-            f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while the object moves: "
-            + ("they are in the merge once for each scan" if keep_background else "they are not part of the merge")
+            f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while"
+            " the object moves: "
+            + (
+                "they are in the merge once for each scan"
+                if keep_background
+                else "they are not part of the merge"
+            )
         )
     for (one, other), contradiction in registered.contradictions.items():
         if contradiction.share > MAX_CONTRADICTION_SHARE:
             messages.append(
-                f"{one} -> {other}: {100 * contradiction.share:.2g} % of the points contradict, they lie more than "
-                f"{contradiction.gate_mm:.2g} mm in front of what the other scan sees there: something moved alone "
-                "or stands still; restrict the scans to the object, or scan again"
+                f"{one} -> {other}: {100 * contradiction.share:.2g} % of the points contradict,"
+                f" they lie more than {contradiction.gate_mm:.2g} mm in front of what the other"
+                " scan sees there: something moved alone or stands still; restrict the scans to"
+                " the object, or scan again"
             )
     return messages
 
@@ -349,19 +409,29 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
     return Merge(
         reference=alignment.reference,
         scans=list(fused.names),
-        pairs={scan: _make_registered(scan, alignment.reference, r) for scan, r in alignment.on_reference().items()},
+        pairs={
+            scan: _make_registered(scan, alignment.reference, r)
+            for scan, r in alignment.on_reference().items()
+        },
         points=len(fused.surface),
-        registered=[_make_registered(*pair, registration) for pair, registration in alignment.pairs.items()],
+        registered=[
+            _make_registered(*pair, registration) for pair, registration in alignment.pairs.items()
+        ],
         loops=[
             LoopClosure(
-                list(loop.names), loop.before.shift_mm, loop.before.turn_deg, loop.after.shift_mm, loop.after.turn_deg
+                list(loop.names),
+                loop.before.shift_mm,
+                loop.before.turn_deg,
+                loop.after.shift_mm,
+                loop.after.turn_deg,
             )
             for loop in alignment.loops
         ],
         dropped=[RefusedPair(*pair, why) for pair, why in alignment.dropped.items()],
         refused=[RefusedPair(*pair, why) for pair, why in alignment.refused.items()],
         markers=[
-            MarkerPair(*pair, list(pose.ids), list(pose.moved), pose.rms_mm) for pair, pose in alignment.markers.items()
+            MarkerPair(*pair, list(pose.ids), list(pose.moved), pose.rms_mm)
+            for pair, pose in alignment.markers.items()
         ],
         static_points={name: int(mask.sum()) for name, mask in registered.static.items()},
         contradictions=[
@@ -395,8 +465,9 @@ def _make_registered(scan: str, onto: str, registration: Registration) -> Regist
 
 
 def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, float] | None:
-    """Return the turntable's angle, deg, of each scan, of a single turn where they are stored with the captures; None
-    where the merge does not start from them. Raises UsageError where they are not known."""
+    """Return the turntable's angle, deg, of each scan, of a single turn where they are stored with
+    the captures; None where the merge does not start from them. Raises UsageError where they are
+    not known."""
     names = settings.names
     if settings.start != "turntable":
         return None
@@ -406,13 +477,13 @@ def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, flo
     table_deg = {name: step.deg for name, step in stored.items() if step is not None}
     if missing := [name for name in names if name not in table_deg]:
         raise UsageError(
-            f"no angle of a turntable is stored with {', '.join(missing)}: give the angle from scan to scan, or start "
-            "from features"
+            f"no angle of a turntable is stored with {', '.join(missing)}: give the angle from scan"
+            " to scan, or start from features"
         )
     if len(turns := dict.fromkeys(step.turn for step in stored.values() if step is not None)) > 1:
         raise UsageError(
-            f"the scans belong to several turns ({', '.join(turns)}), between which the object may have been moved: "
-            "start from features"
+            f"the scans belong to several turns ({', '.join(turns)}), between which the object may"
+            " have been moved: start from features"
         )
     return table_deg
 
@@ -420,7 +491,8 @@ def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, flo
 def _initial_alignments(
     store: Session, settings: MergeSettings, table_deg: Mapping[str, float] | None, warn: Warn
 ) -> Starts:
-    """Return the initial alignments for the requested start; raises for options that do not fit it."""
+    """Return the initial alignments for the requested start; raises for options that do not fit
+    it."""
     names, poses = settings.names, settings.poses
     if settings.start == "placed":
         poses = _load_places(store, names)
@@ -431,6 +503,10 @@ def _initial_alignments(
         picks[scan, onto] = pick
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
     for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
-        if all((name, base) in picks for name in names if name != base):  # pairs without picked points start there too
-            poses = {base: np.eye(4)} | {name: picks[name, base].T for name in names if name != base}
+        if all(
+            (name, base) in picks for name in names if name != base
+        ):  # pairs without picked points start there too
+            poses = {base: np.eye(4)} | {
+                name: picks[name, base].T for name in names if name != base
+            }
     return Starts(poses=poses, table_deg=table_deg, axis=settings.axis, picked=picks)

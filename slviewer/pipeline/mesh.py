@@ -33,8 +33,8 @@ TEXTURED_TRIANGLES = 100_000
 
 @dataclass(frozen=True, eq=False)
 class MeshResult:
-    """A mesh, its source, and the file that it was written to. ``merged``: the merge of several scans; ``textured``:
-    the mesh with its texture."""
+    """A mesh, its source, and the file that it was written to. ``merged``: the merge of several
+    scans; ``textured``: the mesh with its texture."""
 
     meshed: BuiltMesh
     sources: tuple[str, ...]
@@ -45,7 +45,12 @@ class MeshResult:
     def to_json(self) -> dict[str, Any]:
         """The contract of ``mesh --json``."""
         merged = None if self.merged is None else self.merged.to_json()
-        return {"sources": list(self.sources), "out": str(self.out), **self.meshed.to_json(), "merge": merged}
+        return {
+            "sources": list(self.sources),
+            "out": str(self.out),
+            **self.meshed.to_json(),
+            "merge": merged,
+        }
 
     def text(self) -> str:
         """Return the result as a report for the terminal."""
@@ -72,25 +77,31 @@ def mesh(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> MeshResult:
-    """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or .glb.
+    """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or
+    .glb.
 
     Args:
         session: Session folder.
-        names: One scan; several, to be merged into the frame of the first; or a merge of the session, as merge/1.
+        names: One scan; several, to be merged into the frame of the first; or a merge of the
+            session, as merge/1.
         out: The file; by default a .ply in the session's exports, with a texture a .glb.
-        texture: Side of a texture image, px, such as 2048, projected from the scans onto the mesh; for .glb and .obj.
-        white: White balance of a colour camera's texture: board takes the white of the target poses for neutral, any
-            other name that capture, of a grey card or white sheet; by default colours are the camera's.
-        start: Initial alignment of several scans: features estimates it from the scans; turntable uses the angles of
-            the turntable; identity assumes that they are nearly aligned already.
-        angle: Degrees that the turntable turns from each scan to the next, with --start turntable; by default as stored
-            with the captures of `slviewer turn`.
+        texture: Side of a texture image, px, such as 2048, projected from the scans onto the mesh;
+            for .glb and .obj.
+        white: White balance of a colour camera's texture: board takes the white of the target poses
+            for neutral, any other name that capture, of a grey card or white sheet; by default
+            colours are the camera's.
+        start: Initial alignment of several scans: features estimates it from the scans; turntable
+            uses the angles of the turntable; identity assumes that they are nearly aligned already.
+        angle: Degrees that the turntable turns from each scan to the next, with --start turntable;
+            by default as stored with the captures of `slviewer turn`.
         model: Which calibration to use; by default the best one available.
-        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
-            (x right, y down, z away), a TOML file, or off; by default the session's. A merge was cut when it was made.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the
+            camera's frame (x right, y down, z away), a TOML file, or off; by default the session's.
+            A merge was cut when it was made.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    ``merge/`` alone is the session's last merge. The points of merged scans are written next to the mesh.
+    ``merge/`` alone is the session's last merge. The points of merged scans are written next to the
+    mesh.
     """
     sources = tuple(dict.fromkeys(names))
     plan = plan or MeshingPlan()
@@ -102,14 +113,25 @@ def mesh(
         check_accepted(store, accept_rejected)
         gains = measure_white(store, white) if white else None
         suffix = ".ply" if texture is None else ".glb"
-        path = Path(out) if out is not None else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
+        path = (
+            Path(out)
+            if out is not None
+            else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         before = part(progress, 0, 0.5)
         shape: Cloud | PointSet
         if len(sources) > 1:
             points = path.with_name(f"{path.stem}_points.ply")
             settings = MergeSettings(
-                sources, sources[0], points, model, start, angle, roi=roi, accept_rejected=accept_rejected
+                sources,
+                sources[0],
+                points,
+                model,
+                start,
+                angle,
+                roi=roi,
+                accept_rejected=accept_rejected,
             )
             merged = merge_scans(Job(store, before, warn), settings)
             shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
@@ -123,7 +145,9 @@ def mesh(
             shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected, roi)
             restrictions = restriction_notes(store, sources, resolve_region(store, roi))
         if texture is not None:
-            clouds, poses = _textured_scans(store, sources, shape, merged, model, warn, accept_rejected)
+            clouds, poses = _textured_scans(
+                store, sources, shape, merged, model, warn, accept_rejected
+            )
             rig = load_stereo(store).rig
     merging = None if merged is None else show_found(merged.found)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
@@ -135,8 +159,13 @@ def mesh(
     else:
         if gains is not None:
             clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
-        projector, painting = -rig.R.T @ rig.t, stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
-        textured = texture_mesh(meshed.mesh, clouds, poses, size=texture, light=projector, progress=painting)
+        projector, painting = (
+            -rig.R.T @ rig.t,
+            stage(progress, 0.6, 0.95, "projecting the scans onto the mesh"),
+        )
+        textured = texture_mesh(
+            meshed.mesh, clouds, poses, size=texture, light=projector, progress=painting
+        )
         progress(0.95, f"writing {path.name}")
         write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
@@ -144,15 +173,22 @@ def mesh(
 
 
 def _check_request(
-    sources: Sequence[str], plan: MeshingPlan, out: Path | str | None, texture: int | None, white: str
+    sources: Sequence[str],
+    plan: MeshingPlan,
+    out: Path | str | None,
+    texture: int | None,
+    white: str,
 ) -> None:
-    """Raise UsageError for scans and merges that cannot be meshed so, InputError for a file that cannot hold it."""
+    """Raise UsageError for scans and merges that cannot be meshed so, InputError for a file that
+    cannot hold it."""
     if not sources:
         raise UsageError("nothing was named: name one scan, several to merge, or a merge")
     if len(sources) > 1 and any(name.startswith(MERGED) for name in sources):
         raise UsageError("a merge is meshed by itself: name one merge, or scans")
     if len(sources) > 1 and plan.method == "grid":
-        raise UsageError("the method grid joins the pixels of one scan: name one, or use poisson or volume")
+        raise UsageError(
+            "the method grid joins the pixels of one scan: name one, or use poisson or volume"
+        )
     if out is not None:
         suffix = Path(out).suffix.lower()
         check_export("mesh", suffix.removeprefix("."))
@@ -171,23 +207,32 @@ def _textured_scans(
     warn: Warn,
     accept_rejected: bool,
 ) -> tuple[Mapping[str, Cloud], Mapping[str, np.ndarray]]:
-    """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's frame."""
+    """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's
+    frame."""
     if merged is not None:
-        return {name: merged.clouds[name] for name in merged.fused.names}, merged.alignment.T_reference_scan
+        return {
+            name: merged.clouds[name] for name in merged.fused.names
+        }, merged.alignment.T_reference_scan
     if isinstance(shape, Cloud):
         return {sources[0]: shape}, {sources[0]: np.eye(4)}
     made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGED)))
-    placed = {name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()}
+    placed = {
+        name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()
+    }
     placed |= {made.reference: np.eye(4)}
     used = made.model or model
     clouds = {  # what lies outside of the region still hides the surface from a scan
-        name: scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF) for name in made.scans
+        name: scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF)
+        for name in made.scans
     }
     return clouds, placed
 
 
 def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:
-    """Return a cloud with a white balance applied to its texture. InputError where that has no colours."""
+    """Return a cloud with a white balance applied to its texture. InputError where that has no
+    colours."""
     if cloud.texture is None or cloud.texture.ndim != 3:
-        raise InputError(f"the picture of {name} has no colours: make the texture without a white balance")
+        raise InputError(
+            f"the picture of {name} has no colours: make the texture without a white balance"
+        )
     return replace(cloud, texture=balance(cloud.texture, gains))

@@ -30,7 +30,8 @@ MODELS = ("stereo", "pixelwise", "splined")
 VERDICT = "calibration/verdict"
 VALIDATION = "calibration/validation"
 POSES_FOR_PIXELWISE = 8
-"""With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better default."""
+"""With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
+default."""
 COMPILED = "compiled/splined"
 COMPILED_VERSION = 1
 """Of what `SplinedModel.compile_depth` returns."""
@@ -54,7 +55,9 @@ def save_stereo(
     meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
     if verdict is not None:
         meta["verdict"] = verdict.to_json()
-    store.save_result("calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()})
+    store.save_result(
+        "calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()}
+    )
 
 
 def save_fitted(
@@ -90,9 +93,16 @@ def save_imported_stereo(
     camera: tuple[int, int] | None,
     projector: tuple[int, int] | None,
 ) -> None:
-    """Save imported matrices as the session's stereo calibration; sizes that are None follow from its captures."""
+    """Save imported matrices as the session's stereo calibration; sizes that are None follow from
+    its captures."""
     imported = {name: value.tolist() for name, value in matrices.items()}
-    meta = {"imported": imported, "source": source, "camera": camera, "projector": projector, "inputs": {}}
+    meta = {
+        "imported": imported,
+        "source": source,
+        "camera": camera,
+        "projector": projector,
+        "inputs": {},
+    }
     store.save_result("calibration/stereo", meta, {})
 
 
@@ -100,36 +110,49 @@ def load_stereo(store: Session) -> StereoModel:
     """Load the session's stereo calibration, without its residual arrows."""
     if "stereo" not in available_models(store):
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    return store.decode_result("calibration/stereo", lambda meta, _: _decode_stereo(store, meta), only=())
+    return store.decode_result(
+        "calibration/stereo", lambda meta, _: _decode_stereo(store, meta), only=()
+    )
 
 
 def _decode_stereo(store: Session, meta: Mapping[str, Any]) -> StereoModel:
-    """Return the stereo calibration that ``meta`` describes, with the captures' sizes where it states none."""
+    """Return the stereo calibration that ``meta`` describes, with the captures' sizes where it
+    states none."""
     if "model" in meta:
         return StereoModel.from_dict(meta["model"])
     captures = store.captures()
     if not captures and not (meta["camera"] and meta["projector"]):
-        raise SessionError(f"{store.folder} holds no capture that states the camera's size: import the scans first")
+        raise SessionError(
+            f"{store.folder} holds no capture that states the camera's size: import the scans first"
+        )
     camera = tuple(meta["camera"] or captures[0].size)
     projector = tuple(meta["projector"] or captures[0].sequence.projector)
     m = {name: np.array(value) for name, value in meta["imported"].items()}
     rig = StereoRig(
-        Lens(m["K_camera"], m["D_camera"], camera), Lens(m["K_projector"], m["D_projector"], projector), m["R"], m["T"]
+        Lens(m["K_camera"], m["D_camera"], camera),
+        Lens(m["K_projector"], m["D_projector"], projector),
+        m["R"],
+        m["T"],
     )
     return StereoModel.from_rig(rig)
 
 
-def load_calibration(session: SessionLike, model: str | None = None, *, accept_rejected: bool = False) -> Model:
-    """Load the calibration of a session called ``model``; by default the one that the session prefers.
+def load_calibration(
+    session: SessionLike, model: str | None = None, *, accept_rejected: bool = False
+) -> Model:
+    """Load the calibration of a session called ``model``; by default the one that the session
+    prefers.
 
-    Raises InputError where there is none, CalibrationRejected for one that was rejected, unless that is accepted.
+    Raises InputError where there is none, CalibrationRejected for one that was rejected, unless
+    that is accepted.
     """
     with opened(session) as store:
         return load_model(store, model or best_model(store, accept_rejected))
 
 
 def load_stereo_if_complete(store: Session) -> StereoModel | None:
-    """Load the session's stereo calibration; None where there is none, or an imported one without sizes."""
+    """Load the session's stereo calibration; None where there is none, or an imported one without
+    sizes."""
     if "stereo" not in available_models(store):
         return None
     meta = store.load_result("calibration/stereo", only=())[0]
@@ -138,9 +161,14 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
 
 
 def load_residuals(store: Session) -> dict[str, np.ndarray]:
-    """{pose: (n, 4) px} camera and projector residuals of the stereo calibration; empty for one made elsewhere."""
+    """{pose: (n, 4) px} camera and projector residuals of the stereo calibration; empty for one
+    made elsewhere."""
     arrays = store.load_result("calibration/stereo")[1]
-    return {name.removeprefix("residuals_"): r for name, r in arrays.items() if name.startswith("residuals_")}
+    return {
+        name.removeprefix("residuals_"): r
+        for name, r in arrays.items()
+        if name.startswith("residuals_")
+    }
 
 
 def load_model(store: Session, name: str | None) -> Model:
@@ -152,8 +180,9 @@ def load_model(store: Session, name: str | None) -> Model:
     if name not in available_models(store):
         there = ", ".join(available_models(store))
         raise InputError(
-            f"{store.folder} holds no {name} calibration ({f'there is {there}' if there else 'there is none'}): "
-            "run `slviewer calibrate` first"
+            f"{store.folder} holds no {name} calibration"
+            f" ({f'there is {there}' if there else 'there is none'}): run `slviewer calibrate`"
+            " first"
         )
     if name == "stereo":
         return load_stereo(store)
@@ -166,8 +195,8 @@ def load_model(store: Session, name: str | None) -> Model:
     with decoding(
         result,
         lambda fault: SessionError(
-            f"the {name} calibration in {store.folder} was saved by another version of slviewer, or {fault}: "
-            "run `slviewer calibrate` again"
+            f"the {name} calibration in {store.folder} was saved by another version of slviewer, or"
+            f" {fault}: run `slviewer calibrate` again"
         ),
     ):
         model = _RESTORED[name](meta["model"], arrays)
@@ -180,18 +209,26 @@ def load_model(store: Session, name: str | None) -> Model:
 
 
 def _restore_or_compile(store: Session, model: SplinedModel, content: str) -> None:
-    """Load what was compiled from the splined calibration of this hash; else compile and save it, where possible."""
+    """Load what was compiled from the splined calibration of this hash; else compile and save it,
+    where possible."""
     if store.has_result(COMPILED):
         with suppress(SessionError, KeyError):  # damaged: it is compiled again
             meta, arrays = store.load_result(COMPILED)
-            if meta["inputs"] == {"calibration/splined": content} and meta["version"] == COMPILED_VERSION:
+            if (
+                meta["inputs"] == {"calibration/splined": content}
+                and meta["version"] == COMPILED_VERSION
+            ):
                 model.restore_compiled(meta["compiled"], arrays)
                 return
     if store.is_writable:
         compiled, arrays = model.compile_depth()
         inputs = {"calibration/splined": content}
         with suppress(SessionError):  # a full disk prevents nothing else
-            store.save_result(COMPILED, {"compiled": compiled, "version": COMPILED_VERSION, "inputs": inputs}, arrays)
+            store.save_result(
+                COMPILED,
+                {"compiled": compiled, "version": COMPILED_VERSION, "inputs": inputs},
+                arrays,
+            )
 
 
 def best_model(store: Session, accept_rejected: bool = False) -> str:
@@ -204,14 +241,17 @@ def best_model(store: Session, accept_rejected: bool = False) -> str:
 
 
 def preferred_model(store: Session) -> str:
-    """Return the name of the model that the operator has chosen, while it exists; else ``recommended_model``."""
+    """Return the name of the model that the operator has chosen, while it exists; else
+    ``recommended_model``."""
     decided = store.decision("model")
-    return str(decided) if decided and decided in available_models(store) else recommended_model(store)
+    return (
+        str(decided) if decided and decided in available_models(store) else recommended_model(store)
+    )
 
 
 def recommended_model(store: Session) -> str:
-    """The calibration that cross-validation recommends, where it was made for these; else splined or pixelwise, if it
-    has 8 poses or more; else stereo.
+    """The calibration that cross-validation recommends, where it was made for these; else splined
+    or pixelwise, if it has 8 poses or more; else stereo.
     """
     return _recommend(store)[0]
 
@@ -225,7 +265,8 @@ def describe_default_model(session: SessionLike) -> str:
 
 
 def _recommend(store: Session) -> tuple[str, str]:
-    """Return the name of the recommended calibration, and the reason in words. Raises InputError without any."""
+    """Return the name of the recommended calibration, and the reason in words. Raises InputError
+    without any."""
     there = available_models(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
@@ -233,15 +274,26 @@ def _recommend(store: Session) -> tuple[str, str]:
     if compared is not None and compared.recommended in there:
         return compared.recommended, "recommended by the comparison on held-out poses"
     for name in ("splined", "pixelwise"):
-        if name in there and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"]) >= POSES_FOR_PIXELWISE:
+        if (
+            name in there
+            and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"])
+            >= POSES_FOR_PIXELWISE
+        ):
             return name, f"made from {POSES_FOR_PIXELWISE} poses or more"
     if others := there[1:]:
-        return there[0], f"{' and '.join(others)} from fewer than {POSES_FOR_PIXELWISE} poses are used only by --model"
+        return (
+            there[0],
+            (
+                f"{' and '.join(others)} from fewer than {POSES_FOR_PIXELWISE} poses are used only"
+                " by --model"
+            ),
+        )
     return there[0], "the only one"
 
 
 def find_target(store: Session) -> str:
-    """Return the board's notation: as chosen, else that of the calibration or of the poses; empty where unknown."""
+    """Return the board's notation: as chosen, else that of the calibration or of the poses; empty
+    where unknown."""
     decided = store.valid_decision("target")
     if decided:
         return str(decided)
@@ -250,27 +302,36 @@ def find_target(store: Session) -> str:
         stereo = load_stereo_if_complete(store)
     if stereo is not None and stereo.board:
         return stereo.board
-    return next((str(c.meta["board"]) for c in store.captures("calibration") if c.meta.get("board")), "")
+    return next(
+        (str(c.meta["board"]) for c in store.captures("calibration") if c.meta.get("board")), ""
+    )
 
 
 def explain_board(notation: str) -> str:
-    """Return why a stored board cannot be used, and what to do; empty where it can, or where there is none."""
+    """Return why a stored board cannot be used, and what to do; empty where it can, or where there
+    is none."""
     try:
         if notation:
             Board.parse(notation)
     except InputError as error:
-        return f"the target cannot be used: {error}; install the plugin that adds it, or choose another board"
+        return (
+            f"the target cannot be used: {error}; install the plugin that adds it, or choose"
+            " another board"
+        )
     return ""
 
 
 def load_validation(store: Session) -> CrossValidation | None:
-    """How the session's calibrations compare on poses that they were not made from; None where they were not compared
-    them as they are now."""
-    return store.decode_fresh(VALIDATION, lambda meta, _: from_plain(meta["validation"], CrossValidation), only=())
+    """How the session's calibrations compare on poses that they were not made from; None where they
+    were not compared them as they are now."""
+    return store.decode_fresh(
+        VALIDATION, lambda meta, _: from_plain(meta["validation"], CrossValidation), only=()
+    )
 
 
 def rejection_reason(store: Session) -> str:
-    """Return why the session's calibration was rejected; empty where it was not, or was never judged."""
+    """Return why the session's calibration was rejected; empty where it was not, or was never
+    judged."""
     if "stereo" not in available_models(store):
         return ""
     verdict = store.decode_result(
@@ -282,15 +343,21 @@ def rejection_reason(store: Session) -> str:
 
 
 def check_accepted(store: Session, accept_rejected: bool = False) -> None:
-    """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is not accepted."""
+    """Raise CalibrationRejected, with the reason, where the calibration was rejected and that is
+    not accepted."""
     reason = rejection_reason(store)
     if reason and not accept_rejected:
-        raise CalibrationRejected(f"the calibration was rejected, and is not used without --accept-rejected: {reason}")
+        raise CalibrationRejected(
+            f"the calibration was rejected, and is not used without --accept-rejected: {reason}"
+        )
 
 
 def accept_rejected_calibration(store: Session, on: bool) -> None:
-    """Remember whether the present calibration is to be used although rejected; a new one needs a new decision."""
-    store.decide("use_anyway", store.input_hashes("calibration/stereo")["calibration/stereo"] if on else None)
+    """Remember whether the present calibration is to be used although rejected; a new one needs a
+    new decision."""
+    store.decide(
+        "use_anyway", store.input_hashes("calibration/stereo")["calibration/stereo"] if on else None
+    )
 
 
 def accepts_rejected(store: Session) -> bool:
@@ -302,7 +369,8 @@ def accepts_rejected(store: Session) -> bool:
 
 
 def frame_family(name: str) -> str:
-    """The calibration whose camera frame a model's clouds are in: splined has its own, the others that of stereo."""
+    """The calibration whose camera frame a model's clouds are in: splined has its own, the others
+    that of stereo."""
     return "splined" if name == "splined" else "stereo"
 
 
@@ -316,12 +384,14 @@ def frame_of(store: Session, name: str) -> str:
 
 
 def warn_if_frame_changed(store: Session, before: str, warn: Warn) -> None:
-    """Warn where another model is used than ``before`` (empty: none was), whose clouds are in another frame."""
+    """Warn where another model is used than ``before`` (empty: none was), whose clouds are in
+    another frame."""
     after = preferred_model(store) if available_models(store) else ""
     if before and after and frame_family(before) != frame_family(after):
         warn(
-            f"the {after} calibration is used from now on instead of {before}, and its clouds lie in another frame: "
-            f"the {frame_of(store, after)}. Reconstruct earlier scans again before you combine them with new ones"
+            f"the {after} calibration is used from now on instead of {before}, and its clouds lie"
+            f" in another frame: the {frame_of(store, after)}. Reconstruct earlier scans again"
+            " before you combine them with new ones"
         )
 
 
@@ -333,11 +403,17 @@ def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
 
 def warn_if_stale(store: Session, warn: Warn) -> None:
     """Warn when target poses have changed since the calibration was made."""
-    stale = [name for name in available_models(store) if store.state_of(f"calibration/{name}") == "stale"]
+    stale = [
+        name for name in available_models(store) if store.state_of(f"calibration/{name}") == "stale"
+    ]
     if stale:
         *others, last = stale
-        which = f"{', '.join(others)} and {last} calibrations were" if others else f"{last} calibration was"
+        which = (
+            f"{', '.join(others)} and {last} calibrations were"
+            if others
+            else f"{last} calibration was"
+        )
         warn(
-            f"the {which} made from target poses that have since been replaced or removed: run `slviewer calibrate` "
-            "again"
+            f"the {which} made from target poses that have since been replaced or removed: run"
+            " `slviewer calibrate` again"
         )

@@ -15,7 +15,8 @@ SessionLike = Path | str | Session
 
 @contextmanager
 def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
-    """Context manager: the session; one that was opened here is closed at the end, one that was open stays so."""
+    """Context manager: the session; one that was opened here is closed at the end, one that was
+    open stays so."""
     if isinstance(session, Session):
         yield session
     else:
@@ -27,7 +28,8 @@ def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
 def opened_to_save(session: SessionLike, warn: Warn) -> Iterator[Session]:
     """Context manager: the session, to store results in where ``is_writable``.
 
-    One that another process is writing to, or that cannot be written, is opened for reading, with a warning.
+    One that another process is writing to, or that cannot be written, is opened for reading, with a
+    warning.
     """
     if isinstance(session, Session):
         yield session
@@ -43,7 +45,8 @@ def opened_to_save(session: SessionLike, warn: Warn) -> Iterator[Session]:
 
 @contextmanager
 def placed_file(store: Session, out: Path | str | None, name: str) -> Iterator[tuple[Path, Path]]:
-    """Context manager: the file ``out``, or one of this name in the session's exports, and the path to write it to.
+    """Context manager: the file ``out``, or one of this name in the session's exports, and the path
+    to write it to.
 
     In the exports it appears at the end of the block, unless that fails.
     """
@@ -57,8 +60,8 @@ def placed_file(store: Session, out: Path | str | None, name: str) -> Iterator[t
 
 @contextmanager
 def opened_or_made(session: SessionLike) -> Iterator[Session]:
-    """Context manager: the session, open for writing; one created for the block is removed again if nothing was saved
-    in it."""
+    """Context manager: the session, open for writing; one created for the block is removed again if
+    nothing was saved in it."""
     if isinstance(session, Session):
         yield session
         return
@@ -71,7 +74,10 @@ def opened_or_made(session: SessionLike) -> Iterator[Session]:
 
 
 def match_names(
-    names: Sequence[str], patterns: Sequence[str], kind: str, error: type[SlviewerError] = UsageError
+    names: Sequence[str],
+    patterns: Sequence[str],
+    kind: str,
+    error: type[SlviewerError] = UsageError,
 ) -> list[str]:
     """Return those of ``names`` that match a pattern such as ``pose_0*``, in their order.
 
@@ -84,10 +90,15 @@ def match_names(
 
 
 def numbered_results(store: Session, kind: str) -> list[str]:
-    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., in the order of their numbers."""
-    return sorted((name for name in store.result_names() if name.startswith(f"{kind}/")), key=natural_key)
+    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., in the order of
+    their numbers."""
+    return sorted(
+        (name for name in store.result_names() if name.startswith(f"{kind}/")), key=natural_key
+    )
 
 
 def next_number(store: Session, kind: str) -> int:
     """Return the number of the next result of a kind."""
-    return 1 + max((int(name.removeprefix(f"{kind}/")) for name in numbered_results(store, kind)), default=0)
+    return 1 + max(
+        (int(name.removeprefix(f"{kind}/")) for name in numbered_results(store, kind)), default=0
+    )

@@ -1,4 +1,5 @@
-"""Operations: what computes records. One runner opens the session, runs one, stores what it finds, and returns that."""
+"""Operations: what computes records. One runner opens the session, runs one, stores what it finds,
+and returns that."""
 
 import inspect
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -35,8 +36,9 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Found(Generic[R]):
-    """One record that an operation found, and its arrays. ``name``: the capture that it is of, or its number; where it
-    is not to be ``stored``, that of its file. ``files``: what else was written, ``notes`` on it in words.
+    """One record that an operation found, and its arrays. ``name``: the capture that it is of, or
+    its number; where it is not to be ``stored``, that of its file. ``files``: what else was
+    written, ``notes`` on it in words.
     """
 
     name: str
@@ -51,7 +53,11 @@ class Findings(dict[str, R]):
     """The records that an operation found, by name, the files that it wrote, and notes on these."""
 
     def __init__(
-        self, kind: type[R], records: Mapping[str, R], files: tuple[Path, ...] = (), notes: tuple[str, ...] = ()
+        self,
+        kind: type[R],
+        records: Mapping[str, R],
+        files: tuple[Path, ...] = (),
+        notes: tuple[str, ...] = (),
     ) -> None:
         super().__init__(records)
         self.kind, self.files, self.notes = kind, files, notes
@@ -69,7 +75,8 @@ class Findings(dict[str, R]):
     def summary(self) -> str:
         """Return the records in one sentence."""
         return "; ".join(
-            each.summary() if name.isdecimal() else f"{name}: {each.summary()}" for name, each in self.items()
+            each.summary() if name.isdecimal() else f"{name}: {each.summary()}"
+            for name, each in self.items()
         )
 
     def text(self) -> str:
@@ -86,18 +93,27 @@ def show_found(found: Found[R]) -> Findings[R]:
 class Operation(Generic[P, S, R]):
     """A function that computes records, ``function(job, settings)``, which yields each as `Found`.
 
-    Called with a session and the fields of its settings, it runs and returns the records. The function's docstring
-    describes it, and that of the settings their fields: for Python, for the command's help, and for the pages.
+    Called with a session and the fields of its settings, it runs and returns the records. The
+    function's docstring describes it, and that of the settings their fields: for Python, for the
+    command's help, and for the pages.
     """
 
     def __init__(
-        self, name: str, function: Callable[[Job, S], Iterator[Found[Any]]], record: type[R], settings: Callable[P, S]
+        self,
+        name: str,
+        function: Callable[[Job, S], Iterator[Found[Any]]],
+        record: type[R],
+        settings: Callable[P, S],
     ) -> None:
         update_wrapper(self, function)
         self.name, self.function, self.record, self.settings = name, function, record, settings
         parameters = inspect.signature(settings).parameters.values()
-        session = inspect.Parameter("session", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=SessionLike)
-        self.__signature__ = inspect.Signature([session, *parameters], return_annotation=Findings[R])
+        session = inspect.Parameter(
+            "session", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=SessionLike
+        )
+        self.__signature__ = inspect.Signature(
+            [session, *parameters], return_annotation=Findings[R]
+        )
         self.__doc__ = f"{inspect.getdoc(function)}\n\n{inspect.getdoc(settings)}"
 
     def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:
@@ -115,10 +131,11 @@ class Operation(Generic[P, S, R]):
         progress: Progress = ignore_progress,
         warn: Warn = ignore_warnings,
     ) -> Findings[R]:
-        """Run the operation on a session; each record is stored, with its arrays, before the next is computed.
+        """Run the operation on a session; each record is stored, with its arrays, before the next
+        is computed.
 
-        A session that another process writes to, or that is open for reading, is left as it is, with a warning for the
-        former.
+        A session that another process writes to, or that is open for reading, is left as it is,
+        with a warning for the former.
         """
         records: dict[str, R] = {}
         files, notes = list[Path](), list[str]()
@@ -137,18 +154,24 @@ class Operation(Generic[P, S, R]):
             for found in everything:
                 record = found.record
                 if not record.operation:
-                    record = msgspec.structs.replace(record, operation=self.name, settings=plain_settings(settings))
+                    record = msgspec.structs.replace(
+                        record, operation=self.name, settings=plain_settings(settings)
+                    )
                 if found.stored and job.store.is_writable:
                     save_record(job.store, found.name, record, found.arrays)
                 yield replace(found, record=record)
 
 
 def plain_settings(settings: Any) -> dict[str, Any]:
-    """Return the settings that are not the default as plain values, but those that its ``UNRECORDED`` names, which do
-    not influence what is found."""
-    kept = [each for each in fields(settings) if each.name not in getattr(settings, "UNRECORDED", ())]
+    """Return the settings that are not the default as plain values, but those that its
+    ``UNRECORDED`` names, which do not influence what is found."""
+    kept = [
+        each for each in fields(settings) if each.name not in getattr(settings, "UNRECORDED", ())
+    ]
     values = {each.name: getattr(settings, each.name) for each in kept}
-    return to_plain({each.name: values[each.name] for each in kept if values[each.name] != each.default})  # type: ignore[no-any-return]
+    return to_plain(
+        {each.name: values[each.name] for each in kept if values[each.name] != each.default}
+    )  # type: ignore[no-any-return]
 
 
 OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}
@@ -158,7 +181,8 @@ OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}
 def operation(
     name: str, record: type[R], settings: Callable[P, S]
 ) -> Callable[[Callable[[Job, S], Iterator[Found[Any]]]], Operation[P, S, R]]:
-    """Return a decorator that makes a function the operation of that name, which finds records with settings."""
+    """Return a decorator that makes a function the operation of that name, which finds records with
+    settings."""
 
     def register(function: Callable[[Job, S], Iterator[Found[Any]]]) -> Operation[P, S, R]:
         """Return the function's operation."""

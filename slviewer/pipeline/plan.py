@@ -45,29 +45,35 @@ def plan(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> str:
-    """Make an inspection plan from what was measured on a scan, to repeat it on others with `slviewer inspect-parts`.
+    """Make an inspection plan from what was measured on a scan, to repeat it on others with
+    `slviewer inspect-parts`.
 
     The plan is a text file: edit its nominal values and limits there.
 
     Args:
         session: Session folder.
         out: The plan, a TOML file.
-        tolerance: Plus and minus around each measured size, mm (and degrees for angles); the upper limit of form.
-        datums: Align by these three measurements (3-2-1), such as m1 m2 m3: a plane, then planes or spheres.
-        nominal: Align by the best fit to this STL, PLY or OBJ file. By default parts lie in one place, in a fixture.
+        tolerance: Plus and minus around each measured size, mm (and degrees for angles); the upper
+            limit of form.
+        datums: Align by these three measurements (3-2-1), such as m1 m2 m3: a plane, then planes or
+            spheres.
+        nominal: Align by the best fit to this STL, PLY or OBJ file. By default parts lie in one
+            place, in a fixture.
     """
     if not LEAST_TOLERANCE_MM <= tolerance <= MOST_TOLERANCE_MM:
         raise UsageError(
-            f"--tolerance is {tolerance:g}: give {LEAST_TOLERANCE_MM:g} to {MOST_TOLERANCE_MM:g} mm, by default "
-            f"{TOLERANCE_MM:g}"
+            f"--tolerance is {tolerance:g}: give {LEAST_TOLERANCE_MM:g} to {MOST_TOLERANCE_MM:g}"
+            f" mm, by default {TOLERANCE_MM:g}"
         )
     if datums and nominal is not None:
         raise UsageError("--datums and --nominal were given: choose one way to align")
-    made = make_plan(session, tolerance, datums or (), nominal, Path(out).stem, progress=progress, warn=warn)
+    made = make_plan(
+        session, tolerance, datums or (), nominal, Path(out).stem, progress=progress, warn=warn
+    )
     write_plan(made, out)
     return (
-        f"{len(made.characteristic)} characteristics of {len(made.feature)} features -> {out}; set nominal values and "
-        f"limits there, then: slviewer inspect-parts {out} SESSION..."
+        f"{len(made.characteristic)} characteristics of {len(made.feature)} features -> {out}; set"
+        f" nominal values and limits there, then: slviewer inspect-parts {out} SESSION..."
     )
 
 
@@ -81,7 +87,8 @@ def make_plan(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Plan:
-    """The plan of a session's fitted planes, spheres and cylinders, and of the relations between them."""
+    """The plan of a session's fitted planes, spheres and cylinders, and of the relations between
+    them."""
     with opened(session) as store:
         measured = load_measurements(store)
         fits = _select_fits(measured, warn)
@@ -89,30 +96,47 @@ def make_plan(
     names, T, alignment = _distinct_names(fits), np.eye(4), Alignment()
     if datums:
         if missing := [each for each in datums if each not in fits]:
-            raise InputError(f"{', '.join(missing)} is no fit to align by: there are {', '.join(fits)}")
+            raise InputError(
+                f"{', '.join(missing)} is no fit to align by: there are {', '.join(fits)}"
+            )
         T = datum_frame([features[each] for each in datums])
         start = tuple(map(tuple, T.round(9).tolist()))
         alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
     elif nominal is not None:
         ideal, source = read_nominal(nominal), next(iter(fits.values()))
-        surface = load_surface(session, source.source, model=source.model, progress=progress, warn=warn)
+        surface = load_surface(
+            session, source.source, model=source.model, progress=progress, warn=warn
+        )
         T = fit_to_nominal(surface, ideal).T_nominal_scan
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
-    left_out = [each.name for each in measured if each.kind not in (*FORM_OF, "relation") or each.stale]
+    left_out = [
+        each.name for each in measured if each.kind not in (*FORM_OF, "relation") or each.stale
+    ]
     if left_out:
-        warn(f"a plan holds fits and their relations that are not stale: {', '.join(left_out)} are not in it")
-    return Plan(name, tuple(listed), tuple(_list_characteristics(measured, names, tolerance)), alignment)
+        warn(
+            f"a plan holds fits and their relations that are not stale: {', '.join(left_out)} are"
+            " not in it"
+        )
+    return Plan(
+        name, tuple(listed), tuple(_list_characteristics(measured, names, tolerance)), alignment
+    )
 
 
 def _select_fits(measured: Sequence[Measurement], warn: Warn) -> dict[str, Measurement]:
-    """The fits that are not stale, by id; warns where several scans have some: those of the last one are taken."""
+    """The fits that are not stale, by id; warns where several scans have some: those of the last
+    one are taken."""
     fits = [each for each in measured if each.kind in FORM_OF and not each.stale]
     if not fits:
-        raise InputError("nothing was fitted in this session: fit planes, spheres or cylinders to a scan first")
+        raise InputError(
+            "nothing was fitted in this session: fit planes, spheres or cylinders to a scan first"
+        )
     last = fits[-1].source
     if len(sources := {each.source for each in fits}) > 1:
-        warn(f"measurements were made on {', '.join(sorted(sources))}: the plan takes those on {last} alone")
+        warn(
+            f"measurements were made on {', '.join(sorted(sources))}: the plan takes those on"
+            f" {last} alone"
+        )
     return {each.id: each for each in fits if each.source == last}
 
 
@@ -120,7 +144,11 @@ def _list_characteristics(
     measured: Sequence[Measurement], names: Mapping[str, str], tolerance: float
 ) -> Iterator[Characteristic]:
     """Size and form of the fits in ``names``, by id, then the relations between two of them."""
-    relations = [each for each in measured if each.kind == "relation" and not each.stale and names.keys() >= {*each.of}]
+    relations = [
+        each
+        for each in measured
+        if each.kind == "relation" and not each.stale and names.keys() >= {*each.of}
+    ]
     for each in [*(each for each in measured if each.id in names), *relations]:
         form = FORM_OF.get(each.kind)
         features = (names[each.id],) if form else tuple(names[i] for i in each.of)
@@ -143,11 +171,18 @@ def _plan_feature(name: str, measured: Measurement, feature: Feature, T: np.ndar
     """A fitted feature with its region, in part coordinates."""
     region = PlanRegion.of(from_plain(measured.data["region"], Region), T)
     place = tuple((T[:3, :3] @ feature.place + T[:3, 3]).round(6).tolist())
-    direction = None if feature.direction is None else tuple((T[:3, :3] @ feature.direction).round(9).tolist())
+    direction = (
+        None
+        if feature.direction is None
+        else tuple((T[:3, :3] @ feature.direction).round(9).tolist())
+    )
     return PlanFeature(name, feature.kind, region, place, direction, feature.radius)  # type: ignore[arg-type]
 
 
 def _distinct_names(fits: Mapping[str, Measurement]) -> dict[str, str]:
     """The measurements' names by id, with the id where two have the same."""
     names = [each.name for each in fits.values()]
-    return {i: each.name if names.count(each.name) == 1 else f"{each.name} {i}" for i, each in fits.items()}
+    return {
+        i: each.name if names.count(each.name) == 1 else f"{each.name} {i}"
+        for i, each in fits.items()
+    }

@@ -42,8 +42,8 @@ _CHECKED_PX = 500_000
 
 @dataclass(frozen=True)
 class PlannedRig:
-    """A prediction, and with a check ``measured``, the RMS in mm of a simulated plane in the middle of the view, and
-    ``expected``, the prediction for that part."""
+    """A prediction, and with a check ``measured``, the RMS in mm of a simulated plane in the middle
+    of the view, and ``expected``, the prediction for that part."""
 
     camera: str
     projector: str
@@ -58,21 +58,33 @@ class PlannedRig:
         lines = [
             f"camera     {self.camera}",
             f"projector  {self.projector}",
-            f"distance   {plan.distance:.0f} mm, baseline {plan.baseline:.0f} mm, angle {plan.angle_deg:.0f} degrees",
+            (
+                f"distance   {plan.distance:.0f} mm, baseline {plan.baseline:.0f} mm, angle"
+                f" {plan.angle_deg:.0f} degrees"
+            ),
             "",
             f"camera sees          {_size(plan.camera_field)} mm, {plan.camera_px:.3f} mm a pixel",
-            f"projector lights     {_size(plan.projector_field)} mm, {plan.projector_px:.3f} mm a column",
+            (
+                f"projector lights     {_size(plan.projector_field)} mm, {plan.projector_px:.3f} mm"
+                " a column"
+            ),
             f"coverage             {100 * plan.coverage:.0f} % of the camera's view",
             f"depth range          {plan.depth_range[0]:.0f} to {plan.depth_range[1]:.0f} mm",
-            f"fringe period        {plan.period_px:.0f} columns, {plan.period_px * plan.projector_px:.1f} mm; "
-            f"modulation {plan.modulation:.0f} grey levels",
-            f"noise of a point     {_sigma(plan.sigma_middle)} in the middle, {_sigma(plan.sigma_corner)} at the "
-            f"border ({self.light.steps} steps, one sigma, of depth)",
+            (
+                f"fringe period        {plan.period_px:.0f} columns,"
+                f" {plan.period_px * plan.projector_px:.1f} mm; modulation {plan.modulation:.0f}"
+                " grey levels"
+            ),
+            (
+                f"noise of a point     {_sigma(plan.sigma_middle)} in the middle,"
+                f" {_sigma(plan.sigma_corner)} at the border ({self.light.steps} steps, one sigma,"
+                " of depth)"
+            ),
         ]
         if self.measured is not None and self.expected is not None:
             lines.append(
-                f"simulated            {_sigma(self.measured)} RMS from a plane in the middle, predicted "
-                f"{_sigma(self.expected)}"
+                f"simulated            {_sigma(self.measured)} RMS from a plane in the middle,"
+                f" predicted {_sigma(self.expected)}"
             )
         return "\n".join([*lines, *(f"! {advice}" for advice in self.advice())])
 
@@ -81,20 +93,36 @@ class PlannedRig:
         plan, found = self.plan, []
         ratio = plan.camera_px / plan.projector_px
         if plan.coverage < _MIN_COVERAGE:
-            wide = plan.projector_field[0] < plan.camera_field[0] or plan.projector_field[1] < plan.camera_field[1]
-            change = "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
-            found.append(f"the projector lights {100 * plan.coverage:.0f} % of what the camera sees: choose {change}")
+            wide = (
+                plan.projector_field[0] < plan.camera_field[0]
+                or plan.projector_field[1] < plan.camera_field[1]
+            )
+            change = (
+                "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
+            )
+            found.append(
+                f"the projector lights {100 * plan.coverage:.0f} % of what the camera sees: choose"
+                f" {change}"
+            )
         if ratio > 1.5:
             found.append(
-                f"a camera pixel covers {ratio:.1f} projector columns: choose a longer lens or more camera pixels"
+                f"a camera pixel covers {ratio:.1f} projector columns: choose a longer lens or more"
+                " camera pixels"
             )
         if plan.angle_deg < _ANGLES_DEG[0]:
-            found.append(f"the angle of {plan.angle_deg:.0f} degrees is small: a longer baseline lowers the noise")
+            found.append(
+                f"the angle of {plan.angle_deg:.0f} degrees is small: a longer baseline lowers the"
+                " noise"
+            )
         if plan.angle_deg > _ANGLES_DEG[1]:
-            found.append(f"the angle of {plan.angle_deg:.0f} degrees is large: much of a part will be hidden from one")
+            found.append(
+                f"the angle of {plan.angle_deg:.0f} degrees is large: much of a part will be hidden"
+                " from one"
+            )
         if plan.modulation < 20:
             found.append(
-                f"a modulation of {plan.modulation:.0f} grey levels is weak: expose longer, or darken the room"
+                f"a modulation of {plan.modulation:.0f} grey levels is weak: expose longer, or"
+                " darken the room"
             )
         return found
 
@@ -113,13 +141,16 @@ def plan_rig(
     check: bool = False,
     progress: Progress = ignore_progress,
 ) -> PlannedRig:
-    """Predict field, depth range, fringe period and noise of a camera and a projector before they are mounted.
+    """Predict field, depth range, fringe period and noise of a camera and a projector before they
+    are mounted.
 
     The noise is that of a single point; errors of the calibration are not included.
 
     Args:
-        camera: webcam-1080p, global-shutter-2mp, machine-vision-5mp, or its size and width of view: 1920x1080:70deg.
-        projector: pocket-720p, projector-1080p, lightcrafter4500, or its size and throw ratio: 1920x1080:1.4.
+        camera: webcam-1080p, global-shutter-2mp, machine-vision-5mp, or its size and width of view:
+            1920x1080:70deg.
+        projector: pocket-720p, projector-1080p, lightcrafter4500, or its size and throw ratio:
+            1920x1080:1.4.
         distance: Working distance from the camera, mm.
         baseline: Between camera and projector, mm; by default for an angle of 22 degrees.
         lens: Focal length of the camera's lens, mm, for a camera whose pixel size is known.
@@ -127,7 +158,8 @@ def plan_rig(
         period: Fringe period in projector columns, by default the one with the least noise.
         reflectance: Of the object; 1 is white paper, to which the exposure is set.
         ambient: Room light as a share of the projector's.
-        check: Measure a plane with this rig in the simulation, whose lenses and light are other code.
+        check: Measure a plane with this rig in the simulation, whose lenses and light are other
+            code.
 
     Raises InputError for unknown devices and impossible figures.
     """
@@ -142,7 +174,8 @@ def plan_rig(
     between = distance * np.tan(np.radians(ANGLE_DEG)) if baseline is None else baseline
     if not 1 <= between <= 3 * distance:
         raise InputError(
-            f"a baseline of {between:g} mm is impossible at {distance:g} mm: give 1 to {3 * distance:g} mm"
+            f"a baseline of {between:g} mm is impossible at {distance:g} mm: give 1 to"
+            f" {3 * distance:g} mm"
         )
     light = PlannedLight(steps, reflectance, ambient)
     plan = predict_rig(planned_camera, planned_projector, distance, float(between), light, period)
@@ -157,17 +190,21 @@ def plan_rig(
 def _simulate_plane(
     camera: PlannedCamera, projector: PlannedProjector, plan: RigPlan, light: PlannedLight
 ) -> tuple[float, float]:
-    """Return the RMS in mm of a plane that the simulated rig captured, in the middle of the camera's view, with the
-    true calibration; and the one predicted."""
+    """Return the RMS in mm of a plane that the simulated rig captured, in the middle of the
+    camera's view, with the true calibration; and the one predicted."""
     share = min(1.0, np.sqrt(_CHECKED_PX / np.prod(camera.size)))
     size = (int(camera.size[0] * share) // 2 * 2, int(camera.size[1] * share) // 2 * 2)
-    cut = predict_rig(replace(camera, size=size), projector, plan.distance, plan.baseline, light, plan.period_px)
+    cut = predict_rig(
+        replace(camera, size=size), projector, plan.distance, plan.baseline, light, plan.period_px
+    )
     rig = cut.rig
     fx, fy = projector.focal_px
     ideal = (0.0,) * 5
     column, row = rig.projector.K[:2, 2].tolist()
     focus = float(rig.to_projector(np.array([0.0, 0.0, plan.distance]))[2])
-    peak = DARK_LEVEL + (PEAK_LEVEL - DARK_LEVEL) * light.reflectance  # the renderer exposes for what it sees
+    peak = (
+        DARK_LEVEL + (PEAK_LEVEL - DARK_LEVEL) * light.reflectance
+    )  # the renderer exposes for what it sees
     simulated = SimulatedRig(
         SimulatedLens(size, (camera.focal_px,) * 2, ((size[0] - 1) / 2, (size[1] - 1) / 2), ideal),
         SimulatedLens(projector.size, (fx, fy), (column, row), ideal),
@@ -175,23 +212,38 @@ def _simulate_plane(
         np.array(rig.t),
         Sensor(camera.blur_px, DARK_LEVEL, camera.read_variance, camera.shot_variance, peak),
         Illumination(
-            light.ambient, projector.black, 1.0, 0.0, projector.blur_px, focus, fx * projector.aperture_mm / 4
+            light.ambient,
+            projector.black,
+            1.0,
+            0.0,
+            projector.blur_px,
+            focus,
+            fx * projector.aperture_mm / 4,
         ),
     )
-    plate = blank_board(Pose(np.eye(3), np.array([0.0, 0.0, plan.distance])), (4 * plan.camera_field[0],) * 2)
+    plate = blank_board(
+        Pose(np.eye(3), np.array([0.0, 0.0, plan.distance])), (4 * plan.camera_field[0],) * 2
+    )
     sequence = one_axis(complementary(projector.size, light.steps, plan.period_px), "x")
     phase = decode(sequence, Renderer(simulated, plate).capture(sequence), "x")
     cloud = reconstruct_cloud(StereoModel.from_rig(rig), {"x": phase}, "x")
-    return float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm), cut.sigma_rms
+    return (
+        float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm),
+        cut.sigma_rms,
+    )
 
 
 def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
     """Return a camera by its name, or by size and angle of view, and its description."""
-    entry, view = _read_device("camera", text, "global-shutter-2mp", "size and angle of view as in 1920x1080:70deg")
+    entry, view = _read_device(
+        "camera", text, "global-shutter-2mp", "size and angle of view as in 1920x1080:70deg"
+    )
     what = str(entry["what"])
     if view:
         if view[4] == "mm":
-            raise InputError(f"camera {text}: give the angle of view as 70deg, or a known camera with --lens")
+            raise InputError(
+                f"camera {text}: give the angle of view as 70deg, or a known camera with --lens"
+            )
         what = f"{text}, noise as 2 Mpx machine vision"
         entry = {key: value for key, value in entry.items() if key not in ("pixel_um", "lens_mm")}
         entry["view_deg"] = float(view[3])
@@ -203,30 +255,48 @@ def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
         focal, aperture = millimetres * 1000 / entry["pixel_um"], millimetres / entry["f_number"]
         what += f", lens {millimetres:g} mm at f/{entry['f_number']:g}"
     elif lens is not None:
-        raise InputError("the lens of this camera is given by its angle of view: omit --lens, or name another camera")
+        raise InputError(
+            "the lens of this camera is given by its angle of view: omit --lens, or name another"
+            " camera"
+        )
     else:
         focal = size[0] / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
         aperture = entry.get("aperture_mm", 3.0)
-    camera = PlannedCamera(size, focal, aperture, entry["blur_px"], entry["full_well"], entry["read_noise"])
+    camera = PlannedCamera(
+        size, focal, aperture, entry["blur_px"], entry["full_well"], entry["read_noise"]
+    )
     return camera, what
 
 
 def _read_projector(text: str) -> tuple[PlannedProjector, str]:
     """Return a projector by its name, or by size and throw ratio, and its description."""
-    entry, view = _read_device("projector", text, "projector-1080p", "size and throw ratio as in 1920x1080:1.4")
-    ratio, what = (float(view[3]), f"{text}, as a common projector") if view else (entry["throw_ratio"], entry["what"])
+    entry, view = _read_device(
+        "projector", text, "projector-1080p", "size and throw ratio as in 1920x1080:1.4"
+    )
+    ratio, what = (
+        (float(view[3]), f"{text}, as a common projector")
+        if view
+        else (entry["throw_ratio"], entry["what"])
+    )
     if not 0.1 <= ratio <= 20:
-        raise InputError(f"a throw ratio of {ratio:g} is impossible: give distance over width, 0.1 to 20")
+        raise InputError(
+            f"a throw ratio of {ratio:g} is impossible: give distance over width, 0.1 to 20"
+        )
     size = (int(entry["size"][0]), int(entry["size"][1]))
     focal = (size[0] * ratio, size[0] * ratio / entry.get("row_pitch", 1.0))
-    return PlannedProjector(size, focal, entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]), what
+    return (
+        PlannedProjector(
+            size, focal, entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]
+        ),
+        what,
+    )
 
 
 def _read_device(
     kind: Literal["camera", "projector"], text: str, typical: str, notation: str
 ) -> tuple[dict[str, Any], re.Match[str] | None]:
-    """Return the data of a device by its name; or, where ``text`` is its size and view, those of the ``typical`` one of
-    that size, and the match of `_VIEW`. Raises InputError for others."""
+    """Return the data of a device by its name; or, where ``text`` is its size and view, those of
+    the ``typical`` one of that size, and the match of `_VIEW`. Raises InputError for others."""
     known = tomllib.loads(asset("planning/devices.toml").read_text(encoding="utf-8"))[kind]
     if view := _VIEW.fullmatch(text):
         return {**known[typical], "size": [int(view[1]), int(view[2])]}, view

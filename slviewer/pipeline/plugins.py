@@ -9,7 +9,8 @@ from slviewer.target.board import BOARD_PLUGINS
 
 
 def list_plugins() -> list[Plugin]:
-    """All plugins that are installed, group by group; each is imported. One that cannot be used has a ``problem``."""
+    """All plugins that are installed, group by group; each is imported. One that cannot be used has
+    a ``problem``."""
     groups = (DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS)
     return [plugin for group in groups for plugin in group.plugins]
 
@@ -23,9 +24,12 @@ def plugins() -> str:
     if not found:
         return "no plugins are installed"
     lines = [
-        f"{each.group.removeprefix('slviewer.')}: {each.name}, from {each.package}: {each.problem or 'can be used'}"
+        f"{each.group.removeprefix('slviewer.')}: {each.name}, from {each.package}:"
+        f" {each.problem or 'can be used'}"
         for each in found
     ]
     if any(plugin.problem for plugin in found):
-        raise InputError("a plugin cannot be used: update or uninstall its package\n" + "\n".join(lines))
+        raise InputError(
+            "a plugin cannot be used: update or uninstall its package\n" + "\n".join(lines)
+        )
     return "\n".join(lines)

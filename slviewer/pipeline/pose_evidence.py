@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import PoseEvidence
-from slviewer.calibration.diagnosis.frames import fit_mean_turn, measure_axis, measure_motion_px, measure_white_delay
+from slviewer.calibration.diagnosis.frames import (
+    fit_mean_turn,
+    measure_axis,
+    measure_motion_px,
+    measure_white_delay,
+)
 from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import Observation, pitch_px
 from slviewer.fringe.phase import PhaseMap
@@ -25,8 +30,8 @@ EVIDENCE_VERSION = 3
 
 @dataclass(frozen=True, eq=False)
 class DecodedPose:
-    """The frames (n, h, w) of a target pose with what they were decoded to; ``texture`` (h, w) or (h, w, 3) uint8 shows
-    the board."""
+    """The frames (n, h, w) of a target pose with what they were decoded to; ``texture`` (h, w) or
+    (h, w, 3) uint8 shows the board."""
 
     name: str
     sequence: PatternSequence
@@ -43,8 +48,8 @@ def gather_evidence(
     observation: Observation | None,
     refused: str = "",
 ) -> PoseEvidence:
-    """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase, None where they could
-    not be read, for the reason ``refused``; ``check``: of its frames.
+    """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
+    None where they could not be read, for the reason ``refused``; ``check``: of its frames.
     """
     sequence, frames, board = pose.sequence, pose.frames, pose.board
     on_board = board_mask(board, detection, pose.texture.shape) if detection is not None else None
@@ -53,13 +58,24 @@ def gather_evidence(
         name=pose.name,
         refused=refused,
         grid=detect_grid_size(board, pose.texture) if detection is None else None,
-        axes={axis: measure_axis(sequence, frames, phase, on_board) for axis, phase in pose.phases.items()},
+        axes={
+            axis: measure_axis(sequence, frames, phase, on_board)
+            for axis, phase in pose.phases.items()
+        },
         suspects=tuple(suspects[i] for i in sorted(suspects)),
         displaced=measure_white_delay(sequence, frames),
-        moved_px=np.nan
-        if detection is None
-        else measure_motion_px(sequence, frames, detection.pixels, float(np.median(pitch_px(board, detection)))),
-        turn=None if observation is None else fit_mean_turn(observation.camera, observation.projector),
+        moved_px=(
+            np.nan
+            if detection is None
+            else measure_motion_px(
+                sequence, frames, detection.pixels, float(np.median(pitch_px(board, detection)))
+            )
+        ),
+        turn=(
+            None
+            if observation is None
+            else fit_mean_turn(observation.camera, observation.projector)
+        ),
         contradictions=check.contradictions if refused else (),
     )
 
@@ -76,7 +92,8 @@ def save_evidence(store: Session, capture: Capture, board: Board, evidence: Pose
 
 
 def load_evidence(store: Session, name: str, board: Board) -> PoseEvidence | None:
-    """Load the stored evidence of a pose; None where it is missing, or of other frames or another board."""
+    """Load the stored evidence of a pose; None where it is missing, or of other frames or another
+    board."""
 
     def decode(meta: Mapping[str, Any], _: object) -> PoseEvidence | None:
         """Return the evidence, unless it is of another board or version."""

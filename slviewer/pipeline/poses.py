@@ -12,9 +12,19 @@ from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing
 from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture, read_ahead
+from slviewer.pipeline.capture_phases import (
+    capture_texture,
+    check_capture,
+    decode_capture,
+    read_ahead,
+)
 from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_or_save_check
-from slviewer.pipeline.pose_evidence import DecodedPose, gather_evidence, load_evidence, save_evidence
+from slviewer.pipeline.pose_evidence import (
+    DecodedPose,
+    gather_evidence,
+    load_evidence,
+    save_evidence,
+)
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -40,8 +50,9 @@ def read_pose(
 ) -> Judged:
     """Return the observation of a decoded target pose, or the reason why there is none.
 
-    ``examine``: with the evidence of its frames, of which ``check`` returns the check (computed if None). ``observed``
-    is called with the observation before the frames are checked, after which the pose may still be refused.
+    ``examine``: with the evidence of its frames, of which ``check`` returns the check (computed if
+    None). ``observed`` is called with the observation before the frames are checked, after which
+    the pose may still be refused.
     """
     name, sequence, frames, phases = pose.name, pose.sequence, pose.frames, pose.phases
     detection: Detection | None = None
@@ -75,8 +86,11 @@ def read_stored_pose(
     examine: bool = False,
     observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Judged:
-    """Read the pose as ``read_pose`` does, and save the result and the check of the frames in the session."""
-    pose = DecodedPose(capture.name, capture.sequence, frames, phases, capture_texture(capture, frames), board)
+    """Read the pose as ``read_pose`` does, and save the result and the check of the frames in the
+    session."""
+    pose = DecodedPose(
+        capture.name, capture.sequence, frames, phases, capture_texture(capture, frames), board
+    )
     check = partial(load_or_save_check, store, capture, frames)
     judged = read_pose(pose, smoothing, examine, check, observed)
     if judged.evidence is not None:
@@ -94,7 +108,8 @@ def read_stored_pose(
 
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
-    """Load the stored reading of a pose; None where it is of other frames, another board or another smoothing."""
+    """Load the stored reading of a pose; None where it is of other frames, another board or another
+    smoothing."""
 
     def decode(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Judged | None:
         """Return the reading, unless it is of another board, smoothing or version."""
@@ -114,19 +129,21 @@ def read_stored_poses(
     examine: bool = False,
     observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Iterator[Judged]:
-    """Yield every pose in order; frames are read only where no stored result is valid. Damaged frames refuse the pose.
+    """Yield every pose in order; frames are read only where no stored result is valid. Damaged
+    frames refuse the pose.
 
-    ``examine``: each with the evidence of its frames; ``observed`` as in ``read_pose``. Raises InputError
-    where poses come from cameras or projectors of different size.
+    ``examine``: each with the evidence of its frames; ``observed`` as in ``read_pose``. Raises
+    InputError where poses come from cameras or projectors of different size.
     """
     captures = [store.load_capture(name) for name in names]
     for capture in captures[1:]:
         first = captures[0]
         if (capture.size, capture.sequence.projector) != (first.size, first.sequence.projector):
             raise InputError(
-                f"{capture.name} has a {_wxh(capture.size)} camera and a {_wxh(capture.sequence.projector)} projector, "
-                f"{first.name} {_wxh(first.size)} and {_wxh(first.sequence.projector)}: "
-                "calibrate poses of one rig at one resolution"
+                f"{capture.name} has a {_wxh(capture.size)} camera and a"
+                f" {_wxh(capture.sequence.projector)} projector, {first.name} {_wxh(first.size)}"
+                f" and {_wxh(first.sequence.projector)}: calibrate poses of one rig at one"
+                " resolution"
             )
     cached = {name: load_judged(store, name, board, smoothing) for name in names}
     if examine:
@@ -140,7 +157,9 @@ def read_stored_poses(
             capture, frames = next(ahead)
             try:
                 phases = decode_capture(capture, frames.result())
-                judged = read_stored_pose(store, capture, frames.result(), phases, board, smoothing, examine, observed)
+                judged = read_stored_pose(
+                    store, capture, frames.result(), phases, board, smoothing, examine, observed
+                )
             except DamagedError as error:
                 judged = Judged(name, None, str(error).removeprefix(f"{name}: "))
             del frames  # before the next are waited for
@@ -157,7 +176,9 @@ def load_observations(store: Session, names: Sequence[str]) -> list[Observation]
     return observations
 
 
-def _decode_observation(name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Observation | None:
+def _decode_observation(
+    name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> Observation | None:
     """Return the observation in a stored reading; None where the pose was refused."""
     return None if meta["refused"] else Observation.from_arrays(name, arrays)
 

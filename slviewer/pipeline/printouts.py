@@ -32,8 +32,8 @@ def target(board: str, out: Path | str) -> str:
     """Draw a printable target to exact scale.
 
     Args:
-        board: circles:21x16:9, acircles:..., chessboard:9x7:75 or charuco:...; or coded markers for merging:
-            markers:0-23:20 (numbers to cut out, mm) or mat:16 (a mat for a turntable, mm).
+        board: circles:21x16:9, acircles:..., chessboard:9x7:75 or charuco:...; or coded markers for
+            merging: markers:0-23:20 (numbers to cut out, mm) or mat:16 (a mat for a turntable, mm).
         out: A .pdf or .svg file.
 
     Returns what to do with it, in words.

@@ -45,9 +45,9 @@ from slviewer.target.detect import board_mask, detect
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedCapture:
-    """A reconstructed capture: what is stored of it; its cloud without what edits and region remove; the phases that it
-    came from; its PLY file with ``points`` points; for a board pose how flat each model measures the board.
-    ``restrictions`` describes edits and region.
+    """A reconstructed capture: what is stored of it; its cloud without what edits and region
+    remove; the phases that it came from; its PLY file with ``points`` points; for a board pose how
+    flat each model measures the board. ``restrictions`` describes edits and region.
     """
 
     found: Found[Reconstruction]
@@ -65,16 +65,19 @@ class ReconstructSettings:
 
     Args:
         capture: Name of the capture.
-        model: Which calibration to use, here and by what then works on this cloud; by default the best one available.
-        axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
-        depth_range: For patterns that do not cover the projector: near and far end, mm, of the depths between which
-            all surfaces lie; by default the calibrated depths.
-        out: PLY file; by default in the session's exports. That of a board pose holds the points inside the board's
-            outline.
-        grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as .npy.
+        model: Which calibration to use, here and by what then works on this cloud; by default the
+            best one available.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted
+            noise.
+        depth_range: For patterns that do not cover the projector: near and far end, mm, of the
+            depths between which all surfaces lie; by default the calibrated depths.
+        out: PLY file; by default in the session's exports. That of a board pose holds the points
+            inside the board's outline.
+        grid: Also write the whole organised cloud, (h, w, 3) float32 mm, NaN where invalid, as
+            .npy.
         mesh: Put the triangles between neighbouring pixels into the PLY.
-        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the camera's frame
-            (x right, y down, z away), a TOML file, or off; by default the session's.
+        roi: Region of interest, outside of which points are ignored: x0,x1,y0,y1,z0,z1 in mm in the
+            camera's frame (x right, y down, z away), a TOML file, or off; by default the session's.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
@@ -96,15 +99,15 @@ class ReconstructSettings:
         for path, suffix in ((self.out, ".ply"), (self.grid, ".npy")):
             if path is not None and Path(path).suffix.lower() != suffix:
                 raise InputError(
-                    f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid): end its name in "
-                    f"{suffix}; `slviewer export` writes other formats"
+                    f"{path}: a cloud is written as .ply (--out), its whole grid as .npy (--grid):"
+                    f" end its name in {suffix}; `slviewer export` writes other formats"
                 )
 
 
 @operation("reconstruct", Reconstruction, ReconstructSettings)
 def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Reconstruction]]:
-    """Reconstruct a capture as a cloud, and write it as PLY; for a board pose also how flat each model measures the
-    board."""
+    """Reconstruct a capture as a cloud, and write it as PLY; for a board pose also how flat each
+    model measures the board."""
     with _reconstructing(job, settings) as made:  # whose file appears once the record is stored
         notes = (*made.restrictions, f"{made.points:,} points -> {made.ply}")
         if made.board is not None:
@@ -128,41 +131,60 @@ def _reconstructing(job: Job, settings: ReconstructSettings) -> Iterator[Reconst
     warn_if_stale(store, warn)
     check_capture_sizes(store, [capture])
     job.progress(0.1, "reading and decoding")
-    shot, frames, decoded = next(decode_captures(store, [capture], warn, relative=True, check=settings.check))
+    shot, frames, decoded = next(
+        decode_captures(store, [capture], warn, relative=True, check=settings.check)
+    )
     phases = absolute_phases(store, capture, decoded, settings.depth_range, warn)
     is_pose = shot.role == "calibration"
     texture = capture_texture(shot, frames, stretch=is_pose)
     chosen = load_models(store, () if is_pose and settings.model is None else (name,))
     job.progress(0.6, "reconstructing")
-    options: dict[str, Any] = {"axis": settings.axis, "texture": texture, "accept_rejected": settings.accept_rejected}
-    clouds = {n: capture_cloud(store, m, shot, phases, warn=warn, **options) for n, m in chosen.items()}
+    options: dict[str, Any] = {
+        "axis": settings.axis,
+        "texture": texture,
+        "accept_rejected": settings.accept_rejected,
+    }
+    clouds = {
+        n: capture_cloud(store, m, shot, phases, warn=warn, **options) for n, m in chosen.items()
+    }
     board, region = None, segment_board(store, shot, texture, warn) if is_pose else None
     if region is not None:
         depths = load_stereo(store).depth_range_mm
-        board = fit_clouds("plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depths)
+        board = fit_clouds(
+            "plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depths
+        )
     cloud, restrictions = clouds[name], tuple[str, ...]()
     if not is_pose:
         box = resolve_region(store, settings.roi)
-        cloud, restrictions = restrict_cloud(store, capture, cloud, box), restriction_notes(store, [capture], box)
+        cloud, restrictions = (
+            restrict_cloud(store, capture, cloud, box),
+            restriction_notes(store, [capture], box),
+        )
     mask = cloud.mask if region is None else cloud.mask & region
     if not mask.any():
         raise InputError(
-            f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong to this camera and "
-            "projector, and is the scene within its depths?"
+            f"{capture}: no pixel could be reconstructed with {name}: does the calibration belong"
+            " to this camera and projector, and is the scene within its depths?"
         )
     job.progress(0.8, "writing")
     found = cloud_record(store, settings, chosen[name], clouds[name], phases[cloud.axis], region)
     with _write_files(store, settings, cloud, mask, (f"calibration {name}", *restrictions)) as path:
-        yield ReconstructedCapture(found, cloud, phases, path, int(np.count_nonzero(mask)), board, restrictions)
+        yield ReconstructedCapture(
+            found, cloud, phases, path, int(np.count_nonzero(mask)), board, restrictions
+        )
     job.progress(1.0, "reconstructed")
 
 
 @contextmanager
 def _write_files(
-    store: Session, settings: ReconstructSettings, cloud: Cloud, mask: np.ndarray, notes: Sequence[str]
+    store: Session,
+    settings: ReconstructSettings,
+    cloud: Cloud,
+    mask: np.ndarray,
+    notes: Sequence[str],
 ) -> Iterator[Path]:
-    """Context manager: the path of a PLY of a cloud's points under ``mask`` (h, w) bool, which appears there at the
-    end; the cloud's grid is written too where that is wanted."""
+    """Context manager: the path of a PLY of a cloud's points under ``mask`` (h, w) bool, which
+    appears there at the end; the cloud's grid is written too where that is wanted."""
     capture, points = settings.capture, cloud.points
     assert cloud.texture is not None
     faces = triangulate_points(points, mask) if settings.mesh else None
@@ -170,7 +192,15 @@ def _write_files(
     name = f"{capture}_{cloud.model}{'_mesh' if settings.mesh else ''}.ply"
     with placed_file(store, settings.out, name) as (path, written):
         chosen = choose_pixels(points, mask)
-        write_ply(written, chosen, cloud.texture[mask], normals(points)[mask], cloud.sigmas(mask), faces, notes)
+        write_ply(
+            written,
+            chosen,
+            cloud.texture[mask],
+            normals(points)[mask],
+            cloud.sigmas(mask),
+            faces,
+            notes,
+        )
         if settings.grid is not None:
             write_grid(Path(settings.grid), points)
         yield path
@@ -184,7 +214,8 @@ def cloud_record(
     phase: PhaseMap,
     region: np.ndarray | None,
 ) -> Found[Reconstruction]:
-    """Return what is stored of a capture's cloud, before edits and region; ``region`` (h, w) bool: of the board."""
+    """Return what is stored of a capture's cloud, before edits and region; ``region`` (h, w) bool:
+    of the board."""
     near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
     assert cloud.texture is not None
     arrays = {
@@ -197,7 +228,10 @@ def cloud_record(
         "sigma_edges": cloud.sigma_edges,
     }
     left = cloud.sigma_calibration
-    inputs = (settings.capture, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")))
+    inputs = (
+        settings.capture,
+        *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")),
+    )
     record = Reconstruction(
         operation="reconstruct",
         settings=plain_settings(settings),
@@ -214,17 +248,25 @@ def cloud_record(
         scales={cloud.model: scale_factor(store, cloud.model)},
         inputs=store.input_hashes(*inputs),
     )
-    return Found(settings.capture, record, {name: array for name, array in arrays.items() if array is not None})
+    return Found(
+        settings.capture,
+        record,
+        {name: array for name, array in arrays.items() if array is not None},
+    )
 
 
 def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Faces (m, 3) int32 over the pixels ``mask`` (h, w) bool of organised points; surfaces end where depth jumps."""
+    """Faces (m, 3) int32 over the pixels ``mask`` (h, w) bool of organised points; surfaces end
+    where depth jumps."""
     masked_points = np.where(mask[..., None], points, np.float32(np.nan))
     return triangulate_grid(masked_points, JUMP * float(np.median(points[..., 2][mask])))
 
 
-def segment_board(store: Session, shot: Capture, texture: np.ndarray, warn: Warn) -> np.ndarray | None:
-    """Return the board's region (h, w) bool in a target pose; None, with a warning, where no board is detected."""
+def segment_board(
+    store: Session, shot: Capture, texture: np.ndarray, warn: Warn
+) -> np.ndarray | None:
+    """Return the board's region (h, w) bool in a target pose; None, with a warning, where no board
+    is detected."""
     board = load_stereo(store).board
     if not board:
         return None
@@ -237,8 +279,8 @@ def segment_board(store: Session, shot: Capture, texture: np.ndarray, warn: Warn
 
 
 def illuminated_pixels(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
-    """Return the pixels (h, w) bool that a perfect decoder could have measured on the axis that the clouds came
-    from."""
+    """Return the pixels (h, w) bool that a perfect decoder could have measured on the axis that the
+    clouds came from."""
     return phases[next(iter(clouds.values())).axis].illuminated
 
 
@@ -255,14 +297,18 @@ def reconstruct_models(
     """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
     clouds: dict[str, Cloud] = {}
     for name, model in chosen.items():
-        clouds[name] = capture_cloud(store, model, shot, phases, axis=axis, accept_rejected=accept_rejected, warn=warn)
+        clouds[name] = capture_cloud(
+            store, model, shot, phases, axis=axis, accept_rejected=accept_rejected, warn=warn
+        )
         axis = axis or clouds[name].axis
     return clouds
 
 
 def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None = None) -> float | None:
-    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are masked, because they
-    look through parts of camera or projector that no target pose illuminated; None for models that mask none."""
+    """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are
+    masked, because they look through parts of camera or projector that no target pose illuminated;
+    None for models that mask none.
+    """
     if not isinstance(model, SplinedModel):
         return None
     every = np.isfinite(model.points(phase, supported=False)[..., 2])

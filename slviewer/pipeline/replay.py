@@ -1,4 +1,5 @@
-"""Recorded captures as a rig: those of a session, or of a folder that can be imported, one after another."""
+"""Recorded captures as a rig: those of a session, or of a folder that can be imported, one after
+another."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,10 +22,12 @@ Shot = tuple[np.ndarray, PatternSequence]
 
 
 class Reel:
-    """A rig that replays recorded captures; it has only the `sequence` of the current one until it is wound on."""
+    """A rig that replays recorded captures; it has only the `sequence` of the current one until it
+    is wound on."""
 
     def __init__(self, shots: dict[str, Callable[[], Shot]]) -> None:
-        """`shots` read the frames (n, h, w) and the sequence of one capture each, by name, in order."""
+        """`shots` read the frames (n, h, w) and the sequence of one capture each, by name, in
+        order."""
         self.names = list(shots)
         self._shots, self._at = shots, 0
         self._recording = Recording(*shots[self.names[0]]())
@@ -41,7 +44,8 @@ class Reel:
         return any(frame.kind == "black" for frame in self.sequence.frames)
 
     def wind_on(self) -> None:
-        """Play the next capture; the first after the last. Raises InputError where it is not of the same rig."""
+        """Play the next capture; the first after the last. Raises InputError where it is not of the
+        same rig."""
         self._at = (self._at + 1) % len(self.names)
         if len(self.names) > 1:
             self._recording.play(*self._shots[self.names[self._at]]())
@@ -56,9 +60,9 @@ def reel(
 ) -> Reel:
     """Read the captures in `source`, or the one of that name, for a replayed rig.
 
-    `layout` is session or one of `layouts.layouts()`, by default what `source` looks like; `sequence` is the TOML of
-    the layout frames, `projector` its size, such as "912x1140", where it is not the layout's own. Raises InputError,
-    SessionError.
+    `layout` is session or one of `layouts.layouts()`, by default what `source` looks like;
+    `sequence` is the TOML of the layout frames, `projector` its size, such as "912x1140", where it
+    is not the layout's own. Raises InputError, SessionError.
     """
     folder = expand_user(source)
     if layout == "session" or (layout is None and is_session(folder)):
@@ -66,7 +70,10 @@ def reel(
     else:
         shots = _read_imported(folder, layout, sequence, projector)
     if capture is not None and capture not in shots:
-        raise InputError(f"there is no capture {capture!r} in {folder}: the captures are {', '.join(shots) or 'none'}")
+        raise InputError(
+            f"there is no capture {capture!r} in {folder}: the captures are"
+            f" {', '.join(shots) or 'none'}"
+        )
     chosen = shots if capture is None else {capture: shots[capture]}
     if not chosen:
         raise InputError(f"{folder} holds no capture to play back: name a folder that does")

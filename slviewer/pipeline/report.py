@@ -58,7 +58,11 @@ MOST_MAPS = 8
 
 
 def report(
-    session: SessionLike, out: Path | str, *, progress: Progress = ignore_progress, warn: Warn = ignore_warnings
+    session: SessionLike,
+    out: Path | str,
+    *,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
 ) -> str:
     """Write one self-contained HTML report of a session.
 
@@ -80,7 +84,14 @@ def report(
         progress(0.7, "reading the frames")
         certificate = make_certificate(store)
         sections = [*session_sections(data), certificate_section(certificate)]
-        write_page(out, title, subtitle, session_headlines(data), sections, partial(certify_page, certificate))
+        write_page(
+            out,
+            title,
+            subtitle,
+            session_headlines(data),
+            sections,
+            partial(certify_page, certificate),
+        )
     progress(1.0, "written")
     return f"report written to {out}"
 
@@ -88,15 +99,24 @@ def report(
 def _collect_data(store: Session) -> SessionData:
     """Collect everything that a report shows of a session."""
     stereo = load_stereo_if_complete(store)
-    observations = {o.name: o for o in load_observations(store, list(stereo.poses))} if stereo and stereo.poses else {}
+    observations = (
+        {o.name: o for o in load_observations(store, list(stereo.poses))}
+        if stereo and stereo.poses
+        else {}
+    )
     stale = [
-        f"The {name} calibration was made from target poses that have since changed: run calibrate again."
+        f"The {name} calibration was made from target poses that have since changed: run calibrate"
+        " again."
         for name in available_models(store)
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     excluded = store.excluded()
     verdict = load_last_verdict(store)
-    judged = store.load_result("calibration/stereo", only=())[0].get("verdict") if stereo is not None else None
+    judged = (
+        store.load_result("calibration/stereo", only=())[0].get("verdict")
+        if stereo is not None
+        else None
+    )
     records, outdated = _collect_records(store)
     region = load_region(store)
     return SessionData(
@@ -107,10 +127,16 @@ def _collect_data(store: Session) -> SessionData:
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
-        verdict_of_calibration=verdict is not None and judged is not None and from_plain(judged, Verdict) == verdict,
+        verdict_of_calibration=verdict is not None
+        and judged is not None
+        and from_plain(judged, Verdict) == verdict,
         models=_load_models(store),
         region="" if region is None else region.text(),
-        edits=[(scan, words) for scan in store.capture_names("scan") for words in list_edits(store, scan)[0]],
+        edits=[
+            (scan, words)
+            for scan in store.capture_names("scan")
+            for words in list_edits(store, scan)[0]
+        ],
         **measured_views(store),
     )
 
@@ -125,7 +151,8 @@ def _load_pixel_fits(store: Session) -> list[PixelFitView]:
 
 
 def _load_models(store: Session) -> ModelsView | None:
-    """Return the session's calibrations and their comparison; None where there is no calibration."""
+    """Return the session's calibrations and their comparison; None where there is no
+    calibration."""
     there = available_models(store)
     if not there:
         return None
@@ -141,13 +168,17 @@ def _load_models(store: Session) -> ModelsView | None:
 
 
 def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
-    """Return the records made from what the session holds now, by kind, with pictures of the first ones; and warnings
-    of the others."""
+    """Return the records made from what the session holds now, by kind, with pictures of the first
+    ones; and warnings of the others."""
     views, stale = [], []
     for kind in RECORDS.values():
         every = list_records(store, kind)
         fresh = [each for each in every if kind.is_history or not each.stale]
-        stale += [f"{kind.title} of {each.label} is out of date and not shown." for each in every if each not in fresh]
+        stale += [
+            f"{kind.title} of {each.label} is out of date and not shown."
+            for each in every
+            if each not in fresh
+        ]
         figures: list[Figure] = []
         for each in fresh[:MOST_MAPS]:
             if isinstance(each.record, Verification):
@@ -158,8 +189,11 @@ def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
     return views, stale
 
 
-def _describe_capture(capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]) -> CaptureRow:
-    """Return the table row of a capture: sizes, frames, and whether and why it is used or excluded."""
+def _describe_capture(
+    capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]
+) -> CaptureRow:
+    """Return the table row of a capture: sizes, frames, and whether and why it is used or
+    excluded."""
     sequence = capture.sequence
     why = ""
     if capture.role == "scan":
@@ -191,7 +225,9 @@ def calibration_view(store: Session) -> CalibrationFigures:
     Raises InputError where there is none.
     """
     stereo = load_stereo(store)
-    return _load_calibration(store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))})
+    return _load_calibration(
+        store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))}
+    )
 
 
 def _load_calibration(
@@ -224,7 +260,8 @@ def curve_at(
 
 
 MOST_DRAWN = 6
-"""Sections, and comparisons with nominal models, that are drawn, the last ones; the CSV holds all."""
+"""Sections, and comparisons with nominal models, that are drawn, the last ones; the CSV holds
+all."""
 
 
 def measured_views(store: Session) -> dict[str, Any]:
@@ -234,6 +271,10 @@ def measured_views(store: Session) -> dict[str, Any]:
     deviations = [each for each in every if each.kind == "deviation"]
     return {
         "measurements": [each for each in every if each.kind != "deviation"],
-        "sections": [(each.name, section_lines(store, each.id)[1]) for each in sections[-MOST_DRAWN:]],
-        "deviations": [(each, measurement_arrays(store, each.id)) for each in deviations[-MOST_DRAWN:]],
+        "sections": [
+            (each.name, section_lines(store, each.id)[1]) for each in sections[-MOST_DRAWN:]
+        ],
+        "deviations": [
+            (each, measurement_arrays(store, each.id)) for each in deviations[-MOST_DRAWN:]
+        ],
     }

@@ -10,13 +10,14 @@ from slviewer.pipeline.open_session import SessionLike, match_names, opened
 def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
     """List what is in a session's trash, or bring back what is named.
 
-    Captures and results that were deleted or replaced are in the trash. What has a restored name now goes there in
-    exchange, in one step.
+    Captures and results that were deleted or replaced are in the trash. What has a restored name
+    now goes there in exchange, in one step.
 
     Args:
         session: Session folder.
-        names: What to bring back: names, the last deleted of each, or patterns such as 'calibration/*', or the name of
-            one folder in the trash; without any, the trash is listed.
+        names: What to bring back: names, the last deleted of each, or patterns such as
+            'calibration/*', or the name of one folder in the trash; without any, the trash is
+            listed.
     """
     with opened(session, write=bool(names)) as store:
         trashed = store.trashed()
@@ -33,8 +34,16 @@ def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
                 for each in trashed
             ]
             return render(rows)
-        latest = {each.name: each for each in reversed(trashed)} | {each.place.name: each for each in trashed}
+        latest = {each.name: each for each in reversed(trashed)} | {
+            each.place.name: each for each in trashed
+        }
         found = match_names(list(latest), names, "item of the trash", InputError)
-        chosen = list(dict.fromkeys(latest[name] for name in found if name in names or name == latest[name].name))
+        chosen = list(
+            dict.fromkeys(
+                latest[name] for name in found if name in names or name == latest[name].name
+            )
+        )
         store.restore(chosen)
-        return "\n".join(f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen)
+        return "\n".join(
+            f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen
+        )

@@ -1,7 +1,8 @@
 """From what the operator chose to devices: a choice is a plain mapping, as the session keeps it.
 
-``{"driver": "simulated", "scale": 0.5, "seed": 0}`` for a rig that one driver makes, or
-``{"name": "bench", "camera": {"driver": …}, "projector": {"driver": …}}``; all other keys but `ABOUT` go to the driver.
+``{"driver": "simulated", "scale": 0.5, "seed": 0}`` for a rig that one driver makes, or ``{"name":
+"bench", "camera": {"driver": …}, "projector": {"driver": …}}``; all other keys but `ABOUT` go to
+the driver.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,14 +22,14 @@ from slviewer.target.board import Board
 Choice = Mapping[str, Any]
 
 COMMON_KEYS = ("name", "settle_ms", "focal_px", "exposure_ms", "gain", "turntable")
-"""Keys that a choice may hold for any rig: its name, the delay of its light, the nominal focal length of its lens
-in camera px, what its camera is set to by default, and its turntable."""
+"""Keys that a choice may hold for any rig: its name, the delay of its light, the nominal focal
+length of its lens in camera px, what its camera is set to by default, and its turntable."""
 
 
 @dataclass(frozen=True)
 class RigSetup:
-    """A rig that can be opened; `world` is the scene of a simulated one, `focal_px` the lens's nominal focal
-    length in camera px, where it is known, `reel` what is played back.
+    """A rig that can be opened; `world` is the scene of a simulated one, `focal_px` the lens's
+    nominal focal length in camera px, where it is known, `reel` what is played back.
     """
 
     rig: Rig
@@ -41,15 +42,17 @@ SetUp = Callable[[Choice, Board | None], RigSetup]
 
 
 def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = None) -> RigSetup:
-    """The devices of a choice, not opened yet; `board` is in front of a simulated rig, `pages` leads to the pages of
-    the browser's devices where they are served.
+    """The devices of a choice, not opened yet; `board` is in front of a simulated rig, `pages`
+    leads to the pages of the browser's devices where they are served.
 
     Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
     bench = _set_up_devices(choice, board, pages)
     if "turntable" not in choice:
         return bench
-    return replace(bench, rig=replace(bench.rig, turntable=_set_up_turntable(choice["turntable"], bench.world)))
+    return replace(
+        bench, rig=replace(bench.rig, turntable=_set_up_turntable(choice["turntable"], bench.world))
+    )
 
 
 def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable:
@@ -62,10 +65,14 @@ def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable
         if chosen.name != "simulated":
             return chosen.turntable(**options)
         if world is None:
-            raise InputError("a simulated turntable turns only what is before the simulated rig: choose another")
+            raise InputError(
+                "a simulated turntable turns only what is before the simulated rig: choose another"
+            )
         return chosen.turntable(world, **options)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"the turntable {dict(choice)} cannot be set up ({error}): choose it again") from error
+        raise InputError(
+            f"the turntable {dict(choice)} cannot be set up ({error}): choose it again"
+        ) from error
 
 
 def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | None) -> RigSetup:
@@ -82,11 +89,17 @@ def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | N
         if "driver" in choice:
             chosen = driver(str(choice["driver"]))
             if chosen.rig is None:
-                raise InputError(f"the driver {choice['driver']} offers no whole rig: choose a camera and a projector")
+                raise InputError(
+                    f"the driver {choice['driver']} offers no whole rig: choose a camera and a"
+                    " projector"
+                )
             rig = chosen.rig(**options)
             return RigSetup(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
         camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
-        camera_driver, projector_driver = driver(camera.pop("driver")), driver(projector.pop("driver"))
+        camera_driver, projector_driver = (
+            driver(camera.pop("driver")),
+            driver(projector.pop("driver")),
+        )
         if camera_driver.camera is None or projector_driver.projector is None:
             raise InputError("one of the drivers offers no such device: choose others")
         if camera_driver.page:
@@ -97,26 +110,36 @@ def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | N
         rig = Rig(str(choice.get("name", "rig")), *devices, settle_ms)
         return RigSetup(rig, focal_px=focal)
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"the rig {dict(choice)} cannot be set up ({error}): choose it again") from error
+        raise InputError(
+            f"the rig {dict(choice)} cannot be set up ({error}): choose it again"
+        ) from error
 
 
 def list_needed_pages(choice: Choice) -> tuple[PageRole, ...]:
     """Return which of a choice's devices are pages in a browser."""
     parts = {role: choice.get(role) for role in PAGE_ROLES}
-    names = {role: str(part.get("driver")) for role, part in parts.items() if isinstance(part, Mapping)}
+    names = {
+        role: str(part.get("driver")) for role, part in parts.items() if isinstance(part, Mapping)
+    }
     return tuple(role for role, name in names.items() if name in drivers() and drivers()[name].page)
 
 
 def rig_factory(driver: Driver) -> Callable[..., Any] | None:
-    """Return the function that builds the whole rig of a driver from its options; None if it drives no whole rig."""
+    """Return the function that builds the whole rig of a driver from its options; None if it drives
+    no whole rig."""
     own: dict[str, Callable[..., Any]] = {"simulated": _simulated_setup, "replay": reel}
     return own.get(driver.name, driver.rig)
 
 
 def _simulated_setup(
-    board: Board | None, preset: str = "letter", scale: float = 1.0, seed: int = 0, thing: Thing = "board"
+    board: Board | None,
+    preset: str = "letter",
+    scale: float = 1.0,
+    seed: int = 0,
+    thing: Thing = "board",
 ) -> RigSetup:
-    """Return the simulated rig of a preset, with a thing of `devices.world`, such as the board, in view."""
+    """Return the simulated rig of a preset, with a thing of `devices.world`, such as the board, in
+    view."""
     if preset != "letter":
         raise InputError(f"no rig preset is called {preset!r}: use letter")
     rig = letter(scale, seed)

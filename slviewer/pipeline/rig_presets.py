@@ -1,7 +1,8 @@
-"""Rigs by name: choices of devices as TOML files, shipped in ``assets/rigs`` or the operator's own in the session.
+"""Rigs by name: choices of devices as TOML files, shipped in ``assets/rigs`` or the operator's own
+in the session.
 
-A file holds what `pipeline.rig_choice.set_up` takes, and `what`, a sentence about it. The content of a file is checked
-before a device is touched, so that a mistyped option is named and not ignored.
+A file holds what `pipeline.rig_choice.set_up` takes, and `what`, a sentence about it. The content
+of a file is checked before a device is touched, so that a mistyped option is named and not ignored.
 """
 
 import inspect
@@ -30,8 +31,8 @@ _LARGEST = {"settle_ms": 60_000, "focal_px": 1e6, "exposure_ms": 600_000, "gain"
 
 @dataclass(frozen=True)
 class Preset:
-    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, its file, and `problem`,
-    why it cannot be used here and how to correct that, empty if it can.
+    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, its file, and
+    `problem`, why it cannot be used here and how to correct that, empty if it can.
     """
 
     name: str
@@ -42,9 +43,12 @@ class Preset:
 
 
 def presets(session: Session | None = None) -> list[Preset]:
-    """List the session's own rigs, then those that are shipped; a session's hides a shipped one of the same name."""
+    """List the session's own rigs, then those that are shipped; a session's hides a shipped one of
+    the same name."""
     own = {} if session is None else session.rigs()
-    shipped = {path.stem: path for path in sorted(asset(FOLDER).glob("*.toml")) if path.stem not in own}
+    shipped = {
+        path.stem: path for path in sorted(asset(FOLDER).glob("*.toml")) if path.stem not in own
+    }
     return [_read_preset_or_problem(name, path) for name, path in {**own, **shipped}.items()]
 
 
@@ -52,15 +56,19 @@ def rigs(session: Session | None = None) -> str:
     """List the rigs that can be chosen by name, as text."""
     lines = ["rigs:"]
     for preset in presets(session):
-        lines.append(f"  {preset.name}: {preset.what}" + (f" (not here: {preset.problem})" if preset.problem else ""))
+        lines.append(
+            f"  {preset.name}: {preset.what}"
+            + (f" (not here: {preset.problem})" if preset.problem else "")
+        )
     return "\n".join(lines)
 
 
 def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
-    """Load the checked choice in a TOML file, or of the preset of that name; a mapping is returned as it is.
+    """Load the checked choice in a TOML file, or of the preset of that name; a mapping is returned
+    as it is.
 
-    Raises InputError for a file or a name that does not exist, an unknown key or driver, DeviceError where a package is
-    missing.
+    Raises InputError for a file or a name that does not exist, an unknown key or driver,
+    DeviceError where a package is missing.
     """
     if isinstance(rig, Mapping):
         return dict(rig)
@@ -68,13 +76,16 @@ def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
     if path.suffix.lower() == ".toml" or path.is_file():
         if not path.is_file():
             raise InputError(
-                f"there is no file {path}: name a TOML file that describes a rig, or one of {_list_names(session)}"
+                f"there is no file {path}: name a TOML file that describes a rig, or one of"
+                f" {_list_names(session)}"
             )
         preset = _read_preset(path.stem, path)
     else:
         named = {preset.name: preset for preset in presets(session)}
         if str(rig) not in named:
-            raise InputError(f"no rig is called {str(rig)!r}: use {_list_names(session)}, or name a TOML file")
+            raise InputError(
+                f"no rig is called {str(rig)!r}: use {_list_names(session)}, or name a TOML file"
+            )
         preset = _read_preset(str(rig), named[str(rig)].source)
     for name in _driver_names(preset.choice):
         driver(name)  # raises where it cannot be used
@@ -82,13 +93,17 @@ def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
 
 
 def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Preset:
-    """Save a choice in the session under a name, in place of an older one. Raises InputError for an invalid one."""
+    """Save a choice in the session under a name, in place of an older one. Raises InputError for an
+    invalid one."""
     check_choice(choice, f"the rig {name}")
-    return _read_preset(name, session.save_rig(name, to_toml({"what": what, **choice} if what else choice)))
+    return _read_preset(
+        name, session.save_rig(name, to_toml({"what": what, **choice} if what else choice))
+    )
 
 
 def check_choice(choice: Choice, where: str) -> None:
-    """Raise InputError, which names the place `where`, unless `choice` names devices and only options they know."""
+    """Raise InputError, which names the place `where`, unless `choice` names devices and only
+    options they know."""
     for key, largest in _LARGEST.items():
         value = choice.get(key, 1)
         if (
@@ -97,7 +112,9 @@ def check_choice(choice: Choice, where: str) -> None:
             or not 0 <= value <= largest
             or (not value and key != "settle_ms")
         ):
-            raise InputError(f"{where}: {key} = {value!r} is no number above 0, up to {largest:g}: correct it")
+            raise InputError(
+                f"{where}: {key} = {value!r} is no number above 0, up to {largest:g}: correct it"
+            )
     name = choice.get("name", "")
     if not isinstance(name, str) or not name.isprintable():
         raise InputError(f"{where}: name = {name!r} is no text that can be printed: correct it")
@@ -106,18 +123,25 @@ def check_choice(choice: Choice, where: str) -> None:
     if "driver" in choice:
         given = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
         if {"camera", "projector"} & set(given):
-            raise InputError(f"{where} names a driver of a whole rig and a camera or a projector: remove one of both")
+            raise InputError(
+                f"{where} names a driver of a whole rig and a camera or a projector: remove one of"
+                " both"
+            )
         _check_options(str(choice["driver"]), "rig", given, where)
         return
     unknown = sorted(set(choice) - {*COMMON_KEYS, "camera", "projector"})
     if unknown:
-        raise InputError(f"{where} has the unknown key {unknown[0]!r}: use camera, projector, {', '.join(COMMON_KEYS)}")
+        raise InputError(
+            f"{where} has the unknown key {unknown[0]!r}: use camera, projector,"
+            f" {', '.join(COMMON_KEYS)}"
+        )
     for part in ("camera", "projector"):
         _check_device(choice, part, where)
 
 
 def _check_device(choice: Choice, part: str, where: str) -> None:
-    """Raise InputError unless a choice names a driver of the part (camera, projector or turntable) and its options."""
+    """Raise InputError unless a choice names a driver of the part (camera, projector or turntable)
+    and its options."""
     device = choice.get(part)
     if not isinstance(device, Mapping) or "driver" not in device:
         rather = "" if part == "turntable" else ", or a driver of a rig"
@@ -140,7 +164,9 @@ def _read_preset_or_problem(name: str, path: Path) -> Preset:
     """Return the preset in a file, with its `problem` where it cannot be used."""
     try:
         preset = _read_preset(name, path)
-        needed = (drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(preset.choice)))
+        needed = (
+            drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(preset.choice))
+        )
         return replace(preset, problem="; ".join(each.missing for each in needed if each.missing))
     except InputError as error:
         return Preset(name, "", {}, path, str(error))
@@ -149,9 +175,13 @@ def _read_preset_or_problem(name: str, path: Path) -> Preset:
 def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
     """Raise InputError unless the driver exists, offers the part, and accepts the options."""
     if name not in drivers():
-        offering = sorted(d.name for d in drivers().values() if _driver_factory(d, part) is not None)
+        offering = sorted(
+            d.name for d in drivers().values() if _driver_factory(d, part) is not None
+        )
         why = DRIVER_PLUGINS.explain_missing(name)
-        raise InputError(f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}{why}")
+        raise InputError(
+            f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}{why}"
+        )
     make = _driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
@@ -174,7 +204,8 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
 
 
 def _check_type(parameter: inspect.Parameter, options: Mapping[str, Any], where: str) -> None:
-    """Raise InputError where an option is not of the type of the driver's parameter, or no number that is finite."""
+    """Raise InputError where an option is not of the type of the driver's parameter, or no number
+    that is finite."""
     value = options.get(parameter.name, parameter.default)
     if isinstance(value, float) and not isfinite(value):
         raise InputError(f"{where}: {parameter.name} = {value!r} is no number: correct it")
@@ -184,18 +215,26 @@ def _check_type(parameter: inspect.Parameter, options: Mapping[str, Any], where:
         with suppress(TypeError):  # a path, which the driver checks itself
             msgspec.convert(value, parameter.annotation)
     except msgspec.ValidationError as error:
-        raise InputError(f"{where}: {parameter.name} = {value!r} is of the wrong type ({error}): correct it") from error
+        raise InputError(
+            f"{where}: {parameter.name} = {value!r} is of the wrong type ({error}): correct it"
+        ) from error
 
 
 def _driver_factory(driver: Driver, part: str) -> Any:
-    """Return the driver's function that makes the part (camera, projector or rig); None where it has none."""
+    """Return the driver's function that makes the part (camera, projector or rig); None where it
+    has none."""
     return rig_factory(driver) if part == "rig" else getattr(driver, part)
 
 
 def _driver_names(choice: Choice) -> list[str]:
-    """Return the drivers of a choice: that of the whole rig, or those of camera and projector, and of a turntable."""
+    """Return the drivers of a choice: that of the whole rig, or those of camera and projector, and
+    of a turntable."""
     whole = [str(choice["driver"])] if "driver" in choice else []
-    return whole + [str(choice[part]["driver"]) for part in ("camera", "projector", "turntable") if part in choice]
+    return whole + [
+        str(choice[part]["driver"])
+        for part in ("camera", "projector", "turntable")
+        if part in choice
+    ]
 
 
 def _list_names(session: Session | None) -> str:

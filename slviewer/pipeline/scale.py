@@ -1,4 +1,5 @@
-"""A scale that an acceptance test measured and the operator applied: what later clouds are multiplied by."""
+"""A scale that an acceptance test measured and the operator applied: what later clouds are
+multiplied by."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,8 +17,8 @@ LARGEST_FACTOR = 1.25
 
 
 def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
-    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where there is none, or it is
-    of another calibration."""
+    """Return the scale correction of a calibration, as ``record_scale`` stored it; None where there
+    is none, or it is of another calibration."""
     name, calibration = f"scale/{model}", f"calibration/{model}"
     if not (store.has_result(name) and store.has_result(calibration)):
         return None
@@ -32,8 +33,8 @@ def scale_factor(store: Session, model: str) -> float:
 
 
 def scale_sigma(store: Session, model: str) -> float:
-    """The standard uncertainty of ``scale_factor``, from the acceptance test; 0 without a correction,
-    whose scale is the target's."""
+    """The standard uncertainty of ``scale_factor``, from the acceptance test; 0 without a
+    correction, whose scale is the target's."""
     applied = load_scale_correction(store, model)
     return 0.0 if applied is None else 1e-6 * float(applied["U_ppm"]) / 2
 
@@ -55,14 +56,19 @@ def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
         cloud,
         points=cloud.points * np.float32(factor),
         sigma_z=cloud.sigma_z * np.float32(factor),
-        sigma_calibration=None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor),
+        sigma_calibration=(
+            None
+            if cloud.sigma_calibration is None
+            else cloud.sigma_calibration * np.float32(factor)
+        ),
         sigma_edges=None if cloud.sigma_edges is None else cloud.sigma_edges * np.float32(factor),
         texture=cloud.texture,
     )
 
 
 def record_scale(store: Session, acceptance: Acceptance) -> float:
-    """Record that the calibration's clouds are to be corrected by a test's scale; returns the new factor.
+    """Record that the calibration's clouds are to be corrected by a test's scale; returns the new
+    factor.
 
     A correction that was in force during the test stays in it.
     """
@@ -71,8 +77,9 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
     factor = before / (1 + 1e-6 * acceptance.scale.ppm)
     if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:  # False for NaN
         raise InputError(
-            f"the scale factor would be {factor:.6g}, which is no correction (at most {LARGEST_FACTOR:g}): check the "
-            "certificate's length, temperature and expansion, and that its captures show this artefact"
+            f"the scale factor would be {factor:.6g}, which is no correction (at most"
+            f" {LARGEST_FACTOR:g}): check the certificate's length, temperature and expansion, and"
+            " that its captures show this artefact"
         )
     calibration = f"calibration/{acceptance.model}"
     meta = {

@@ -1,4 +1,5 @@
-"""Restricting scans to the region of interest, and to the points that were not deleted; editing them."""
+"""Restricting scans to the region of interest, and to the points that were not deleted; editing
+them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,29 +27,43 @@ def resolve_region(store: Session, roi: str = "") -> RegionOfInterest | None:
 
 
 def parse_region(roi: str) -> RegionOfInterest:
-    """Return the box of six numbers "x0,x1,y0,y1,z0,z1" in mm, or of a TOML file with ``centre_mm``, ``size_mm`` and,
-    where it is turned, ``rotation_deg``. UsageError for other text, InputError for a file that states no box."""
+    """Return the box of six numbers "x0,x1,y0,y1,z0,z1" in mm, or of a TOML file with
+    ``centre_mm``, ``size_mm`` and, where it is turned, ``rotation_deg``. UsageError for other text,
+    InputError for a file that states no box.
+    """
     parts = roi.replace(",", " ").split()
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
         return _read_region(expand_user(roi))
     if len(numbers) != 6 or not np.isfinite(numbers).all():
-        raise UsageError(f"--roi has {len(numbers)} numbers, six are needed: x0,x1,y0,y1,z0,z1 in mm, {_EXAMPLE}")
+        raise UsageError(
+            f"--roi has {len(numbers)} numbers, six are needed: x0,x1,y0,y1,z0,z1 in mm, {_EXAMPLE}"
+        )
     low, high = numbers[::2], numbers[1::2]
     if any(a >= b for a, b in zip(low, high, strict=True)):
-        raise UsageError(f"--roi {roi} ends before it begins: give the lower number of each axis first, {_EXAMPLE}")
+        raise UsageError(
+            f"--roi {roi} ends before it begins: give the lower number of each axis first,"
+            f" {_EXAMPLE}"
+        )
     return RegionOfInterest.between(low, high)
 
 
 def refuse_region(merge: str, roi: str) -> None:
-    """Raise UsageError where a region was stated for a merge, whose scans were cut when it was made."""
+    """Raise UsageError where a region was stated for a merge, whose scans were cut when it was
+    made."""
     if roi:
-        raise UsageError(f"{merge} was cut by the region when its scans were merged: merge them again with --roi {roi}")
+        raise UsageError(
+            f"{merge} was cut by the region when its scans were merged: merge them again with --roi"
+            f" {roi}"
+        )
 
 
-def restrict_cloud(store: Session, scan: str, cloud: Cloud, region: RegionOfInterest | None) -> Cloud:
-    """Return a scan's cloud with NaN for what was deleted from it and what lies outside of the region.
+def restrict_cloud(
+    store: Session, scan: str, cloud: Cloud, region: RegionOfInterest | None
+) -> Cloud:
+    """Return a scan's cloud with NaN for what was deleted from it and what lies outside of the
+    region.
 
     InputError, with the numbers, where nothing remains.
     """
@@ -57,14 +72,17 @@ def restrict_cloud(store: Session, scan: str, cloud: Cloud, region: RegionOfInte
         return cloud
     nan = np.float32(np.nan)
     return replace(
-        cloud, points=np.where(kept[..., None], cloud.points, nan), sigma_z=np.where(kept, cloud.sigma_z, nan)
+        cloud,
+        points=np.where(kept[..., None], cloud.points, nan),
+        sigma_z=np.where(kept, cloud.sigma_z, nan),
     )
 
 
 def restriction_mask(
     store: Session, scan: str, points: np.ndarray, region: RegionOfInterest | None
 ) -> np.ndarray | None:
-    """Mask (h, w) of the points (h, w, 3) mm of a scan that edits and region keep; None where there are neither.
+    """Mask (h, w) of the points (h, w, 3) mm of a scan that edits and region keep; None where there
+    are neither.
 
     InputError where nothing remains of what was measured.
     """
@@ -75,15 +93,17 @@ def restriction_mask(
     measured = int(np.count_nonzero(np.isfinite(points).all(axis=-1)))
     if measured and not kept.any():
         raise InputError(
-            f"{scan}: all of its {measured} points were deleted by {history.applied} edits: undo some, with "
-            f"`slviewer edit SESSION {scan} --undo 1` or in the step Scan"
+            f"{scan}: all of its {measured} points were deleted by {history.applied} edits: undo"
+            f" some, with `slviewer edit SESSION {scan} --undo 1` or in the step Scan"
         )
     if region is not None:
         kept &= crop_mask(scan, np.where(kept[..., None], points, np.nan), region)
     return kept
 
 
-def restriction_notes(store: Session, scans: Sequence[str], region: RegionOfInterest | None) -> tuple[str, ...]:
+def restriction_notes(
+    store: Session, scans: Sequence[str], region: RegionOfInterest | None
+) -> tuple[str, ...]:
     """Return what restricts scans, in sentences, for the comments of files and for reports."""
     notes = [] if region is None else [f"region of interest: {region.text()}"]
     for scan in scans:
@@ -93,15 +113,17 @@ def restriction_notes(store: Session, scans: Sequence[str], region: RegionOfInte
 
 
 def _read_region(path: Path) -> RegionOfInterest:
-    """Return the box that a TOML file states. UsageError without the file, InputError for another content."""
+    """Return the box that a TOML file states. UsageError without the file, InputError for another
+    content."""
     if not path.is_file():
         raise UsageError(
-            f"--roi {path} is neither six numbers (x0,x1,y0,y1,z0,z1 in mm, {_EXAMPLE}), nor a TOML file, nor off"
+            f"--roi {path} is neither six numbers (x0,x1,y0,y1,z0,z1 in mm, {_EXAMPLE}), nor a TOML"
+            " file, nor off"
         )
     try:
         return from_plain(read_toml(path), RegionOfInterest)
     except InputError as error:
         raise InputError(
-            f"{path} states no region ({error}): write centre_mm = [x, y, z], size_mm = [x, y, z] and, for a turned "
-            "box, rotation_deg = [x, y, z]"
+            f"{path} states no region ({error}): write centre_mm = [x, y, z], size_mm = [x, y, z]"
+            " and, for a turned box, rotation_deg = [x, y, z]"
         ) from error

@@ -18,8 +18,8 @@ from slviewer.session.store import Session
 class SessionOperations(Session):
     """A session on disk: captures, results and decisions, and what is done with them.
 
-    Each method is the command of its name, with the session as first argument; it needs no open session to be called
-    as a function, as in ``slviewer.verify(folder, ["plane_01"], "plane")``::
+    Each method is the command of its name, with the session as first argument; it needs no open
+    session to be called as a function, as in ``slviewer.verify(folder, ["plane_01"], "plane")``::
 
         with slviewer.Session.open("my-session", write=True) as session:
             session.calibrate("circles:21x16:9")

@@ -46,21 +46,23 @@ def simulate(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> list[str]:
-    """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object at three depths.
+    """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object
+    at three depths.
 
-    The preset turn has, besides target poses, the object turned by up to 15 degrees between its three depths, and
-    another on a turntable, in twelve steps round.
+    The preset turn has, besides target poses, the object turned by up to 15 degrees between its
+    three depths, and another on a turntable, in twelve steps round.
 
     Args:
         session: Session folder to make.
-        preset: letter: planes, spheres and an object at three depths; turn: an object at three depths, and another on a
-            turntable.
+        preset: letter: planes, spheres and an object at three depths; turn: an object at three
+            depths, and another on a turntable.
         scale: Resolution of the camera, as a share of 1600x1200 px; 0.25 is quick.
         poses: How many target poses.
         seed: Another seed is another rig of the same kind.
 
-    Returns the captures' names: ``pose_XX`` (both axes), ``plane_01`` ... ``plane_10``, ``sphere_1`` ... ``sphere_6``,
-    ``object_r1`` ... ``object_r3``, ``turn_01`` ... ``turn_12`` (axis x).
+    Returns the captures' names: ``pose_XX`` (both axes), ``plane_01`` ... ``plane_10``,
+    ``sphere_1`` ... ``sphere_6``, ``object_r1`` ... ``object_r3``, ``turn_01`` ... ``turn_12``
+    (axis x).
     """
     if preset not in get_args(Preset):
         raise InputError(f"no rig preset is called {preset!r}: use {' or '.join(get_args(Preset))}")
@@ -71,7 +73,13 @@ def simulate(
     plan = letter_plan(rig, board, poses) if preset == "letter" else turn_plan(rig, board, poses)
     both = p18(rig.projector.size)
     only_x = one_axis(both, "x")
-    truth: dict[str, Any] = {"preset": preset, "scale": scale, "seed": seed, "target": TARGET, "rig": rig_record(rig)}
+    truth: dict[str, Any] = {
+        "preset": preset,
+        "scale": scale,
+        "seed": seed,
+        "target": TARGET,
+        "rig": rig_record(rig),
+    }
 
     def rendered(scenes: dict[str, Scene], sequence: PatternSequence) -> Iterator[NewCapture]:
         """One capture after another; the next one is rendered while one is saved."""
@@ -88,7 +96,9 @@ def simulate(
                 yield NewCapture(name, sequence, waiting.popleft().result(), None, source)
 
     with Session.create(session) as store:
-        groups = {kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS}
+        groups = {
+            kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS
+        }
         scans = {n: s for n, s in plan.items() if n not in groups["pose"]}
         saved = store.save_captures(rendered(groups["pose"], both), "calibration", board=board)
         saved += store.save_captures(rendered(scans, only_x), "scan")
@@ -114,13 +124,18 @@ def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:
 
 
 def save_true_stereo(store: Session, rig: SimulatedRig, **other: np.ndarray) -> None:
-    """Make a simulated rig's true lenses and pose the session's stereo calibration, local distortion apart.
+    """Make a simulated rig's true lenses and pose the session's stereo calibration, local
+    distortion apart.
 
-    ``other``: matrices K_camera (3, 3), D_camera (5,), K_projector, D_projector, R (3, 3) or T (3,) mm that replace the
-    true ones.
+    ``other``: matrices K_camera (3, 3), D_camera (5,), K_projector, D_projector, R (3, 3) or T (3,)
+    mm that replace the true ones.
     """
     record = rig_record(rig)
-    lenses = {f"{name}_{device}": np.array(record[device][name]) for name in "KD" for device in ("camera", "projector")}
+    lenses = {
+        f"{name}_{device}": np.array(record[device][name])
+        for name in "KD"
+        for device in ("camera", "projector")
+    }
     save_imported_stereo(
         store,
         {**lenses, "R": rig.R, "T": rig.t, **other},

@@ -18,7 +18,8 @@ R = TypeVar("R", bound=Record)
 
 @dataclass(frozen=True)
 class Stored(Generic[R]):
-    """A record of a session: the capture that it is of, or its number; the operator's label; whether it is stale."""
+    """A record of a session: the capture that it is of, or its number; the operator's label;
+    whether it is stale."""
 
     name: str
     label: str
@@ -26,23 +27,31 @@ class Stored(Generic[R]):
     stale: bool = False
 
 
-def save_record(store: Session, name: str, record: Record, arrays: Mapping[str, np.ndarray]) -> None:
-    """Store a record of a capture, or with a number, and its arrays; it replaces one of the same kind and name."""
+def save_record(
+    store: Session, name: str, record: Record, arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Store a record of a capture, or with a number, and its arrays; it replaces one of the same
+    kind and name."""
     store.save_result(f"{record.kind}/{name}", to_plain(record), arrays)
 
 
 def read_record(kind: type[R], meta: Mapping[str, Any]) -> R:
-    """Return the record of a result's `meta`, also of one that an older version stored. InputError where it is none."""
+    """Return the record of a result's `meta`, also of one that an older version stored. InputError
+    where it is none."""
     return from_plain(kind.upgrade(meta), kind)
 
 
 def load_record(store: Session, kind: type[R], name: str) -> R:
-    """Load a record, without its arrays. InputError where there is none, DamagedError where it is damaged."""
-    return store.decode_result(f"{kind.kind}/{name}", lambda meta, _: read_record(kind, meta), only=())
+    """Load a record, without its arrays. InputError where there is none, DamagedError where it is
+    damaged."""
+    return store.decode_result(
+        f"{kind.kind}/{name}", lambda meta, _: read_record(kind, meta), only=()
+    )
 
 
 def load_arrays(session: SessionLike, result: str) -> dict[str, np.ndarray]:
-    """Return the arrays of a result of a session by name, such as ``verify/plane_01``. InputError where there is none.
+    """Return the arrays of a result of a session by name, such as ``verify/plane_01``. InputError
+    where there is none.
 
     Which there are says the docstring of the record.
     """
@@ -56,7 +65,8 @@ def captures_of(name: str, record: Record) -> list[str]:
 
 
 def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
-    """Return the records of a kind in natural order of their names; those of deleted captures are skipped."""
+    """Return the records of a kind in natural order of their names; those of deleted captures are
+    skipped."""
     labels, there = store.valid_decision("names") or {}, set(store.capture_names())
     records = []
     for result in numbered_results(store, kind.kind):
@@ -71,7 +81,9 @@ def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
 def name_records(found: Sequence[Stored[R]]) -> dict[str, R]:
     """Return records by their labels, with the name beside a label that several have."""
     counts = Counter(each.label for each in found)
-    names = (each.label if counts[each.label] == 1 else f"{each.label} ({each.name})" for each in found)
+    names = (
+        each.label if counts[each.label] == 1 else f"{each.label} ({each.name})" for each in found
+    )
     return {name: each.record for name, each in zip(names, found, strict=True)}
 
 

@@ -1,4 +1,5 @@
-"""Choosing the exposures of a capture: from a quick bracket, the few that measure as much of the scene as possible."""
+"""Choosing the exposures of a capture: from a quick bracket, the few that measure as much of the
+scene as possible."""
 
 import math
 import time
@@ -32,7 +33,8 @@ _STOP = 4.0  # between exposures of the bracket
 _MAX_LOOKS = 6  # on either side of the present exposure
 _LONGEST_LOOK_MS = 1000.0
 _FEW = 0.002  # of the pixels: a further exposure that concerns fewer is not tried
-_HEADROOM = 0.97  # of full scale, that the brightest grey level of a pixel may reach: the light varies a little
+# of full scale, that the brightest grey level of a pixel may reach: the light varies a little
+_HEADROOM = 0.97
 _WEAK_COST = 0.3
 """By how much less a pixel counts that is barely modulated: its depth is noisier."""
 _WORTH = 0.02
@@ -42,8 +44,9 @@ _APART = 1.9  # ratio of neighbouring exposures
 _CORRECTIONS = 3
 _MAX_DOUBLINGS = 3
 _BEYOND = 1.33
-"""By how much longer than the longest that was tried an exposure may have to be for a pixel to count as illuminated;
-noise alone has the modulation that asks for 1.33 times in one pixel of 10,000."""
+"""By how much longer than the longest that was tried an exposure may have to be for a pixel to
+count as illuminated; noise alone has the modulation that asks for 1.33 times in one pixel of
+10,000."""
 _LATE = 0.05
 """Share of the illuminated pixels that time is too short for, from which the gain is raised."""
 _ALL = 0.98
@@ -54,10 +57,11 @@ _FACTOR = 0.8  # of exposures that turn out to saturate
 class ExposureSuggestion:
     """Exposures that were chosen and tried, and what they measure.
 
-    ``exposures_ms`` ascending, and the camera's ``gain``, None where it is unknown. ``share`` of the illuminated
-    pixels that are measured with them, and ``share_before`` with the exposures before. ``capture_s`` that a capture
-    then lasts. ``state`` and ``state_before`` (h, w) uint8, indices of `STATES`, of every ``stride``-th row and column;
-    ``image`` (h, w) uint8 is the scene there.
+    ``exposures_ms`` ascending, and the camera's ``gain``, None where it is unknown. ``share`` of
+    the illuminated pixels that are measured with them, and ``share_before`` with the exposures
+    before. ``capture_s`` that a capture then lasts. ``state`` and ``state_before`` (h, w) uint8,
+    indices of `STATES`, of every ``stride``-th row and column; ``image`` (h, w) uint8 is the scene
+    there.
     """
 
     exposures_ms: tuple[float, ...]
@@ -75,16 +79,16 @@ class ExposureSuggestion:
         listed = " and ".join(f"{exposure:g}" for exposure in self.exposures_ms)
         gain = "" if self.gain is None else f" at gain {self.gain:g}"
         return (
-            f"{len(self.exposures_ms)} exposure{'s' * (len(self.exposures_ms) > 1)} of {listed} ms{gain} measure "
-            f"{100 * self.share:.1f} % of what the projector lights ({100 * self.share_before:.1f} % before), "
-            f"in {self.capture_s:.1f} s a capture"
+            f"{len(self.exposures_ms)} exposure{'s' * (len(self.exposures_ms) > 1)} of {listed}"
+            f" ms{gain} measure {100 * self.share:.1f} % of what the projector lights"
+            f" ({100 * self.share_before:.1f} % before), in {self.capture_s:.1f} s a capture"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """Fringes in one exposure, (h, w) float32 grey levels each: modulation, background, and the brightest sample;
-    ``repeat`` (2, h, w): the same frame twice."""
+    """Fringes in one exposure, (h, w) float32 grey levels each: modulation, background, and the
+    brightest sample; ``repeat`` (2, h, w): the same frame twice."""
 
     exposure_ms: float
     modulation: NDArray[np.float32]
@@ -104,22 +108,25 @@ def suggest_exposure(
 ) -> ExposureSuggestion:
     """Choose one to four exposures with which an open rig measures as many pixels as possible.
 
-    Takes the finest fringes of ``sequence`` in a bracket of exposures, chooses, and tries what was chosen. The lowest
-    gain is used that lets the exposures fit. Settings are as before when this returns or raises.
+    Takes the finest fringes of ``sequence`` in a bracket of exposures, chooses, and tries what was
+    chosen. The lowest gain is used that lets the exposures fit. Settings are as before when this
+    returns or raises.
 
     Args:
         current_ms: The exposures in use, to compare with; by default the camera's.
         budget_s: What a capture may last.
         region: x, y, width and height, px, of the part of the image that matters; by default all.
 
-    Raises DeviceError where the camera does not report its exposure, or nothing sees the patterns; InputError for a
-    region or time that is impossible; and whatever `progress` raises.
+    Raises DeviceError where the camera does not report its exposure, or nothing sees the patterns;
+    InputError for a region or time that is impossible; and whatever `progress` raises.
     """
     if not budget_s > 0:
         raise InputError(f"a capture of {budget_s:g} s is impossible: give a time above 0")
     before = rig.camera.settings()
     if before.exposure_ms is None:
-        raise DeviceError(f"{rig.camera.name} does not report its exposure: set it by hand, at the camera")
+        raise DeviceError(
+            f"{rig.camera.name} does not report its exposure: set it by hand, at the camera"
+        )
     bracket = _Bracket(rig, sequence, region, progress)
     try:
         return bracket.choose(tuple(current_ms) or (before.exposure_ms,), before.gain, budget_s)
@@ -128,7 +135,8 @@ def suggest_exposure(
 
 
 def apply_suggestion(rig: Rig, suggestion: ExposureSuggestion) -> list[float]:
-    """Set the camera as suggested. Returns the exposures of each capture where they are several, else none."""
+    """Set the camera as suggested. Returns the exposures of each capture where they are several,
+    else none."""
     exposures = list(suggestion.exposures_ms)
     rig.camera.apply(CameraSettings(exposures[0], suggestion.gain))
     return exposures if len(exposures) > 1 else []
@@ -137,7 +145,9 @@ def apply_suggestion(rig: Rig, suggestion: ExposureSuggestion) -> list[float]:
 class _Bracket:
     """Looks at the fringes of a scene in several exposures, and the choice among them."""
 
-    def __init__(self, rig: Rig, sequence: PatternSequence, region: Region | None, progress: Progress) -> None:
+    def __init__(
+        self, rig: Rig, sequence: PatternSequence, region: Region | None, progress: Progress
+    ) -> None:
         self._rig, self._progress, self._grabs = rig, progress, 0
         self._frames = len(sequence.frames)
         layout = axis_layout(sequence, sequence.axes[0])
@@ -153,13 +163,17 @@ class _Bracket:
         self._budget_s = BUDGET_S
         rig.projector.load(sequence)
 
-    def choose(self, current_ms: tuple[float, ...], gain: float | None, budget_s: float) -> ExposureSuggestion:
+    def choose(
+        self, current_ms: tuple[float, ...], gain: float | None, budget_s: float
+    ) -> ExposureSuggestion:
         """Look, choose, try, and correct what saturates after all."""
         self._budget_s = budget_s
         if gain is not None and gain > 1:
             gain = self._rig.camera.apply(CameraSettings(gain=1.0)).gain
         low, high, lit = self._examine(current_ms)
-        for _ in range(_MAX_DOUBLINGS):  # of the gain, where time does not allow for the exposures that are needed
+        for _ in range(
+            _MAX_DOUBLINGS
+        ):  # of the gain, where time does not allow for the exposures that are needed
             late = np.count_nonzero(low[lit] > self._longest_ms())
             if gain is None or late <= _LATE * np.count_nonzero(lit):
                 break
@@ -170,13 +184,14 @@ class _Bracket:
             low, high, lit = self._examine(current_ms)
         if np.count_nonzero(lit) < max(50, _FEW * np.count_nonzero(self._inside)):
             raise DeviceError(
-                "no pixel sees the patterns in any exposure: check that the projector lights what the camera sees"
+                "no pixel sees the patterns in any exposure: check that the projector lights what"
+                " the camera sees"
             )
         chosen = self._choose(low[lit], high[lit])
         if not chosen:
             raise DeviceError(
-                f"no capture of {self._frames} frames fits into {budget_s:g} s: allow more time, or choose patterns "
-                "with fewer frames"
+                f"no capture of {self._frames} frames fits into {budget_s:g} s: allow more time, or"
+                " choose patterns with fewer frames"
             )
         for _ in range(_CORRECTIONS):
             chosen = tuple(self._look(exposure).exposure_ms for exposure in chosen)
@@ -186,8 +201,13 @@ class _Bracket:
                 break
             chosen = tuple(_round(_FACTOR * exposure) for exposure in chosen)
         chosen = tuple(self._look(exposure).exposure_ms for exposure in chosen)
-        state, state_before = self._classify(chosen, lit), self._classify(self._applied(current_ms), lit)
-        share, share_before = (np.count_nonzero(each == 1) / np.count_nonzero(lit) for each in (state, state_before))
+        state, state_before = (
+            self._classify(chosen, lit),
+            self._classify(self._applied(current_ms), lit),
+        )
+        share, share_before = (
+            np.count_nonzero(each == 1) / np.count_nonzero(lit) for each in (state, state_before)
+        )
         return ExposureSuggestion(
             chosen,
             gain,
@@ -200,12 +220,17 @@ class _Bracket:
             self._stride,
         )
 
-    def _draw_scene(self, exposures_ms: tuple[float, ...], lit: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """The scene (h, w) as an image, each pixel from the longest of these exposures that does not saturate it."""
+    def _draw_scene(
+        self, exposures_ms: tuple[float, ...], lit: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        """The scene (h, w) as an image, each pixel from the longest of these exposures that does
+        not saturate it."""
         best = self._looks[exposures_ms[0]].background
         for exposure in exposures_ms[1:]:
             look = self._looks[exposure]
-            best = np.where(look.peak < self._clip, look.background * (exposures_ms[0] / exposure), best)
+            best = np.where(
+                look.peak < self._clip, look.background * (exposures_ms[0] / exposure), best
+            )
         tone = np.sqrt(np.clip(best / max(float(np.quantile(best[lit], 0.99)), 1e-6), 0, 1))
         return (255 * tone).astype(np.uint8)
 
@@ -224,11 +249,15 @@ class _Bracket:
         return tuple(sorted(self._look(exposure).exposure_ms for exposure in exposures))
 
     def _look(self, exposure_ms: float) -> _Look:
-        """Capture the fringes in the exposure that the camera has nearest to this one, unless that was done."""
+        """Capture the fringes in the exposure that the camera has nearest to this one, unless that
+        was done."""
         with report_driver_faults(self._rig.camera):
             set_ms = self._rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
         if set_ms is None:
-            raise DeviceError(f"{self._rig.camera.name} does not report its exposure: set it by hand, at the camera")
+            raise DeviceError(
+                f"{self._rig.camera.name} does not report its exposure: set it by hand, at the"
+                " camera"
+            )
         if set_ms in self._looks:
             return self._looks[set_ms]
         self._grabs += 1
@@ -250,7 +279,11 @@ class _Bracket:
         if self._is_fringe:
             _, modulation, background, peak = phase_shift(stack, tuple(range(n)), 1)
         else:
-            modulation, background, peak = abs(stack[0] - stack[1]) / 2, stack[:2].mean(0), stack[:2].max(0)
+            modulation, background, peak = (
+                abs(stack[0] - stack[1]) / 2,
+                stack[:2].mean(0),
+                stack[:2].max(0),
+            )
         self._looks[set_ms] = look = _Look(set_ms, modulation, background, peak, stack[n - 1 :])
         return look
 
@@ -261,8 +294,10 @@ class _Bracket:
     def _examine(
         self, current_ms: Sequence[float]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Look at the present exposures, at shorter ones until nothing is saturated, and at longer ones until all is or
-        time allows for no more. Returns the `_limits`, and (h, w) the pixels of the region that see the patterns."""
+        """Look at the present exposures, at shorter ones until nothing is saturated, and at longer
+        ones until all is or time allows for no more. Returns the `_limits`, and (h, w) the pixels
+        of the region that see the patterns.
+        """
         for exposure in current_ms:
             self._look(exposure)
         look = self._look(min(self._looks))
@@ -275,7 +310,9 @@ class _Bracket:
             look = shorter
         look = self._look(max(self._looks))
         for _ in range(_MAX_LOOKS):
-            next_ms = _STOP * look.exposure_ms  # one more than time allows for, to see what is missed
+            next_ms = (
+                _STOP * look.exposure_ms
+            )  # one more than time allows for, to see what is missed
             is_bright = np.mean(look.peak[self._inside] >= self._clip) > _ALL
             if is_bright or next_ms > min(_STOP * self._longest_ms(), _LONGEST_LOOK_MS):
                 break
@@ -287,8 +324,10 @@ class _Bracket:
         return low, high, np.isfinite(low) & self._inside
 
     def _limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(h, w) ms each: the shortest exposure at which a pixel is modulated enough, infinite where it sees no
-        patterns, and the longest at which it is not saturated. From the longest exposure that did not saturate it."""
+        """(h, w) ms each: the shortest exposure at which a pixel is modulated enough, infinite
+        where it sees no patterns, and the longest at which it is not saturated. From the longest
+        exposure that did not saturate it.
+        """
         variance = self._noise()
         shape = self._inside.shape
         low, high = np.full(shape, np.inf), np.zeros(shape)
@@ -298,8 +337,12 @@ class _Bracket:
             with np.errstate(divide="ignore"):
                 longest = exposure * _HEADROOM * self._full / np.maximum(look.peak, 1)
                 longest[look.peak >= self._clip] = 0.5 * exposure  # how far beyond is not known
-            shortest = exposure * _required_factor(look, variance, self._sigmas, DARK_LEVELS * self._full / 255)
-            shortest[look.peak >= self._clip] = exposure  # of what is saturated in all, to be counted
+            shortest = exposure * _required_factor(
+                look, variance, self._sigmas, DARK_LEVELS * self._full / 255
+            )
+            shortest[look.peak >= self._clip] = (
+                exposure  # of what is saturated in all, to be counted
+            )
             low[free] = np.where(shortest > _BEYOND * exposure, np.inf, shortest)[free]
             high[free] = longest[free]
         return low, high
@@ -317,8 +360,12 @@ class _Bracket:
         order = np.argsort(mean)
         groups = [order[part] for part in np.array_split(np.arange(mean.size), 12)]
         level = np.array([mean[group].mean() for group in groups])
-        spread = np.array([np.mean(np.sort(square[group])[: max(1, int(0.99 * group.size))]) for group in groups])
-        slope, offset = np.polyfit(level, spread, 1) if np.ptp(level) > 1 else (0.0, float(spread.mean()))
+        spread = np.array(
+            [np.mean(np.sort(square[group])[: max(1, int(0.99 * group.size))]) for group in groups]
+        )
+        slope, offset = (
+            np.polyfit(level, spread, 1) if np.ptp(level) > 1 else (0.0, float(spread.mean()))
+        )
         return max(float(offset), 1 / 12), max(float(slope), 0.0)
 
     def _duration_s(self, exposures_ms: NDArray[np.float64]) -> float:
@@ -326,7 +373,8 @@ class _Bracket:
         return float(self._frames * np.sum(exposures_ms + self._overhead_ms) / 1e3)
 
     def _choose(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[float, ...]:
-        """The exposures for pixels with limits (n,) ms; none where the time does not even allow for one."""
+        """The exposures for pixels with limits (n,) ms; none where the time does not even allow for
+        one."""
         first, most = max(min(self._looks), float(np.quantile(high, 0.001))), self._longest_ms()
         most = min(max(self._looks) * 2, most)
         if most <= first:
@@ -348,36 +396,46 @@ class _Bracket:
         if not best:
             return ()
         largest = max(measured for measured, _ in best)
-        return next(exposures for measured, exposures in best if measured >= largest - _WORTH * low.size)
+        return next(
+            exposures for measured, exposures in best if measured >= largest - _WORTH * low.size
+        )
 
     def _classify(self, exposures_ms: Sequence[float], lit: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """State (h, w) of each pixel if it is used from the longest of these exposures that does not saturate it."""
+        """State (h, w) of each pixel if it is used from the longest of these exposures that does
+        not saturate it."""
         variance = self._noise()
         looks = [self._looks[exposure] for exposure in exposures_ms]
         state = np.full(lit.shape, STATES.index("saturated"), np.uint8)
         for look in looks:
             factor = _required_factor(look, variance, self._sigmas, DARK_LEVELS * self._full / 255)
             free = look.peak < self._clip
-            state[free] = np.where(factor <= 1, STATES.index("measured"), STATES.index("dark"))[free]
+            state[free] = np.where(factor <= 1, STATES.index("measured"), STATES.index("dark"))[
+                free
+            ]
         state[~lit] = STATES.index("unlit")
         return state
 
 
 def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
-    """Frames by which fringes are examined: three or four equal steps of the finest period, all where no such share of
-    them exists, and True; of Gray code alone the finest bit, or white, and what is complementary to it, and False."""
+    """Frames by which fringes are examined: three or four equal steps of the finest period, all
+    where no such share of them exists, and True; of Gray code alone the finest bit, or white, and
+    what is complementary to it, and False.
+    """
     if layout.shifts:
         indices = layout.shifts[-1].indices
         count = next((count for count in (4, 3) if len(indices) % count == 0), len(indices))
         return indices[:: len(indices) // count], True
     if layout.inverse:
         return (layout.gray[-1], layout.inverse[-1]), False
-    assert layout.white is not None and layout.black is not None  # or its layout would have been refused
+    assert (
+        layout.white is not None and layout.black is not None
+    )  # or its layout would have been refused
     return (layout.white, layout.black), False
 
 
 def _mask_region(region: Region | None, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(height, width) bool, True inside of the region x, y, width, height; InputError where it is outside."""
+    """(height, width) bool, True inside of the region x, y, width, height; InputError where it is
+    outside."""
     width, height = size
     inside = np.zeros((height, width), bool)
     x, y, across, down = region or (0, 0, width, height)
@@ -390,9 +448,11 @@ def _mask_region(region: Region | None, size: tuple[int, int]) -> NDArray[np.boo
     return inside
 
 
-def _required_factor(look: _Look, variance: tuple[float, float], sigmas: float, least: float) -> NDArray[np.float64]:
-    """Factor (h, w) of the exposure at which a pixel's modulation reaches ``least`` grey levels and ``sigmas`` standard
-    deviations of a grey level, whose ``variance`` is an offset and a slope."""
+def _required_factor(
+    look: _Look, variance: tuple[float, float], sigmas: float, least: float
+) -> NDArray[np.float64]:
+    """Factor (h, w) of the exposure at which a pixel's modulation reaches ``least`` grey levels and
+    ``sigmas`` standard deviations of a grey level, whose ``variance`` is an offset and a slope."""
     offset, slope = variance
     modulation = np.maximum(look.modulation.astype(np.float64), 1e-3)
     square, linear = modulation**2, sigmas**2 * slope * np.maximum(look.background, 0)
@@ -403,8 +463,9 @@ def _required_factor(look: _Look, variance: tuple[float, float], sigmas: float, 
 def _tabulate_values(
     grid: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Value and number (n, n + 1) of the pixels that exposure i of the grid measures where exposure j, the next one,
-    saturates them; j = n: none follows. A pixel's value is 1, less where it is weakly modulated."""
+    """Value and number (n, n + 1) of the pixels that exposure i of the grid measures where exposure
+    j, the next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is
+    weakly modulated."""
     n = len(grid)
     saturated_by = np.searchsorted(grid, high, side="right")
     values, counts = np.zeros((n, n + 1)), np.zeros((n, n + 1))

@@ -1,7 +1,7 @@
 """Scanning an object all round: capture at each angle of a turntable, then merge and mesh.
 
-Each capture is saved, with its angle, before the table turns on; whatever ends a turn, the scans before it stay, and
-the missing steps can be captured later.
+Each capture is saved, with its angle, before the table turns on; whatever ends a turn, the scans
+before it stay, and the missing steps can be captured later.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +12,14 @@ from typing import Any, TypeVar
 
 from slviewer.devices.capture import capture_with_texture, check_exposures
 from slviewer.devices.protocols import Rig, Turntable
-from slviewer.errors import Cancelled, DeviceError, InputError, SlviewerError, TurntableError, UsageError
+from slviewer.errors import (
+    Cancelled,
+    DeviceError,
+    InputError,
+    SlviewerError,
+    TurntableError,
+    UsageError,
+)
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import (
     check_space,
@@ -51,7 +58,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """The captures of a turn, in the order of their angles, and what was made of them, None where nothing was."""
+    """The captures of a turn, in the order of their angles, and what was made of them, None where
+    nothing was."""
 
     captures: tuple[Capture, ...]
     merged: Findings[Merge] | None = None
@@ -70,7 +78,9 @@ class Turn:
         """Return the result as a report for the terminal."""
         names = [capture.name for capture in self.captures]
         lines = [f"{len(names)} scans all round: {names[0]} to {names[-1]}"]
-        return "\n".join(lines + [made.text() for made in (self.merged, self.meshed) if made is not None])
+        return "\n".join(
+            lines + [made.text() for made in (self.merged, self.meshed) if made is not None]
+        )
 
 
 def turn(
@@ -93,29 +103,35 @@ def turn(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Turn:
-    """Scan an object all round on the rig's turntable, merge the scans, and close them to a watertight mesh.
+    """Scan an object all round on the rig's turntable, merge the scans, and close them to a
+    watertight mesh.
 
-    Each scan is saved before the table turns on; a turn that was cancelled or failed can be resumed.
+    Each scan is saved before the table turns on; a turn that was cancelled or failed can be
+    resumed.
 
     Args:
         session: Session folder.
-        rig: A TOML file that describes the rig with its turntable, or the name of one that `slviewer devices` lists.
+        rig: A TOML file that describes the rig with its turntable, or the name of one that
+            `slviewer devices` lists.
         steps: How many scans.
-        range_deg: Degrees from the first scan to the last; 360 is a full turn, whose last scan is one step before it.
-            Negative to turn the other way.
-        name: Name of the turn; its captures are NAME_01, NAME_02 and so on. By default turn1, turn2 ...
+        range_deg: Degrees from the first scan to the last; 360 is a full turn, whose last scan is
+            one step before it. Negative to turn the other way.
+        name: Name of the turn; its captures are NAME_01, NAME_02 and so on. By default turn1, turn2
+            ...
         resume: Capture what is missing of the turn of that name, by default of the last one.
         merge: Whether to merge the scans and mesh the merge; --no-merge captures only.
-        mesh: File of the mesh, .ply, .stl, .obj or .glb; by default a .ply in the session's exports.
-        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light themselves); by default the
-            session's, else complementary.
+        mesh: File of the mesh, .ply, .stl, .obj or .glb; by default a .ply in the session's
+            exports.
+        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light
+            themselves); by default the session's, else complementary.
         exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
         exposures_ms: Two or more exposures for shiny and dark parts.
         gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
-    Raises InputError, DeviceError, SessionError, and whatever `progress` raises; what was captured stays.
+    Raises InputError, DeviceError, SessionError, and whatever `progress` raises; what was captured
+    stays.
     """
     if mesh is not None and not merge:
         raise UsageError("a mesh is made of the merged scans: give --mesh or --no-merge, not both")
@@ -126,9 +142,16 @@ def turn(
         if merge:  # refused before anything turns
             check_accepted(store, accept_rejected)
             load_model(store, model)
-        todo = missing_steps(store, name) if resume else plan_turn(name or next_turn(store), steps, range_deg)
+        todo = (
+            missing_steps(store, name)
+            if resume
+            else plan_turn(name or next_turn(store), steps, range_deg)
+        )
         if taken := set(store.taken_names()).intersection(step.name for step in todo):
-            raise InputError(f"there is a capture {min(taken)!r} already: choose another name, or resume the turn")
+            raise InputError(
+                f"there is a capture {min(taken)!r} already: choose another name, or resume the"
+                " turn"
+            )
         choice = load_rig(rig, store)
         if choice.get("driver") == "replay":
             raise InputError("a recording cannot be turned: choose a rig with a turntable")
@@ -140,18 +163,33 @@ def turn(
         sequence = choose_sequence(bench, patterns)
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
-        check_space(store, bench.rig.camera, len(sequence.frames) * max(1, len(exposures)) * len(todo), "the turn")
+        check_space(
+            store,
+            bench.rig.camera,
+            len(sequence.frames) * max(1, len(exposures)) * len(todo),
+            "the turn",
+        )
         with bench.rig.opened() as devices:
             set_camera(devices, choice, exposure_ms, gain, warn)
 
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step."""
                 captured = capture_with_texture(
-                    devices, sequence, exposures, progress=lambda done, n: progress(done / n, f"frame {done} of {n}")
+                    devices,
+                    sequence,
+                    exposures,
+                    progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
                 )
                 save_frames(store, step.name, "scan", captured, turn_step=step)
 
-            capture_turn(devices, todo, capture_step, recorded_steps(store, todo[0].turn), part(progress, 0, 0.5), warn)
+            capture_turn(
+                devices,
+                todo,
+                capture_step,
+                recorded_steps(store, todo[0].turn),
+                part(progress, 0, 0.5),
+                warn,
+            )
         names = [step.name for step in recorded_steps(store, todo[0].turn)]
         captures = tuple(map(store.load_capture, names))
         if not merge:
@@ -168,14 +206,18 @@ def turn(
 
 
 def plan_turn(name: str, steps: int = STEPS, range_deg: float = FULL_TURN_DEG) -> list[TurnStep]:
-    """Return the steps of a turn: of a full one (360 degrees either way) equal ones, else from end to end of the range.
+    """Return the steps of a turn: of a full one (360 degrees either way) equal ones, else from end
+    to end of the range.
 
     Raises InputError for a number of steps or a range that cannot be scanned and merged.
     """
     if not 2 <= steps <= MOST_SCANS:
         raise InputError(f"{steps} steps make no turn: choose 2 to {MOST_SCANS}")
     if not 0 < abs(range_deg) <= FULL_TURN_DEG:
-        raise InputError(f"a turn of {range_deg:g} degrees is impossible: choose up to 360, negative the other way")
+        raise InputError(
+            f"a turn of {range_deg:g} degrees is impossible: choose up to 360, negative the"
+            " other way"
+        )
     safe_name(f"{name}_{steps:02d}")
     step_deg = range_deg / (steps if abs(range_deg) == FULL_TURN_DEG else steps - 1)
     return [TurnStep(name, k, steps, step_deg) for k in range(1, steps + 1)]
@@ -193,11 +235,15 @@ def next_turn(store: Session) -> str:
 def recorded_steps(store: Session, name: str) -> list[TurnStep]:
     """List the captured steps of a turn, in their order."""
     steps = (capture.turn_step for capture in store.captures("scan"))
-    return sorted((step for step in steps if step is not None and step.turn == name), key=lambda step: step.step)
+    return sorted(
+        (step for step in steps if step is not None and step.turn == name),
+        key=lambda step: step.step,
+    )
 
 
 def missing_steps(store: Session, name: str | None = None) -> list[TurnStep]:
-    """Return the steps of a turn, by default of the last one, that are not captured. Raises InputError if none is."""
+    """Return the steps of a turn, by default of the last one, that are not captured. Raises
+    InputError if none is."""
     turned = [capture for capture in store.captures("scan") if capture.turn_step is not None]
     if name is None and turned:
         last = max(turned, key=lambda capture: str(capture.meta.get("created", ""))).turn_step
@@ -210,11 +256,14 @@ def missing_steps(store: Session, name: str | None = None) -> list[TurnStep]:
     steps = [replace(first, step=k) for k in range(1, first.steps + 1)]
     if missing := [step for step in steps if step.name not in taken]:
         return missing
-    raise InputError(f"all {first.steps} steps of {name} are captured: delete a scan to capture it again")
+    raise InputError(
+        f"all {first.steps} steps of {name} are captured: delete a scan to capture it again"
+    )
 
 
 def place_object(bench: RigSetup) -> None:
-    """Let the stone stand on the turntable before a simulated rig, where a board, plate or ball shows nothing."""
+    """Let the stone stand on the turntable before a simulated rig, where a board, plate or ball
+    shows nothing."""
     if bench.world is not None and bench.world.standing in ("board", "plane", "sphere"):
         bench.world.place("stone")
 
@@ -234,10 +283,12 @@ def capture_turn(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> None:
-    """Turn to each step with the open rig, and capture there: `capture_step(step, progress)` saves what it captures.
+    """Turn to each step with the open rig, and capture there: `capture_step(step, progress)` saves
+    what it captures.
 
-    ``recorded``: the steps of the same turn that were captured before. The turntable is opened for the turn alone.
-    `progress` may raise Cancelled at any time, which stops the table. Other errors name the step, and how to go on.
+    ``recorded``: the steps of the same turn that were captured before. The turntable is opened for
+    the turn alone. `progress` may raise Cancelled at any time, which stops the table. Other errors
+    name the step, and how to go on.
     """
     table = require_turntable(rig)
     table.open()
@@ -258,32 +309,45 @@ def capture_turn(
                 kinds = (TurntableError, DeviceError, InputError)
                 kind = next((each for each in kinds if isinstance(error, each)), SlviewerError)
                 raise kind(
-                    f"{label}, at {step.deg:g} degrees: {error}. {saved} scan{'s are' if saved != 1 else ' is'} saved: "
-                    "correct the cause, then resume the turn"
+                    f"{label}, at {step.deg:g} degrees: {error}. {saved}"
+                    f" scan{'s are' if saved != 1 else ' is'} saved: correct the cause, then resume"
+                    " the turn"
                 ) from error
     finally:
         table.close()
 
 
-def merge_turn(store: Session, settings: MergeSettings, progress: Progress, warn: Warn) -> Findings[Merge]:
-    """Merge the scans of a turn by the angles of its turntable; by features where the angles do not fit the scans."""
-    return align_turn(lambda start: merge_operation.run(store, replace(settings, start=start), progress, warn), warn)
+def merge_turn(
+    store: Session, settings: MergeSettings, progress: Progress, warn: Warn
+) -> Findings[Merge]:
+    """Merge the scans of a turn by the angles of its turntable; by features where the angles do not
+    fit the scans."""
+    return align_turn(
+        lambda start: merge_operation.run(store, replace(settings, start=start), progress, warn),
+        warn,
+    )
 
 
 def align_turn(merge: Callable[[StartKind], T], warn: Warn) -> T:
-    """Return ``merge("turntable")`` of the scans of a turn; by features where the angles do not fit the scans.
+    """Return ``merge("turntable")`` of the scans of a turn; by features where the angles do not fit
+    the scans.
 
-    They do not where the motor lost steps, the object slipped, or the table was moved while it was switched off.
+    They do not where the motor lost steps, the object slipped, or the table was moved while it was
+    switched off.
     """
     try:
         return merge("turntable")
     except (Refused, InputError) as error:
-        warn(f"the angles of the turntable do not align the scans, they are aligned by features instead: {error}")
+        warn(
+            "the angles of the turntable do not align the scans, they are aligned by features"
+            f" instead: {error}"
+        )
     return merge("features")
 
 
 def _origin(table: Turntable, recorded: Sequence[TurnStep], warn: Warn) -> float:
-    """Return what the open table counts at the first step of a turn, deg, so that a resumed turn goes on with it."""
+    """Return what the open table counts at the first step of a turn, deg, so that a resumed turn
+    goes on with it."""
     now_deg = table.position_deg()
     if not recorded:
         return now_deg
@@ -291,7 +355,7 @@ def _origin(table: Turntable, recorded: Sequence[TurnStep], warn: Warn) -> float
     lost = not table.is_absolute and abs(now_deg) < _COUNT_LOST_DEG < abs(last.position_deg)
     if lost:
         warn(
-            f"{table.name} was switched off and counts from 0 again: it is taken to stand where {last.name} was "
-            "captured; merging checks this against the scans"
+            f"{table.name} was switched off and counts from 0 again: it is taken to stand where"
+            f" {last.name} was captured; merging checks this against the scans"
         )
     return (now_deg if lost else last.position_deg) - last.deg

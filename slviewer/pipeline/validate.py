@@ -54,17 +54,19 @@ def validate(
 
     Args:
         session: Session folder, calibrated.
-        models: Which models to compare; by default all there are. The recommended one is used where none is named.
+        models: Which models to compare; by default all there are. The recommended one is used where
+            none is named.
         folds: Into how many parts the poses are split, each excluded once.
 
-    Nothing is decoded again: the session stores what it needs of the poses. The result stays in the session as
-    ``calibration/validation``.
+    Nothing is decoded again: the session stores what it needs of the poses. The result stays in the
+    session as ``calibration/validation``.
     """
     with opened(session, write=True) as store:
         stereo = load_stereo(store)
         if not stereo.poses:
             raise InputError(
-                "this calibration was made elsewhere, without target poses: calibrate here to cross-validate"
+                "this calibration was made elsewhere, without target poses: calibrate here to"
+                " cross-validate"
             )
         names = [name for name in MODELS if name in (models or available_models(store))]
         if not names:
@@ -73,12 +75,17 @@ def validate(
         observations = load_observations(store, list(stereo.poses))
         if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
             raise InputError(
-                f"the session no longer holds the observations of {', '.join(missing)}: run `slviewer calibrate` again"
+                f"the session no longer holds the observations of {', '.join(missing)}: run"
+                " `slviewer calibrate` again"
             )
-        validated = cross_validate(move_to_centres(observations, stereo), stereo, names, folds, progress)
+        validated = cross_validate(
+            move_to_centres(observations, stereo), stereo, names, folds, progress
+        )
         for model, why in validated.failed.items():
             warn(f"{model} is not judged: {why}")
-        judged = [f"calibration/{name}" for name in validated.models if name in available_models(store)]
+        judged = [
+            f"calibration/{name}" for name in validated.models if name in available_models(store)
+        ]
         inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
         before = preferred_model(store)
         store.save_result(VALIDATION, {"validation": validated.to_json(), "inputs": inputs}, {})
@@ -94,7 +101,8 @@ def cross_validate(
     folds: int = FOLDS,
     progress: Progress = ignore_progress,
 ) -> CrossValidation:
-    """Cross-validate models on observations, with circles at their centres, and their stereo calibration."""
+    """Cross-validate models on observations, with circles at their centres, and their stereo
+    calibration."""
     depths = {o.name: float(np.median(_board_depths(o, stereo))) for o in observations}
     parts = split_folds(depths, folds)
     axis = best_axis(observations, stereo)
@@ -119,11 +127,18 @@ def cross_validate(
             except (CalibrationRejected, InputError) as error:
                 failed[name] = str(error)
         report(len(models) / (len(models) + 1), f"measuring fold {k + 1} of {len(parts)}")
-        measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in observations if o.name in fold})
+        measured.append(
+            {
+                o.name: measure_held_out(fitted, o, axis, stereo.rig)
+                for o in observations
+                if o.name in fold
+            }
+        )
     return gather_results(models, measured, parts, failed)
 
 
 def _board_depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
-    """Return the depths (n,) mm in the camera's frame of a pose's board points, by the stereo model."""
+    """Return the depths (n,) mm in the camera's frame of a pose's board points, by the stereo
+    model."""
     T = stereo.poses[observation.name]
     return np.asarray((observation.points @ T[:3, :3].T + T[:3, 3])[:, 2])

@@ -45,9 +45,11 @@ class VerifySettings:
         captures: Names of the captures.
         shape: What the captures show.
         models: Which calibrations to compare; by default all there are.
-        depth_range: Near and far end of the calibrated depths R2, mm; by default those of the board poses.
+        depth_range: Near and far end of the calibrated depths R2, mm; by default those of the board
+            poses.
         radius: Nominal radius of the sphere, mm: helps to detect it; the fitted radius stays free.
-        axis: Which pattern axis gives the depth; by default the one with the smaller predicted noise.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted
+            noise.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     ``check``: also compare the frames with each other, and warn of those that do not fit.
@@ -65,7 +67,9 @@ class VerifySettings:
 
     def __post_init__(self) -> None:
         if not self.captures:
-            raise UsageError("no capture named: give the captures to measure, for instance plane_01 plane_02")
+            raise UsageError(
+                "no capture named: give the captures to measure, for instance plane_01 plane_02"
+            )
         if self.depth_range is not None and not 0 < self.depth_range[0] < self.depth_range[1]:
             near, far = self.depth_range
             raise UsageError(f"the range {near:g} {far:g} is empty: give near and far in mm")
@@ -75,8 +79,9 @@ class VerifySettings:
 
 @dataclass(frozen=True, eq=False)
 class ComparedCapture:
-    """A capture that models were compared on: its phases, what was found, and {model: share of the shape's pixels that
-    it masks, because no target pose illuminated what they look through} of models that do."""
+    """A capture that models were compared on: its phases, what was found, and {model: share of the
+    shape's pixels that it masks, because no target pose illuminated what they look through} of
+    models that do."""
 
     capture: Capture
     frames: np.ndarray
@@ -86,51 +91,81 @@ class ComparedCapture:
 
 
 @operation("verify", Verification, VerifySettings)
-def verify(job: Job, settings: VerifySettings) -> Iterator[Found[Verification] | Found[Reconstruction]]:
-    """Measure captures of a plane or a sphere with each model, over the pixels that all of them measure, and compare.
+def verify(
+    job: Job, settings: VerifySettings
+) -> Iterator[Found[Verification] | Found[Reconstruction]]:
+    """Measure captures of a plane or a sphere with each model, over the pixels that all of them
+    measure, and compare.
 
-    The session stores the figures, the error maps, and the cloud of the model that it prefers, if that is compared.
+    The session stores the figures, the error maps, and the cloud of the model that it prefers, if
+    that is compared.
     """
     store = job.store
     chosen = load_models(store, settings.models)
     for each in compare_captures(job, settings, chosen):
         name = each.capture.name
-        yield Found(name, _make_record(store, each), {f"error_{m}": r.error_map for m, r in each.found.results.items()})
+        yield Found(
+            name,
+            _make_record(store, each),
+            {f"error_{m}": r.error_map for m, r in each.found.results.items()},
+        )
         if store.is_writable and (best := chosen.get(preferred_model(store))) is not None:
-            yield _reconstruct_best(store, best, each, settings)  # by its own best axis, as reconstruct
+            yield _reconstruct_best(
+                store, best, each, settings
+            )  # by its own best axis, as reconstruct
 
 
-def compare_captures(job: Job, settings: VerifySettings, chosen: Mapping[str, Model]) -> Iterator[ComparedCapture]:
+def compare_captures(
+    job: Job, settings: VerifySettings, chosen: Mapping[str, Model]
+) -> Iterator[ComparedCapture]:
     """Yield the comparison of models on each capture."""
     store, names = job.store, settings.captures
     check_accepted(store, settings.accept_rejected)
     warn_if_stale(store, job.warn)
     check_capture_sizes(store, names)
     depths = settings.depth_range or load_stereo(store).depth_range_mm
-    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn, check=settings.check)):
+    for i, (shot, frames, phases) in enumerate(
+        decode_captures(store, names, job.warn, check=settings.check)
+    ):
         job.progress(i / len(names), f"measuring {shot.name}")
         clouds = reconstruct_models(
-            store, chosen, shot, phases, settings.axis, accept_rejected=settings.accept_rejected, warn=job.warn
+            store,
+            chosen,
+            shot,
+            phases,
+            settings.axis,
+            accept_rejected=settings.accept_rejected,
+            warn=job.warn,
         )
         region: np.ndarray | None = None
         if settings.shape == "plane" and shot.role == "calibration":
             region = segment_board(store, shot, capture_texture(shot, frames), job.warn)
         lit = illuminated_pixels(phases, clouds)
         try:
-            found = fit_clouds(settings.shape, clouds, lit, region=region, depth_range=depths, radius=settings.radius)
+            found = fit_clouds(
+                settings.shape,
+                clouds,
+                lit,
+                region=region,
+                depth_range=depths,
+                radius=settings.radius,
+            )
         except InputError as error:
             raise InputError(f"{shot.name}: {error}") from error
         for message in found.warnings:
             job.warn(f"{shot.name}: {message}")
         phase = phases[next(iter(clouds.values())).axis]
-        shares = {model: masked_share(fitted, phase, found.region) for model, fitted in chosen.items()}
+        shares = {
+            model: masked_share(fitted, phase, found.region) for model, fitted in chosen.items()
+        }
         masked = {model: share for model, share in shares.items() if share is not None}
         yield ComparedCapture(shot, frames, phases, found, masked)
     job.progress(1.0, "measured")
 
 
 def _make_record(store: Session, each: ComparedCapture) -> Verification:
-    """Return the record of a comparison, with the scales and the hashes of what it was made from."""
+    """Return the record of a comparison, with the scales and the hashes of what it was made
+    from."""
     models = tuple(each.found.results)
     return each.found.record(
         each.masked,
@@ -146,8 +181,16 @@ def _reconstruct_best(
     shot, found = each.capture, each.found
     texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
     cloud = capture_cloud(
-        store, model, shot, each.phases, axis=settings.axis, texture=texture, accept_rejected=settings.accept_rejected
+        store,
+        model,
+        shot,
+        each.phases,
+        axis=settings.axis,
+        texture=texture,
+        accept_rejected=settings.accept_rejected,
     )
     region = None if found.is_searched else found.region
-    as_reconstructed = ReconstructSettings(shot.name, axis=settings.axis, accept_rejected=settings.accept_rejected)
+    as_reconstructed = ReconstructSettings(
+        shot.name, axis=settings.axis, accept_rejected=settings.accept_rejected
+    )
     return cloud_record(store, as_reconstructed, model, cloud, each.phases[cloud.axis], region)

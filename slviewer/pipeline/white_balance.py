@@ -22,16 +22,17 @@ MAX_GAIN = 8.0
 def measure_white(store: Session, reference: str) -> np.ndarray:
     """Return the gains (3,) of red, green and blue, at most 1, that make a reference neutral.
 
-    ``reference``: a capture of a grey card or white sheet that fills most of the view, a target pose, or ``board``: all
-    target poses. Raises InputError for pictures without colours, and for white that is overexposed or too dark.
+    ``reference``: a capture of a grey card or white sheet that fills most of the view, a target
+    pose, or ``board``: all target poses. Raises InputError for pictures without colours, and for
+    white that is overexposed or too dark.
     """
     if reference != BOARD:
         return _measure_gains(store, store.load_capture(reference))
     captures = [capture for capture in store.captures("calibration") if capture.texture is not None]
     if not captures:
         raise InputError(
-            "the target poses have no colours, so that the board's white is unknown: capture them with a colour camera "
-            "and a white image, or name a capture of a grey card"
+            "the target poses have no colours, so that the board's white is unknown: capture them"
+            " with a colour camera and a white image, or name a capture of a grey card"
         )
     gains, why = list[np.ndarray](), ""
     for capture in captures:
@@ -46,7 +47,8 @@ def measure_white(store: Session, reference: str) -> np.ndarray:
 
 
 def balance(texture: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return a texture (h, w, 3) uint8 with the gains (3,) applied; overexposed pixels become neutral."""
+    """Return a texture (h, w, 3) uint8 with the gains (3,) applied; overexposed pixels become
+    neutral."""
     return np.rint(np.minimum(texture * gains, 255 * gains.min())).astype(np.uint8)
 
 
@@ -54,7 +56,9 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
     """Return the gains of one reference."""
     texture = capture.texture
     if texture is None:
-        raise InputError(f"{capture.name} has no colours: name a capture of a colour camera with a white image")
+        raise InputError(
+            f"{capture.name} has no colours: name a capture of a colour camera with a white image"
+        )
     texture = to_eight_bits(texture, capture.sequence.full_scale)
     pixels = texture[_reference_mask(store, capture, texture)].astype(np.float64)
     brightness = pixels.max(axis=1)
@@ -62,13 +66,15 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
     usable = white[white.max(axis=1) < SATURATED]
     if len(usable) < len(white) / 2:
         share = 100 * (1 - len(usable) / len(white))
-        raise InputError(f"{share:.0f} % of the white in {capture.name} is overexposed: lower the exposure")
+        raise InputError(
+            f"{share:.0f} % of the white in {capture.name} is overexposed: lower the exposure"
+        )
     colour = np.median(usable, axis=0)
     if colour.min() < DARKEST or colour.max() > MAX_GAIN * colour.min():
         levels = ", ".join(f"{level:.0f}" for level in colour)
         raise InputError(
-            f"the white in {capture.name} has {levels} grey levels of red, green and blue: expose it so that each has "
-            f"{DARKEST} or more, none {MAX_GAIN:g} times another"
+            f"the white in {capture.name} has {levels} grey levels of red, green and blue: expose"
+            f" it so that each has {DARKEST} or more, none {MAX_GAIN:g} times another"
         )
     return np.asarray(colour.min() / colour)
 

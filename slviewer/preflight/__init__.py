@@ -1,1 +1,2 @@
-"""Is this rig fit to capture with? The checks, and `check_rig.preflight`, which makes them all in about 10 s."""
+"""Is this rig fit to capture with? The checks, and `check_rig.preflight`, which makes them all in
+about 10 s."""

@@ -1,4 +1,5 @@
-"""The preflight without a browser: is a rig fit to capture with, and is a capture fit to measure with?"""
+"""The preflight without a browser: is a rig fit to capture with, and is a capture fit to measure
+with?"""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -13,7 +14,13 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.rig_choice import SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
 from slviewer.preflight.latency import measure_latency
-from slviewer.preflight.light import capture_burst, check_ambient, check_exposure, check_flicker, check_gamma
+from slviewer.preflight.light import (
+    capture_burst,
+    check_ambient,
+    check_exposure,
+    check_flicker,
+    check_gamma,
+)
 from slviewer.preflight.order import check_order
 from slviewer.preflight.recorded_capture import preflight_capture
 from slviewer.preflight.rig_under_test import SYSTEM_CLOCK, Clock, RigUnderTest
@@ -33,7 +40,8 @@ def check_rig(
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> Preflight:
-    """Check a rig in about 10 s: screen, delay, order of frames, light, stillness, turntable; or a capture's frames.
+    """Check a rig in about 10 s: screen, delay, order of frames, light, stillness, turntable; or a
+    capture's frames.
 
     Reports of each what is wrong, and what to do. Ends with status 1 where something is bad.
 
@@ -63,9 +71,12 @@ def check_rig(
                 devices.camera.apply(before)
 
 
-def check_recorded_rig(session: SessionLike, capture: str, *, progress: Progress = ignore_progress) -> Preflight:
+def check_recorded_rig(
+    session: SessionLike, capture: str, *, progress: Progress = ignore_progress
+) -> Preflight:
     """Check the rig of a recorded capture from its frames: order, light, exposure, response, noise,
-    description, decoded share. Raises SessionError for a capture that cannot be read, and whatever `progress` raises.
+    description, decoded share. Raises SessionError for a capture that cannot be read, and whatever
+    `progress` raises.
     """
     with opened(session) as store:
         return preflight_capture(store.load_capture(capture), progress)
@@ -97,9 +108,9 @@ def preflight(
 ) -> Preflight:
     """Check an open rig, on the thread that owns its devices; about 10 s.
 
-    `say` receives one sentence for each check. `progress` may raise Cancelled. Raises DeviceError where a
-    device does not answer. Patterns are loaded and light is shown; what was loaded and shown before is for the caller
-    to restore.
+    `say` receives one sentence for each check. `progress` may raise Cancelled. Raises DeviceError
+    where a device does not answer. Patterns are loaded and light is shown; what was loaded and
+    shown before is for the caller to restore.
     """
     began, shown = clock.now(), 0
     checks: list[Check] = []
@@ -129,7 +140,10 @@ def preflight(
         add(screen)
         if screen.verdict != "bad":
             add(delay)
-        unseen = "It was not looked at, because the camera does not see what the projector is given to show."
+        unseen = (
+            "It was not looked at, because the camera does not see what the projector is given to"
+            " show."
+        )
         rest = [name for name in _CHECK_ORDER if name not in {check.name for check in checks}]
         checks += [Check(name, "unknown", unseen, "", {}) for name in rest]
         return Preflight(tuple(checks), None, None, None, clock.now() - began)
@@ -140,7 +154,9 @@ def preflight(
     add(check_flicker(bench, images))
     response, levels, middle = check_gamma(bench)
     add(response, check_pixels(bench, middle), *check_order(bench))
-    last_dark, last_white = (bench.grab_mean(grey, "what changed meanwhile", _AVERAGED_IMAGES) for grey in (None, 255))
+    last_dark, last_white = (
+        bench.grab_mean(grey, "what changed meanwhile", _AVERAGED_IMAGES) for grey in (None, 255)
+    )
     add(check_ambient(bench, last_dark), check_motion(bench, images, last_white))
     if rig.turntable is not None:
         tick("turning the turntable")

@@ -4,7 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.fringe.response import fit_gamma, linearise_levels, measure_nonlinearity, predict_phase_error
+from slviewer.fringe.response import (
+    fit_gamma,
+    linearise_levels,
+    measure_nonlinearity,
+    predict_phase_error,
+)
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.exposure_check import CLIPPED, MUCH_CLIPPED, TOO_WEAK, WEAK
 from slviewer.preflight.rig_under_test import RigUnderTest
@@ -15,7 +20,8 @@ _BURST = 24
 
 @dataclass(frozen=True, eq=False)
 class Burst:
-    """Images ``white`` (n, h, w) and ``dark`` (m, h, w); ``white_s`` (n,), ``dark_s`` (m,): when each began, s."""
+    """Images ``white`` (n, h, w) and ``dark`` (m, h, w); ``white_s`` (n,), ``dark_s`` (m,): when
+    each began, s."""
 
     white: np.ndarray
     dark: np.ndarray
@@ -24,13 +30,16 @@ class Burst:
 
 
 def capture_burst(bench: RigUnderTest) -> Burst:
-    """Capture several images in white light, then several in the dark, with the time at which each began.
+    """Capture several images in white light, then several in the dark, with the time at which each
+    began.
 
     The bench's ``unsteady`` rises to what they show: it was measured from fewer images.
     """
     white_s, white = _grab_images(bench, 255)
     dark_s, dark = _grab_images(bench, None)
-    bench.unsteady = max(bench.unsteady, bench.measure_unsteadiness(white), bench.measure_unsteadiness(dark))
+    bench.unsteady = max(
+        bench.unsteady, bench.measure_unsteadiness(white), bench.measure_unsteadiness(dark)
+    )
     return Burst(white, dark, white_s, dark_s)
 
 
@@ -42,17 +51,24 @@ def _grab_images(bench: RigUnderTest, grey: int | None) -> tuple[np.ndarray, np.
 
 
 _TARGET_LEVEL = 0.85  # of full scale, for the 99.5th percentile of what is illuminated
-_SATURATED_FACTOR = 0.5  # the excess of a saturated image is unknown: half of it, then measure again
+_SATURATED_FACTOR = (
+    0.5  # the excess of a saturated image is unknown: half of it, then measure again
+)
 
 
 def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
-    """Check the exposure; return the check and the exposure in ms to set, None where it is right or unknown."""
+    """Check the exposure; return the check and the exposure in ms to set, None where it is right or
+    unknown."""
     level, full = bench.white[bench.illuminated], bench.full
     bright = float(np.quantile(level, 0.995))
     clipped = float(np.mean(level >= 0.985 * full))
     black = float(np.median(bench.dark[bench.illuminated]))
     present = bench.read_exposure_ms()
-    factor = _SATURATED_FACTOR if bright >= 0.985 * full else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
+    factor = (
+        _SATURATED_FACTOR
+        if bright >= 0.985 * full
+        else (_TARGET_LEVEL * full - black) / max(bright - black, 1.0)
+    )
     wanted = None if present is None else float(f"{present * factor:.3g}")
     figures = {
         "bright_share_of_full_scale": round(bright / full, 3),
@@ -71,13 +87,25 @@ def check_exposure(bench: RigUnderTest) -> tuple[Check, float | None]:
         verdict: CheckVerdict = "bad" if clipped > MUCH_CLIPPED else "warning"
         text = f"{100 * clipped:.1f} % of what the projector lights is saturated in white light."
         if bright < 0.985 * full:
-            return Check("exposure", verdict, text, "Turn what shines, or capture with two exposures.", figures), None
+            return (
+                Check(
+                    "exposure",
+                    verdict,
+                    text,
+                    "Turn what shines, or capture with two exposures.",
+                    figures,
+                ),
+                None,
+            )
         return Check("exposure", verdict, text, f"{change}, then check again.", figures), wanted
     if bright < WEAK * full:
         verdict = "bad" if bright < TOO_WEAK * full else "warning"
         text = f"White light reaches only {100 * bright / full:.0f} % of the camera's range."
         return Check("exposure", verdict, text, f"{change}, or open the aperture.", figures), wanted
-    text = f"White light reaches {100 * bright / full:.0f} % of the camera's range; {100 * clipped:.1f} % is saturated."
+    text = (
+        f"White light reaches {100 * bright / full:.0f} % of the camera's range;"
+        f" {100 * clipped:.1f} % is saturated."
+    )
     return Check("exposure", "good", text, "", figures), None
 
 
@@ -89,7 +117,8 @@ _MAX_FLICKER = 0.02
 
 
 def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, float]:
-    """Measure gamma: the check, a table for `PatternSequence.levels`, and the light of level 127.5 over white."""
+    """Measure gamma: the check, a table for `PatternSequence.levels`, and the light of level 127.5
+    over white."""
     where = bench.usable()
     if where.sum() < _MIN_PIXELS:
         return _fail_gamma("too few pixels are illuminated and not saturated", "the exposure")
@@ -115,15 +144,17 @@ def check_gamma(bench: RigUnderTest) -> tuple[Check, tuple[int, ...] | None, flo
         text = f"Light is proportional to grey levels within {100 * curved:.1f} %."
         return Check("gamma", "good", text, "", figures), levels, middle
     text = (
-        f"Light follows grey levels with a gamma of {exponent:.2f}, {100 * curved:.0f} % off a straight line: an error "
-        f"of {errors[3]:.3f} rad with 3 steps and {errors[4]:.3f} rad with 4, before blur smooths it."
+        f"Light follows grey levels with a gamma of {exponent:.2f}, {100 * curved:.0f} % off a"
+        f" straight line: an error of {errors[3]:.3f} rad with 3 steps and {errors[4]:.3f} rad with"
+        " 4, before blur smooths it."
     )
     remedy = "Use the table that straightens it (measured just now), or 8 steps and more."
     return Check("gamma", "warning", text, remedy, figures), levels, middle
 
 
 def _fail_gamma(why: str, fault: str) -> tuple[Check, None, float]:
-    """The result of `check_gamma` where nothing can be measured, and the ``fault`` to correct before."""
+    """The result of `check_gamma` where nothing can be measured, and the ``fault`` to correct
+    before."""
     text = f"The response cannot be measured: {why}."
     return Check("gamma", "unknown", text, f"Correct {fault} first.", {}), None, 0.5
 
@@ -146,7 +177,8 @@ def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
         return Check(
             "ambient",
             "warning",
-            f"The room became {more} by {100 * abs(step):.0f} % of the projector's light while this was checked.",
+            f"The room became {more} by {100 * abs(step):.0f} % of the projector's light while this"
+            " was checked.",
             "Keep lamps, doors and daylight as they are while capturing.",
             figures,
         )
@@ -158,20 +190,34 @@ def check_ambient(bench: RigUnderTest, last_dark: np.ndarray) -> Check:
             "Darken the room, or move closer so that the projector is brighter.",
             figures,
         )
-    return Check("ambient", "good", f"The room adds {100 * ambient:.0f} % to the projector's light.", "", figures)
+    return Check(
+        "ambient",
+        "good",
+        f"The room adds {100 * ambient:.0f} % to the projector's light.",
+        "",
+        figures,
+    )
 
 
 def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     """Check brightness changes from image to image beyond the noise."""
     where, span = bench.usable(), max(bench.contrast, 1e-6)
     if not where.any():
-        return Check("flicker", "unknown", "Flicker cannot be measured: all that is illuminated is saturated.", "", {})
+        return Check(
+            "flicker",
+            "unknown",
+            "Flicker cannot be measured: all that is illuminated is saturated.",
+            "",
+            {},
+        )
     noise = bench.noise / np.sqrt(where.sum()) / span
     (white_rest, drift), (dark_rest, _) = (
         _remove_drift(images[:, where].mean(axis=1, dtype=float) / span, seconds)
         for images, seconds in ((burst.white, burst.white_s), (burst.dark, burst.dark_s))
     )
-    swing, ambient = (float(np.sqrt(max(0.0, np.var(rest) - noise**2))) for rest in (white_rest, dark_rest))
+    swing, ambient = (
+        float(np.sqrt(max(0.0, np.var(rest) - noise**2))) for rest in (white_rest, dark_rest)
+    )
     present = bench.read_exposure_ms()
     hertz = _identify_mains(white_rest, burst.white_s)
     figures = {
@@ -186,7 +232,13 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
     if worst <= _UNSTEADY:
         if abs(drift) > 2 * _UNSTEADY:
             text = f"The light drifts by {100 * abs(drift):.1f} % within a second."
-            return Check("flicker", "warning", text, "Let the projector's lamp warm up for some minutes.", figures)
+            return Check(
+                "flicker",
+                "warning",
+                text,
+                "Let the projector's lamp warm up for some minutes.",
+                figures,
+            )
         return Check("flicker", "good", f"The light is steady to {100 * worst:.2f} %.", "", figures)
     source = "room's" if ambient > 0.5 * swing else "projector's"
     named = {100: " (100 Hz)", 120: " (120 Hz)", None: ""}[hertz]
@@ -204,12 +256,15 @@ def check_flicker(bench: RigUnderTest, burst: Burst) -> Check:
 def _format_flicker_remedy(present: float | None, hertz: int | None) -> str:
     """Text that recommends exposure times in ms, multiples of the mains period."""
     choices = _list_mains_multiples(present, hertz)
-    listed = " or ".join(f"{value:g} ms (a multiple of 1/{name} s)" for name, value in choices.items())
+    listed = " or ".join(
+        f"{value:g} ms (a multiple of 1/{name} s)" for name, value in choices.items()
+    )
     return f"Set the exposure to {listed}, and less gain or aperture if that is too bright"
 
 
 def _list_mains_multiples(present: float | None, hertz: int | None) -> dict[str, float]:
-    """By frequency in Hz, the multiple of its period in ms that is nearest to the present exposure."""
+    """By frequency in Hz, the multiple of its period in ms that is nearest to the present
+    exposure."""
     return {
         str(name): round(max(1, round((present or 0.0) * name / 1000)) * 1000 / name, 2)
         for name in (100, 120)
@@ -235,4 +290,6 @@ def _identify_mains(values: np.ndarray, seconds: np.ndarray) -> int | None:
         rest = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
         explained[hertz] = 1 - np.var(rest) / max(np.var(values), 1e-15)
     best, other = sorted(explained, key=lambda h: -explained[h])
-    return best if explained[best] > _EXPLAINS and explained[other] < explained[best] - 0.3 else None
+    return (
+        best if explained[best] > _EXPLAINS and explained[other] < explained[best] - 0.3 else None
+    )

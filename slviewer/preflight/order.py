@@ -31,16 +31,26 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
     sequence = PatternSequence(projector, frames, full_scale=stated_full_scale(bench.rig.camera))
     bench.show(None, "order of the frames")
     bench.wait()
-    stack = capture_frames(replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep)
+    stack = capture_frames(
+        replace(bench.rig, settle_ms=bench.settle_ms), sequence, sleep=bench.clock.sleep
+    )
     return _judge_order(bench, sequence, stack), check_repeats(sequence, stack)
 
 
 def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarray) -> Check:
-    """The check of the order of a captured stack (n, h, w): white and black frames, then fringe residuals."""
+    """The check of the order of a captured stack (n, h, w): white and black frames, then fringe
+    residuals."""
     n = len(stack)
-    levels = {i: int(f.kind == "white") for i, f in enumerate(sequence.frames) if f.kind in ("white", "black")}
+    levels = {
+        i: int(f.kind == "white")
+        for i, f in enumerate(sequence.frames)
+        if f.kind in ("white", "black")
+    }
     shares = {
-        i: bench.share(stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.illuminated) for i in levels
+        i: bench.share(
+            stack[i][:: bench.stride, :: bench.stride].astype(np.float32), bench.illuminated
+        )
+        for i in levels
     }
     errors = {i: abs(shares[i] - on) for i, on in levels.items()}
     wrong = [i for i, error in errors.items() if error > 0.4]
@@ -59,37 +69,49 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
         sentence = f"Every frame is {many} late: frame k shows pattern k - {lag}."
         remedy = "Switch the camera's buffering off, or wait longer between showing and grabbing."
         return Check("order", "bad", sentence, remedy, figures | {"lag": lag})
-    verdict, sentence, remedy = _describe_order(n, wrong, mixed, [s.sentence for s in misplaced], residuals.message)
+    verdict, sentence, remedy = _describe_order(
+        n, wrong, mixed, [s.sentence for s in misplaced], residuals.message
+    )
     return Check("order", verdict, sentence, remedy, figures)
 
 
 def _describe_order(
     n: int, wrong: list[int], mixed: list[int], misplaced: list[str], unknown: str
 ) -> tuple[CheckVerdict, str, str]:
-    """Verdict, sentence and remedy for ``n`` frames that do not lag: indices of frames of a wrong level of light, and
-    of those that mix two; sentences on misplaced ones, and why the order cannot be proved."""
+    """Verdict, sentence and remedy for ``n`` frames that do not lag: indices of frames of a wrong
+    level of light, and of those that mix two; sentences on misplaced ones, and why the order cannot
+    be proved."""
     if wrong or misplaced:
-        sentence = "; ".join(misplaced[:3]) or f"frame {wrong[0] + 1} shows the wrong level of light"
+        sentence = (
+            "; ".join(misplaced[:3]) or f"frame {wrong[0] + 1} shows the wrong level of light"
+        )
         remedy = (
-            "Check the cable and the load of the computer, wait longer between showing and grabbing, then check again."
+            "Check the cable and the load of the computer, wait longer between showing and"
+            " grabbing, then check again."
         )
         return "bad", f"Of {n} coded frames, {sentence}.", remedy
     if mixed:
         sentence = f"Frame {mixed[0] + 1} of {n} still shows part of the pattern before it."
-        return "warning", sentence, "Wait longer between showing and grabbing, or lock the camera to the projector."
+        return (
+            "warning",
+            sentence,
+            "Wait longer between showing and grabbing, or lock the camera to the projector.",
+        )
     if unknown:
         return "unknown", f"The order could not be proved: {unknown}.", ""
     return "good", f"All {n} coded frames came in order.", ""
 
 
 def _is_lagging_by(shares: dict[int, float], levels: dict[int, int], lag: int) -> bool:
-    """Whether every white or black frame shows the level of `lag` frames before, where that was one too."""
+    """Whether every white or black frame shows the level of `lag` frames before, where that was one
+    too."""
     pairs = [(shares[i], levels[i - lag]) for i in shares if i - lag in levels]
     return all(abs(share - on) < 0.3 for share, on in pairs)
 
 
 def check_repeats(sequence: PatternSequence, stack: np.ndarray) -> Check:
-    """The check of images identical to the one before although the pattern changed; a camera may be without noise."""
+    """The check of images identical to the one before although the pattern changed; a camera may be
+    without noise."""
     changed = [k for k in range(1, len(stack)) if sequence.frames[k] != sequence.frames[k - 1]]
     same = [k for k in changed if np.array_equal(stack[k], stack[k - 1])]
     figures = {"detect_copies": [k + 1 for k in same], "frames": len(stack)}
@@ -98,8 +120,10 @@ def check_repeats(sequence: PatternSequence, stack: np.ndarray) -> Check:
         return Check(
             "repeats",
             "bad",
-            f"{len(same)} of {len(stack)} images of the burst are the one before once more (frame {listed}).",
-            "The driver hands out old images: lower the frame rate, or update it; then check again.",
+            f"{len(same)} of {len(stack)} images of the burst are the one before once more (frame"
+            f" {listed}).",
+            "The driver hands out old images: lower the frame rate, or update it; then check"
+            " again.",
             figures,
         )
     return Check("repeats", "good", f"No image of {len(stack)} came twice.", "", figures)

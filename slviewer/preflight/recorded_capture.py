@@ -28,9 +28,11 @@ _LIGHT_FAULTS = ("light", "flicker", "exposure-drift")
 _ROOM_FAULTS = ("room-light",)
 _RESPONSE_FAULTS = ("gamma",)
 _FEW, _TOO_FEW = 0.75, 0.25
-"""Shares of the illuminated pixels that must decode: below the first a warning, below the other most is lost."""
+"""Shares of the illuminated pixels that must decode: below the first a warning, below the other
+most is lost."""
 _LEAST_ILLUMINATED = 0.005
-"""Share of the image that must carry a pattern: half a percent is a board in a corner of the image."""
+"""Share of the image that must carry a pattern: half a percent is a board in a corner of the
+image."""
 
 
 def preflight_capture(capture: Capture, progress: Progress = ignore_progress) -> Preflight:
@@ -42,7 +44,13 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
     try:
         phases = decode_frames(capture.name, sequence, frames)
     except InputError as error:
-        failed = Check("description", "bad", f"The frames cannot be decoded: {error}.", "Correct the description.", {})
+        failed = Check(
+            "description",
+            "bad",
+            f"The frames cannot be decoded: {error}.",
+            "Correct the description.",
+            {},
+        )
         return Preflight((failed,), None, None, None, time.monotonic() - began)
     progress(0.5, "comparing the frames")
     check = check_frames(sequence, frames, capture.files)
@@ -63,15 +71,27 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
 
 
 def _check_description(
-    name: str, sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap], check: FrameCheck
+    name: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    phases: Mapping[Axis, PhaseMap],
+    check: FrameCheck,
 ) -> Check:
     """Check that the frames (n, h, w) agree with the description of their patterns."""
     try:
         check_capture(name, sequence, frames, phases, check)
     except InputError as error:
         text = str(error).removeprefix(f"{name}: ")
-        return Check("description", "bad", f"{text}.", "Correct the description of the capture, then import again.", {})
-    return Check("description", "good", "The frames agree with the description of the patterns.", "", {})
+        return Check(
+            "description",
+            "bad",
+            f"{text}.",
+            "Correct the description of the capture, then import again.",
+            {},
+        )
+    return Check(
+        "description", "good", "The frames agree with the description of the patterns.", "", {}
+    )
 
 
 def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> Check:
@@ -82,11 +102,20 @@ def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> C
     figures = {"frames": n, "misplaced_frames": sorted({s.frame + 1 for s in suspects})}
     if suspects:
         findings = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
-        remedy = "Capture again with a longer delay between showing and grabbing, or put the files in order."
+        remedy = (
+            "Capture again with a longer delay between showing and grabbing, or put the files in"
+            " order."
+        )
         return Check("order", "bad", f"Of {n} frames, {findings}.", remedy, figures)
     unknown = "; ".join(fit.message for fit in fits if fit.message)
     if unknown:
-        return Check("order", "unknown", f"The order of some frames cannot be checked: {unknown}.", "", figures)
+        return Check(
+            "order",
+            "unknown",
+            f"The order of some frames cannot be checked: {unknown}.",
+            "",
+            figures,
+        )
     return Check("order", "good", f"All {n} frames are in order.", "", figures)
 
 
@@ -98,13 +127,21 @@ def _check_light(fits: Sequence[FrameResiduals]) -> Check:
     suspects = _list_suspects(fits, _LIGHT_FAULTS)
     if suspects:
         remedy = (
-            "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10 ms (8.33 ms where "
-            "the mains have 60 Hz)."
+            "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10"
+            " ms (8.33 ms where the mains have 60 Hz)."
         )
         return Check("flicker", "warning", _join_findings(suspects[:3]), remedy, figures)
     if spread is None:
-        return Check("flicker", "good", "No frame is brighter or darker than the others.", "", figures)
-    return Check("flicker", "good", f"The light is steady to {100 * spread:.2f} % from frame to frame.", "", figures)
+        return Check(
+            "flicker", "good", "No frame is brighter or darker than the others.", "", figures
+        )
+    return Check(
+        "flicker",
+        "good",
+        f"The light is steady to {100 * spread:.2f} % from frame to frame.",
+        "",
+        figures,
+    )
 
 
 def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
@@ -113,10 +150,14 @@ def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
     if suspects:
         remedy = "Keep lamps, doors and daylight as they are while capturing."
         return Check("ambient", "warning", _join_findings(suspects), remedy, {})
-    return Check("ambient", "good", "The light of the room did not change between the frames.", "", {})
+    return Check(
+        "ambient", "good", "The light of the room did not change between the frames.", "", {}
+    )
 
 
-def _check_response(sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]) -> Check:
+def _check_response(
+    sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]
+) -> Check:
     """Check the linearity of the projector's response by the second harmonic of the fringes."""
     remedy = "Straighten the projector's response, or use more steps."
     suspects = _list_suspects(fits, _RESPONSE_FAULTS)
@@ -131,16 +172,29 @@ def _check_response(sequence: PatternSequence, frames: np.ndarray, fits: Sequenc
     gamma, steps = gamma_from_harmonic(known[axis]), axis_layout(sequence, axis).steps
     shown = np.linspace(0, 255, 18)
     response = (shown / 255) ** gamma
-    curved, error = measure_nonlinearity(shown, response), predict_phase_error(shown, response, steps)
-    figures = {"second_harmonic": {a: round(h, 4) for a, h in known.items()}, "gamma": round(gamma, 3)}
-    findings = f"a second harmonic of {100 * known[axis]:.1f} % of the fringe, as of a gamma of {gamma:.2f}"
+    curved, error = (
+        measure_nonlinearity(shown, response),
+        predict_phase_error(shown, response, steps),
+    )
+    figures = {
+        "second_harmonic": {a: round(h, 4) for a, h in known.items()},
+        "gamma": round(gamma, 3),
+    }
+    findings = (
+        f"a second harmonic of {100 * known[axis]:.1f} % of the fringe, as of a gamma of"
+        f" {gamma:.2f}"
+    )
     if curved <= MAX_NONLINEARITY:
         return Check("gamma", "good", f"The response is straight: {findings}.", "", figures)
-    sentence = f"The response is curved: {findings}; an error of {error:.4f} rad with {steps} steps."
+    sentence = (
+        f"The response is curved: {findings}; an error of {error:.4f} rad with {steps} steps."
+    )
     return Check("gamma", "warning", sentence, remedy, figures)
 
 
-def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]) -> Check:
+def _check_noise(
+    sequence: PatternSequence, frames: np.ndarray, phases: Mapping[Axis, PhaseMap]
+) -> Check:
     """The check of median noise and modulation, grey levels, and coordinate sigma, px, by axis."""
     figures: dict[str, Any] = {}
     lines, weak = [], False
@@ -148,12 +202,17 @@ def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[
         valid = phase.mask
         if not valid.any():
             continue
-        background, modulation = (float(np.median(values[valid])) for values in (phase.background, phase.modulation))
+        background, modulation = (
+            float(np.median(values[valid])) for values in (phase.background, phase.modulation)
+        )
         noise = float(np.sqrt(phase.noise[0] + phase.noise[1] * background))
         sigma = float(np.median(phase.sigma_phase[valid])) * phase.period_px / (2 * np.pi)
         white = white_level(sequence, frames, sequence.select(axis))
         least = dark_limit(
-            np.array([background], np.float32), phase.noise, white, dark_sigmas(axis_layout(sequence, axis))
+            np.array([background], np.float32),
+            phase.noise,
+            white,
+            dark_sigmas(axis_layout(sequence, axis)),
         )
         weak |= modulation < NEAR_DARK * float(least[0])
         figures[axis] = {
@@ -161,13 +220,21 @@ def _check_noise(sequence: PatternSequence, frames: np.ndarray, phases: Mapping[
             "median_modulation_levels": round(modulation, 2),
             "median_sigma_px": round(sigma, 5),
         }
-        lines.append(f"axis {axis}: noise {noise:.2f} of {modulation:.1f} grey levels of modulation, {sigma:.3f} px")
+        lines.append(
+            f"axis {axis}: noise {noise:.2f} of {modulation:.1f} grey levels of modulation,"
+            f" {sigma:.3f} px"
+        )
     if not lines:
         return Check("noise", "unknown", "The noise cannot be judged: no pixel is valid.", "", {})
     sentence = _join_findings(lines)
     if weak:
-        remedy = "Make the patterns brighter: longer exposure, wider aperture, darker room, or a nearer projector."
-        return Check("noise", "warning", f"{sentence[:-1]}: near the least that is decoded.", remedy, figures)
+        remedy = (
+            "Make the patterns brighter: longer exposure, wider aperture, darker room, or a nearer"
+            " projector."
+        )
+        return Check(
+            "noise", "warning", f"{sentence[:-1]}: near the least that is decoded.", remedy, figures
+        )
     return Check("noise", "good", sentence, "", figures)
 
 
@@ -180,16 +247,22 @@ def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
         counts = {reason: float(np.mean(phase.reason == reason)) for reason in Reason}
         share = counts[Reason.VALID] / illuminated if illuminated else 0.0
         worst, least = min(worst, share), min(least, illuminated)
-        figures[axis] = {"illuminated_share": round(illuminated, 4), "decoded_share": round(share, 4)} | {
-            f"{reason.name.lower()}_share": round(value, 4) for reason, value in counts.items()
-        }
+        figures[axis] = {
+            "illuminated_share": round(illuminated, 4),
+            "decoded_share": round(share, 4),
+        } | {f"{reason.name.lower()}_share": round(value, 4) for reason, value in counts.items()}
         lines.append(
-            f"axis {axis}: {100 * share:.1f} % of the illuminated {100 * illuminated:.1f} % of the image decode"
+            f"axis {axis}: {100 * share:.1f} % of the illuminated {100 * illuminated:.1f} % of the"
+            " image decode"
         )
     verdict: CheckVerdict = "warning" if worst < _FEW else "good"
     if least < _LEAST_ILLUMINATED or worst < _TOO_FEW:
         verdict = "bad"
-    remedy = "" if verdict == "good" else "See the picture that `slviewer decode` writes: it shows where, and why."
+    remedy = (
+        ""
+        if verdict == "good"
+        else "See the picture that `slviewer decode` writes: it shows where, and why."
+    )
     return Check("decoding", verdict, _join_findings(lines), remedy, figures)
 
 

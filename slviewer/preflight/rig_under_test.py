@@ -1,4 +1,5 @@
-"""The rig under test: projects light, grabs and times images, and shares results between the checks."""
+"""The rig under test: projects light, grabs and times images, and shares results between the
+checks."""
 
 import math
 import time
@@ -16,7 +17,8 @@ _DISCARDED_GRABS = 4
 """What a reference waits for: longer than any projector and camera take between them."""
 _MEAN = 8
 _SIGMAS = 6.0
-_SPREAD_S = 0.01  # one period of 100 Hz, over which images begin: at an even pace they may all see one phase
+# one period of 100 Hz, over which images begin: at an even pace they may all see one phase
+_SPREAD_S = 0.01
 _GOLDEN = 0.618034
 
 
@@ -34,9 +36,10 @@ SYSTEM_CLOCK = Clock()
 class RigUnderTest:
     """An open rig. Images come as (h, w) float32 grey levels of every `stride`-th row and column.
 
-    ``settle_ms`` and ``stale`` are the results of the latency check: the time to wait after a change, and how many
-    images to throw away. ``dark`` and ``white`` are the references, ``illuminated`` (h, w) bool lit by the projector;
-    ``noise`` of one grey level, and ``unsteady``, by how much whole images differ, as a share of the white light (rms).
+    ``settle_ms`` and ``stale`` are the results of the latency check: the time to wait after a
+    change, and how many images to throw away. ``dark`` and ``white`` are the references,
+    ``illuminated`` (h, w) bool lit by the projector; ``noise`` of one grey level, and ``unsteady``,
+    by how much whole images differ, as a share of the white light (rms).
     """
 
     def __init__(self, rig: Rig, tick: Callable[[str], None], clock: Clock = SYSTEM_CLOCK) -> None:
@@ -64,7 +67,8 @@ class RigUnderTest:
         return start_s, self.grab()
 
     def grab_spread(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Start times (n,) s and images (n, h, w) of the next ``count`` images, spread over the mains period."""
+        """Start times (n,) s and images (n, h, w) of the next ``count`` images, spread over the
+        mains period."""
         timed = []
         for k in range(count):
             self.clock.sleep(_SPREAD_S * (k * _GOLDEN % 1))
@@ -96,7 +100,8 @@ class RigUnderTest:
             self.grab()
 
     def measure_references(self) -> None:
-        """Measure the dark and white images with long waits, since the rig's delays are not known yet."""
+        """Measure the dark and white images with long waits, since the rig's delays are not known
+        yet."""
         bursts = []
         for grey, doing in ((None, "dark"), (255, "white light")):
             self.show(grey, doing)
@@ -109,15 +114,20 @@ class RigUnderTest:
         dark, white = bursts
         self.dark, self.white = dark.mean(axis=0), white.mean(axis=0)
         difference = white[1] - white[0]
-        self.noise = float(np.median(np.abs(difference - np.median(difference)))) / 0.6745 / math.sqrt(2)
+        self.noise = (
+            float(np.median(np.abs(difference - np.median(difference)))) / 0.6745 / math.sqrt(2)
+        )
         # Light that flickers lifts whole images, and must not pass for the projector's.
         swing = max(float(np.std([np.median(image) for image in images])) for images in bursts)
-        self.illuminated = self.white - self.dark > max(_SIGMAS * self.noise, 0.02 * self.full, 3 * swing)
+        self.illuminated = self.white - self.dark > max(
+            _SIGMAS * self.noise, 0.02 * self.full, 3 * swing
+        )
         if self.illuminated.any():
             self.unsteady = max(map(self.measure_unsteadiness, bursts))
 
     def measure_unsteadiness(self, images: np.ndarray) -> float:
-        """By how much images (n, h, w) under even light differ as a whole, as a share of the white light (rms)."""
+        """By how much images (n, h, w) under even light differ as a whole, as a share of the white
+        light (rms)."""
         return float(np.std([self.share(image, self.illuminated) for image in images]))
 
     @property
@@ -128,7 +138,11 @@ class RigUnderTest:
     @property
     def contrast(self) -> float:
         """Grey levels of the projector's white light: median over the illuminated pixels."""
-        return float(np.median((self.white - self.dark)[self.illuminated])) if self.illuminated.any() else 0.0
+        return (
+            float(np.median((self.white - self.dark)[self.illuminated]))
+            if self.illuminated.any()
+            else 0.0
+        )
 
     def usable(self) -> np.ndarray:
         """(h, w) bool: illuminated, and not clipped in white light."""

@@ -1,4 +1,5 @@
-"""Whether the camera sees this projector, and each pixel of a pattern is one pixel of the projector."""
+"""Whether the camera sees this projector, and each pixel of a pattern is one pixel of the
+projector."""
 
 import numpy as np
 
@@ -15,14 +16,19 @@ _NOTHING, _LITTLE = 0.01, 0.1  # shares of the image
 
 
 def check_screen(bench: RigUnderTest) -> Check:
-    """Check that the camera sees the projector, switched by a code; stores the illuminated pixels in the rig."""
-    images = np.stack([bench.grab_mean(255 if on else None, "which screen the camera sees") for on in _CODE])
+    """Check that the camera sees the projector, switched by a code; stores the illuminated pixels
+    in the rig."""
+    images = np.stack(
+        [bench.grab_mean(255 if on else None, "which screen the camera sees") for on in _CODE]
+    )
     code = np.array(_CODE) - np.mean(_CODE)
     images = images - images.mean(axis=0)
     amplitude = np.tensordot(code, images, 1) / float(code @ code)  # grey levels, white less dark
     spread = np.sqrt((images**2).sum(axis=0) * float(code @ code))
     correlation = amplitude * float(code @ code) / np.maximum(spread, 1e-6)
-    follows = (correlation > _MIN_CORRELATION) & (amplitude > max(4 * bench.noise, 0.01 * bench.full))
+    follows = (correlation > _MIN_CORRELATION) & (
+        amplitude > max(4 * bench.noise, 0.01 * bench.full)
+    )
     share = float(follows.mean())
     if share >= _NOTHING:
         bench.illuminated = follows
@@ -35,8 +41,8 @@ def check_screen(bench: RigUnderTest) -> Check:
             "screen",
             "bad",
             "The camera sees no change when the projector goes from dark to white.",
-            "Check that the projector is on and shows this program's picture on the right screen, that the lens cap is "
-            "off, and that the camera looks at what it lights.",
+            "Check that the projector is on and shows this program's picture on the right screen,"
+            " that the lens cap is off, and that the camera looks at what it lights.",
             figures,
         )
     if share < _LITTLE:
@@ -44,7 +50,8 @@ def check_screen(bench: RigUnderTest) -> Check:
             "screen",
             "warning",
             f"Only {100 * share:.0f} % of the image follows the projector.",
-            "Turn the camera and the projector so that both look at the same place, or raise the exposure.",
+            "Turn the camera and the projector so that both look at the same place, or raise the"
+            " exposure.",
             figures,
         )
     text = f"{100 * share:.0f} % of the image follows the projector's light."
@@ -61,17 +68,22 @@ _MAX_DEVIATION = 0.3  # of that distance
 
 
 def check_pixels(bench: RigUnderTest, middle: float) -> Check:
-    """Whether each pixel of a pattern is one pixel of the projector; ``middle``: light of the middle grey level as a
-    share of white, which the gamma check measured.
+    """Whether each pixel of a pattern is one pixel of the projector; ``middle``: light of the
+    middle grey level as a share of white, which the gamma check measured.
 
-    Stripes one pixel wide are half white and half black, and half as bright as white, whether the camera resolves them
-    or not. Where a display scales them they become grey, and grey of a gamma is not half as bright.
+    Stripes one pixel wide are half white and half black, and half as bright as white, whether the
+    camera resolves them or not. Where a display scales them they become grey, and grey of a gamma
+    is not half as bright.
     """
     where = bench.usable()
     if abs(middle - 0.5) < _MIN_GREY_CONTRAST or not where.any():
-        text = "Whether the display scales the patterns cannot be seen: its grey is as bright as its finest stripes."
+        text = (
+            "Whether the display scales the patterns cannot be seen: its grey is as bright as its"
+            " finest stripes."
+        )
         remedy = (
-            "Check in the projector's menu: native resolution, a zoom of 100 %, no keystone correction or sharpening."
+            "Check in the projector's menu: native resolution, a zoom of 100 %, no keystone"
+            " correction or sharpening."
         )
         return Check("pixels", "unknown", text, remedy, {"middle_grey": round(middle, 3)})
     size = bench.rig.projector.size
@@ -80,7 +92,9 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
         sequence = PatternSequence(size, tuple(phase_steps(axis, 4, 2.0)))
         rig = Rig(bench.rig.name, bench.rig.camera, bench.rig.projector, bench.settle_ms)
         frames = capture_frames(rig, sequence)[:, :: bench.stride, :: bench.stride]
-        both = (frames[0].astype(np.float32) + frames[2]) / 2  # stripes and their negative: without moire
+        both = (
+            frames[0].astype(np.float32) + frames[2]
+        ) / 2  # stripes and their negative: without moire
         shares.append(bench.share(both, where))
     worst = max(shares, key=lambda share: abs(share - 0.5))
     figures = {
@@ -92,9 +106,10 @@ def check_pixels(bench: RigUnderTest, middle: float) -> Check:
         return Check(
             "pixels",
             "bad",
-            f"Stripes one pixel wide are {100 * worst:.0f} % as bright as white instead of 50 %: the display scales or "
-            "blurs the patterns.",
-            "Set the projector's native resolution, a zoom of 100 %, and no keystone correction or sharpening.",
+            f"Stripes one pixel wide are {100 * worst:.0f} % as bright as white instead of 50 %:"
+            " the display scales or blurs the patterns.",
+            "Set the projector's native resolution, a zoom of 100 %, and no keystone correction or"
+            " sharpening.",
             figures,
         )
     return Check("pixels", "good", "Patterns are shown pixel for pixel.", "", figures)

@@ -14,11 +14,19 @@ _SOME_MOTION, _MUCH_MOTION = 0.004, 0.05  # shares of what is illuminated
 
 
 def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> Check:
-    """White images of the beginning, the middle and the end, block by block, whatever the light as a whole did."""
-    grids = np.stack([_average_blocks(image, bench.illuminated) for image in (bench.white, *burst.white, last_white)])
+    """White images of the beginning, the middle and the end, block by block, whatever the light as
+    a whole did."""
+    grids = np.stack(
+        [
+            _average_blocks(image, bench.illuminated)
+            for image in (bench.white, *burst.white, last_white)
+        ]
+    )
     measured = np.isfinite(grids[0])
     if not measured.any():
-        return Check("motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {})
+        return Check(
+            "motion", "unknown", "Motion cannot be seen: too little is illuminated.", "", {}
+        )
     blocks = grids[:, measured]
     blocks = np.stack([_match_light(image, blocks[0]) for image in blocks])
     noise = 1.4826 * float(np.median(np.abs(np.diff(blocks[1:-1], axis=0)))) / np.sqrt(2)
@@ -30,7 +38,8 @@ def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> C
         return Check(
             "motion",
             "bad" if share > _MUCH_MOTION else "warning",
-            f"{100 * share:.1f} % of the illuminated image changed while nothing should have: something moved.",
+            f"{100 * share:.1f} % of the illuminated image changed while nothing should have:"
+            " something moved.",
             "Let nothing move in front of the rig, stand it firmly, then check again.",
             figures,
         )
@@ -47,9 +56,11 @@ def check_motion(bench: RigUnderTest, burst: Burst, last_white: np.ndarray) -> C
 
 
 def _match_light(image: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Block means with the projector and ambient light of the other image, fitted by robust regression.
+    """Block means with the projector and ambient light of the other image, fitted by robust
+    regression.
 
-    The gain is bounded: a scene without contrast determines none, and what comes into its view must not pass for light.
+    The gain is bounded: a scene without contrast determines none, and what comes into its view must
+    not pass for light.
     """
     here = np.ones(len(image), bool)
     fitted = image

@@ -17,7 +17,11 @@ def check_turning(table: Turntable) -> Check:
             try:
                 begin_deg = table.position_deg()
                 low, high = table.limits_deg or (-float("inf"), float("inf"))
-                turned_deg = begin_deg + _TURN_DEG if begin_deg + _TURN_DEG <= high else max(low, begin_deg - _TURN_DEG)
+                turned_deg = (
+                    begin_deg + _TURN_DEG
+                    if begin_deg + _TURN_DEG <= high
+                    else max(low, begin_deg - _TURN_DEG)
+                )
                 table.turn_to(turned_deg)
                 error_deg = table.position_deg() - turned_deg
                 table.turn_to(begin_deg)
@@ -26,8 +30,16 @@ def check_turning(table: Turntable) -> Check:
                 table.close()
     except (InputError, DeviceError) as error:
         sentence, _, remedy = str(error).rpartition(": ")
-        return Check("turntable", "bad", f"{sentence}.", f"{remedy[:1].upper()}{remedy[1:]}.", figures)
+        return Check(
+            "turntable", "bad", f"{sentence}.", f"{remedy[:1].upper()}{remedy[1:]}.", figures
+        )
     if abs(error_deg) > _TOLERANCE_DEG:
         sentence = f"{table.name} stops {error_deg:+.2f} degrees off."
-        return Check("turntable", "warning", sentence, "Check degrees_per_unit and the controller's steps.", figures)
+        return Check(
+            "turntable",
+            "warning",
+            sentence,
+            "Check degrees_per_unit and the controller's steps.",
+            figures,
+        )
     return Check("turntable", "good", f"{table.name} turns, and comes back.", "", figures)

@@ -1,8 +1,9 @@
 """Whether a capture belongs to a calibration: sizes, and what its second axis says of the first.
 
-A camera ray and the projector ray of both measured coordinates must meet. By how much they miss each other, as the
-distance of the projector point from its epipolar line, needs no depth: it exposes exchanged axes, an inverted
-transform, another rig, and a rig that was bumped, whichever axis depth is taken from.
+A camera ray and the projector ray of both measured coordinates must meet. By how much they miss
+each other, as the distance of the projector point from its epipolar line, needs no depth: it
+exposes exchanged axes, an inverted transform, another rig, and a rig that was bumped, whichever
+axis depth is taken from.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,27 +25,35 @@ SAMPLE = 20_000
 LEAST_PIXELS = 200
 """Fewer say nothing about a rig."""
 RAISED_RATIO = 3.0
-"""Times the predicted misfit, beyond which noise and the calibration's own residuals do not explain a median of
-thousands of pixels: the predicted sigma is then raised."""
+"""Times the predicted misfit, beyond which noise and the calibration's own residuals do not explain
+a median of thousands of pixels: the predicted sigma is then raised."""
 REFUSED_RATIO = 6.0
 REFUSED_PX = 2.0
-"""A capture that misses its calibration by more than both does not belong to it: 2 px is also the reprojection error at
-which a calibration itself is rejected."""
+"""A capture that misses its calibration by more than both does not belong to it: 2 px is also the
+reprojection error at which a calibration itself is rejected."""
 TILES = (12, 16)
-"""Rows and columns of tiles in each of which the axes are compared: a second light path spoils a part of an image."""
+"""Rows and columns of tiles in each of which the axes are compared: a second light path spoils a
+part of an image."""
 LEAST_IN_TILE = 20
 """Pixels, below which a tile says nothing."""
 LEAST_IN_FRONT = 0.8
-"""Share of the points that lie before both devices: all of them, by the right calibration, but for decoding errors."""
+"""Share of the points that lie before both devices: all of them, by the right calibration, but for
+decoding errors."""
 LEAST_MEASURED = (0.5, 0.8)
-"""Share of the decoded pixels of one axis whose point the projector could have lit: below the first the capture is
-refused, below the second there is a warning."""
+"""Share of the decoded pixels of one axis whose point the projector could have lit: below the first
+the capture is refused, below the second there is a warning."""
 EXPLAINED = 0.25
-"""A hypothesis explains a misfit that it brings down to this share, or below the limit of refusal."""
+"""A hypothesis explains a misfit that it brings down to this share, or below the limit of
+refusal."""
 DEPTHS = (0.7, 1.4)
-"""Of the nearest and the farthest calibrated depth: beyond, no calibration of ours measures (as ``splined.model``)."""
+"""Of the nearest and the farthest calibrated depth: beyond, no calibration of ours measures (as
+``splined.model``)."""
 _FLIPS = (
-    ((True, False), "the x axis is reversed; number the projector's columns from the other end", "mirrored"),
+    (
+        (True, False),
+        "the x axis is reversed; number the projector's columns from the other end",
+        "mirrored",
+    ),
     (
         (False, True),
         "the y axis is reversed; number the projector's rows from the other end",
@@ -52,12 +61,15 @@ _FLIPS = (
     ),
     (
         (True, True),
-        "the projector's image is turned by 180 degrees; number columns and rows from the other end, or switch off its "
-        "ceiling mode",
+        (
+            "the projector's image is turned by 180 degrees; number columns and rows from the other"
+            " end, or switch off its ceiling mode"
+        ),
         "turned by 180 degrees",
     ),
 )
-"""Coordinates (x, y) that run backwards, and what that says of the projector's and of the camera's image."""
+"""Coordinates (x, y) that run backwards, and what that says of the projector's and of the camera's
+image."""
 LEAST_WITHIN = 0.5
 """Share of the points between these depths, below which the depths themselves are doubtful."""
 
@@ -65,9 +77,11 @@ LEAST_WITHIN = 0.5
 class Calibration(Protocol):
     """Camera and projector rays of a calibration. ``rig``: its pinholes and their arrangement."""
 
-    def undistort_pairs(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and of ``projector`` pixels (n, 2);
-        NaN where not calibrated."""
+    def undistort_pairs(
+        self, pixels: np.ndarray, projector: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and of
+        ``projector`` pixels (n, 2); NaN where not calibrated."""
 
     @property
     def pinholes(self) -> StereoRig:
@@ -75,17 +89,18 @@ class Calibration(Protocol):
 
     @property
     def residual_px(self) -> float:
-        """How far, in projector px, its own target poses miss their epipolar lines beyond noise (1 sigma); 0 where it
-        is not known."""
+        """How far, in projector px, its own target poses miss their epipolar lines beyond noise (1
+        sigma); 0 where it is not known."""
 
 
 @dataclass(frozen=True)
 class AxisAgreement:
-    """How far projector points lie from the epipolar lines of their camera pixels, px of the projector.
+    """How far projector points lie from the epipolar lines of their camera pixels, px of the
+    projector.
 
-    ``misfit_px``: 1.4826 times the median distance; ``predicted_px``: what noise and the calibration's residuals make
-    of it (1 sigma). ``in_front``: share of the points that lie before both devices; ``depths_mm``: those of these
-    points.
+    ``misfit_px``: 1.4826 times the median distance; ``predicted_px``: what noise and the
+    calibration's residuals make of it (1 sigma). ``in_front``: share of the points that lie before
+    both devices; ``depths_mm``: those of these points.
     """
 
     misfit_px: float
@@ -108,9 +123,10 @@ class AxisAgreement:
 
 @dataclass(frozen=True)
 class CaptureCheck:
-    """Result of a check. ``sigma_factor``: by how much the predicted sigma is too small, 1 where it is not.
-    ``excess_px``: float32, `TILES`, the px of the projector by which the axes miss each other in each tile of the image
-    beyond what is predicted; None where they do so nowhere, or everywhere alike."""
+    """Result of a check. ``sigma_factor``: by how much the predicted sigma is too small, 1 where it
+    is not. ``excess_px``: float32, `TILES`, the px of the projector by which the axes miss each
+    other in each tile of the image beyond what is predicted; None where they do so nowhere, or
+    everywhere alike."""
 
     sigma_factor: float = 1.0
     warnings: tuple[str, ...] = ()
@@ -119,19 +135,24 @@ class CaptureCheck:
 
 
 def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: StereoRig) -> None:
-    """Raise InputError where a capture's camera or projector has not the size that was calibrated."""
+    """Raise InputError where a capture's camera or projector has not the size that was
+    calibrated."""
     use_camera = (
-        "use captures of the calibrated camera, at the same resolution and without cropping, or calibrate at this one"
+        "use captures of the calibrated camera, at the same resolution and without cropping, or"
+        " calibrate at this one"
     )
-    use_size = "import the capture with the projector's true size, or calibrate with patterns of the same size"
+    use_size = (
+        "import the capture with the projector's true size, or calibrate with patterns of the same"
+        " size"
+    )
     for what, size, wanted, remedy in (
         ("camera image", camera, calibrated.camera.size, use_camera),
         ("projector", projector, calibrated.projector.size, use_size),
     ):
         if size is not None and tuple(size) != wanted:
             raise InputError(
-                f"{name}: the capture was taken with a {what} of {_size(size)} px, the calibration was made with "
-                f"{_size(wanted)}{_scale(size, wanted)}: {remedy}"
+                f"{name}: the capture was taken with a {what} of {_size(size)} px, the calibration"
+                f" was made with {_size(wanted)}{_scale(size, wanted)}: {remedy}"
             )
 
 
@@ -144,14 +165,16 @@ def check_phases(
 ) -> CaptureCheck:
     """Check whether the decoded axes of a capture agree with each other by a calibration.
 
-    ``depth_range`` mm: the calibrated depths. With both axes their misfit decides, with one the share of its pixels
-    that the projector could have lit. Raises InputError, with the likely reason, where the capture cannot belong to the
-    calibration, unless that is ``accept``-ed: then it is a warning.
+    ``depth_range`` mm: the calibrated depths. With both axes their misfit decides, with one the
+    share of its pixels that the projector could have lit. Raises InputError, with the likely
+    reason, where the capture cannot belong to the calibration, unless that is ``accept``-ed: then
+    it is a warning.
     """
     warnings: list[str] = []
 
     def refuse(reason: str) -> None:
-        """Raise InputError with the reason, or append it to the warnings where contradictions are accepted."""
+        """Raise InputError with the reason, or append it to the warnings where contradictions are
+        accepted."""
         if not accept:
             raise InputError(reason)
         warnings.append(reason)
@@ -161,14 +184,14 @@ def check_phases(
         depths, share = _single_axis(phases, rig)
         if share < LEAST_MEASURED[0]:
             refuse(
-                f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the calibrated projector "
-                "could light: the calibration does not belong to this capture; import the projector's true size and "
-                "axes, or calibrate this rig"
+                f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the"
+                " calibrated projector could light: the calibration does not belong to this"
+                " capture; import the projector's true size and axes, or calibrate this rig"
             )
         elif share < LEAST_MEASURED[1]:
             warnings.append(
-                f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the calibrated projector "
-                "could light: see that the calibration belongs to this rig"
+                f"{name}: {100 * (1 - share):.0f} % of the decoded pixels meet no point that the"
+                " calibrated projector could light: see that the calibration belongs to this rig"
             )
         return CaptureCheck(1.0, (*warnings, *_depth_warning(name, depths, depth_range)))
     pixels, measured, sigma = _samples(phases)
@@ -176,40 +199,53 @@ def check_phases(
     if agreement is None:
         return CaptureCheck()
     if agreement.is_refused:
-        refuse(f"{name}: {_describe_contradiction(agreement)}: {_likely_reason(agreement, rig, pixels, measured)}")
+        refuse(
+            f"{name}: {_describe_contradiction(agreement)}:"
+            f" {_likely_reason(agreement, rig, pixels, measured)}"
+        )
     factor = agreement.ratio if agreement.ratio > RAISED_RATIO else 1.0
     if factor > 1.0 and not agreement.is_refused:
         warnings.append(
-            f"{name}: the x and y patterns disagree by {agreement.misfit_px:.2f} px with this calibration, and noise "
-            f"explains {agreement.predicted_px:.2f} px: the uncertainty of the points was raised by a factor of "
-            f"{factor:.1f}; the rig may have moved since it was calibrated (run `slviewer check`), or the frames are "
-            "disturbed"
+            f"{name}: the x and y patterns disagree by {agreement.misfit_px:.2f} px with this"
+            f" calibration, and noise explains {agreement.predicted_px:.2f} px: the uncertainty of"
+            f" the points was raised by a factor of {factor:.1f}; the rig may have moved since it"
+            " was calibrated (run `slviewer check`), or the frames are disturbed"
         )
     excess = local_misfit(calibration, pixels, measured, sigma) if factor == 1.0 else None
     if excess is not None:
         warnings.append(
-            f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns disagree by up to "
-            f"{excess.max():.2f} px (elsewhere {agreement.misfit_px:.2f} px): the uncertainty of the points there was "
-            "raised; look for reflections of the projector's light (a glossy table or wall, a shiny part, a deep "
-            "corner), or for something that moved"
+            f"{name}: in {100 * np.mean(excess > 0):.0f} % of the image the x and y patterns"
+            f" disagree by up to {excess.max():.2f} px (elsewhere {agreement.misfit_px:.2f} px):"
+            " the uncertainty of the points there was raised; look for reflections of the"
+            " projector's light (a glossy table or wall, a shiny part, a deep corner), or for"
+            " something that moved"
         )
-    return CaptureCheck(factor, (*warnings, *_depth_warning(name, agreement.depths_mm, depth_range)), agreement, excess)
+    return CaptureCheck(
+        factor,
+        (*warnings, *_depth_warning(name, agreement.depths_mm, depth_range)),
+        agreement,
+        excess,
+    )
 
 
 def local_misfit(
     calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
 ) -> NDArray[np.float32] | None:
-    """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond what is predicted
-    there; 0 where noise and the calibration's residuals explain it, None where they do so everywhere.
+    """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond
+    what is predicted there; 0 where noise and the calibration's residuals explain it, None where
+    they do so everywhere.
 
-    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_axis_agreement` takes them. What disturbs one axis
-    disturbs the other about as much.
+    ``pixels``, ``measured`` and ``sigma`` (n, 2) as `measure_axis_agreement` takes them. What
+    disturbs one axis disturbs the other about as much.
     """
     rig = calibration.pinholes
     distance, normal = epipolar_distance(rig, *calibration.undistort_pairs(pixels, measured))
     known = np.isfinite(distance)
     distance, noise = np.abs(distance[known]), np.sum((normal[known] * sigma[known]) ** 2, axis=1)
-    tile = (pixels[known, ::-1] * TILES / np.array(rig.camera.size[::-1])).astype(int) @ (TILES[1], 1)
+    tile = (pixels[known, ::-1] * TILES / np.array(rig.camera.size[::-1])).astype(int) @ (
+        TILES[1],
+        1,
+    )
     order = np.argsort(tile, kind="stable")
     excess = np.zeros(TILES, np.float32)
     for group in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
@@ -223,16 +259,21 @@ def local_misfit(
 def measure_axis_agreement(
     calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
 ) -> AxisAgreement | None:
-    """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px, of noise ``sigma``
-    (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
+    """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px,
+    of noise ``sigma`` (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
     rig = calibration.pinholes
-    agreement = _compute_agreement(rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px)
+    agreement = _compute_agreement(
+        rig, *calibration.undistort_pairs(pixels, measured), sigma, calibration.residual_px
+    )
     return agreement if agreement.pixels >= LEAST_PIXELS else None
 
 
-def epipolar_distance(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return signed distances (n,) px of projector points from the epipolar lines of their camera rays, and the lines'
-    unit normals (n, 2). ``camera``, ``projector`` (n, 2): undistorted normalised coordinates."""
+def epipolar_distance(
+    rig: StereoRig, camera: np.ndarray, projector: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return signed distances (n,) px of projector points from the epipolar lines of their camera
+    rays, and the lines' unit normals (n, 2). ``camera``, ``projector`` (n, 2): undistorted
+    normalised coordinates."""
     along = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
     line = np.cross(rig.t, along)
     K = rig.projector.K
@@ -244,27 +285,32 @@ def epipolar_distance(rig: StereoRig, camera: np.ndarray, projector: np.ndarray)
 
 
 def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
-    """(n, 2) mm: depths before camera and projector at which the rays of undistorted normalised coordinates (n, 2) come
-    nearest to each other; negative behind a device."""
+    """(n, 2) mm: depths before camera and projector at which the rays of undistorted normalised
+    coordinates (n, 2) come nearest to each other; negative behind a device."""
     a = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
     b = np.column_stack([projector, np.ones(len(projector))])
     aa, bb, ab = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (b, b), (a, b)))
     at, bt = a @ rig.t, b @ rig.t
     with np.errstate(invalid="ignore", divide="ignore"):
         determinant = aa * bb - ab * ab
-        return np.column_stack([(ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant])
+        return np.column_stack(
+            [(ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant]
+        )
 
 
 def _compute_agreement(
     rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray, residual_px: float
 ) -> AxisAgreement:
-    """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2) px."""
+    """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2)
+    px."""
     distance, normal = epipolar_distance(rig, camera, projector)
     known = np.isfinite(distance)
     if not known.any():
         return AxisAgreement(np.inf, 1.0, 0.0, np.empty(0), 0)
     d = distance[known]
-    predicted = float(np.sqrt(np.median(np.sum((normal[known] * sigma[known]) ** 2, axis=1)) + residual_px**2))
+    predicted = float(
+        np.sqrt(np.median(np.sum((normal[known] * sigma[known]) ** 2, axis=1)) + residual_px**2)
+    )
     depths = ray_depths(rig, camera[known], projector[known])
     front = (depths > 0).all(axis=1)
     return AxisAgreement(
@@ -283,8 +329,8 @@ def _sample_pixels(mask: np.ndarray) -> np.ndarray:
 
 
 def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their errors (n, 2) px
-    by noise and by blur at edges."""
+    """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their
+    errors (n, 2) px by noise and by blur at edges."""
     v, u = _sample_pixels(np.logical_and.reduce([phase.mask for phase in phases.values()]))
     measured, sigma = np.empty((2, len(v), 2))
     for column, axis in enumerate(("x", "y")):
@@ -300,13 +346,18 @@ def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.nd
     v, u = _sample_pixels(phase.mask)
     if len(v) < LEAST_PIXELS:
         return np.empty(0), 1.0
-    points = triangulate_pixels(rig, np.column_stack([u, v]).astype(float), phase.coordinate[v, u], axis)
+    points = triangulate_pixels(
+        rig, np.column_stack([u, v]).astype(float), phase.coordinate[v, u], axis
+    )
     known = np.isfinite(points[:, 2])
     return points[known, 2], float(known.mean())
 
 
-def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, float] | None) -> tuple[str, ...]:
-    """Return a warning, in a tuple, where many ``depths`` (n,) mm are outside the range of the target poses."""
+def _depth_warning(
+    name: str, depths: np.ndarray, depth_range: tuple[float, float] | None
+) -> tuple[str, ...]:
+    """Return a warning, in a tuple, where many ``depths`` (n,) mm are outside the range of the
+    target poses."""
     if depth_range is None or len(depths) < LEAST_PIXELS:
         return ()
     near, far = depth_range
@@ -314,9 +365,12 @@ def _depth_warning(name: str, depths: np.ndarray, depth_range: tuple[float, floa
     if outside <= 1 - LEAST_WITHIN:
         return ()
     return (
-        f"{name}: {100 * outside:.0f} % of the points lie nearer than {DEPTHS[0] * near:.0f} mm or farther than "
-        f"{DEPTHS[1] * far:.0f} mm (median {np.median(depths):.0f} mm), and the target poses lay at {near:.0f}-"
-        f"{far:.0f} mm: see that the calibration belongs to this capture; it says little at such depths",
+        (
+            f"{name}: {100 * outside:.0f} % of the points lie nearer than {DEPTHS[0] * near:.0f} mm"
+            f" or farther than {DEPTHS[1] * far:.0f} mm (median {np.median(depths):.0f} mm), and"
+            f" the target poses lay at {near:.0f}-{far:.0f} mm: see that the calibration belongs to"
+            " this capture; it says little at such depths"
+        ),
     )
 
 
@@ -324,19 +378,25 @@ def _describe_contradiction(agreement: AxisAgreement) -> str:
     """Describe how the capture contradicts the calibration: epipolar misfit or negative depths."""
     if agreement.misfit_px > max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px):
         return (
-            f"the x and y patterns disagree by {agreement.misfit_px:.1f} px with this calibration, and noise explains "
-            f"{agreement.predicted_px:.2f} px"
+            f"the x and y patterns disagree by {agreement.misfit_px:.1f} px with this calibration,"
+            f" and noise explains {agreement.predicted_px:.2f} px"
         )
     share = f"{100 * (1 - agreement.in_front):.0f} %"
     return f"by this calibration {share} of the points lie behind the camera or the projector"
 
 
-def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray) -> str:
+def _likely_reason(
+    agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray
+) -> str:
     """Return in words the hypothesis that explains the frames best."""
     best, reason = np.inf, ""
     for words, other, at, coordinates in _hypotheses(rig, pixels, measured):
         tried = _compute_agreement(
-            other, other.camera.undistort(at), other.projector.undistort(coordinates), np.zeros_like(at), 0.0
+            other,
+            other.camera.undistort(at),
+            other.projector.undistort(coordinates),
+            np.zeros_like(at),
+            0.0,
         )
         enough = tried.pixels > 0.5 * agreement.pixels and tried.in_front >= LEAST_IN_FRONT
         if enough and tried.misfit_px < best:
@@ -346,13 +406,17 @@ def _likely_reason(agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray,
         explained = max(explained, EXPLAINED * agreement.misfit_px)
     if best < explained:
         return f"{reason} (then they disagree by {best:.1f} px)"
-    return "the calibration is of another rig, or the rig was moved since: calibrate the rig as it stands"
+    return (
+        "the calibration is of another rig, or the rig was moved since: calibrate the rig as it"
+        " stands"
+    )
 
 
 def _hypotheses(
     rig: StereoRig, pixels: np.ndarray, measured: np.ndarray
 ) -> Iterator[tuple[str, StereoRig, np.ndarray, np.ndarray]]:
-    """Yield each hypothesis of what is wrong, in words, with rig, pixels and coordinates corrected accordingly."""
+    """Yield each hypothesis of what is wrong, in words, with rig, pixels and coordinates corrected
+    accordingly."""
     size, image = np.array(rig.projector.size), np.array(rig.camera.size)
     exchanged = "x and y are exchanged; exchange them in the description of the frames"
     yield exchanged, rig, pixels, measured[:, ::-1]
@@ -361,9 +425,15 @@ def _hypotheses(
         reason = f"the camera's image is {of_camera}; record it as for the calibration"
         yield reason, rig, np.where(flip, image - 1 - pixels, pixels), measured
     inverse = StereoRig(rig.camera, rig.projector, rig.R.T, -rig.R.T @ rig.t)
-    yield "R and T are inverted: they map the projector to the camera; import their inverse", inverse, pixels, measured
+    yield (
+        "R and T are inverted: they map the projector to the camera; import their inverse",
+        inverse,
+        pixels,
+        measured,
+    )
     camera, projector = (
-        Lens(other.K, other.D, own.size) for own, other in ((rig.camera, rig.projector), (rig.projector, rig.camera))
+        Lens(other.K, other.D, own.size)
+        for own, other in ((rig.camera, rig.projector), (rig.projector, rig.camera))
     )
     reason = "the matrices of camera and projector are exchanged; import them the other way round"
     yield reason, StereoRig(camera, projector, rig.R, rig.t), pixels, measured
@@ -379,8 +449,8 @@ def _hypotheses(
         ):
             matrix = f", or correct its matrix: {repair}" if factors[0] == factors[1] else ""
             reason = (
-                f"the patterns were described with {which} as the calibrated projector has; give the projector's size "
-                f"and the fringe period as in the calibration{matrix}"
+                f"the patterns were described with {which} as the calibrated projector has; give"
+                f" the projector's size and the fringe period as in the calibration{matrix}"
             )
             yield reason, rig, pixels, (measured + 0.5) * factors - 0.5
 
@@ -391,8 +461,14 @@ def _size(size: Size) -> str:
 
 
 def _scale(size: Size, calibrated: Size) -> str:
-    """Describe the ratio of two sizes where it is a quarter, half, twice or four times; empty otherwise."""
-    for factor, words in ((0.5, "half"), (2.0, "twice"), (0.25, "a quarter of"), (4.0, "four times")):
+    """Describe the ratio of two sizes where it is a quarter, half, twice or four times; empty
+    otherwise."""
+    for factor, words in (
+        (0.5, "half"),
+        (2.0, "twice"),
+        (0.25, "a quarter of"),
+        (4.0, "four times"),
+    ):
         if size[0] == factor * calibrated[0] and size[1] == factor * calibrated[1]:
             return f" (the capture's is {words} the calibrated size)"
     return ""

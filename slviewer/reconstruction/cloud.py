@@ -13,13 +13,14 @@ from slviewer.fringe.layout import to_eight_bits
 class Cloud:
     """The organised cloud of one capture.
 
-    ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one that depth came from.
-    ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm, predicted from the capture's noise.
-    ``sigma_calibration``: (h, w) float32 mm of z too, what the calibration leaves uncertain, rigid motion apart: the
-    same in every scan; None from a model that does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur
-    at edges and light by other paths add, systematic as well; None where nothing does.
-    ``texture``: (h, w) grey or (h, w, 3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's
-    range (10, 12, 14 or 16 bits, whichever holds its brightest pixel).
+    ``points``: (h, w, 3) float32 mm in the camera's frame, NaN where invalid. ``axis``: the one
+    that depth came from. ``model``: the calibration's name. ``sigma_z``: (h, w) float32 mm,
+    predicted from the capture's noise. ``sigma_calibration``: (h, w) float32 mm of z too, what the
+    calibration leaves uncertain, rigid motion apart: the same in every scan; None from a model that
+    does not know. ``sigma_edges``: (h, w) float32 mm, what the camera's blur at edges and light by
+    other paths add, systematic as well; None where nothing does. ``texture``: (h, w) grey or (h, w,
+    3) RGB, uint8, or None; a 16-bit texture is scaled to 8 bits by the camera's range (10, 12, 14
+    or 16 bits, whichever holds its brightest pixel).
     """
 
     points: np.ndarray
@@ -35,8 +36,8 @@ class Cloud:
         sigma_z = np.asarray(self.sigma_z, dtype=np.float32)
         if points.ndim != 3 or points.shape[2] != 3 or sigma_z.shape != points.shape[:2]:
             raise InputError(
-                f"Points of shape {points.shape} and sigma_z of shape {sigma_z.shape} make no cloud: "
-                "(h, w, 3) and (h, w) are needed."
+                f"Points of shape {points.shape} and sigma_z of shape {sigma_z.shape} make no"
+                " cloud: (h, w, 3) and (h, w) are needed."
             )
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "sigma_z", sigma_z)
@@ -44,7 +45,10 @@ class Cloud:
             if getattr(self, name) is not None:
                 systematic = np.asarray(getattr(self, name), dtype=np.float32)
                 if systematic.shape != sigma_z.shape:
-                    raise InputError(f"{name} of shape {systematic.shape} does not belong to {sigma_z.shape} pixels.")
+                    raise InputError(
+                        f"{name} of shape {systematic.shape} does not belong to {sigma_z.shape}"
+                        " pixels."
+                    )
                 object.__setattr__(self, name, systematic)
         if self.texture is not None:
             object.__setattr__(self, "texture", _convert_texture(self.texture, points.shape[:2]))
@@ -52,7 +56,9 @@ class Cloud:
     @property
     def mask(self) -> np.ndarray:
         """(h, w) bool: the measured pixels."""
-        with np.errstate(invalid="ignore"):  # `all` along a short axis takes ten times as long as a product
+        with np.errstate(
+            invalid="ignore"
+        ):  # `all` along a short axis takes ten times as long as a product
             return np.isfinite(self.points @ np.ones(3, np.float32))
 
     @property
@@ -62,43 +68,52 @@ class Cloud:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(h, w) float32 mm: standard deviation of z from the known ones of noise, calibration and edges; NaN where
-        invalid."""
+        """(h, w) float32 mm: standard deviation of z from the known ones of noise, calibration and
+        edges; NaN where invalid."""
         systematic = self.sigma_systematic
-        return self.sigma_z if systematic is None else np.asarray(np.hypot(self.sigma_z, systematic))
+        return (
+            self.sigma_z if systematic is None else np.asarray(np.hypot(self.sigma_z, systematic))
+        )
 
     @property
     def sigma_systematic(self) -> np.ndarray | None:
-        """(h, w) float32 mm: the part of `sigma` that averaging over exposures does not lessen; None if not known."""
+        """(h, w) float32 mm: the part of `sigma` that averaging over exposures does not lessen;
+        None if not known."""
         if self.sigma_calibration is None or self.sigma_edges is None:
             return self.sigma_edges if self.sigma_calibration is None else self.sigma_calibration
         return np.asarray(np.hypot(self.sigma_calibration, self.sigma_edges))
 
     def sigmas(self, chosen: np.ndarray) -> dict[str, np.ndarray]:
-        """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them: ``sigma_noise``, and
-        where the model knows it ``sigma_calibration`` and ``sigma``, all together; mm of z."""
+        """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them:
+        ``sigma_noise``, and where the model knows it ``sigma_calibration`` and ``sigma``, all
+        together; mm of z."""
         scalars = {"sigma_noise": self.sigma_z[chosen]}
         if self.sigma_calibration is not None:
-            scalars |= {"sigma_calibration": self.sigma_calibration[chosen], "sigma": self.sigma[chosen]}
+            scalars |= {
+                "sigma_calibration": self.sigma_calibration[chosen],
+                "sigma": self.sigma[chosen],
+            }
         return scalars
 
     def colours(self) -> np.ndarray | None:
-        """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None without a texture."""
+        """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None
+        without a texture."""
         return None if self.texture is None else self.texture[self.mask]
 
 
 def choose_pixels(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """The values (n, k) of the ``chosen`` pixels (h, w) bool of an image (h, w, k), as indexing gives them, in a sixth
-    of its time."""
+    """The values (n, k) of the ``chosen`` pixels (h, w) bool of an image (h, w, k), as indexing
+    gives them, in a sixth of its time."""
     return np.compress(chosen.ravel(), values.reshape(-1, values.shape[-1]), axis=0)
 
 
 def _convert_texture(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a texture (h, w) or (h, w, 3) as uint8; InputError for another shape or dtype than allowed."""
+    """Return a texture (h, w) or (h, w, 3) as uint8; InputError for another shape or dtype than
+    allowed."""
     if texture.shape not in (shape, (*shape, 3)):
         raise InputError(
-            f"A texture of shape {texture.shape} does not belong to a cloud of {shape[1]}x{shape[0]} pixels: "
-            "use the one of the same capture."
+            f"A texture of shape {texture.shape} does not belong to a cloud of"
+            f" {shape[1]}x{shape[0]} pixels: use the one of the same capture."
         )
     if texture.dtype not in (np.uint8, np.uint16):
         raise InputError(f"A texture of {texture.dtype} was given: it must be uint8 or uint16.")

@@ -1,4 +1,5 @@
-"""From frames to a cloud in one pass over them, as fast as memory allows: for live scanning and for many captures."""
+"""From frames to a cloud in one pass over them, as fast as memory allows: for live scanning and for
+many captures."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,8 +25,10 @@ from slviewer.reconstruction.cloud import Cloud
 
 @dataclass(frozen=True)
 class LightLevels:
-    """Noise and light levels of a rig's frames: ``noise`` (a, b) and ``mean`` as returned by `measure_noise` and
-    `fringe_mean`, and the grey level ``white`` at which the camera clips. They change with the camera's settings."""
+    """Noise and light levels of a rig's frames: ``noise`` (a, b) and ``mean`` as returned by
+    `measure_noise` and `fringe_mean`, and the grey level ``white`` at which the camera clips. They
+    change with the camera's settings.
+    """
 
     noise: tuple[float, float]
     mean: float
@@ -34,12 +37,13 @@ class LightLevels:
 
 @dataclass(frozen=True, eq=False)
 class PassResult:
-    """Maps of one pass on the camera's pixel grid; the next pass into the same arrays overwrites them.
+    """Maps of one pass on the camera's pixel grid; the next pass into the same arrays overwrites
+    them.
 
-    ``points`` (h, w, 3) float32 mm, NaN where invalid; ``phase`` (h, w) float32 rad, absolute, NaN where ``reason``
-    (uint8, a `fringe.phase.Reason`) is not VALID; ``sigma_z`` float32 mm, the depth's noise where there is a phase;
-    ``modulation`` float32 grey levels; ``texture`` of the frames' dtype: the scene under white light. ``light`` is what
-    the pixels were judged by.
+    ``points`` (h, w, 3) float32 mm, NaN where invalid; ``phase`` (h, w) float32 rad, absolute, NaN
+    where ``reason`` (uint8, a `fringe.phase.Reason`) is not VALID; ``sigma_z`` float32 mm, the
+    depth's noise where there is a phase; ``modulation`` float32 grey levels; ``texture`` of the
+    frames' dtype: the scene under white light. ``light`` is what the pixels were judged by.
     """
 
     axis: Axis
@@ -59,9 +63,9 @@ class PassResult:
 
 @dataclass(frozen=True, eq=False)
 class PassTask:
-    """Description of the work that a device is prepared for: the ``shape`` (h, w) of a camera's frames, their layout,
-    all ``frames`` that the axis is decoded from, whether the texture is the background of the fringes (``is_shaded``),
-    and the calibration."""
+    """Description of the work that a device is prepared for: the ``shape`` (h, w) of a camera's
+    frames, their layout, all ``frames`` that the axis is decoded from, whether the texture is the
+    background of the fringes (``is_shaded``), and the calibration."""
 
     shape: tuple[int, int]
     axis: Axis
@@ -73,24 +77,30 @@ class PassTask:
 
 
 class OnePass:
-    """Reconstruct the frames of one axis in one pass, by a pixelwise or a splined calibration, with prepared tables.
+    """Reconstruct the frames of one axis in one pass, by a pixelwise or a splined calibration, with
+    prepared tables.
 
-    The results are those of `fringe.decode.decode` and the model's ``points``. Raises InputError for other models, an
-    axis that sequence or model lacks, and Gray code without phase steps.
+    The results are those of `fringe.decode.decode` and the model's ``points``. Raises InputError
+    for other models, an axis that sequence or model lacks, and Gray code without phase steps.
     """
 
-    def __init__(self, sequence: PatternSequence, model: PixelwiseModel | SplinedModel, axis: Axis) -> None:
+    def __init__(
+        self, sequence: PatternSequence, model: PixelwiseModel | SplinedModel, axis: Axis
+    ) -> None:
         self.sequence, self.model, self.axis = sequence, model, axis
         self._layout = one_pass_layout(self.sequence, self.axis)
         if self.axis not in self.model.axes:
-            raise InputError(f"The {self.model.name} calibration has no axis {self.axis}: choose another axis.")
+            raise InputError(
+                f"The {self.model.name} calibration has no axis {self.axis}: choose another axis."
+            )
         if isinstance(self.model, PixelwiseModel):
             self._depths = _pixelwise(self.model, self.axis, self._layout.period_px)
         elif isinstance(self.model, SplinedModel):
             self._depths = _splined(self.model, self.axis, self._layout.period_px)
         else:
             raise InputError(
-                f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise or the splined one."
+                f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise"
+                " or the splined one."
             )
         self._texture = texture_frame(self.sequence)
         self._shifts = pack_shifts(self._layout)
@@ -104,24 +114,28 @@ class OnePass:
         return height, width
 
     def light(self, frames: np.ndarray) -> LightLevels:
-        """Estimate noise and light levels of frames (n, h, w) from a sample of their pixels; of uint16 frames the
-        largest grey level is searched in all of them."""
+        """Estimate noise and light levels of frames (n, h, w) from a sample of their pixels; of
+        uint16 frames the largest grey level is searched in all of them."""
         self._check(frames)
         white = white_level(self.sequence, frames, self.sequence.select(self.axis))
         mean = fringe_mean(self._layout, frames) if self._layout.is_plain else MIDDLE
         return LightLevels(measure_noise(self._layout, frames, white), mean, white)
 
-    def run(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
+    def run(
+        self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None
+    ) -> PassResult:
         """The scan of frames (n, h, w) uint8 or uint16, spikes repaired.
 
-        ``light``: of earlier frames of the same rig; None measures it from these. ``out``: an earlier scan of frames
-        like these, whose arrays are used again; None makes new ones.
+        ``light``: of earlier frames of the same rig; None measures it from these. ``out``: an
+        earlier scan of frames like these, whose arrays are used again; None makes new ones.
         """
         scan = self.sweep(frames, light, out)
         self.repair_spikes(scan)
         return scan
 
-    def sweep(self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None) -> PassResult:
+    def sweep(
+        self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None
+    ) -> PassResult:
         """Run the first pass over frames: every pixel by itself; each frame is read once."""
         frames, scan = self._begun(frames, light, out)
         deep = frames.dtype == np.uint16
@@ -142,12 +156,17 @@ class OnePass:
             multiple=kernels.ROWS,
         )
         # a camera may turn out to have more bits than it seemed
-        if deep and clip_level(frames.dtype, int(peaks.max()), self.sequence.full_scale) > scan.light.white:
+        if (
+            deep
+            and clip_level(frames.dtype, int(peaks.max()), self.sequence.full_scale)
+            > scan.light.white
+        ):
             return self.sweep(frames, self.light(frames), scan)
         return scan
 
     def repair_spikes(self, scan: PassResult) -> None:
-        """The second pass, over few pixels: spikes of one period are moved, lonely and outside pixels masked."""
+        """The second pass, over few pixels: spikes of one period are moved, lonely and outside
+        pixels masked."""
         rules, maps = spikes.spike_rules(self._layout), _collect_maps(scan)
         columns, words, counts = self._lists
         if rules.is_plain:
@@ -159,13 +178,15 @@ class OnePass:
         kernels.mask_points(columns, counts, maps)
 
     def _check(self, frames: np.ndarray) -> None:
-        """Raise InputError unless the frames (n, h, w) fit the sequence and the calibrated resolution."""
+        """Raise InputError unless the frames (n, h, w) fit the sequence and the calibrated
+        resolution."""
         check_stack(self.sequence, frames)
         if frames.shape[1:] != self.shape:
             height, width = self.shape
             raise InputError(
-                f"Frames of {frames.shape[2]}x{frames.shape[1]} px were given, and the camera was calibrated at "
-                f"{width}x{height}: use captures of the same camera, at the same resolution and without cropping."
+                f"Frames of {frames.shape[2]}x{frames.shape[1]} px were given, and the camera was"
+                f" calibrated at {width}x{height}: use captures of the same camera, at the same"
+                " resolution and without cropping."
             )
 
     def _empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
@@ -181,19 +202,29 @@ class OnePass:
         light = light or self.light(frames)
         scan = self._allocate(frames.dtype, light) if out is None else replace(out, light=light)
         if scan.texture.dtype != frames.dtype or scan.points.shape[:2] != self.shape:
-            raise InputError("The arrays to write into belong to other frames: leave them out, and new ones are made.")
+            raise InputError(
+                "The arrays to write into belong to other frames: leave them out, and new ones are"
+                " made."
+            )
         return frames, scan
 
     def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
-        """Return a result with uninitialised arrays of the camera's size, the texture of ``dtype``."""
+        """Return a result with uninitialised arrays of the camera's size, the texture of
+        ``dtype``."""
         phase, sigma_z, modulation = (self._empty(self.shape, np.float32) for _ in range(3))
-        points, reason = self._empty((*self.shape, 3), np.float32), self._empty(self.shape, np.uint8)
+        points, reason = (
+            self._empty((*self.shape, 3), np.float32),
+            self._empty(self.shape, np.uint8),
+        )
         texture = self._empty(self.shape, dtype)
-        return PassResult(self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light)
+        return PassResult(
+            self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light
+        )
 
 
 def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
-    """The layout of one axis. Raises InputError for a sequence that takes more than one pass to decode."""
+    """The layout of one axis. Raises InputError for a sequence that takes more than one pass to
+    decode."""
     layout = axis_layout(sequence, axis)
     if not layout.shifts:
         what = "Gray code without phase steps"
@@ -208,7 +239,9 @@ def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
 
 def _collect_maps(scan: PassResult) -> kernels.Maps:
     """Return the arrays of a result as the compiled kernels take them."""
-    return kernels.Maps(scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture)
+    return kernels.Maps(
+        scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture
+    )
 
 
 def texture_frame(sequence: PatternSequence) -> int:
@@ -218,8 +251,8 @@ def texture_frame(sequence: PatternSequence) -> int:
 
 
 def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.Depths:
-    """Return a pixelwise model's coefficients about the middle of all phases, where float32 represents depths to some
-    1e-5 mm."""
+    """Return a pixelwise model's coefficients about the middle of all phases, where float32
+    represents depths to some 1e-5 mm."""
     fit = model.fits[axis]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         low, high = fit.phase_min.astype(float), fit.phase_max.astype(float)
@@ -229,17 +262,27 @@ def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.D
         bounds = np.stack([low - margin - middle, high + margin - middle]).astype(np.float32)
         c0, c1, c2, c3, c4 = fit.coefficients
         scale = 1 + c2 * middle
-        c = np.stack([(c0 + c1 * middle) / scale, c1 / scale, c2 / scale, c3, c4]).astype(np.float32)
+        c = np.stack([(c0 + c1 * middle) / scale, c1 / scale, c2 / scale, c3, c4]).astype(
+            np.float32
+        )
     grid = np.empty((0, 0, 0), np.float32)
     return kernels.Depths(c, period_px / model.periods_px[axis], middle, bounds, grid, 1, 0.0, 0.0)
 
 
 def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depths:
-    """Return a splined model's compiled coefficients; pixels outside the calibrated region are masked."""
+    """Return a splined model's compiled coefficients; pixels outside the calibrated region are
+    masked."""
     fast = model.fast_axis(axis)
     c = np.concatenate([fast.coefficients, model.single_rays])
     per_mm = (fast.supported_grid.shape[2] - 1) / (fast.far - fast.near)
     bounds = np.empty((2, 0, 0), np.float32)
     return kernels.Depths(
-        c, period_px / (2 * np.pi), fast.centre, bounds, fast.supported_grid, fast.step, fast.near, per_mm
+        c,
+        period_px / (2 * np.pi),
+        fast.centre,
+        bounds,
+        fast.supported_grid,
+        fast.step,
+        fast.near,
+        per_mm,
     )

@@ -1,4 +1,5 @@
-"""What lies on a CUDA device for one pass: coefficients, frames, maps and kernels. Imported only where there is one."""
+"""What lies on a CUDA device for one pass: coefficients, frames, maps and kernels. Imported only
+where there is one."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -18,7 +19,8 @@ from slviewer.reconstruction.onepass_cuda_sweep import frame_slots, sweep_kernel
 from slviewer.reconstruction.pixel_depths import INVALID, pixelwise_point, splined_point
 
 THREADS = 256
-"""Of a block: eight warps, which leave every scheduler of a multiprocessor with work, whatever registers they need."""
+"""Of a block: eight warps, which leave every scheduler of a multiprocessor with work, whatever
+registers they need."""
 
 
 class Card:
@@ -48,7 +50,9 @@ class Card:
             (first, last, self._frames[at * pixels : (at + last - first) * pixels])
             for at, first, last in _list_runs(slots)
         ]
-        self._phase, self._modulation, self._sigma_z = (cuda.device_array(pixels, np.float32) for _ in range(3))
+        self._phase, self._modulation, self._sigma_z = (
+            cuda.device_array(pixels, np.float32) for _ in range(3)
+        )
         self._phase_map = self._phase.reshape(job.shape)
         self._points = cuda.device_array((pixels, 3), np.float32)
         self._reason, self._words = (cuda.device_array(pixels, np.uint8) for _ in range(2))
@@ -60,7 +64,14 @@ class Card:
     def bytes_moved(self) -> int:
         """Bytes that the first pass reads and writes in the device's memory, each number once."""
         read = self._frames, self._c, self._extra
-        written = self._phase, self._modulation, self._sigma_z, self._points, self._reason, self._texture
+        written = (
+            self._phase,
+            self._modulation,
+            self._sigma_z,
+            self._points,
+            self._reason,
+            self._texture,
+        )
         return sum(array.size * array.dtype.itemsize for array in (*read, *written))
 
     def load(self, frames: np.ndarray) -> None:
@@ -72,7 +83,13 @@ class Card:
         """Run the first pass over the loaded frames."""
         if self._deep:
             self._highest.copy_to_device(self._none, stream=self.stream)
-        numbers = (*light.noise, limits.DARK_LEVELS * light.white / 255, self._dark_sigmas, light.white, light.mean)
+        numbers = (
+            *light.noise,
+            limits.DARK_LEVELS * light.white / 255,
+            self._dark_sigmas,
+            light.white,
+            light.mean,
+        )
         self._sweep[self._grid](
             self._frames, tuple(np.float32(number) for number in numbers), self._c, self._extra, self._phase,
             self._reason, self._modulation, self._points, self._sigma_z, self._texture, self._highest,
@@ -83,13 +100,15 @@ class Card:
         list_moves, move, list_masked, mask = self._spikes
         if self._is_plain:
             list_moves[self._grid](self._phase_map, self._words)
-            move[self._grid](self._words, self._c, self._extra, self._phase, self._points, self._sigma_z)
+            move[self._grid](
+                self._words, self._c, self._extra, self._phase, self._points, self._sigma_z
+            )
         list_masked[self._grid](self._phase_map, self._words)
         mask[self._grid](self._words, self._phase, self._reason, self._points, self._sigma_z)
 
     def fetch(self, scan: PassResult) -> int:
-        """Copy the maps into a scan's arrays, the texture only where it is computed from fringes; returns the largest
-        grey level, 0 for uint8 frames."""
+        """Copy the maps into a scan's arrays, the texture only where it is computed from fringes;
+        returns the largest grey level, 0 for uint8 frames."""
         pairs = [
             (self._points, scan.points),
             (self._phase, scan.phase),
@@ -107,26 +126,31 @@ class Card:
 
 
 def _depths(job: PassTask) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
-    """Return the device function (pixel, phase, c, extra) that measures a pixel like `pixel_depths`, and two arrays:
-    ``c`` (m, h, w) of the camera's pixels, and ``extra``. The pixel is a uint64, so that indices are not tested for
-    their sign."""
+    """Return the device function (pixel, phase, c, extra) that measures a pixel like
+    `pixel_depths`, and two arrays: ``c`` (m, h, w) of the camera's pixels, and ``extra``. The pixel
+    is a uint64, so that indices are not tested for their sign."""
     width, d = job.shape[1], job.depths
     if isinstance(d, StereoRig):
         extra = np.zeros((6, 10))
-        for row, numbers in zip(extra, (*d.R, d.t, d.projector.parameters, d.projector.size), strict=True):
+        for row, numbers in zip(
+            extra, (*d.R, d.t, d.projector.parameters, d.projector.size), strict=True
+        ):
             row[: len(numbers)] = numbers
         return (
             _compile_stereo(0 if job.axis == "x" else 1, job.layout.period_px),
             np.moveaxis(d.camera.rays(), 2, 0),
             extra,
         )
-    gain, centre, near, per_mm = (np.float32(number) for number in (d.gain, d.centre, d.near, d.per_mm))
+    gain, centre, near, per_mm = (
+        np.float32(number) for number in (d.gain, d.centre, d.near, d.per_mm)
+    )
     if d.grid.size:
         splined, step = device_function(splined_point), d.step
 
         @cuda.jit(device=True)
         def measure_splined(i, phase, c, grid):
-            """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by the splined model's grid."""
+            """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by the splined model's
+            grid."""
             return splined(i, phase, c, grid, gain, centre, width, step, near, per_mm)
 
         return measure_splined, d.c, d.grid
@@ -141,13 +165,15 @@ def _depths(job: PassTask) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
 
 
 def _compile_stereo(row: int, period_px: float) -> Callable[..., Any]:
-    """Compile the device function that triangulates a pixel by `geometry.triangulation` in float64; ``c`` (2, n): the
-    camera's rays; ``extra`` (6, 10): the rows of R, t, the projector's parameters, and its size."""
+    """Compile the device function that triangulates a pixel by `geometry.triangulation` in float64;
+    ``c`` (2, n): the camera's rays; ``extra`` (6, 10): the rows of R, t, the projector's
+    parameters, and its size."""
     px_per_rad, depth_of = np.float32(period_px / (2 * np.pi)), device_function(ray_depth)
 
     @cuda.jit(device=True)
     def measure(i, phase, c, extra):
-        """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by triangulation; NaN where it fails."""
+        """Return (x, y, z, |dz/dphi|) of pixel ``i`` at a phase, by triangulation; NaN where it
+        fails."""
         measured, extent = np.float64(phase * px_per_rad), extra[5, row]
         if not (-0.5 - MARGIN * extent <= measured <= (1.0 + MARGIN) * extent - 0.5):
             return INVALID, INVALID, INVALID, INVALID
@@ -155,13 +181,19 @@ def _compile_stereo(row: int, period_px: float) -> Callable[..., Any]:
         z, _, slope = depth_of(u, v, measured, 0.0, extra[:3], extra[3], extra[4], row, extra[5])
         if z != z:
             return INVALID, INVALID, INVALID, INVALID
-        return np.float32(u * z), np.float32(v * z), np.float32(z), px_per_rad * np.float32(abs(1.0 / slope))
+        return (
+            np.float32(u * z),
+            np.float32(v * z),
+            np.float32(z),
+            px_per_rad * np.float32(abs(1.0 / slope)),
+        )
 
     return measure
 
 
 def _list_runs(slots: list[int]) -> Iterator[tuple[int, int, int]]:
-    """Return (slot, first frame, frame after the last) of each run of consecutive frames of the capture."""
+    """Return (slot, first frame, frame after the last) of each run of consecutive frames of the
+    capture."""
     at = 0
     for k in range(1, len(slots) + 1):
         if k == len(slots) or slots[k] != slots[k - 1] + 1:

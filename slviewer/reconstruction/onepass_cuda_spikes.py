@@ -1,7 +1,7 @@
 """The second pass of `OnePass` on a CUDA device, by the rules of `fringe.kernels_spikes`.
 
-What changes is listed before the first pixel is changed, because each one's neighbours vote with the phase that they
-had. Imported only where there is a device.
+What changes is listed before the first pixel is changed, because each one's neighbours vote with
+the phase that they had. Imported only where there is a device.
 """
 
 from collections.abc import Callable
@@ -14,36 +14,48 @@ from slviewer.fringe import kernels_spikes
 from slviewer.fringe.kernels_spikes import INVALID, TURN, UNCHANGED, UP, SpikeRules
 from slviewer.geometry.cuda_device import device_function
 
-cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
+cuda: Any = import_module(
+    "numba.cuda"
+)  # its own annotations are not those of what a kernel may call
 
 
-def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[..., Any]) -> tuple[Any, ...]:
+def spike_kernels(
+    rules: SpikeRules, shape: tuple[int, int], measure: Callable[..., Any]
+) -> tuple[Any, ...]:
     """Kernels (list what is to be moved by a period, move it, list what is to be masked, mask it).
 
-    Those that list take the phase (h, w) and fill ``words`` (n,) uint8; the others take maps flattened. ``measure`` is
-    one of `onepass_cuda_card`.
+    Those that list take the phase (h, w) and fill ``words`` (n,) uint8; the others take maps
+    flattened. ``measure`` is one of `onepass_cuda_card`.
     """
     height, width = shape
     per_cell = np.float32(1 / rules.cell_rad)
     is_suspect, period_change, masking_reason = (
         device_function(rule)
-        for rule in (kernels_spikes.is_suspect, kernels_spikes.period_change, kernels_spikes.masking_reason)
+        for rule in (
+            kernels_spikes.is_suspect,
+            kernels_spikes.period_change,
+            kernels_spikes.masking_reason,
+        )
     )
 
     @cuda.jit
     def list_moves(phase, words):
-        """Kernel: write to ``words`` (h w,) for each suspect pixel whether its phase moves up or down a period."""
+        """Kernel: write to ``words`` (h w,) for each suspect pixel whether its phase moves up or
+        down a period."""
         i = cuda.grid(1)
         if i < height * width:
             row = i // width
             x = i - row * width
             words[i] = UNCHANGED
-            if phase[row, x] == phase[row, x] and is_suspect(phase, row, x, per_cell):  # False for NaN
+            if phase[row, x] == phase[row, x] and is_suspect(
+                phase, row, x, per_cell
+            ):  # False for NaN
                 words[i] = period_change(phase, row, x, rules)
 
     @cuda.jit
     def move(words, c, extra, phase, points, sigma_z):
-        """Kernel: move the phases listed in ``words`` by one period, and update their points and sigma_z."""
+        """Kernel: move the phases listed in ``words`` by one period, and update their points and
+        sigma_z."""
         i = cuda.grid(1)
         if i >= height * width or words[i] == UNCHANGED:
             return
@@ -68,7 +80,8 @@ def spike_kernels(rules: SpikeRules, shape: tuple[int, int], measure: Callable[.
 
     @cuda.jit
     def mask(words, phase, reason, points, sigma_z):
-        """Kernel: mask the pixels listed in ``words``: store the reason, set phase, point and sigma_z to NaN."""
+        """Kernel: mask the pixels listed in ``words``: store the reason, set phase, point and
+        sigma_z to NaN."""
         i = cuda.grid(1)
         if i >= height * width or words[i] == UNCHANGED:
             return

@@ -1,8 +1,10 @@
-"""Frames to points on a CUDA device, one thread a pixel: a twin of `onepass_kernels` and of `fringe.kernels`.
+"""Frames to points on a CUDA device, one thread a pixel: a twin of `onepass_kernels` and of
+`fringe.kernels`.
 
-A kernel is compiled for one sequence, so that loops over steps and bits have a known length and are unrolled, and for
-one way to measure depth. Everything is float32 but the sums that `fringe.kernels_levels` takes in float64, and the
-absolute phase. Imported only where there is a device.
+A kernel is compiled for one sequence, so that loops over steps and bits have a known length and are
+unrolled, and for one way to measure depth. Everything is float32 but the sums that
+`fringe.kernels_levels` takes in float64, and the absolute phase. Imported only where there is a
+device.
 """
 
 import math
@@ -30,7 +32,9 @@ from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKE
 from slviewer.fringe.layout import Layout
 from slviewer.reconstruction.onepass import PassTask
 
-cuda: Any = import_module("numba.cuda")  # its own annotations are not those of what a kernel may call
+cuda: Any = import_module(
+    "numba.cuda"
+)  # its own annotations are not those of what a kernel may call
 
 TWO_PI = 2 * math.pi
 
@@ -39,18 +43,24 @@ NOISE_A, NOISE_B, DARK_LEVELS, DARK_SIGMAS, WHITE, MEAN = range(6)
 
 
 def frame_slots(layout: Layout) -> list[int]:
-    """The frames that are decoded, in the order in which the kernel reads them: phase steps, longest period first; Gray
-    bits; their inverses; the complementary bit."""
+    """The frames that are decoded, in the order in which the kernel reads them: phase steps,
+    longest period first; Gray bits; their inverses; the complementary bit."""
     steps = [i for shift in layout.shifts for i in shift.indices]
-    return [*steps, *layout.gray, *layout.inverse, *([] if layout.complementary is None else [layout.complementary])]
+    return [
+        *steps,
+        *layout.gray,
+        *layout.inverse,
+        *([] if layout.complementary is None else [layout.complementary]),
+    ]
 
 
 def sweep_kernel(job: PassTask, slots: int, measure: Callable[..., Any], deep: bool) -> Any:
     """The kernel for one job and one of `onepass_cuda_card`'s ways to measure depth.
 
-    ``slots``: frames on the device, those of `frame_slots` first. ``deep``: the largest grey level of all is needed,
-    as of uint16 frames. It takes frames of n pixels, (slots n,), the light, the two arrays of ``measure`` and what it
-    writes: maps (n,), points (n, 3), and the largest grey level (1,) int32.
+    ``slots``: frames on the device, those of `frame_slots` first. ``deep``: the largest grey level
+    of all is needed, as of uint16 frames. It takes frames of n pixels, (slots n,), the light, the
+    two arrays of ``measure`` and what it writes: maps (n,), points (n, 3), and the largest grey
+    level (1,) int32.
     """
     pixels, shaded = job.shape[0] * job.shape[1], job.is_shaded
     decode = _compile_coded(job.layout, pixels) if job.layout.gray else _compile_levels(job, pixels)
@@ -96,16 +106,18 @@ def _steps(layout: Layout) -> list[tuple[int, ...]]:
 
 
 def _compile_shift(layout: Layout, pixels: int) -> Any:
-    """Compile the device function that returns wrapped phase, modulation, background and largest sample of one period's
-    frames."""
-    angles = np.concatenate([TWO_PI * layout.sign * np.arange(n) / n for n in map(len, _steps(layout))])
+    """Compile the device function that returns wrapped phase, modulation, background and largest
+    sample of one period's frames."""
+    angles = np.concatenate(
+        [TWO_PI * layout.sign * np.arange(n) / n for n in map(len, _steps(layout))]
+    )
     cosines, sines = (f(angles + layout.offset_rad).astype(np.float32) for f in (np.cos, np.sin))
     stride = np.uint64(pixels)
 
     @cuda.jit(device=True)
     def shift(stack, i, first, last):
-        """Return (wrapped phase, modulation, background, largest sample) of pixel ``i`` from frames ``first`` to
-        ``last``, the last one excluded."""
+        """Return (wrapped phase, modulation, background, largest sample) of pixel ``i`` from frames
+        ``first`` to ``last``, the last one excluded."""
         cosine_of, sine_of = cuda.const.array_like(cosines), cuda.const.array_like(sines)
         at = i + np.uint64(first) * stride
         base = np.float32(stack[at])
@@ -128,7 +140,8 @@ def _compile_shift(layout: Layout, pixels: int) -> Any:
 
 @cuda.jit(device=True)
 def _verdict(B, A, clipped, inconsistent, light):
-    """Return the reason to mask a pixel, the first that applies: saturated, dark, inconsistent; VALID without one."""
+    """Return the reason to mask a pixel, the first that applies: saturated, dark, inconsistent;
+    VALID without one."""
     sigma = np.float32(math.sqrt(light[NOISE_A] + light[NOISE_B] * A))
     if clipped:
         return SATURATED
@@ -138,18 +151,25 @@ def _verdict(B, A, clipped, inconsistent, light):
 
 
 def _compile_coded(layout: Layout, pixels: int) -> Any:
-    """Compile the device function that decodes a pixel by Gray code: (absolute phase, reason, modulation,
-    background)."""
+    """Compile the device function that decodes a pixel by Gray code: (absolute phase, reason,
+    modulation, background)."""
     shift = _compile_shift(layout, pixels)
-    steps, bits, inverses, complementary = layout.steps, len(layout.gray), bool(layout.inverse), not layout.is_plain
-    stride, code_from, inverse_from = (np.uint64(number) for number in (pixels, steps, steps + bits))
+    steps, bits, inverses, complementary = (
+        layout.steps,
+        len(layout.gray),
+        bool(layout.inverse),
+        not layout.is_plain,
+    )
+    stride, code_from, inverse_from = (
+        np.uint64(number) for number in (pixels, steps, steps + bits)
+    )
     extra_at = np.uint64(steps + bits + len(layout.inverse))
     origin = np.float32(layout.gray_origin_px / layout.period_px)
 
     @cuda.jit(device=True)
     def height_of(stack, i, bit, threshold):
-        """Return the signed grey level of a Gray code bit: half the difference to its inverse frame, or the level above
-        the threshold."""
+        """Return the signed grey level of a Gray code bit: half the difference to its inverse
+        frame, or the level above the threshold."""
         slot = np.uint64(bit)
         value = np.float32(stack[(code_from + slot) * stride + i])
         if inverses:
@@ -158,7 +178,8 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
 
     @cuda.jit(device=True)
     def misread(stack, i, threshold, top, bottom, code, part, mean):
-        """Return the correction (-1, 0 or 1) of a code whose bit that switches next to the pixel is weak."""
+        """Return the correction (-1, 0 or 1) of a code whose bit that switches next to the pixel is
+        weak."""
         contrast = max(top / (ONE - mean), -bottom / mean)
         middle = (HALF - mean) * contrast
         zeros, ones = 0, 0
@@ -196,7 +217,9 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
             last = np.float32(stack[extra_at * stride + i]) - A
             half = 2 * code + (digit ^ (1 if last > ZERO else 0))
             middle = QUARTER <= part < THREE_QUARTERS
-            order = half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= THREE_QUARTERS else 0)
+            order = (
+                half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= THREE_QUARTERS else 0)
+            )
             unclear = (least if middle else abs(last)) < UNDECIDED * B
         else:
             beside = part < EDGE or part >= FAR_EDGE
@@ -213,8 +236,8 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
 
 
 def _compile_levels(job: PassTask, pixels: int) -> Any:
-    """Compile the device function that decodes a pixel by several periods: (absolute phase, reason, modulation,
-    background)."""
+    """Compile the device function that decodes a pixel by several periods: (absolute phase, reason,
+    modulation, background)."""
     shift, ladder = _compile_shift(job.layout, pixels), job.ladder
     count, levels = len(job.layout.shifts), len(ladder.periods)
     starts = np.cumsum([0, *map(len, _steps(job.layout))]).astype(np.int32)

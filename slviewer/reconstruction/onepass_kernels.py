@@ -1,7 +1,8 @@
-"""Frames to points in one pass: a row's phase is unwrapped, measured and written while it is in the cache.
+"""Frames to points in one pass: a row's phase is unwrapped, measured and written while it is in the
+cache.
 
-Decoding is that of `fringe.kernels`, row by row; depth is that of the models, ``z = (c0 + c1 s)/(1 + c2 s)`` of what a
-phase has beyond a reference, in float32.
+Decoding is that of `fringe.kernels`, row by row; depth is that of the models, ``z = (c0 + c1 s)/(1
++ c2 s)`` of what a phase has beyond a reference, in float32.
 """
 
 from typing import NamedTuple
@@ -19,11 +20,12 @@ from slviewer.reconstruction.pixel_depths import pixelwise_point, splined_point
 
 
 class Depths(NamedTuple):
-    """A calibration. ``c`` (5, h, w) float32: c0, c1, c2 for ``s = gain phase - centre``, and the ray's x and y.
+    """A calibration. ``c`` (5, h, w) float32: c0, c1, c2 for ``s = gain phase - centre``, and the
+    ray's x and y.
 
-    Pixelwise: ``bounds`` (2, h, w) float32 hold the least and the largest s that a pixel measures, ``grid`` is empty.
-    Splined: ``grid`` (nv, nu, nz) float32 mm corrects the depth, ``step`` px and 1 / ``per_mm`` mm apart from depth
-    ``near``; ``bounds`` are empty.
+    Pixelwise: ``bounds`` (2, h, w) float32 hold the least and the largest s that a pixel measures,
+    ``grid`` is empty. Splined: ``grid`` (nv, nu, nz) float32 mm corrects the depth, ``step`` px and
+    1 / ``per_mm`` mm apart from depth ``near``; ``bounds`` are empty.
     """
 
     c: np.ndarray
@@ -48,13 +50,17 @@ class Maps(NamedTuple):
 
 
 @kernel()
-def sweep_rows(start, stop, stack, shifts, ladder, rules, scale, depths, maps, texture, frames, peaks):
-    """Fill rows of ``maps`` from the stack (n, h, w); frame ``texture`` shows the scene under white light, -1 for none.
+def sweep_rows(
+    start, stop, stack, shifts, ladder, rules, scale, depths, maps, texture, frames, peaks
+):
+    """Fill rows of ``maps`` from the stack (n, h, w); frame ``texture`` shows the scene under white
+    light, -1 for none.
 
-    ``peaks`` (blocks of rows,) int32, where it is not empty: the largest grey levels of the ``frames`` (k,).
+    ``peaks`` (blocks of rows,) int32, where it is not empty: the largest grey levels of the
+    ``frames`` (k,).
 
-    The parts are functions of their own, whose results lie in arrays of their own: the compiler then takes a tenth of
-    the time, and knows that nothing overlaps.
+    The parts are functions of their own, whose results lie in arrays of their own: the compiler
+    then takes a tenth of the time, and knows that nothing overlaps.
     """
     width = stack.shape[2]
     per_step = np.float32(2.0 / shifts.steps[-1])
@@ -62,7 +68,11 @@ def sweep_rows(start, stop, stack, shifts, ladder, rules, scale, depths, maps, t
     for first in range(start, stop, ROWS):
         last = min(first + ROWS, stop)
         A, psi = background[: last - first], wrapped[: last - first]
-        phase, B, reason = maps.phase[first:last], maps.modulation[first:last], maps.reason[first:last]
+        phase, B, reason = (
+            maps.phase[first:last],
+            maps.modulation[first:last],
+            maps.reason[first:last],
+        )
         if len(rules.gray):
             coded_rows(stack, shifts, scale, rules, first, phase, psi, B, A, reason)
         else:
@@ -75,15 +85,30 @@ def sweep_rows(start, stop, stack, shifts, ladder, rules, scale, depths, maps, t
 
 @kernel()
 def _measure(first, last, background, depths, scale, per_step, maps):
-    """Compute points and their depth noise by each pixel's rational function, and the grid's correction, if any."""
+    """Compute points and their depth noise by each pixel's rational function, and the grid's
+    correction, if any."""
     one, zero, none = np.float32(1), np.float32(0), np.float32(np.nan)
-    gain, centre, c, grid = np.float32(depths.gain), np.float32(depths.centre), depths.c, depths.grid
-    # the phase's standard deviation is the square root of the noise's variance times 2/n, over the modulation
+    gain, centre, c, grid = (
+        np.float32(depths.gain),
+        np.float32(depths.centre),
+        depths.c,
+        depths.grid,
+    )
+    # the phase's standard deviation is the square root of the noise's variance times 2/n, over the
+    # modulation
     squared, least_B = per_step * gain * gain, np.float32(1e-6)
     noise_a, noise_b = np.float32(scale.noise_a) * squared, np.float32(scale.noise_b) * squared
-    near, per_mm, deepest = np.float32(depths.near), np.float32(depths.per_mm), np.float32(grid.shape[2] - 1.0001)
+    near, per_mm, deepest = (
+        np.float32(depths.near),
+        np.float32(depths.per_mm),
+        np.float32(grid.shape[2] - 1.0001),
+    )
     width = maps.phase.shape[1]
-    z, cell, rest = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.float32)
+    z, cell, rest = (
+        np.empty(width, np.float32),
+        np.empty(width, np.int32),
+        np.empty(width, np.float32),
+    )
     for row in range(first, last):
         phase, A, B = maps.phase[row], background[row - first], maps.modulation[row]
         c0, c1, c2, ray_x, ray_y = c[0, row], c[1, row], c[2, row], c[3, row], c[4, row]
@@ -111,7 +136,8 @@ def _measure(first, last, background, depths, scale, per_step, maps):
 
 @kernel()
 def _fill_texture(stack, texture, first, last, background, maps):
-    """Fill the texture with the frame ``texture``, or the background of the fringes where it is -1."""
+    """Fill the texture with the frame ``texture``, or the background of the fringes where it is
+    -1."""
     for row in range(first, last):
         if texture >= 0:
             seen = stack[texture, row]
@@ -146,8 +172,12 @@ def measure_moved(columns, words, counts, depths, maps):
             i, phase = row * width + x, maps.phase[row, x]
             before = phase - (TURN if words[row, k] == UP else -TURN)
             if depths.grid.size:
-                _, _, _, old = splined_point(i, before, c, depths.grid, gain, centre, width, depths.step, near, per_mm)
-                a, b, z, new = splined_point(i, phase, c, depths.grid, gain, centre, width, depths.step, near, per_mm)
+                _, _, _, old = splined_point(
+                    i, before, c, depths.grid, gain, centre, width, depths.step, near, per_mm
+                )
+                a, b, z, new = splined_point(
+                    i, phase, c, depths.grid, gain, centre, width, depths.step, near, per_mm
+                )
             else:
                 _, _, _, old = pixelwise_point(i, before, c, bounds, gain, centre)
                 a, b, z, new = pixelwise_point(i, phase, c, bounds, gain, centre)
@@ -157,7 +187,8 @@ def measure_moved(columns, words, counts, depths, maps):
 
 @kernel()
 def mask_points(columns, counts, maps):
-    """Invalidate points and sigma_z at the pixels, ``counts`` per row in ``columns``, that ``mask_phases`` masked."""
+    """Invalidate points and sigma_z at the pixels, ``counts`` per row in ``columns``, that
+    ``mask_phases`` masked."""
     for row in range(len(counts)):
         for k in range(counts[row]):
             x = columns[row, k]

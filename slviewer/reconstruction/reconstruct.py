@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 Axis = Literal["x", "y"]
 
 EDGE_SIGMAS = 10.0
-"""Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel; smaller ones are part
-of its uncertainty."""
+"""Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel;
+smaller ones are part of its uncertainty."""
 Measured = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 JUMP = 0.01
@@ -58,7 +58,8 @@ class HasCalibrationSigma(Protocol):
     """A calibration that knows its own uncertainty."""
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
-        """(h, w) float32 mm: standard deviation of the depth of organised points due to the calibration."""
+        """(h, w) float32 mm: standard deviation of the depth of organised points due to the
+        calibration."""
 
 
 def reconstruct_cloud(
@@ -67,17 +68,21 @@ def reconstruct_cloud(
     axis: Axis | None = None,
     texture: np.ndarray | None = None,
 ) -> Cloud:
-    """Reconstruct the organised cloud of a capture: points, predicted sigmas and texture on the camera's grid.
+    """Reconstruct the organised cloud of a capture: points, predicted sigmas and texture on the
+    camera's grid.
 
-    ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken from; None selects the
-    one with the smaller median predicted sigma_z over the pixels that both measure, or, where there are none, the one
-    that measures more pixels. ``texture``: (h, w) or (h, w, 3), uint8 or uint16.
+    ``phases``: the capture's absolute phase maps by axis. ``axis``: the one that depth is taken
+    from; None selects the one with the smaller median predicted sigma_z over the pixels that both
+    measure, or, where there are none, the one that measures more pixels. ``texture``: (h, w) or (h,
+    w, 3), uint8 or uint16.
 
     Raises InputError where the capture or the model lacks the axis.
     """
     if axis is not None:
         if axis not in phases:
-            raise InputError(f"The capture holds no axis {axis}, only {_join_axes(phases)}: choose one of these.")
+            raise InputError(
+                f"The capture holds no axis {axis}, only {_join_axes(phases)}: choose one of these."
+            )
         if axis not in model.axes:
             raise InputError(
                 f"The {model.name} calibration has no axis {axis}, only {_join_axes(model.axes)}: "
@@ -88,32 +93,40 @@ def reconstruct_cloud(
         measured = _measure_all(model, phases)
         axis = _select_axis(measured)
         points, sigma_z, edges = measured[axis]
-    sigma_calibration = model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
+    sigma_calibration = (
+        model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
+    )
     return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
 
 
 def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
-    """Unit normals (h, w, 3) float32 of an organised cloud, towards the camera; NaN where neighbours are missing.
+    """Unit normals (h, w, 3) float32 of an organised cloud, towards the camera; NaN where
+    neighbours are missing.
 
-    The cross product of the surface's differences along rows and columns: central differences, averaged by least
-    squares over the valid pixels of a window of 2 ``reach`` + 1, because two neighbours alone would show little but
-    their noise. Neighbours across a depth jump are excluded.
+    The cross product of the surface's differences along rows and columns: central differences,
+    averaged by least squares over the valid pixels of a window of 2 ``reach`` + 1, because two
+    neighbours alone would show little but their noise. Neighbours across a depth jump are excluded.
     """
     points = np.ascontiguousarray(points, dtype=np.float32)
     if points.ndim != 3 or points.shape[2] != 3:
-        raise InputError(f"Points of shape {points.shape} were given: normals need an organised cloud, (h, w, 3).")
+        raise InputError(
+            f"Points of shape {points.shape} were given: normals need an organised cloud, (h,"
+            " w, 3)."
+        )
     out = np.empty_like(points)
     _normals(points, reach, out)
     return out
 
 
 def _measure(model: Model, phase: PhaseMap) -> Measured:
-    """Points (h, w, 3) mm, NaN where the camera's blur spoils the phase at an edge; the standard deviation (h, w) mm of
-    their depth, from the phase noise and from what the calibration's own phases scatter by beyond theirs; and the error
-    (h, w) mm of the depth that blur makes at edges, None for Gray code alone."""
+    """Points (h, w, 3) mm, NaN where the camera's blur spoils the phase at an edge; the standard
+    deviation (h, w) mm of their depth, from the phase noise and from what the calibration's own
+    phases scatter by beyond theirs; and the error (h, w) mm of the depth that blur makes at edges,
+    None for Gray code alone."""
     if phase.is_relative:
         raise InputError(
-            f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it by a depth range."
+            f"The phase of axis {phase.axis} repeats every {phase.unambiguous_px:g} px: resolve it"
+            " by a depth range."
         )
     phase, remaining_px = phase.correct_edges()
     points = model.points(phase)
@@ -136,18 +149,23 @@ def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Me
     shared = [axis for axis in model.axes if axis in phases]
     if not shared:
         raise InputError(
-            f"The capture holds axis {_join_axes(phases)} and the {model.name} calibration {_join_axes(model.axes)}: "
-            "capture along an axis that is calibrated, or calibrate with the captured one."
+            f"The capture holds axis {_join_axes(phases)} and the {model.name} calibration"
+            f" {_join_axes(model.axes)}: capture along an axis that is calibrated, or calibrate"
+            " with the captured one."
         )
     return {axis: _measure(model, phases[axis]) for axis in shared}
 
 
 def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
-    """Return the axis with the lowest median sigma where both are valid, else the one with most valid pixels."""
+    """Return the axis with the lowest median sigma where both are valid, else the one with most
+    valid pixels."""
     axes = list(measured)
     if len(axes) == 1:
         return axes[0]
-    valid = {axis: np.isfinite(points[..., 2]) & np.isfinite(sigma) for axis, (points, sigma, _) in measured.items()}
+    valid = {
+        axis: np.isfinite(points[..., 2]) & np.isfinite(sigma)
+        for axis, (points, sigma, _) in measured.items()
+    }
     both = np.logical_and.reduce(list(valid.values()))
     if both.any():
         return min(axes, key=lambda axis: float(np.median(measured[axis][1][both])))
@@ -161,7 +179,8 @@ def _join_axes(axes: Mapping[Axis, PhaseMap] | tuple[Axis, ...]) -> str:
 
 @kernel(parallel=True)
 def _normals(points, reach, out):
-    """Per pixel, fits p = p0 + a du + b dv to the window's valid points; the normal is along a x b."""
+    """Per pixel, fits p = p0 + a du + b dv to the window's valid points; the normal is along a x
+    b."""
     height, width = points.shape[0], points.shape[1]
     for y in numba.prange(height):
         for x in range(width):

@@ -1,4 +1,5 @@
-"""From a phase known modulo some projector px to an absolute one, by the depths between which the scene lies."""
+"""From a phase known modulo some projector px to an absolute one, by the depths between which the
+scene lies."""
 
 from dataclasses import dataclass, replace
 
@@ -17,8 +18,9 @@ SAMPLE = 4000
 class Resolved:
     """An absolute phase, and the evidence for it.
 
-    ``outside``: share of the decoded pixels that have no depth in the range, and are masked as OUTSIDE. ``spacing_mm``:
-    distance in depth of the next candidates, in the median: a surface outside of the range is displaced by about that.
+    ``outside``: share of the decoded pixels that have no depth in the range, and are masked as
+    OUTSIDE. ``spacing_mm``: distance in depth of the next candidates, in the median: a surface
+    outside of the range is displaced by about that.
     """
 
     phase: PhaseMap
@@ -30,22 +32,24 @@ class Resolved:
 def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, float]) -> Resolved:
     """The absolute phase whose points lie between two depths (near, far) mm of the camera's frame.
 
-    Between them a camera pixel's ray covers a stretch of the projector's columns (rows); where that is shorter than
-    what the phase tells apart, one candidate is left at most. Raises InputError, with a range that is narrow enough,
-    where the stretch is longer at any decoded pixel.
+    Between them a camera pixel's ray covers a stretch of the projector's columns (rows); where that
+    is shorter than what the phase tells apart, one candidate is left at most. Raises InputError,
+    with a range that is narrow enough, where the stretch is longer at any decoded pixel.
     """
     near, far = depth_range_mm
     if not 0 < near < far < np.inf:
         raise InputError(
-            f"depths from {near:g} to {far:g} mm are no range: give the nearest depth first, both positive"
+            f"depths from {near:g} to {far:g} mm are no range: give the nearest depth first, both"
+            " positive"
         )
     reach = phase.unambiguous_px
     rays = rig.camera.rays()
     if phase.phase.shape != rays.shape[:2]:
         height, width = phase.phase.shape
         raise InputError(
-            f"the capture has {width}x{height} px and the camera was calibrated at {rays.shape[1]}x{rays.shape[0]}: "
-            "use captures of the same camera, at the same resolution and without cropping"
+            f"the capture has {width}x{height} px and the camera was calibrated at"
+            f" {rays.shape[1]}x{rays.shape[0]}: use captures of the same camera, at the same"
+            " resolution and without cropping"
         )
     low, high = _coordinate_range(rig, rays, near, far, phase.axis)
     longest = float(np.nanmax(np.where(phase.mask, high - low, np.nan), initial=0.0))
@@ -53,21 +57,27 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
         limit = _unique_far(rig, rays[phase.mask], near, far, phase.axis, reach)
         narrower = f", such as {near:.0f} to {limit:.0f} mm" if limit - near >= 1 else ""
         raise InputError(
-            f"axis {phase.axis}: between {near:.0f} and {far:.0f} mm a camera pixel sees up to {longest:.0f} px of the "
-            f"projector, and the phase repeats every {reach:g} px: up to {int(longest // reach) + 1} depths fit. State "
-            f"a narrower depth range{narrower}, or capture with Gray code or a longer period"
+            f"axis {phase.axis}: between {near:.0f} and {far:.0f} mm a camera pixel sees up to"
+            f" {longest:.0f} px of the projector, and the phase repeats every {reach:g} px: up to"
+            f" {int(longest // reach) + 1} depths fit. State a narrower depth range{narrower}, or"
+            " capture with Gray code or a longer period"
         )
     with np.errstate(invalid="ignore"):
         coordinate = phase.coordinate.astype(np.float64)
         order = np.ceil((low - coordinate) / reach)
         inside = phase.mask & (coordinate + order * reach <= high)
-        absolute = phase.phase + np.float32(2 * np.pi / phase.period_px) * (order * reach).astype(np.float32)
+        absolute = phase.phase + np.float32(2 * np.pi / phase.period_px) * (order * reach).astype(
+            np.float32
+        )
     reason = np.where(phase.mask & ~inside, np.uint8(Reason.OUTSIDE), phase.reason)
     outside = float(np.mean(~inside[phase.mask])) if phase.mask.any() else 0.0
     stretch = float(np.nanmedian((high - low)[phase.mask])) if phase.mask.any() else np.nan
     return Resolved(
         replace(
-            phase, phase=np.where(inside, absolute, np.float32(np.nan)), reason=reason, unambiguous_px=float(np.inf)
+            phase,
+            phase=np.where(inside, absolute, np.float32(np.nan)),
+            reason=reason,
+            unambiguous_px=float(np.inf),
         ),
         depth_range_mm,
         outside,
@@ -78,15 +88,19 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
 def _coordinate_range(
     rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest projector coordinate (...,) px of rays (..., 2) between two depths."""
+    """Return the lowest and the highest projector coordinate (...,) px of rays (..., 2) between two
+    depths."""
     row = 0 if axis == "x" else 1
     at_near, at_far = (
-        rig.project(points_from_depth(rays, np.full(rays.shape[:-1], depth)))[..., row] for depth in (near, far)
+        rig.project(points_from_depth(rays, np.full(rays.shape[:-1], depth)))[..., row]
+        for depth in (near, far)
     )
     return np.minimum(at_near, at_far), np.maximum(at_near, at_far)
 
 
-def _unique_far(rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str, reach: float) -> float:
+def _unique_far(
+    rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str, reach: float
+) -> float:
     """Return the depth in mm up to which the phase is unique from ``near`` on."""
     rays = rays[:: max(1, len(rays) // SAMPLE)]
     least, most = near, far

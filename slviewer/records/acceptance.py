@@ -13,17 +13,18 @@ Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
 COVERAGE = 2.0
 RULE = (
-    "Decided with a guard band as in ISO 14253-1: pass if error and expanded uncertainty (k = 2) "
-    "together stay within the limit at every position, fail if the error exceeds it by more than the "
-    "uncertainty at one, else undecided. The test follows the ideas of VDI/VDE 2634 part 2 and "
-    "ISO 10360-13, and claims conformity with neither."
+    "Decided with a guard band as in ISO 14253-1: pass if error and expanded uncertainty (k = 2)"
+    " together stay within the limit at every position, fail if the error exceeds it by more than"
+    " the uncertainty at one, else undecided. The test follows the ideas of VDI/VDE 2634 part 2 and"
+    " ISO 10360-13, and claims conformity with neither."
 )
 MARKS: Mapping[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
 
 
 class PropertyError(msgspec.Struct, frozen=True):
-    """The error of a property at one position, with the test's expanded uncertainty (k = 2), and where the error lies
-    with 95 and 99.7 % probability; of form and flatness the ranges that hold as many points."""
+    """The error of a property at one position, with the test's expanded uncertainty (k = 2), and
+    where the error lies with 95 and 99.7 % probability; of form and flatness the ranges that hold
+    as many points."""
 
     property: str
     position: str
@@ -34,7 +35,8 @@ class PropertyError(msgspec.Struct, frozen=True):
 
 
 class JudgedProperty(msgspec.Struct, frozen=True):
-    """One property over all positions: the ``worst`` error, the limit, and the decision (None without a limit)."""
+    """One property over all positions: the ``worst`` error, the limit, and the decision (None
+    without a limit)."""
 
     property: str
     worst: PropertyError
@@ -43,9 +45,10 @@ class JudgedProperty(msgspec.Struct, frozen=True):
 
 
 class PositionErrors(msgspec.Struct, frozen=True):
-    """What was measured at one position: ``rms_mm`` and ``floor_mm`` of each ball or the plane, RMS of the points'
-    deviations and what noise alone would leave; ``noise_mm``: standard uncertainty of a length by the cloud's noise
-    alone; ``incidence``: percent in R1, R2, R3; ``warnings``: what was excluded."""
+    """What was measured at one position: ``rms_mm`` and ``floor_mm`` of each ball or the plane, RMS
+    of the points' deviations and what noise alone would leave; ``noise_mm``: standard uncertainty
+    of a length by the cloud's noise alone; ``incidence``: percent in R1, R2, R3; ``warnings``: what
+    was excluded."""
 
     position: str
     capture: str
@@ -68,11 +71,12 @@ class PositionErrors(msgspec.Struct, frozen=True):
 
 
 class ScaleError(msgspec.Struct, frozen=True):
-    """Relative error of the scale, positive where the instrument measures too long; ``u_ppm`` is its standard
-    uncertainty.
+    """Relative error of the scale, positive where the instrument measures too long; ``u_ppm`` is
+    its standard uncertainty.
 
-    From the errors of one length at several positions: their mean, with the scatter between positions (widened for
-    their number by Student's t) and what all of them share, the certificate and the temperature.
+    From the errors of one length at several positions: their mean, with the scatter between
+    positions (widened for their number by Student's t) and what all of them share, the certificate
+    and the temperature.
     """
 
     ppm: float
@@ -91,8 +95,8 @@ class ScaleError(msgspec.Struct, frozen=True):
 
 
 class Contribution(msgspec.Struct, frozen=True):
-    """One source of a length's uncertainty: its standard uncertainty, None where nothing is known of it. ``kind`` A:
-    from repeated observations; B: from anything else."""
+    """One source of a length's uncertainty: its standard uncertainty, None where nothing is known
+    of it. ``kind`` A: from repeated observations; B: from anything else."""
 
     source: str
     u_mm: float | None
@@ -109,7 +113,9 @@ class ErrorBudget(msgspec.Struct, frozen=True):
     @property
     def U_mm(self) -> float:
         """Expanded uncertainty (k = 2) of all known contributions."""
-        return COVERAGE * hypot(*(each.u_mm for each in self.contributions if each.u_mm is not None))
+        return COVERAGE * hypot(
+            *(each.u_mm for each in self.contributions if each.u_mm is not None)
+        )
 
     @property
     def unknown(self) -> list[str]:
@@ -132,8 +138,8 @@ class ErrorBudget(msgspec.Struct, frozen=True):
 
 
 class StillCaptures(msgspec.Struct, frozen=True):
-    """The spread of depth over captures of a still object: medians over the pixels, and what noise predicts;
-    ``wandering_mm``: how far the mean depth moved."""
+    """The spread of depth over captures of a still object: medians over the pixels, and what noise
+    predicts; ``wandering_mm``: how far the mean depth moved."""
 
     captures: Count
     pixels: Count
@@ -154,8 +160,8 @@ class CertifiedArtefact(msgspec.Struct, frozen=True):
 class AcceptanceTest(Record, frozen=True, kw_only=True):
     """Artefacts with known lengths, measured in several places.
 
-    ``lacks``: what the positions do not test; ``scale_factor``: the correction in force during the test,
-    ``scale_applied`` the one that it put in force; ``time``: ISO 8601, UTC.
+    ``lacks``: what the positions do not test; ``scale_factor``: the correction in force during the
+    test, ``scale_applied`` the one that it put in force; ``time``: ISO 8601, UTC.
     """
 
     kind: ClassVar[str] = "acceptance"
@@ -179,7 +185,9 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
         """Convert a record of version 0.2, whose figures were one entry."""
         old = meta.get("accepted")
         return (
-            {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})} if isinstance(old, dict) else meta
+            {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})}
+            if isinstance(old, dict)
+            else meta
         )
 
     @property
@@ -191,8 +199,9 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
         """Return artefact, decision and what is missing in one sentence."""
         missing = f"; incomplete: {'; '.join(self.lacks)}" if self.lacks else ""
         return (
-            f"{self.artefact.name}, certificate {self.artefact.certificate}, measured by {self.model} on "
-            f"{self.time[:10]}: {(self.decision or 'not decided').upper()}{missing}"
+            f"{self.artefact.name}, certificate {self.artefact.certificate}, measured by"
+            f" {self.model} on {self.time[:10]}:"
+            f" {(self.decision or 'not decided').upper()}{missing}"
         )
 
     def figures(self) -> dict[str, float]:
@@ -201,8 +210,13 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
 
     @classmethod
     def tables(cls, found: Mapping[str, "AcceptanceTest"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each test, the properties, the positions, and the budget of a length; the last test first."""
-        return [table for name, each in reversed(list(found.items())) for table in each._list_tables(name)]
+        """Return, for each test, the properties, the positions, and the budget of a length; the
+        last test first."""
+        return [
+            table
+            for name, each in reversed(list(found.items()))
+            for table in each._list_tables(name)
+        ]
 
     def _list_tables(self, name: str) -> list[Table]:
         columns = [
@@ -239,25 +253,40 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             *(Column(name, "mm", digits=4) for name in shown),
             Column("RMS", "mm"),
             Column("noise floor", "mm"),
-            *(Column(depths, "%", "share in", digits=0, detail=True) for depths in ("R1", "R2", "R3")),
+            *(
+                Column(depths, "%", "share in", digits=0, detail=True)
+                for depths in ("R1", "R2", "R3")
+            ),
             Column("points", detail=True),
         ]
         rows: list[list[Value | Cell]] = []
         for each in self.positions:
             shares = [(each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")]
-            errors = [each.error(name).error_mm if name in each.properties else None for name in shown]
+            errors = [
+                each.error(name).error_mm if name in each.properties else None for name in shown
+            ]
             floor = max((mm for mm in each.floor_mm if mm is not None), default=None)
             rows.append([each.position, *errors, max(each.rms_mm), floor, *shares, each.points])
-        notes = [f"{each.position}: {warning}" for each in self.positions for warning in each.warnings]
-        return Table(columns, rows, "The worst error of each property at each position", notes).without_empty()
+        notes = [
+            f"{each.position}: {warning}" for each in self.positions for warning in each.warnings
+        ]
+        return Table(
+            columns, rows, "The worst error of each property at each position", notes
+        ).without_empty()
 
     def _list_notes(self) -> list[str]:
         notes = [f"{self.summary()}.", f"{len(self.positions)} positions.", RULE]
         if self.scale is not None:
             scale = self.scale
-            notes.append(f"Scale: {scale.ppm:+.0f} ppm ± {scale.U_ppm:.0f} ppm (k = 2) over {scale.length_mm:.3f} mm.")
+            notes.append(
+                f"Scale: {scale.ppm:+.0f} ppm ± {scale.U_ppm:.0f} ppm (k = 2) over"
+                f" {scale.length_mm:.3f} mm."
+            )
         if self.scale_applied is not None:
-            notes.append(f"The scale was corrected by {1e6 * (self.scale_applied - 1):+.0f} ppm from this test on.")
+            notes.append(
+                f"The scale was corrected by {1e6 * (self.scale_applied - 1):+.0f} ppm from this"
+                " test on."
+            )
         elif self.scale_factor != 1:
             ppm = f"{1e6 * (self.scale_factor - 1):+.0f}"
             notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
@@ -265,8 +294,10 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             notes.append("The scale was not corrected: --apply-scale does so.")
         if (still := self.repeatability) is not None:
             notes.append(
-                f"Repeatability over {still.captures} captures of a still object: {still.sigma_mm:.4f} mm (median over "
-                f"{still.pixels:,} pixels; 95 % below {still.sigma_95_mm:.4f}), {still.predicted_mm:.4f} mm expected "
-                f"from noise; the mean depth drifted by {still.wandering_mm:.4f} mm. This is not a measure of accuracy."
+                f"Repeatability over {still.captures} captures of a still object:"
+                f" {still.sigma_mm:.4f} mm (median over {still.pixels:,} pixels; 95 % below"
+                f" {still.sigma_95_mm:.4f}), {still.predicted_mm:.4f} mm expected from noise; the"
+                f" mean depth drifted by {still.wandering_mm:.4f} mm. This is not a measure of"
+                " accuracy."
             )
         return [note.replace(" -", " −").replace("−-apply", "--apply") for note in notes]

@@ -14,11 +14,11 @@ class Drift(Record, frozen=True, kw_only=True):
 
     Sigmas are standard deviations. ``turn_mrad``, ``shift_mm``: estimated rotation about and
     translation along the projector's own axes. ``scale_ppm``: apparent growth of the board;
-    ``across_px``: mean offset across the epipolar lines, None with one axis; ``misfit_px``: RMS that
-    no movement explains. ``chance``: p-value of the change if nothing moved. ``seen_alone``: size in
-    mrad and mm at which each rotation and translation would be detected with 95 % probability if it
-    were the only change. ``unseen``: descriptions of changes that would not be detected. ``time``:
-    ISO 8601, UTC.
+    ``across_px``: mean offset across the epipolar lines, None with one axis; ``misfit_px``: RMS
+    that no movement explains. ``chance``: p-value of the change if nothing moved. ``seen_alone``:
+    size in mrad and mm at which each rotation and translation would be detected with 95 %
+    probability if it were the only change. ``unseen``: descriptions of changes that would not be
+    detected. ``time``: ISO 8601, UTC.
     """
 
     kind: ClassVar[str] = "drift"
@@ -68,7 +68,8 @@ class Drift(Record, frozen=True, kw_only=True):
 
     @classmethod
     def tables(cls, found: Mapping[str, "Drift"]) -> list[Table]:  # type: ignore[override]
-        """Return a table of the checks, the latest first, and one of what the latest found of each axis."""
+        """Return a table of the checks, the latest first, and one of what the latest found of each
+        axis."""
         columns = [
             Column("check", align="left"),
             Column("time, UTC", align="left", detail=True),
@@ -117,9 +118,13 @@ class Drift(Record, frozen=True, kw_only=True):
         rows = [list(row) for row in zip("xyz", *figures, strict=True)]
         notes = [
             f"{self.summary()}.",
-            f"Baseline {1e3 * self.baseline_mm:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace("-", "−"),
-            "A pan and a shift along x look nearly alike, as do a nod and a shift along y: their sum is "
-            "known far better than each. Detectable: if it is the only change.",
+            f"Baseline {1e3 * self.baseline_mm:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace(
+                "-", "−"
+            ),
+            (
+                "A pan and a shift along x look nearly alike, as do a nod and a shift along y:"
+                " their sum is known far better than each. Detectable: if it is the only change."
+            ),
             *(f"Not detectable: {what}." for what in self.unseen),
         ]
         return Table(columns, rows, f"Check {name}: how the projector has moved", notes)

@@ -23,8 +23,9 @@ EXCLUDED = {
 
 
 class Registered(msgspec.Struct, frozen=True, kw_only=True):
-    """The registration of one scan onto another: RMS along the normal, and from point to point; ``overlap``, 0 to 1;
-    one standard deviation of the pose at ``middle``, the centre of the overlap."""
+    """The registration of one scan onto another: RMS along the normal, and from point to point;
+    ``overlap``, 0 to 1; one standard deviation of the pose at ``middle``, the centre of the
+    overlap."""
 
     scan: str = ""
     onto: str = ""
@@ -51,14 +52,18 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
         """How far the centre of the overlap was moved; None where an older merge lacks it."""
         if self.middle is None:
             return None
-        R, t = [row[:3] for row in self.T_reference_scan[:3]], [row[3] for row in self.T_reference_scan[:3]]
+        R, t = (
+            [row[:3] for row in self.T_reference_scan[:3]],
+            [row[3] for row in self.T_reference_scan[:3]],
+        )
         back = [x - s for x, s in zip(self.middle, t, strict=True)]
         before = [sum(R[k][i] * back[k] for k in range(3)) for i in range(3)]
         return dist(self.middle, before)
 
 
 class LoopClosure(msgspec.Struct, frozen=True):
-    """The closure error of the pairs round these scans: as registered, and what the joint adjustment left."""
+    """The closure error of the pairs round these scans: as registered, and what the joint
+    adjustment left."""
 
     scans: list[str]
     error_mm: float
@@ -76,7 +81,8 @@ class RefusedPair(msgspec.Struct, frozen=True):
 
 
 class MarkerPair(msgspec.Struct, frozen=True):
-    """Coded markers that two scans share, those that moved between them, and RMS distance of their corners."""
+    """Coded markers that two scans share, those that moved between them, and RMS distance of their
+    corners."""
 
     scan: str
     onto: str
@@ -86,7 +92,8 @@ class MarkerPair(msgspec.Struct, frozen=True):
 
 
 class ContradictingPair(msgspec.Struct, frozen=True):
-    """Share of the compared points that lie more than ``gate_mm`` in front of the other scan's surface."""
+    """Share of the compared points that lie more than ``gate_mm`` in front of the other scan's
+    surface."""
 
     scan: str
     onto: str
@@ -96,7 +103,8 @@ class ContradictingPair(msgspec.Struct, frozen=True):
 
 
 class Merge(Record, frozen=True, kw_only=True):
-    """Scans registered onto one of them, and fused into one surface, by the joint adjustment of all pairs.
+    """Scans registered onto one of them, and fused into one surface, by the joint adjustment of all
+    pairs.
 
     ``pairs``: every scan but the reference on it; ``registered``: the pairs that the merge was made
     from; ``loops`` that these close, the worst first; ``dropped``: pairs that the others
@@ -127,10 +135,14 @@ class Merge(Record, frozen=True, kw_only=True):
 
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Add the registered pairs, which merges of version 0.1 lack: theirs are those on the reference."""
+        """Add the registered pairs, which merges of version 0.1 lack: theirs are those on the
+        reference."""
         if "registered" in meta or not {"pairs", "reference"} <= meta.keys():
             return meta
-        onto = [{**pair, "scan": scan, "onto": meta["reference"]} for scan, pair in meta["pairs"].items()]
+        onto = [
+            {**pair, "scan": scan, "onto": meta["reference"]}
+            for scan, pair in meta["pairs"].items()
+        ]
         return {**meta, "registered": onto}
 
     @property
@@ -143,19 +155,25 @@ class Merge(Record, frozen=True, kw_only=True):
 
     def summary(self) -> str:
         """Return RMS and overlap of each scan on the reference."""
-        pairs = (f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %" for n, p in self.pairs.items())
+        pairs = (
+            f"{n} RMS {p.rms_mm:.3f} mm, overlap {100 * p.overlap:.0f} %"
+            for n, p in self.pairs.items()
+        )
         return f"merged on {self.reference}: {'; '.join(pairs)}"
 
     def figures(self) -> dict[str, float]:
         """Return the RMS and overlap of each registered pair, and the number of points."""
         pairs = {
-            f"{p.scan} on {p.onto} {key}": getattr(p, key) for p in self.registered for key in ("rms_mm", "overlap")
+            f"{p.scan} on {p.onto} {key}": getattr(p, key)
+            for p in self.registered
+            for key in ("rms_mm", "overlap")
         }
         return {"points": float(self.points), **pairs}
 
     @classmethod
     def tables(cls, found: Mapping[str, "Merge"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each merge, a table of its pairs and one of its loops, and notes of all that was excluded."""
+        """Return, for each merge, a table of its pairs and one of its loops, and notes of all that
+        was excluded."""
         return [table for name, each in found.items() for table in each._list_tables(name)]
 
     def _list_tables(self, name: str) -> list[Table]:
@@ -174,7 +192,9 @@ class Merge(Record, frozen=True, kw_only=True):
         ]
         marked = {(each.scan, each.onto): each for each in self.markers}
         rows: list[list[Value | Cell]] = []
-        for pair in sorted(self.registered, key=lambda pair: self.reference not in (pair.scan, pair.onto)):
+        for pair in sorted(
+            self.registered, key=lambda pair: self.reference not in (pair.scan, pair.onto)
+        ):
             marks = marked.get((pair.scan, pair.onto))
             rows.append(
                 [
@@ -191,35 +211,58 @@ class Merge(Record, frozen=True, kw_only=True):
                     None if marks is None else marks.rms_mm,
                 ]
             )
-        tables = [Table(columns, rows, f"Merge {name}: registered pairs", self._list_notes()).without_empty()]
+        tables = [
+            Table(
+                columns, rows, f"Merge {name}: registered pairs", self._list_notes()
+            ).without_empty()
+        ]
         if self.loops:
             ends = ("before", "after")
             tables.append(
                 Table(
                     [
                         Column("loop", align="left"),
-                        *(Column(end, u, digits=d, detail=u == "°") for end in ends for u, d in (("mm", 3), ("°", 4))),
+                        *(
+                            Column(end, u, digits=d, detail=u == "°")
+                            for end in ends
+                            for u, d in (("mm", 3), ("°", 4))
+                        ),
                     ],
                     [
-                        [" – ".join([*o.scans, o.scans[0]]), o.error_mm, o.error_deg, o.left_mm, o.left_deg]
+                        [
+                            " – ".join([*o.scans, o.scans[0]]),
+                            o.error_mm,
+                            o.error_deg,
+                            o.left_mm,
+                            o.left_deg,
+                        ]
                         for o in self.loops
                     ],
-                    f"Merge {name}: closure error of its loops, before and after the joint adjustment",
+                    f"Merge {name}: closure error of its loops, before and after the joint"
+                    " adjustment",
                 )
             )
         return tables
 
     def _list_notes(self) -> list[str]:
-        shared = "" if self.shared is None else f", {100 * self.shared:.0f} % of them seen by several scans"
+        shared = (
+            ""
+            if self.shared is None
+            else f", {100 * self.shared:.0f} % of them seen by several scans"
+        )
         notes = [f"{self.points:,} points in the frame of {self.reference}{shared}."]
         notes += [f"Excluded: {each.why}." for each in self.dropped]
-        notes += [f"Not registered: {each.scan} onto {each.onto}: {each.why}." for each in self.refused]
-        if counts := [f"{count:,} {EXCLUDED.get(why, why)}" for why, count in self.excluded.items() if count]:
+        notes += [
+            f"Not registered: {each.scan} onto {each.onto}: {each.why}." for each in self.refused
+        ]
+        if counts := [
+            f"{count:,} {EXCLUDED.get(why, why)}" for why, count in self.excluded.items() if count
+        ]:
             notes.append(f"Excluded points: {', '.join(counts)}.")
         if self.contradictions:
             worst = max(self.contradictions, key=lambda each: each.share)
             notes.append(
-                f"Contradicting points: {100 * worst.share:.2g} % at most of what both scans of a pair "
-                f"cover lie more than {worst.gate_mm:.2g} mm in front of the other's surface."
+                f"Contradicting points: {100 * worst.share:.2g} % at most of what both scans of a"
+                f" pair cover lie more than {worst.gate_mm:.2g} mm in front of the other's surface."
             )
         return [*notes, *(f"{each}." for each in (*self.restrictions, self.scale) if each)]

@@ -36,7 +36,9 @@ class Placement(Record, frozen=True, kw_only=True):
             return f"kept apart: {self.why}"
         if not self.onto or self.rms_mm is None or self.overlap is None:
             return "the first scan, which others are aligned to"
-        return f"aligned to {self.onto}: RMS {self.rms_mm:.3f} mm, overlap {100 * self.overlap:.0f} %"
+        return (
+            f"aligned to {self.onto}: RMS {self.rms_mm:.3f} mm, overlap {100 * self.overlap:.0f} %"
+        )
 
     def figures(self) -> dict[str, float]:
         """Return none: a scan's place depends on the order in which the others were aligned."""
@@ -53,9 +55,19 @@ class Placement(Record, frozen=True, kw_only=True):
             Column("kept apart because", align="left"),
         ]
         rows: list[list[Value | Cell]] = [
-            [name, p.onto, p.rms_mm, None if p.overlap is None else 100 * p.overlap, Cell(p.why, "worse")]
+            [
+                name,
+                p.onto,
+                p.rms_mm,
+                None if p.overlap is None else 100 * p.overlap,
+                Cell(p.why, "worse"),
+            ]
             for name, p in found.items()
         ]
         again = [each.seen_again for each in found.values() if each.seen_again is not None]
-        notes = [f"{100 * again[-1]:.0f} % of the surface is seen by more than one scan."] if again else []
+        notes = (
+            [f"{100 * again[-1]:.0f} % of the surface is seen by more than one scan."]
+            if again
+            else []
+        )
         return [Table(columns, rows, cls.title, notes).without_empty()]

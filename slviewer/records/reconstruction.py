@@ -7,19 +7,21 @@ from slviewer.records.record import Count, Record
 from slviewer.records.table import Cell, Column, Table, Value
 
 REPORTED_RAISE = 1.2
-"""Times its predicted noise that a calibration's residual is, from which raising sigma is reported."""
+"""Times its predicted noise that a calibration's residual is, from which raising sigma is
+reported."""
 
 
 class Reconstruction(Record, frozen=True, kw_only=True):
     """Captures as clouds, each by one model along one pattern axis, before edits and region.
 
-    Arrays, on the camera's grid: ``points`` (h, w, 3) float32 mm, ``sigma_z`` mm, ``phase`` rad, ``modulation`` (h, w)
-    float32, NaN where invalid; ``texture`` (h, w) or (h, w, 3) uint8; of some models ``sigma_calibration`` and
-    ``sigma_edges`` (h, w) float32 mm. ``depth_mm``: 1st and 99th percentile; ``noise_mm`` and ``sigma_calibration_mm``:
-    medians, of the depth's noise and of what the calibration leaves uncertain; ``raised``: the calibration's residuals
-    over their predicted noise, by which sigmas are raised; ``masked``: share of the pixels, 0 to 1, outside the
-    calibrated region, None for models that mask none; ``scale``: the correction of scale, in words; ``frame``: the one
-    that the points are in, in words.
+    Arrays, on the camera's grid: ``points`` (h, w, 3) float32 mm, ``sigma_z`` mm, ``phase`` rad,
+    ``modulation`` (h, w) float32, NaN where invalid; ``texture`` (h, w) or (h, w, 3) uint8; of some
+    models ``sigma_calibration`` and ``sigma_edges`` (h, w) float32 mm. ``depth_mm``: 1st and 99th
+    percentile; ``noise_mm`` and ``sigma_calibration_mm``: medians, of the depth's noise and of what
+    the calibration leaves uncertain; ``raised``: the calibration's residuals over their predicted
+    noise, by which sigmas are raised; ``masked``: share of the pixels, 0 to 1, outside the
+    calibrated region, None for models that mask none; ``scale``: the correction of scale, in words;
+    ``frame``: the one that the points are in, in words.
     """
 
     kind: ClassVar[str] = "clouds"
@@ -50,7 +52,9 @@ class Reconstruction(Record, frozen=True, kw_only=True):
 
     def figures(self) -> dict[str, float]:
         """Return the number of points and the median noise of their depth."""
-        return {"points": float(self.points)} | ({} if self.noise_mm is None else {"noise_mm": self.noise_mm})
+        return {"points": float(self.points)} | (
+            {} if self.noise_mm is None else {"noise_mm": self.noise_mm}
+        )
 
     @classmethod
     def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
@@ -74,16 +78,17 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             figures = (each.points, near, far, each.noise_mm, each.sigma_calibration_mm, masked)
             rows.append([name, each.model, each.axis, *figures, each.scale])
         raised = [
-            f"{name}: sigma was raised: the calibration's residuals in {each.axis} are {each.raised:.1f} times their "
-            "predicted noise, and what disturbs its phases disturbs this capture's as well."
+            f"{name}: sigma was raised: the calibration's residuals in {each.axis} are"
+            f" {each.raised:.1f} times their predicted noise, and what disturbs its phases disturbs"
+            " this capture's as well."
             for name, each in found.items()
             if each.raised > REPORTED_RAISE
         ]
         frames = {each.frame: None for each in found.values() if each.frame}
         note = (
-            "Nearest and farthest: 1 % and 99 % of the depths. Noise and calibration: medians of the "
-            "standard deviations of depth, by the capture's noise and by what the calibration leaves "
-            "uncertain."
+            "Nearest and farthest: 1 % and 99 % of the depths. Noise and calibration: medians of"
+            " the standard deviations of depth, by the capture's noise and by what the calibration"
+            " leaves uncertain."
         )
         notes = [note, *raised, *(f"Frame: {frame}." for frame in frames)]
         return [Table(columns, rows, cls.title, notes).without_empty()]

@@ -38,10 +38,10 @@ def to_matrix(T: np.ndarray) -> Matrix4:
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What an operation found: figures with their units in the names, and what they were made from.
 
-    ``operation`` and ``settings``, those that are not the default, made it from ``inputs``: {capture
-    or result: its hash}; ``scales``: {model: correction of scale in the figures}. A subclass names
-    its ``kind``, the folder of its results, and its ``title``; its docstring explains its figures in
-    the report. What older versions stored is converted by `upgrade`.
+    ``operation`` and ``settings``, those that are not the default, made it from ``inputs``:
+    {capture or result: its hash}; ``scales``: {model: correction of scale in the figures}. A
+    subclass names its ``kind``, the folder of its results, and its ``title``; its docstring
+    explains its figures in the report. What older versions stored is converted by `upgrade`.
     """
 
     kind: ClassVar[str] = ""
@@ -63,11 +63,13 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def tables(cls, found: Mapping[str, "Record"]) -> list[Table]:
-        """Return the tables of some records of this kind, by the name of each: by default a line each, and a column for
-        every figure."""
+        """Return the tables of some records of this kind, by the name of each: by default a line
+        each, and a column for every figure."""
         figures = {name: record.figures() for name, record in found.items()}
         names = list(dict.fromkeys(figure for each in figures.values() for figure in each))
-        rows: list[list[Value]] = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
+        rows: list[list[Value]] = [
+            [name, *(each.get(f) for f in names)] for name, each in figures.items()
+        ]
         return [Table([Column("name", align="left"), *map(figure_column, names)], rows, cls.title)]
 
     @property
@@ -78,11 +80,19 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def summary(self) -> str:
         """Return the figures in one sentence."""
         columns = [(figure_column(name), value) for name, value in self.figures().items()]
-        return ", ".join(f"{column.title} {column.format(value)} {column.unit}".strip() for column, value in columns)
+        return ", ".join(
+            f"{column.title} {column.format(value)} {column.unit}".strip()
+            for column, value in columns
+        )
 
     def figures(self) -> dict[str, float]:
-        """Return the numbers of the record by name; of those inside others ``name of the outer, of the inner``."""
-        plain = {key: value for key, value in to_plain(self).items() if key not in Record.__struct_fields__}
+        """Return the numbers of the record by name; of those inside others ``name of the outer, of
+        the inner``."""
+        plain = {
+            key: value
+            for key, value in to_plain(self).items()
+            if key not in Record.__struct_fields__
+        }
         return dict(_list_numbers(plain, ""))
 
 
@@ -94,7 +104,8 @@ def figure_column(name: str) -> Column:
 
 
 def _list_numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
-    """List the numbers in plain values, with their names; texts, lists and truth values are none."""
+    """List the numbers in plain values, with their names; texts, lists and truth values are
+    none."""
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from _list_numbers(inner, f"{name} {key}".strip())

@@ -8,7 +8,8 @@ from typing import Literal
 from slviewer.errors import InputError
 
 Mark = Literal["", "better", "worse", "strong", "muted"]
-"""How a value compares with its rivals; colour and weight follow it, and the text beside it says so in words."""
+"""How a value compares with its rivals; colour and weight follow it, and the text beside it says so
+in words."""
 Value = str | int | float | None
 """Of a cell; None and NaN are unknown."""
 UNKNOWN = "–"
@@ -26,8 +27,8 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """A column's heading, its unit, the group of neighbours that it shares a heading with, and the decimals of its
-    numbers. ``detail``: left out where a table is narrow."""
+    """A column's heading, its unit, the group of neighbours that it shares a heading with, and the
+    decimals of its numbers. ``detail``: left out where a table is narrow."""
 
     title: str
     unit: str = ""
@@ -42,7 +43,8 @@ class Column:
         return " ".join(filter(None, (self.group, self.title, self.unit)))
 
     def format(self, value: Value) -> str:
-        """Return a value as text: numbers with the column's decimals, halves rounded up; a dash for unknown ones."""
+        """Return a value as text: numbers with the column's decimals, halves rounded up; a dash for
+        unknown ones."""
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
             return UNKNOWN
         if isinstance(value, str):
@@ -54,7 +56,8 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values or cells under columns; ``footer`` rows (means) stand apart below, then ``notes``."""
+    """Rows of values or cells under columns; ``footer`` rows (means) stand apart below, then
+    ``notes``."""
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[Value | Cell]]
@@ -66,13 +69,14 @@ class Table:
         for row in (*self.rows, *self.footer):
             if len(row) != len(self.columns):
                 raise InputError(
-                    f"a row of the table '{self.caption}' has {len(row)} cells and the table {len(self.columns)} "
-                    "columns: give one cell a column"
+                    f"a row of the table '{self.caption}' has {len(row)} cells and the table"
+                    f" {len(self.columns)} columns: give one cell a column"
                 )
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """The headings above the columns' own, with how many columns each spans; empty where no column has one."""
+        """The headings above the columns' own, with how many columns each spans; empty where no
+        column has one."""
         spans: list[tuple[str, int]] = []
         for column in self.columns:
             if spans and spans[-1][0] == column.group:
@@ -81,12 +85,18 @@ class Table:
                 spans.append((column.group, 1))
         return spans if any(name for name, _ in spans) else []
 
-    def format(self, rows: Sequence[Sequence[Value | Cell]]) -> list[list[tuple[Column, str, Mark]]]:
-        """Return column, text and mark of each cell of some rows; a name that repeats the one above it is blank."""
+    def format(
+        self, rows: Sequence[Sequence[Value | Cell]]
+    ) -> list[list[tuple[Column, str, Mark]]]:
+        """Return column, text and mark of each cell of some rows; a name that repeats the one above
+        it is blank."""
         lines: list[list[tuple[Column, str, Mark]]] = []
         above = ""
         for row in rows:
-            line = [(column, *_format_cell(column, cell)) for column, cell in zip(self.columns, row, strict=True)]
+            line = [
+                (column, *_format_cell(column, cell))
+                for column, cell in zip(self.columns, row, strict=True)
+            ]
             if line and line[0][0].align == "left":
                 name = line[0][1]
                 line[0] = (line[0][0], "" if name == above else name, line[0][2])
@@ -102,18 +112,23 @@ class Table:
     def select(self, keep: Sequence[Column]) -> "Table":
         """Return the table with some of its columns alone."""
         chosen = [index for index, column in enumerate(self.columns) if column in keep]
-        rows, footer = ([[row[k] for k in chosen] for row in part] for part in (self.rows, self.footer))
+        rows, footer = (
+            [[row[k] for k in chosen] for row in part] for part in (self.rows, self.footer)
+        )
         return Table([self.columns[k] for k in chosen], rows, self.caption, self.notes, footer)
 
     def without_constant(self) -> "Table":
-        """Return the table without a first column that holds one name alone, where it has several rows."""
+        """Return the table without a first column that holds one name alone, where it has several
+        rows."""
         names = {str(row[0]) for row in self.rows}
         return self.select(self.columns[1:]) if len(names) == 1 < len(self.rows) else self
 
     def without_empty(self) -> "Table":
         """Return the table without columns that hold nothing."""
         rows = list(map(self.values, self.rows))
-        return self.select([c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)])
+        return self.select(
+            [c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)]
+        )
 
 
 def _format_cell(column: Column, cell: Value | Cell) -> tuple[str, Mark]:
@@ -124,7 +139,8 @@ def _format_cell(column: Column, cell: Value | Cell) -> tuple[str, Mark]:
 
 
 def better_worse(error: float | None, rival: float | None) -> Mark:
-    """Return the mark "better" or "worse" of an error against a rival's, by magnitude; none where they are equal."""
+    """Return the mark "better" or "worse" of an error against a rival's, by magnitude; none where
+    they are equal."""
     if error is None or rival is None or not (math.isfinite(error) and math.isfinite(rival)):
         return ""
     error, rival = abs(error), abs(rival)
@@ -134,7 +150,8 @@ def better_worse(error: float | None, rival: float | None) -> Mark:
 
 
 def compare_errors(error: float | None, rival: float | None) -> Cell:
-    """Return the cell that compares an error with a rival's, such as ``2.60 × better``, coloured."""
+    """Return the cell that compares an error with a rival's, such as ``2.60 × better``,
+    coloured."""
     if not (error and rival and math.isfinite(error) and math.isfinite(rival)):
         return Cell(None)
     error, rival, mark = abs(error), abs(rival), better_worse(error, rival)
@@ -142,20 +159,27 @@ def compare_errors(error: float | None, rival: float | None) -> Cell:
 
 
 def render_text(table: Table) -> str:
-    """Return a table for the terminal: names to the left, figures to the right, and its notes below.
+    """Return a table for the terminal: names to the left, figures to the right, and its notes
+    below.
 
     Titles stand above their columns one word a line, so that wide tables stay narrow.
     """
     body = [[text for _, text, _ in line] for line in table.format([*table.rows, *table.footer])]
     is_left = [column.align == "left" for column in table.columns]
-    lines = align_columns([column.heading for column in table.columns], body, is_left, len(table.footer))
+    lines = align_columns(
+        [column.heading for column in table.columns], body, is_left, len(table.footer)
+    )
     return "\n".join([*lines, *table.notes])
 
 
 def align_columns(
-    headings: Sequence[str], body: Sequence[Sequence[str]], is_left: Sequence[bool], footers: int = 0
+    headings: Sequence[str],
+    body: Sequence[Sequence[str]],
+    is_left: Sequence[bool],
+    footers: int = 0,
 ) -> list[str]:
-    """Return lines of texts in columns, below headings of one word a line, and a rule above the last ``footers``."""
+    """Return lines of texts in columns, below headings of one word a line, and a rule above the
+    last ``footers``."""
     words = [heading.split() for heading in headings]
     height = max(map(len, words), default=0)
     head = list(zip(*([""] * (height - len(each)) + each for each in words), strict=True))
@@ -164,8 +188,12 @@ def align_columns(
     def align(line: Sequence[str]) -> str:
         """Return the cells of a line side by side."""
         cells = zip(line, widths, is_left, strict=True)
-        return "  ".join(text.ljust(width) if left else text.rjust(width) for text, width, left in cells).rstrip()
+        return "  ".join(
+            text.ljust(width) if left else text.rjust(width) for text, width, left in cells
+        ).rstrip()
 
     rule = "-" * (sum(widths) + 2 * max(0, len(widths) - 1))
     lines = [*map(align, head), rule, *map(align, body)]
-    return [*lines[: len(lines) - footers], rule, *lines[len(lines) - footers :]] if footers else lines
+    return (
+        [*lines[: len(lines) - footers], rule, *lines[len(lines) - footers :]] if footers else lines
+    )

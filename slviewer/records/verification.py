@@ -18,9 +18,10 @@ REPORTED_MASKED = 0.005
 
 
 class ModelFit(msgspec.Struct, frozen=True):
-    """A shape fitted to the points of one model: ``excluded`` of the ``points`` lie beyond 5 robust sigma. Shares, 0 to
-    1: ``coverage`` of the illuminated pixels is measured, ``masked`` lie outside the calibrated region. A plane is
-    ``normal . X = offset_mm``, a sphere has a radius and a centre, in the camera's frame."""
+    """A shape fitted to the points of one model: ``excluded`` of the ``points`` lie beyond 5 robust
+    sigma. Shares, 0 to 1: ``coverage`` of the illuminated pixels is measured, ``masked`` lie
+    outside the calibrated region. A plane is ``normal . X = offset_mm``, a sphere has a radius and
+    a centre, in the camera's frame."""
 
     points: Count
     excluded: Count
@@ -35,12 +36,13 @@ class ModelFit(msgspec.Struct, frozen=True):
 
 
 class Verification(Record, frozen=True, kw_only=True):
-    """Known shapes, measured by each model over the pixels that all of them measure. Every RMS stands beside its noise
-    floor: what the capture's noise alone would give.
+    """Known shapes, measured by each model over the pixels that all of them measure. Every RMS
+    stands beside its noise floor: what the capture's noise alone would give.
 
-    Arrays: ``error_<model>`` (h, w) float32 mm, NaN where nothing was evaluated; positive towards the camera for a
-    plane, outwards for a sphere. ``incidence``: percent of the shape in R1, R2 and R3. ``region_px``: first and last
-    column, first and last row; ``share`` of the measured pixels lie in it.
+    Arrays: ``error_<model>`` (h, w) float32 mm, NaN where nothing was evaluated; positive towards
+    the camera for a plane, outwards for a sphere. ``incidence``: percent of the shape in R1, R2 and
+    R3. ``region_px``: first and last column, first and last row; ``share`` of the measured pixels
+    lie in it.
     """
 
     kind: ClassVar[str] = "verify"
@@ -59,7 +61,11 @@ class Verification(Record, frozen=True, kw_only=True):
         models = {name: dict(fit) for name, fit in meta["models"].items()}
         for name, fit in models.items():
             fit["excluded"] = fit.pop("set_aside")
-            for key, old in (("centre_mm", "centres_mm"), ("normal", "normals"), ("masked", "masked")):
+            for key, old in (
+                ("centre_mm", "centres_mm"),
+                ("normal", "normals"),
+                ("masked", "masked"),
+            ):
                 fit[key] = meta.get(old, {}).get(name)
         captures = [name for name in meta.get("inputs", {}) if "/" not in name]
         settings = {"captures": captures, "shape": meta["shape"], "models": list(models)}
@@ -72,7 +78,9 @@ class Verification(Record, frozen=True, kw_only=True):
 
     def summary(self) -> str:
         """Return the RMS of each model in one sentence."""
-        return "RMS " + ", ".join(f"{name} {_or_infinite(fit.rms_mm):.3f} mm" for name, fit in self.models.items())
+        return "RMS " + ", ".join(
+            f"{name} {_or_infinite(fit.rms_mm):.3f} mm" for name, fit in self.models.items()
+        )
 
     def figures(self) -> dict[str, float]:
         """Return RMS, noise floor and radius of each model."""
@@ -85,7 +93,8 @@ class Verification(Record, frozen=True, kw_only=True):
 
     @classmethod
     def tables(cls, found: Mapping[str, "Verification"]) -> list[Table]:  # type: ignore[override]
-        """Return a table of the planes, one of the spheres, and one of the distances between their centres."""
+        """Return a table of the planes, one of the spheres, and one of the distances between their
+        centres."""
         tables = []
         for shape, caption in (
             ("plane", "Planes: RMS distance from the best plane"),
@@ -95,20 +104,30 @@ class Verification(Record, frozen=True, kw_only=True):
                 tables.append(_make_table(of_shape, caption))
         if distances := centre_distances_mm(found):
             models = list(dict.fromkeys(model for each in distances.values() for model in each))
-            rows: list[list[Value]] = [[f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()]
+            rows: list[list[Value]] = [
+                [f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()
+            ]
             columns = [Column("spheres", align="left"), *(Column(model, "mm") for model in models)]
             tables.append(Table(columns, rows, "Distances between the centres of spheres"))
         return tables
 
 
-def centre_distances_mm(found: Mapping[str, Verification]) -> dict[tuple[str, str], dict[str, float]]:
+def centre_distances_mm(
+    found: Mapping[str, Verification],
+) -> dict[tuple[str, str], dict[str, float]]:
     """Return {(name, name): {model: mm}}, the distances between the centres of each two spheres."""
     centres = {
-        name: {model: fit.centre_mm for model, fit in each.models.items() if fit.centre_mm is not None}
+        name: {
+            model: fit.centre_mm for model, fit in each.models.items() if fit.centre_mm is not None
+        }
         for name, each in found.items()
     }
     return {
-        (a, b): {model: dist(centre, centres[b][model]) for model, centre in centres[a].items() if model in centres[b]}
+        (a, b): {
+            model: dist(centre, centres[b][model])
+            for model, centre in centres[a].items()
+            if model in centres[b]
+        }
         for a, b in combinations([name for name, models in centres.items() if models], 2)
     }
 
@@ -132,13 +151,20 @@ def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
     rows: list[list[Value | Cell]] = []
     for name, each in found.items():
         for model, fit in each.models.items():
-            compared = Cell("") if model == first else compare_errors(fit.rms_mm, each.models[first].rms_mm)
+            compared = (
+                Cell("")
+                if model == first
+                else compare_errors(fit.rms_mm, each.models[first].rms_mm)
+            )
             excluded = fit.excluded / max(1, fit.points)
             rows.append(
                 [
                     name,
                     model,
-                    Cell(fit.rms_mm, "better" if model == each.best and len(each.models) > 1 else compared.mark),
+                    Cell(
+                        fit.rms_mm,
+                        "better" if model == each.best and len(each.models) > 1 else compared.mark,
+                    ),
                     fit.noise_floor_mm,
                     compared,
                     fit.radius_mm,
@@ -155,19 +181,35 @@ def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
 def _list_notes(found: Mapping[str, Verification]) -> list[str]:
     """Return what a reader of the table must know."""
     notes = [
-        "Excluded: points beyond 5 robust sigma; above 2 % the RMS does not describe the shape. Coverage: measured "
-        "pixels of those illuminated and modulated."
+        "Excluded: points beyond 5 robust sigma; above 2 % the RMS does not describe the shape."
+        " Coverage: measured pixels of those illuminated and modulated."
     ]
     masked = [fit.masked for each in found.values() for fit in each.models.values()]
     if any(share is not None and share > REPORTED_MASKED for share in masked):
-        notes.append("Masked: pixels that look through parts of camera or projector that no target pose illuminated.")
+        notes.append(
+            "Masked: pixels that look through parts of camera or projector that no target pose"
+            " illuminated."
+        )
     for name, each in found.items():
         if each.region_px is not None:
             left, right, top, bottom = each.region_px
-            share = "" if each.share is None else f", {100 * each.share:.0f} % of the measured pixels"
-            notes.append(f"{name}: columns {left}-{right}, rows {top}-{bottom}{share}; coverage is of this region.")
-    scaled = {model: factor for each in found.values() for model, factor in each.scales.items() if factor != 1}
-    notes += [f"{model}: scale corrected by {1e6 * (f - 1):+.0f} ppm.".replace("-", "−") for model, f in scaled.items()]
+            share = (
+                "" if each.share is None else f", {100 * each.share:.0f} % of the measured pixels"
+            )
+            notes.append(
+                f"{name}: columns {left}-{right}, rows {top}-{bottom}{share}; coverage is of this"
+                " region."
+            )
+    scaled = {
+        model: factor
+        for each in found.values()
+        for model, factor in each.scales.items()
+        if factor != 1
+    }
+    notes += [
+        f"{model}: scale corrected by {1e6 * (f - 1):+.0f} ppm.".replace("-", "−")
+        for model, f in scaled.items()
+    ]
     return notes
 
 

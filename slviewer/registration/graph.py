@@ -1,4 +1,5 @@
-"""Pose graph: scans are nodes, registered pairs are edges; initial poses, loop gaps, and optimisation."""
+"""Pose graph: scans are nodes, registered pairs are edges; initial poses, loop gaps, and
+optimisation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,9 +22,11 @@ _LEVER_MM = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A registered pair: ``T`` (4, 4) mm maps points of node ``scan`` into the frame of node ``onto``.
+    """A registered pair: ``T`` (4, 4) mm maps points of node ``scan`` into the frame of node
+    ``onto``.
 
-    ``covariance`` (6, 6): of a small rotation (rad) about ``centre`` (3,) mm and a translation (mm), in that frame.
+    ``covariance`` (6, 6): of a small rotation (rad) about ``centre`` (3,) mm and a translation
+    (mm), in that frame.
     """
 
     scan: int
@@ -41,7 +44,8 @@ class Edge:
 
 @dataclass(frozen=True)
 class LoopGap:
-    """The gap of a loop: translation at the middle of the overlap, rotation, and the expected translation."""
+    """The gap of a loop: translation at the middle of the overlap, rotation, and the expected
+    translation."""
 
     shift_mm: float
     turn_deg: float
@@ -51,10 +55,11 @@ class LoopGap:
 def spanning_poses(
     nodes: int, edges: Sequence[Edge], root: int, costs: np.ndarray | None = None
 ) -> tuple[np.ndarray, list[int]]:
-    """Compute poses along the tree of shortest paths from the root, by the edges' variances or the given ``costs``.
+    """Compute poses along the tree of shortest paths from the root, by the edges' variances or the
+    given ``costs``.
 
-    Returns T_root_node (nodes, 4, 4) mm, NaN for unconnected nodes, and the index of the tree's edge that leads to each
-    node, -1 for the root and unconnected ones.
+    Returns T_root_node (nodes, 4, 4) mm, NaN for unconnected nodes, and the index of the tree's
+    edge that leads to each node, -1 for the root and unconnected ones.
     """
     costs = np.array([edge.variance for edge in edges]) if costs is None else costs
     poses = np.full((nodes, 4, 4), np.nan)
@@ -84,11 +89,16 @@ def spanning_poses(
 def loop_gap(edge: Edge, poses: np.ndarray, expected_mm: float = float("nan")) -> LoopGap:
     """Return the gap between an edge and the relative pose of its nodes by ``poses`` (n, 4, 4)."""
     residual = edge_residuals([edge], poses)[0]
-    return LoopGap(float(np.linalg.norm(residual[3:])), float(np.degrees(np.linalg.norm(residual[:3]))), expected_mm)
+    return LoopGap(
+        float(np.linalg.norm(residual[3:])),
+        float(np.degrees(np.linalg.norm(residual[:3]))),
+        expected_mm,
+    )
 
 
 def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[int]:
-    """Return the nodes of the loop that an edge closes with the ``tree`` of ``spanning_poses``, from end to end."""
+    """Return the nodes of the loop that an edge closes with the ``tree`` of ``spanning_poses``,
+    from end to end."""
 
     def path_to_root(node: int) -> list[int]:
         """Return the nodes from a node to the root, both included."""
@@ -105,20 +115,27 @@ def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[i
 
 
 def expected_gap_mm(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> float:
-    """Return the expected gap in mm of the loop that an edge closes, from the variances of its edges."""
+    """Return the expected gap in mm of the loop that an edge closes, from the variances of its
+    edges."""
     pairs = {frozenset(pair) for pair in pairwise(loop_nodes(edge, edges, tree))}
-    variances = [edges[k].variance for k in tree if k >= 0 and frozenset((edges[k].scan, edges[k].onto)) in pairs]
+    variances = [
+        edges[k].variance
+        for k in tree
+        if k >= 0 and frozenset((edges[k].scan, edges[k].onto)) in pairs
+    ]
     return float(np.sqrt(sum(variances) + edge.variance))
 
 
 def optimise_poses(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:
-    """Optimise approximate poses T_root_node (n, 4, 4) mm by weighted least squares over all edges."""
+    """Optimise approximate poses T_root_node (n, 4, 4) mm by weighted least squares over all
+    edges."""
     apply_step, cost, _ = _build_problem(poses, edges, root)
     return apply_step(least_squares(cost, np.zeros(6 * (len(poses) - 1)), x_scale="jac").x)
 
 
 def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
-    """Return the uncertainty of each optimised pose T_root_node (n, 4, 4), at the mean of the edges' centres.
+    """Return the uncertainty of each optimised pose T_root_node (n, 4, 4), at the mean of the
+    edges' centres.
 
     It grows with the distance from the root along the graph; the root's own is 0.
     """
@@ -127,7 +144,9 @@ def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> l
     J = np.stack([(cost(step) - cost(-step)) / 2e-3 for step in steps], axis=1)
     unit = np.repeat([1 / _LEVER_MM, 1.0], 3)
     covariance = np.linalg.inv(J.T @ J)
-    blocks = [covariance[k : k + 6, k : k + 6] * np.outer(unit, unit) for k in range(0, len(steps), 6)]
+    blocks = [
+        covariance[k : k + 6, k : k + 6] * np.outer(unit, unit) for k in range(0, len(steps), 6)
+    ]
     blocks.insert(root, np.zeros((6, 6)))
     return [Uncertainty(block, middle) for block in blocks]
 
@@ -135,15 +154,21 @@ def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> l
 def _build_problem(
     poses: np.ndarray, edges: Sequence[Edge], root: int
 ) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray], np.ndarray]:
-    """Return the least-squares problem of the poses T_root_node (n, 4, 4): (apply_step, cost, middle).
+    """Return the least-squares problem of the poses T_root_node (n, 4, 4): (apply_step, cost,
+    middle).
 
-    Its unknowns x (6 (n - 1),) are a rotation (in mm at the lever) and a translation about ``middle`` (3,) mm for each
-    node but the root. ``apply_step(x)`` returns the moved poses, ``cost(x)`` the edges' residuals in sigmas.
+    Its unknowns x (6 (n - 1),) are a rotation (in mm at the lever) and a translation about
+    ``middle`` (3,) mm for each node but the root. ``apply_step(x)`` returns the moved poses,
+    ``cost(x)`` the edges' residuals in sigmas.
     """
     free = [node for node in range(len(poses)) if node != root]
     floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_MM**2] * 3)
-    whitening = np.linalg.inv(np.linalg.cholesky(np.array([edge.covariance for edge in edges]) + floor))
-    middle = np.mean([move_points(poses[edge.onto], edge.centre[None])[0] for edge in edges], axis=0)
+    whitening = np.linalg.inv(
+        np.linalg.cholesky(np.array([edge.covariance for edge in edges]) + floor)
+    )
+    middle = np.mean(
+        [move_points(poses[edge.onto], edge.centre[None])[0] for edge in edges], axis=0
+    )
 
     def apply_step(x: np.ndarray) -> np.ndarray:
         """Return the poses (n, 4, 4) moved by the unknowns."""
@@ -161,7 +186,8 @@ def _build_problem(
 
 
 def edge_residuals(edges: Sequence[Edge], poses: np.ndarray) -> np.ndarray:
-    """Return (m, 6): rotation (rad) and translation (mm, at the edge's centre) from each edge to the poses' own."""
+    """Return (m, 6): rotation (rad) and translation (mm, at the edge's centre) from each edge to
+    the poses' own."""
     scans, ontos = [edge.scan for edge in edges], [edge.onto for edge in edges]
     relative = np.linalg.inv(poses[ontos]) @ poses[scans]
     D = relative @ np.linalg.inv(np.array([edge.T for edge in edges]))

@@ -1,7 +1,7 @@
 """Coded markers on scans: their corners in 3D, and the pose between two scans that they determine.
 
-A corner lies where a smooth surface, fitted to the points around it, meets the corner's line of sight; so neither the
-marker's own print nor the few points at its edges decide.
+A corner lies where a smooth surface, fitted to the points around it, meets the corner's line of
+sight; so neither the marker's own print nor the few points at its edges decide.
 """
 
 from collections.abc import Mapping
@@ -23,8 +23,8 @@ from slviewer.target.coded import detect_markers
 CORNER_PX = 0.05
 """Standard deviation of a corner in the image, beyond which its own residuals speak."""
 MOVED_SIGMAS, MOVED_MM, MOVED_MEDIANS = 6.0, 0.1, 4.0
-"""A marker whose corners are further from where the others put them, in standard deviations, mm, and medians of all
-markers, has been moved."""
+"""A marker whose corners are further from where the others put them, in standard deviations, mm,
+and medians of all markers, has been moved."""
 MOST_GAP = 0.005
 """Of the markers' extent: where their gaps are larger in the median, no motion explains them."""
 LEAST_CORNER_POINTS = 40
@@ -35,8 +35,9 @@ _FIT_REACH = 0.75
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """Markers on a scan: numbers ``ids`` (n,), ``corners`` (n, 4, 3) mm in the scan's frame, their standard deviations
-    ``sigma_mm`` (n, 4), and the numbers that were ``repeated`` and are excluded."""
+    """Markers on a scan: numbers ``ids`` (n,), ``corners`` (n, 4, 3) mm in the scan's frame, their
+    standard deviations ``sigma_mm`` (n, 4), and the numbers that were ``repeated`` and are
+    excluded."""
 
     ids: np.ndarray
     corners: Floats
@@ -46,9 +47,9 @@ class MeasuredMarkers:
 
 @dataclass(frozen=True, eq=False)
 class MarkerPose:
-    """The pose ``T`` (4, 4), T_reference_scan, that the markers ``ids`` of two scans determine, with the corners of
-    both (m, 3) mm, their common standard deviations ``sigma_mm`` (m,), raised where their gaps are larger, and the
-    numbers that have ``moved``."""
+    """The pose ``T`` (4, 4), T_reference_scan, that the markers ``ids`` of two scans determine,
+    with the corners of both (m, 3) mm, their common standard deviations ``sigma_mm`` (m,), raised
+    where their gaps are larger, and the numbers that have ``moved``."""
 
     T: Floats
     ids: tuple[int, ...]
@@ -65,11 +66,13 @@ class MarkerPose:
     def inverse(self) -> "MarkerPose":
         """The pose of the reference on the scan."""
         T = np.asarray(np.linalg.inv(self.T), np.float64)
-        return MarkerPose(T, self.ids, self.moved, self.reference_corners, self.scan_corners, self.sigma_mm)
+        return MarkerPose(
+            T, self.ids, self.moved, self.reference_corners, self.scan_corners, self.sigma_mm
+        )
 
     def normal_equations(self, T: Floats, centre: Floats, sigma_mm: float) -> tuple[Floats, Floats]:
-        """Matrix (6, 6) and gradient (6,) of the corners' squared gaps at a pose ``T`` (4, 4), by a small rotation
-        about ``centre`` (3,) and a shift, as those of residuals of ``sigma_mm``."""
+        """Matrix (6, 6) and gradient (6,) of the corners' squared gaps at a pose ``T`` (4, 4), by a
+        small rotation about ``centre`` (3,) and a shift, as those of residuals of ``sigma_mm``."""
         placed = move_points(T, self.scan_corners)
         weight = (sigma_mm / self.sigma_mm) ** 2
         J = motion_jacobian(placed - centre)
@@ -84,10 +87,17 @@ class MarkerPose:
 
 
 def measure_markers(cloud: Cloud) -> MeasuredMarkers:
-    """Measure the corners of the coded markers that a scan's texture shows; raises InputError without a texture."""
+    """Measure the corners of the coded markers that a scan's texture shows; raises InputError
+    without a texture."""
     if cloud.texture is None:
-        raise InputError("A cloud without a texture shows no markers: reconstruct the capture with its texture.")
-    grey = cloud.texture if cloud.texture.ndim == 2 else cv2.cvtColor(cloud.texture, cv2.COLOR_RGB2GRAY)
+        raise InputError(
+            "A cloud without a texture shows no markers: reconstruct the capture with its texture."
+        )
+    grey = (
+        cloud.texture
+        if cloud.texture.ndim == 2
+        else cv2.cvtColor(cloud.texture, cv2.COLOR_RGB2GRAY)
+    )
     seen = detect_markers(np.asarray(grey, np.uint8))
     ids, corners, sigmas = [], [], []
     for number, quad in zip(seen.ids, seen.corners, strict=True):
@@ -103,12 +113,17 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
     )  # fmt: skip
 
 
-def _measure_corner(cloud: Cloud, corner: np.ndarray, quad: np.ndarray) -> tuple[Floats, float] | None:
-    """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard deviation; None
-    where too little of the surface around it was measured."""
+def _measure_corner(
+    cloud: Cloud, corner: np.ndarray, quad: np.ndarray
+) -> tuple[Floats, float] | None:
+    """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard
+    deviation; None where too little of the surface around it was measured."""
     reach = _FIT_REACH * float(lengths(quad - np.roll(quad, 1, axis=0)).mean())
     height, width = cloud.points.shape[:2]
-    (left, top), (right, bottom) = np.floor(corner - reach).astype(int), np.ceil(corner + reach).astype(int) + 1
+    (left, top), (right, bottom) = (
+        np.floor(corner - reach).astype(int),
+        np.ceil(corner + reach).astype(int) + 1,
+    )
     left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
     v, u = np.mgrid[top:bottom, left:right]
     points = cloud.points[top:bottom, left:right].astype(np.float64)
@@ -121,7 +136,10 @@ def _measure_corner(cloud: Cloud, corner: np.ndarray, quad: np.ndarray) -> tuple
         return None
     points = points[known]
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    noise = np.maximum(np.nan_to_num(cloud.sigma[top:bottom, left:right][known], nan=1.0), 1e-6) / points[:, 2] ** 2
+    noise = (
+        np.maximum(np.nan_to_num(cloud.sigma[top:bottom, left:right][known], nan=1.0), 1e-6)
+        / points[:, 2] ** 2
+    )
     weight = noise**-2.0
     for _ in range(3):  # a plane's 1/z is linear in the image
         A = basis * weight[:, None]
@@ -138,10 +156,11 @@ def _measure_corner(cloud: Cloud, corner: np.ndarray, quad: np.ndarray) -> tuple
 
 
 def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> MarkerPose | None:
-    """Fit the pose that brings the markers of a scan onto those of a reference; None without common ones.
+    """Fit the pose that brings the markers of a scan onto those of a reference; None without common
+    ones.
 
-    Markers that contradict most of the others have been moved, and are excluded. Raises ``Refused`` where it is
-    undecidable which ones have.
+    Markers that contradict most of the others have been moved, and are excluded. Raises ``Refused``
+    where it is undecidable which ones have.
     """
     common, mine, theirs = np.intersect1d(scan.ids, reference.ids, return_indices=True)
     if not len(common):
@@ -152,8 +171,8 @@ def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> Marker
     if len(common) > 1 and steady.sum() <= len(common) / 2:
         raise Refused(
             "picks",
-            f"Of {len(common)} common markers only {int(steady.sum())} keep their places: glue the markers on, or scan "
-            "without moving those beside the object.",
+            f"Of {len(common)} common markers only {int(steady.sum())} keep their places: glue the"
+            " markers on, or scan without moving those beside the object.",
         )
     p, q, s = p[steady].reshape(-1, 3), q[steady].reshape(-1, 3), sigma[steady].ravel()
     ids = tuple(int(number) for number in common[steady])
@@ -164,7 +183,8 @@ def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> Marker
 
 
 def fit_weighted(points: Floats, targets: Floats, sigma_mm: Floats) -> Floats:
-    """(4, 4): the motion of weighted least squares that brings points (m, 3) mm onto ``targets`` (m, 3)."""
+    """(4, 4): the motion of weighted least squares that brings points (m, 3) mm onto ``targets``
+    (m, 3)."""
     T = fit_rigid(points, targets)
     w = sigma_mm**-2.0 / np.sum(sigma_mm**-2.0)
     p0, q0 = w @ points, w @ targets
@@ -187,7 +207,9 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
         return np.ones(1, bool)
     pairs = list(combinations(range(n), 2))
     pairs = pairs[:: -(-len(pairs) // _MOST_HYPOTHESES)]
-    starts = (fit_rigid(p[list(pair)].reshape(-1, 3), q[list(pair)].reshape(-1, 3)) for pair in pairs)
+    starts = (
+        fit_rigid(p[list(pair)].reshape(-1, 3), q[list(pair)].reshape(-1, 3)) for pair in pairs
+    )
     gap = min((_largest_gaps(T, p, q) for T in starts), key=lambda gap: float(np.median(gap)))
     steady = gap <= np.median(gap)
     limit = np.zeros(n)
@@ -214,7 +236,13 @@ def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:
     for name, markers in measured.items():
         if markers.repeated:
             numbers = ", ".join(map(str, markers.repeated))
-            notes.append(f"{name} shows marker {numbers} more than once, which is ignored: use every number once")
+            notes.append(
+                f"{name} shows marker {numbers} more than once, which is ignored: use every number"
+                " once"
+            )
         if not len(markers.ids):
-            notes.append(f"{name} shows no marker that could be measured: bring markers into view, at least 16 px wide")
+            notes.append(
+                f"{name} shows no marker that could be measured: bring markers into view, at least"
+                " 16 px wide"
+            )
     return notes

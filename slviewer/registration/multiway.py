@@ -1,8 +1,9 @@
 """Multiway registration: bring many scans of one object into the frame of one of them.
 
-Consecutive scans are expected to overlap, and the last one with the first; where they do not, every other pair that
-could connect the pose graph is tried. Once all scans are connected, further pairs that overlap at the estimated poses
-are registered, which close loops. Pairs that contradict the others are dropped; the poses are then optimised together.
+Consecutive scans are expected to overlap, and the last one with the first; where they do not, every
+other pair that could connect the pose graph is tried. Once all scans are connected, further pairs
+that overlap at the estimated poses are registered, which close loops. Pairs that contradict the
+others are dropped; the poses are then optimised together.
 """
 
 import os
@@ -27,7 +28,12 @@ from slviewer.registration.prepared import LEAST_POINTS, PreparedScan, prepare_s
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import Scan
 from slviewer.registration.start import Candidate, Start
-from slviewer.registration.turntable import TurntableAxis, determines_axis, fit_turntable_axis, shortest_turn
+from slviewer.registration.turntable import (
+    TurntableAxis,
+    determines_axis,
+    fit_turntable_axis,
+    shortest_turn,
+)
 from slviewer.registration.uncertainty import Uncertainty
 
 Item = TypeVar("Item")
@@ -50,10 +56,10 @@ _LOOP_OVERLAP = 0.3
 class Starts:
     """Initial alignments of a multiway registration; by features where nothing is given.
 
-    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``table_deg``: the angle of a
-    turntable by name, of some of the scans at least; ``axis``: its axis, None to estimate it from the first pairs.
-    ``picked``: initial poses from picked points, by pair. ``markers``: coded markers by name, which give initial poses
-    and constrain the registration.
+    ``poses``: approximate T_world_scan (4, 4) mm by name, in any common frame. ``table_deg``: the
+    angle of a turntable by name, of some of the scans at least; ``axis``: its axis, None to
+    estimate it from the first pairs. ``picked``: initial poses from picked points, by pair.
+    ``markers``: coded markers by name, which give initial poses and constrain the registration.
     """
 
     poses: Mapping[str, np.ndarray] | None = None
@@ -79,10 +85,11 @@ class Loop:
 class MultiwayAlignment:
     """Result of a multiway registration.
 
-    ``T_reference_scan`` (4, 4) mm by name, into the frame of ``reference``, with ``uncertainties``. ``pairs``: the
-    registrations from which it was computed; ``loops`` of them, the one with the largest gap first. ``dropped``: pairs
-    that the others contradict; ``refused``: pairs that could not be registered; each with the reason. ``markers``: of
-    pairs with common ones, the pose that they alone determine.
+    ``T_reference_scan`` (4, 4) mm by name, into the frame of ``reference``, with ``uncertainties``.
+    ``pairs``: the registrations from which it was computed; ``loops`` of them, the one with the
+    largest gap first. ``dropped``: pairs that the others contradict; ``refused``: pairs that could
+    not be registered; each with the reason. ``markers``: of pairs with common ones, the pose that
+    they alone determine.
     """
 
     reference: str
@@ -95,16 +102,19 @@ class MultiwayAlignment:
     markers: Mapping[Pair, MarkerPose] = field(default_factory=dict)
 
     def on_reference(self) -> dict[str, Registration]:
-        """Return a registration onto the reference for every other scan, with its optimised pose and uncertainty.
+        """Return a registration onto the reference for every other scan, with its optimised pose
+        and uncertainty.
 
-        The remaining figures are those of the pair with the reference where there is one, else of the scan's pair with
-        the smallest uncertainty.
+        The remaining figures are those of the pair with the reference where there is one, else of
+        the scan's pair with the smallest uncertainty.
         """
         registrations = {}
         for name, T in self.T_reference_scan.items():
             if name != self.reference:
                 own = [pair for pair in self.pairs if name in pair]
-                best = min(own, key=lambda p: (self.reference not in p, self.pairs[p].uncertainty.shift_mm))
+                best = min(
+                    own, key=lambda p: (self.reference not in p, self.pairs[p].uncertainty.shift_mm)
+                )
                 registrations[name] = replace(
                     self.pairs[best], T_reference_scan=T, uncertainty=self.uncertainties[name]
                 )
@@ -117,36 +127,56 @@ def register_all(
     starts: Starts | None = None,
     progress: Progress | None = None,
 ) -> MultiwayAlignment:
-    """Register 2 to 255 scans, by name in the order of capture, into the frame of the one called ``reference``.
+    """Register 2 to 255 scans, by name in the order of capture, into the frame of the one called
+    ``reference``.
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
 
-    Raises ``InputError`` for an unknown reference or too few scans, and ``Refused``, naming the scans, where a scan
-    cannot be connected to the reference or where it is undecidable which of contradicting pairs are wrong.
+    Raises ``InputError`` for an unknown reference or too few scans, and ``Refused``, naming the
+    scans, where a scan cannot be connected to the reference or where it is undecidable which of
+    contradicting pairs are wrong.
     """
     if reference not in scans:
-        raise InputError(f"There is no scan called {reference!r}: choose the reference among {', '.join(scans)}.")
+        raise InputError(
+            f"There is no scan called {reference!r}: choose the reference among {', '.join(scans)}."
+        )
     if not 2 <= len(scans) <= MOST_SCANS:
-        raise InputError(f"{len(scans)} scan(s) given: registering takes 2 to {MOST_SCANS} scans of one object.")
-    return _PoseGraphBuilder(scans, reference, starts or Starts(), progress or (lambda share: None)).build()
+        raise InputError(
+            f"{len(scans)} scan(s) given: registering takes 2 to {MOST_SCANS} scans of one object."
+        )
+    return _PoseGraphBuilder(
+        scans, reference, starts or Starts(), progress or (lambda share: None)
+    ).build()
 
 
 def _check_trusted(name: str, scan: Scan) -> None:
-    """Raise InputError where too few points of a scan are away from edges, so that a registration would fail later."""
-    if scan.trusted is None or np.count_nonzero(scan.trusted) >= LEAST_POINTS or len(scan.points) < LEAST_POINTS:
+    """Raise InputError where too few points of a scan are away from edges, so that a registration
+    would fail later."""
+    if (
+        scan.trusted is None
+        or np.count_nonzero(scan.trusted) >= LEAST_POINTS
+        or len(scan.points) < LEAST_POINTS
+    ):
         return
     raise InputError(
-        f"{name} has {len(scan.points)} points, and all but {np.count_nonzero(scan.trusted)} lie beside holes or depth "
-        "steps: the cloud is too sparse or too noisy to be aligned; capture it with more light and longer exposure, or "
-        "with more phase steps"
+        f"{name} has {len(scan.points)} points, and all but {np.count_nonzero(scan.trusted)} lie"
+        " beside holes or depth steps: the cloud is too sparse or too noisy to be aligned; capture"
+        " it with more light and longer exposure, or with more phase steps"
     )
 
 
 class _PoseGraphBuilder:
     """Builds the pose graph of one call of ``register_all``, pair by pair, and optimises it."""
 
-    def __init__(self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, progress: Progress) -> None:
-        self.names, self.reference, self.starts, self._progress = list(scans), reference, starts, progress
+    def __init__(
+        self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, progress: Progress
+    ) -> None:
+        self.names, self.reference, self.starts, self._progress = (
+            list(scans),
+            reference,
+            starts,
+            progress,
+        )
         self._share, self._progress_lock = 0.0, Lock()
         self.root = self.names.index(reference)
         self.registered: dict[Pair, Registration] = {}
@@ -155,14 +185,18 @@ class _PoseGraphBuilder:
         self.scans = _map_parallel(self._prepare, list(scans.items()))
         self.size = min(scan.size for scan in self.scans)
         self.markers = self._fit_markers()
-        self.expected = len(self._list_first_pairs()) + (_LOOP_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0)
+        self.expected = len(self._list_first_pairs()) + (
+            _LOOP_PAIRS * len(scans) if len(scans) > ALL_PAIRS else 0
+        )
 
     def build(self) -> MultiwayAlignment:
         """Register pairs until all scans are connected, close loops, and optimise the poses."""
         for pair, start in (self.starts.picked or {}).items():
             self._register(pair, start)
         known = self._initial_poses()
-        self._register_all([(pair, self._relative_pose(known, *pair)) for pair in self._list_first_pairs()])
+        self._register_all(
+            [(pair, self._relative_pose(known, *pair)) for pair in self._list_first_pairs()]
+        )
         self._connect()
         poses = self._spanning_poses()[0]
         if len(self.names) > ALL_PAIRS:
@@ -172,8 +206,8 @@ class _PoseGraphBuilder:
     # selection of pairs and of their initial poses
 
     def _list_first_pairs(self) -> list[Pair]:
-        """List every pair of a few scans, or each scan with the one before it and the last with the first; with markers
-        those pairs that show the same ones."""
+        """List every pair of a few scans, or each scan with the one before it and the last with the
+        first; with markers those pairs that show the same ones."""
         names = self.names
         if self.starts.markers is not None and not self.starts.table_deg:
             return list(self.markers)
@@ -185,17 +219,26 @@ class _PoseGraphBuilder:
         return pairs + [pair for pair in self.markers if not {pair, pair[::-1]} & {*pairs}]
 
     def _initial_poses(self) -> dict[str, tuple[np.ndarray, Start]]:
-        """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin; {} without these."""
+        """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin;
+        {} without these."""
         if self.starts.poses is not None:
-            return {name: (np.asarray(T, dtype=np.float64), "initial") for name, T in self.starts.poses.items()}
+            return {
+                name: (np.asarray(T, dtype=np.float64), "initial")
+                for name, T in self.starts.poses.items()
+            }
         if not self.starts.table_deg:
             return {}
-        angles = {name: self.starts.table_deg[name] for name in self.names if name in self.starts.table_deg}
+        angles = {
+            name: self.starts.table_deg[name]
+            for name in self.names
+            if name in self.starts.table_deg
+        }
         axis = self.starts.axis or self._estimate_axis(angles)
         return {name: (axis.rotation(-deg), "turntable") for name, deg in angles.items()}
 
     def _estimate_axis(self, angles: Mapping[str, float]) -> TurntableAxis:
-        """Estimate the turntable's axis from the first two consecutive pairs that register by features.
+        """Estimate the turntable's axis from the first two consecutive pairs that register by
+        features.
 
         ``angles``: of the table, degrees, by name.
         """
@@ -214,7 +257,8 @@ class _PoseGraphBuilder:
         return fit_turntable_axis(steps, steps_deg)
 
     def _fit_markers(self) -> dict[Pair, MarkerPose]:
-        """Fit the poses of pairs with common markers: of a few scans all, of many each scan's `_MARKER_PAIRS` best."""
+        """Fit the poses of pairs with common markers: of a few scans all, of many each scan's
+        `_MARKER_PAIRS` best."""
         poses: dict[Pair, MarkerPose] = {}
         seen = self.starts.markers or {}
         for i, a in enumerate(self.names):
@@ -239,22 +283,29 @@ class _PoseGraphBuilder:
         return chosen
 
     def _get_markers(self, pair: Pair) -> MarkerPose | None:
-        """Return the pose of a pair by its common markers, whichever way round it was fitted; None without these."""
+        """Return the pose of a pair by its common markers, whichever way round it was fitted; None
+        without these."""
         turned = self.markers.get(pair[::-1])
         return self.markers.get(pair) or (None if turned is None else turned.inverse())
 
-    def _relative_pose(self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str) -> Candidate | None:
-        """Return the initial pose of a pair from poses in a common frame; None where one of them is not known."""
+    def _relative_pose(
+        self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str
+    ) -> Candidate | None:
+        """Return the initial pose of a pair from poses in a common frame; None where one of them is
+        not known."""
         if scan not in known or onto not in known:
             return None
         return Candidate(np.linalg.inv(known[onto][0]) @ known[scan][0], known[scan][1])
 
     def _connect(self) -> None:
-        """Register further pairs, the most promising first, until every scan is connected to the reference.
+        """Register further pairs, the most promising first, until every scan is connected to the
+        reference.
 
         Raises ``Refused`` where no pair is left to try.
         """
-        while unconnected := [k for k, T in enumerate(self._spanning_poses()[0]) if not np.isfinite(T).all()]:
+        while unconnected := [
+            k for k, T in enumerate(self._spanning_poses()[0]) if not np.isfinite(T).all()
+        ]:
             candidates = []
             for a in unconnected:
                 for b in sorted(set(range(len(self.names))) - set(unconnected)):
@@ -267,10 +318,13 @@ class _PoseGraphBuilder:
                     break
             else:
                 names = [self.names[k] for k in unconnected]
-                error = next(error for pair, error in self.refused.items() if set(pair) & set(names))
+                error = next(
+                    error for pair, error in self.refused.items() if set(pair) & set(names)
+                )
                 pronoun = "it" if len(names) == 1 else "them"
                 raise error.with_context(
-                    f"{', '.join(names)} could not be merged: nothing joins {pronoun} to {self.reference}."
+                    f"{', '.join(names)} could not be merged: nothing joins {pronoun} to"
+                    f" {self.reference}."
                 )
 
     def _close_loops(self, poses: np.ndarray) -> None:
@@ -307,8 +361,11 @@ class _PoseGraphBuilder:
         return prepared
 
     def _register_all(self, pairs: Sequence[tuple[Pair, Candidate | None]]) -> None:
-        """Register independent pairs from their initial poses in parallel, and store the results in their order."""
-        pending = [(pair, start) for pair, start in pairs if not {pair, pair[::-1]} & set(self.registered)]
+        """Register independent pairs from their initial poses in parallel, and store the results in
+        their order."""
+        pending = [
+            (pair, start) for pair, start in pairs if not {pair, pair[::-1]} & set(self.registered)
+        ]
         results = _map_parallel(lambda item: self._align(*item), pending)
         for (pair, _), result in zip(pending, results, strict=True):
             self._store(pair, result)
@@ -345,7 +402,8 @@ class _PoseGraphBuilder:
             return error
 
     def _store(self, pair: Pair, result: Registration | Refused) -> Registration | None:
-        """Store the result of a pair in ``registered`` or ``refused``; return the registration if it is one."""
+        """Store the result of a pair in ``registered`` or ``refused``; return the registration if
+        it is one."""
         if isinstance(result, Refused):
             self.refused[pair] = result
             return None
@@ -355,7 +413,8 @@ class _PoseGraphBuilder:
         return result
 
     def _report(self, share: float) -> None:
-        """Report the completed share of the work, never less than before; the receiver may raise to cancel."""
+        """Report the completed share of the work, never less than before; the receiver may raise to
+        cancel."""
         with self._progress_lock:
             self._share = max(self._share, share)
             self._progress(self._share)
@@ -381,21 +440,31 @@ class _PoseGraphBuilder:
         self._report(0.92)
         pairs, edges = list(self.registered), self._edges()
         gates = [self.registered[pair].gate_mm for pair in pairs]
-        consistent, gaps = select_consistent_edges(len(self.names), edges, self.root, gates, self._is_good_fit)
+        consistent, gaps = select_consistent_edges(
+            len(self.names), edges, self.root, gates, self._is_good_fit
+        )
         dropped = {
-            pairs[k]: f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {shift:.1f} mm "
-            f"and {turn:.1f} degrees, and is excluded"
+            pairs[k]: (
+                f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {shift:.1f} mm "
+                f"and {turn:.1f} degrees, and is excluded"
+            )
             for k, (shift, turn) in gaps.items()
         }
         edges, pairs = [edges[k] for k in consistent], [pairs[k] for k in consistent]
         start, tree = graph.spanning_poses(len(self.names), edges, self.root)
-        poses = graph.optimise_poses(start, edges, self.root) if len(edges) >= len(self.names) else start
+        poses = (
+            graph.optimise_poses(start, edges, self.root)
+            if len(edges) >= len(self.names)
+            else start
+        )
         loops = []
         for k, edge in enumerate(edges):
             if k not in tree:
                 expected = graph.expected_gap_mm(edge, edges, tree)
                 names = tuple(self.names[node] for node in graph.loop_nodes(edge, edges, tree))
-                loops.append(Loop(names, graph.loop_gap(edge, start, expected), graph.loop_gap(edge, poses)))
+                loops.append(
+                    Loop(names, graph.loop_gap(edge, start, expected), graph.loop_gap(edge, poses))
+                )
         self._report(1.0)
         return MultiwayAlignment(
             self.reference,
@@ -409,7 +478,8 @@ class _PoseGraphBuilder:
         )
 
     def _is_good_fit(self, edge: Edge, T: np.ndarray) -> bool:
-        """Whether ICP of an edge's scans from the pose ``T`` (4, 4) succeeds and stays within its gate."""
+        """Whether ICP of an edge's scans from the pose ``T`` (4, 4) succeeds and stays within its
+        gate."""
         try:
             result = register_prepared(
                 self.scans[edge.scan],
@@ -426,13 +496,15 @@ class _PoseGraphBuilder:
 
 
 def _map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Map a function over items in threads on all cores; the results are in the order of the items."""
+    """Map a function over items in threads on all cores; the results are in the order of the
+    items."""
     with ThreadPoolExecutor(max(1, min(len(items), os.cpu_count() or 1))) as pool:
         return list(pool.map(function, items))
 
 
 def _estimate_overlap(scan: PreparedScan, reference: PreparedScan, T: np.ndarray) -> float:
-    """Estimate the share of the scan within a voxel of the reference at the pose ``T`` (4, 4), from thinned clouds."""
+    """Estimate the share of the scan within a voxel of the reference at the pose ``T`` (4, 4), from
+    thinned clouds."""
     voxel = reference.size / 80.0
     points = np.asarray(scan.thinned(voxel).points)
     distance, _ = reference.fine_tree.query(move_points(T, points), distance_upper_bound=voxel)

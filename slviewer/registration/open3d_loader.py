@@ -1,8 +1,8 @@
 """Open3D, imported when it is first needed, also on a machine without libusb.
 
-Open3D's wheels for Linux are linked against ``libusb-1.0.so.0`` (for depth cameras that nobody here uses), which bare
-machines lack. The package ``libusb-package`` carries it; once loaded into the process under its own name, the dynamic
-linker is content with it.
+Open3D's wheels for Linux are linked against ``libusb-1.0.so.0`` (for depth cameras that nobody here
+uses), which bare machines lack. The package ``libusb-package`` carries it; once loaded into the
+process under its own name, the dynamic linker is content with it.
 """
 
 import ctypes
@@ -49,7 +49,8 @@ def open3d() -> Any:
             f"Open3D, which aligns scans and casts rays, cannot be imported ({error}): "
             f"run 'pip install {package} libusb-package' in the environment that runs slviewer."
         ) from error
-    # Open3D brings a TBB older than numba wants; numba then takes another threading layer, and need not say so
+    # Open3D brings a TBB older than numba wants; numba then takes another threading layer, and need
+    # not say so
     warnings.filterwarnings("ignore", message="The TBB threading layer requires")
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
@@ -57,9 +58,11 @@ def open3d() -> Any:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Context manager: delay Ctrl-C to the end of the block, because an interrupted import of Open3D is reported as a
-    missing package, or ends the process with its own messages."""
-    if threading.current_thread() is not threading.main_thread():  # signals come to the main thread alone
+    """Context manager: delay Ctrl-C to the end of the block, because an interrupted import of
+    Open3D is reported as a missing package, or ends the process with its own messages."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # signals come to the main thread alone
         yield
         return
     came = False
@@ -96,13 +99,22 @@ def _supply_libusb() -> None:
 
 
 def align_icp(
-    scan: Any, reference: Any, T: np.ndarray, gate: float, loss: Any, settled: float, iterations: int
+    scan: Any,
+    reference: Any,
+    T: np.ndarray,
+    gate: float,
+    loss: Any,
+    settled: float,
+    iterations: int,
 ) -> np.ndarray:
-    """(4, 4): Open3D's point-to-plane ICP of two of its clouds from the pose ``T``, with pairs up to ``gate`` mm apart.
+    """(4, 4): Open3D's point-to-plane ICP of two of its clouds from the pose ``T``, with pairs up
+    to ``gate`` mm apart.
 
     Ends after ``iterations``, or where fitness and RMSE change by less than the share ``settled``.
     """
     pipeline = open3d().pipelines.registration
     criteria = pipeline.ICPConvergenceCriteria(settled, settled, iterations)
     method = pipeline.TransformationEstimationPointToPlane(loss)
-    return np.array(pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation)
+    return np.array(
+        pipeline.registration_icp(scan, reference, gate, T, method, criteria).transformation
+    )

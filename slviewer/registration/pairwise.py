@@ -1,8 +1,8 @@
 """Pairwise registration: point-to-plane ICP, coarse to fine, with checks of the result.
 
-A registration is refused, with the reason, unless the surfaces agree where they face each other, enough of the scan
-overlaps, the shape of the overlap determines all six degrees of freedom (a plane slides on a plane, a sphere turns in a
-sphere), and no other pose fits as well.
+A registration is refused, with the reason, unless the surfaces agree where they face each other,
+enough of the scan overlaps, the shape of the overlap determines all six degrees of freedom (a plane
+slides on a plane, a sphere turns in a sphere), and no other pose fits as well.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,8 @@ from slviewer.registration.uncertainty import Uncertainty
 Progress = Callable[[float], None]
 
 LEVELS_MM = ((2.0, 8.0), (1.0, 2.0))
-"""Voxel and gate for objects of 75 to 300 mm, coarse to fine; the last stage, ``refine``, goes on from there."""
+"""Voxel and gate for objects of 75 to 300 mm, coarse to fine; the last stage, ``refine``, goes on
+from there."""
 LAST_GATE_MM = 1.0
 LEAST_OVERLAP = 0.15
 LEAST_AGREEMENT = 0.8
@@ -36,7 +37,8 @@ LEAST_MARKERS = 2
 MOST_MARKER_ERROR = 1 / 300
 """Of the object's size: what markers alone may leave open at its rim (1 sigma)."""
 RIVAL_SCORE, RIVAL_OVERLAP, RIVAL_RMS = 0.7, 0.6, 1.25
-"""A rival comes to so much of the best pose's score and overlap, and to at most so many times its RMS."""
+"""A rival comes to so much of the best pose's score and overlap, and to at most so many times its
+RMS."""
 _STATISTICS_POINTS = 50_000
 
 
@@ -44,14 +46,16 @@ _STATISTICS_POINTS = 50_000
 class Registration:
     """The pose of a scan on a reference, and its figures.
 
-    ``T_reference_scan`` (4, 4) maps scan points into the reference frame, in mm. ``rms_mm`` is the root mean square of
-    the point-to-plane distances (along the reference's normal) of the overlapping points; it holds the noise of both
-    scans. ``inlier_rmse_mm`` is the same of point-to-point distances, as Open3D counts it and the Letter reports it: it
-    also holds the spacing of the points. Overlapping are the scan points that have a reference point within
-    ``gate_mm``; ``overlap`` is their share. ``agreement`` is the share, among the scan points that face the reference
-    within four gates, of those within one. ``slack_mm`` says how well the shape holds the pose: how far the scan would
-    have to slide or turn (at the overlap's rim) in its loosest direction until the surfaces come apart by ``rms_mm``.
-    It is large for planes and spheres, and always far larger than the pose's error, which ``uncertainty`` estimates.
+    ``T_reference_scan`` (4, 4) maps scan points into the reference frame, in mm. ``rms_mm`` is the
+    root mean square of the point-to-plane distances (along the reference's normal) of the
+    overlapping points; it holds the noise of both scans. ``inlier_rmse_mm`` is the same of
+    point-to-point distances, as Open3D counts it and the Letter reports it: it also holds the
+    spacing of the points. Overlapping are the scan points that have a reference point within
+    ``gate_mm``; ``overlap`` is their share. ``agreement`` is the share, among the scan points that
+    face the reference within four gates, of those within one. ``slack_mm`` says how well the shape
+    holds the pose: how far the scan would have to slide or turn (at the overlap's rim) in its
+    loosest direction until the surfaces come apart by ``rms_mm``. It is large for planes and
+    spheres, and always far larger than the pose's error, which ``uncertainty`` estimates.
     """
 
     T_reference_scan: np.ndarray
@@ -76,20 +80,22 @@ def register(
 ) -> Registration:
     """Align a scan with a reference that shows part of the same object.
 
-    Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals ``(n, 3)`` point to that
-    camera, and are estimated where missing. ``initial`` replaces the search for a start: the last pose (4, 4), or a
-    ``Candidate`` such as ``picked.fit_picked_start`` gives. ``progress`` receives the share of the work done, 0 to 1,
-    and may raise to cancel.
+    Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals
+    ``(n, 3)`` point to that camera, and are estimated where missing. ``initial`` replaces the
+    search for a start: the last pose (4, 4), or a ``Candidate`` such as ``picked.fit_picked_start``
+    gives. ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel.
 
-    Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not hold the pose, or where
-    a second pose fits alike.
+    Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
+    hold the pose, or where a second pose fits alike.
     """
     report = progress or (lambda share: None)
     report(0.0)
     scan = prepare_scan("scan", scan_points, scan_normals)
     reference = prepare_scan("reference", reference_points, reference_normals)
     report(0.3)
-    return register_prepared(scan, reference, initial=initial, progress=lambda share: report(0.3 + 0.7 * share))
+    return register_prepared(
+        scan, reference, initial=initial, progress=lambda share: report(0.3 + 0.7 * share)
+    )
 
 
 def register_prepared(
@@ -104,9 +110,10 @@ def register_prepared(
 ) -> Registration:
     """Register prepared scans; see ``register``.
 
-    ``size``: of the object in mm, by default that of the smaller scan. ``starts``: result of an earlier
-    ``search_starts``, which is run otherwise. ``markers``: those that both scans show, from whose pose it starts, and
-    which hold what the shape leaves open; alone, where the surfaces do not overlap.
+    ``size``: of the object in mm, by default that of the smaller scan. ``starts``: result of an
+    earlier ``search_starts``, which is run otherwise. ``markers``: those that both scans show, from
+    whose pose it starts, and which hold what the shape leaves open; alone, where the surfaces do
+    not overlap.
     """
     report = progress or (lambda share: None)
     size = min(scan.size, reference.size) if size is None else size
@@ -122,31 +129,46 @@ def register_prepared(
             result = _refine_start(scan, reference, start, size)
         except Refused as error:
             refusal = refusal or error  # the best start's refusal says most
-            if error.reason in WORDS:  # the surfaces agree, and every other start would slide or turn as well
+            if (
+                error.reason in WORDS
+            ):  # the surfaces agree, and every other start would slide or turn as well
                 break
             continue
         if start.start in SEARCHED:
-            _refuse_rivals(scan, reference, result, start, starts[attempt + 1 : MOST_ATTEMPTS + 1], size)
+            _refuse_rivals(
+                scan, reference, result, start, starts[attempt + 1 : MOST_ATTEMPTS + 1], size
+            )
         report(1.0)
         return result
-    raise refusal or Refused("overlap", "The scan and the reference share nothing to start from: pick point pairs.")
+    raise refusal or Refused(
+        "overlap", "The scan and the reference share nothing to start from: pick point pairs."
+    )
 
 
 def search_starts(
-    scan: PreparedScan, reference: PreparedScan, size: float, initial: np.ndarray | Candidate | None = None
+    scan: PreparedScan,
+    reference: PreparedScan,
+    size: float,
+    initial: np.ndarray | Candidate | None = None,
 ) -> list[Candidate]:
-    """Return candidate initial poses after a coarse ICP, the best first; only ``initial`` where it is given."""
+    """Return candidate initial poses after a coarse ICP, the best first; only ``initial`` where it
+    is given."""
     if initial is not None and not isinstance(initial, Candidate):
         if np.shape(initial) != (4, 4):
-            raise InputError(f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix.")
+            raise InputError(
+                f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix."
+            )
         initial = Candidate(np.asarray(initial, dtype=np.float64), "initial")
     coarse = max(size / 40.0, 2.0 * reference.spacing, 2.0 * scan.spacing)
     return rank_starts(scan, reference, float(f"{coarse:.3g}"), initial)
 
 
-def _register_by_markers(scan: PreparedScan, reference: PreparedScan, markers: MarkerPose, size: float) -> Registration:
-    """Register scans from the pose of their common markers: by surfaces and markers where the surfaces overlap, else by
-    the markers alone. Raises ``Refused`` where the surfaces contradict them, and where they do not determine the pose.
+def _register_by_markers(
+    scan: PreparedScan, reference: PreparedScan, markers: MarkerPose, size: float
+) -> Registration:
+    """Register scans from the pose of their common markers: by surfaces and markers where the
+    surfaces overlap, else by the markers alone. Raises ``Refused`` where the surfaces contradict
+    them, and where they do not determine the pose.
     """
     try:
         return _refine_start(scan, reference, Candidate(markers.T, "markers"), size, markers)
@@ -158,12 +180,14 @@ def _register_by_markers(scan: PreparedScan, reference: PreparedScan, markers: M
     if len(markers.ids) < LEAST_MARKERS or not error <= MOST_MARKER_ERROR * size:
         raise Refused(
             "overlap",
-            f"The scans hardly overlap, and the markers that both show ({len(markers.ids)}) leave {error:.2g} mm open: "
-            "let both see three markers or more, well apart.",
+            f"The scans hardly overlap, and the markers that both show ({len(markers.ids)}) leave"
+            f" {error:.2g} mm open: let both see three markers or more, well apart.",
         )
     gate = max(MOVED_MM, 2.0 * reference.spacing)
     figures, _ = _compute_figures(scan, reference, markers.T, gate, uncertainty, "markers")
-    return replace(figures, rms_mm=markers.rms_mm, inlier_rmse_mm=markers.rms_mm, agreement=1.0, slack_mm=error)
+    return replace(
+        figures, rms_mm=markers.rms_mm, inlier_rmse_mm=markers.rms_mm, agreement=1.0, slack_mm=error
+    )
 
 
 def _refine_start(
@@ -173,23 +197,41 @@ def _refine_start(
     size: float,
     markers: MarkerPose | None = None,
 ) -> Registration:
-    """Run ICP from an initial pose, and compute its figures; raises ``Refused`` where the result is not reliable."""
+    """Run ICP from an initial pose, and compute its figures; raises ``Refused`` where the result is
+    not reliable."""
     scale = scale_of(size)
     T = start.T
     for voxel, gate in LEVELS_MM:
-        widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * _pair_noise(scan, reference))
-        if markers is None:  # else it starts within a fraction of a millimetre, and a plane would slide
+        widest = max(
+            gate * scale,
+            2.0 * max(scan.spacing, reference.spacing),
+            3.0 * _pair_noise(scan, reference),
+        )
+        if (
+            markers is None
+        ):  # else it starts within a fraction of a millimetre, and a plane would slide
             loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
-            T = align_icp(scan.thinned(voxel * scale), reference.thinned(voxel * scale), T, widest, loss, 1e-6, 40)
+            T = align_icp(
+                scan.thinned(voxel * scale),
+                reference.thinned(voxel * scale),
+                T,
+                widest,
+                loss,
+                1e-6,
+                40,
+            )
     narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _pair_noise(scan, reference))
     end = refine_pose(scan, reference, T, widest, narrowest, markers)
-    result, held = _compute_figures(scan, reference, end.T, end.gate_mm, end.uncertainty, start.start)
+    result, held = _compute_figures(
+        scan, reference, end.T, end.gate_mm, end.uncertainty, start.start
+    )
     _refuse_if_doubtful(result, None if markers is not None else held, size)
     return result
 
 
 def _pair_noise(scan: PreparedScan, reference: PreparedScan) -> float:
-    """Return the standard deviation in mm of the distance of two corresponding points; unknown sigmas count as 0."""
+    """Return the standard deviation in mm of the distance of two corresponding points; unknown
+    sigmas count as 0."""
     return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
 
 
@@ -201,7 +243,8 @@ def _compute_figures(
     uncertainty: Uncertainty | None,
     start: Start,
 ) -> tuple[Registration, Freedom]:
-    """Compute the figures of a pose ``T`` (4, 4) from up to 50,000 scan points, and the freedom of the overlap."""
+    """Compute the figures of a pose ``T`` (4, 4) from up to 50,000 scan points, and the freedom of
+    the overlap."""
     spacing = reference.spacing
     gate = max(gate, 2.0 * spacing)
     points = move_points(T, scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)])
@@ -237,30 +280,33 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _refuse_if_doubtful(result: Registration, held: Freedom | None, size: float) -> None:
-    """Raise ``Refused`` for too small an overlap or agreement, or a shape that leaves the pose undetermined.
+    """Raise ``Refused`` for too small an overlap or agreement, or a shape that leaves the pose
+    undetermined.
 
     ``held``: None where markers determine the pose.
     """
     if not result.overlap >= LEAST_OVERLAP:
         raise Refused(
             "overlap",
-            f"Only {100 * result.overlap:.0f} % of the scan lies on the reference within {result.gate_mm:.2g} mm: "
-            f"take scans that share at least {100 * LEAST_OVERLAP:.0f} % of the surface, or choose another reference.",
+            f"Only {100 * result.overlap:.0f} % of the scan lies on the reference within"
+            f" {result.gate_mm:.2g} mm: take scans that share at least {100 * LEAST_OVERLAP:.0f} %"
+            " of the surface, or choose another reference.",
         )
     if not result.agreement >= LEAST_AGREEMENT:
         raise Refused(
             "disagree",
-            f"No pose found in which the two scans agree: where they face each other only "
-            f"{100 * result.agreement:.0f} % of the points come within {result.gate_mm:.2g} mm; check that both show "
-            "the same object, and that it did not change between the scans.",
+            "No pose found in which the two scans agree: where they face each other only"
+            f" {100 * result.agreement:.0f} % of the points come within {result.gate_mm:.2g} mm;"
+            " check that both show the same object, and that it did not change between the scans.",
         )
     shape = None if held is None else held.shape(MOST_SLACK * size)
     if shape is not None or not np.isfinite(result.uncertainty.shift_mm):
         shape = shape or "plane"
         raise Refused(
             shape,
-            f"The surface that the two scans share {WORDS[shape]}, so that nothing holds the pose: let them share "
-            "edges, corners or bumps too, or put coded markers on it or beside it, and start from markers.",
+            f"The surface that the two scans share {WORDS[shape]}, so that nothing holds the pose:"
+            " let them share edges, corners or bumps too, or put coded markers on it or beside it,"
+            " and start from markers.",
         )
 
 
@@ -272,7 +318,8 @@ def _refuse_rivals(
     others: list[Candidate],
     size: float,
 ) -> None:
-    """Raise ``Refused`` where ICP from one of the ``others`` ends at a different pose that fits equally well."""
+    """Raise ``Refused`` where ICP from one of the ``others`` ends at a different pose that fits
+    equally well."""
     for other in others:
         if not other.score >= RIVAL_SCORE * start.score:
             continue
@@ -282,12 +329,15 @@ def _refuse_rivals(
             continue
         gap = pose_distance(scan.fine_points, result.T_reference_scan, rival.T_reference_scan)
         distinct = gap > max(5.0 * result.gate_mm, 10.0 * result.uncertainty.shift_mm)
-        alike = rival.overlap >= RIVAL_OVERLAP * result.overlap and rival.rms_mm <= RIVAL_RMS * result.rms_mm
+        alike = (
+            rival.overlap >= RIVAL_OVERLAP * result.overlap
+            and rival.rms_mm <= RIVAL_RMS * result.rms_mm
+        )
         if distinct and alike:
             raise Refused(
                 "ambiguous",
-                f"Two poses fit alike, with an RMS of {result.rms_mm:.3f} and {rival.rms_mm:.3f} mm over "
-                f"{100 * result.overlap:.0f} and {100 * rival.overlap:.0f} % of the scan, and they lie {gap:.0f} mm "
-                "apart: pick three point pairs, give the turntable's angle, or put something beside the object that "
-                "tells one side from the other.",
+                f"Two poses fit alike, with an RMS of {result.rms_mm:.3f} and {rival.rms_mm:.3f} mm"
+                f" over {100 * result.overlap:.0f} and {100 * rival.overlap:.0f} % of the scan, and"
+                f" they lie {gap:.0f} mm apart: pick three point pairs, give the turntable's angle,"
+                " or put something beside the object that tells one side from the other.",
             )

@@ -1,4 +1,5 @@
-"""Preparation of a scan for registration: downsampled clouds, normals, search trees and features, computed once."""
+"""Preparation of a scan for registration: downsampled clouds, normals, search trees and features,
+computed once."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,15 +14,18 @@ from slviewer.registration.open3d_loader import open3d
 
 LEAST_POINTS = 500
 FINEST_MM = 0.5
-"""Thinned to one point in so many mm, of objects of 75 to 300 mm: the noise of several pixels is averaged."""
+"""Thinned to one point in so many mm, of objects of 75 to 300 mm: the noise of several pixels is
+averaged."""
 _GRAZING = np.cos(np.radians(75.0))
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedScan:
-    """``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of them, thinned to
-    ``voxel`` mm, with unit normals towards the camera, without what is seen at grazing angles; ``spacing``: median
-    distance in mm of a point to the next; ``size``: longest side in mm; ``sigma_mm``: expected error of a point."""
+    """``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of
+    them, thinned to ``voxel`` mm, with unit normals towards the camera, without what is seen at
+    grazing angles; ``spacing``: median distance in mm of a point to the next; ``size``: longest
+    side in mm; ``sigma_mm``: expected error of a point.
+    """
 
     points: np.ndarray
     fine: Any
@@ -59,8 +63,8 @@ class PreparedScan:
 
     @cached_property
     def smooth(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (k, 3) mm, thinned to an eightieth of the size, and normals (k, 3) fitted to some thirty of them,
-        which show the shape and not the noise; towards either side."""
+        """Points (k, 3) mm, thinned to an eightieth of the size, and normals (k, 3) fitted to some
+        thirty of them, which show the shape and not the noise; towards either side."""
         cloud = self.thinned(self.size / 80.0)
         cloud = open3d().geometry.PointCloud(cloud.points)
         cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
@@ -69,8 +73,13 @@ class PreparedScan:
     def features(self, voxel: float) -> Any:
         """Return Open3D's FPFH features of the cloud thinned to ``voxel`` mm; cached."""
         if voxel not in self._features:
-            pipeline, search = open3d().pipelines.registration, open3d().geometry.KDTreeSearchParamHybrid
-            self._features[voxel] = pipeline.compute_fpfh_feature(self.thinned(voxel), search(5.0 * voxel, 100))
+            pipeline, search = (
+                open3d().pipelines.registration,
+                open3d().geometry.KDTreeSearchParamHybrid,
+            )
+            self._features[voxel] = pipeline.compute_fpfh_feature(
+                self.thinned(voxel), search(5.0 * voxel, 100)
+            )
         return self._features[voxel]
 
     def thinned(self, voxel: float) -> Any:
@@ -90,23 +99,28 @@ def prepare_scan(
 ) -> PreparedScan:
     """Prepare the points ``(n, 3)`` mm of one scan, in the frame of its camera, for registration.
 
-    ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for errors. Raises
-    ``InputError`` for points that cannot be used.
+    ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for
+    errors. Raises ``InputError`` for points that cannot be used.
     """
     _check_arrays(name, points, normals)
     points = np.ascontiguousarray(points, dtype=np.float64)
     size = measure_size(points)
     if not size > 0:
-        raise InputError(f"Nearly all points of the {name} are one: give those that were measured, each once.")
+        raise InputError(
+            f"Nearly all points of the {name} are one: give those that were measured, each once."
+        )
     voxel = FINEST_MM * scale_of(size)
     fine = _make_cloud(points, normals, voxel)
     if len(fine.points) < LEAST_POINTS // 5:
         raise InputError(
-            f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or have no normal "
-            f"({len(fine.points)} places are left): turn the object towards the camera."
+            f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or"
+            f" have no normal ({len(fine.points)} places are left): turn the object towards the"
+            " camera."
         )
     thinning = len(points) / len(fine.points)
-    spacing = _spacing(cKDTree(np.asarray(fine.points)), np.asarray(fine.points)) / np.sqrt(thinning)
+    spacing = _spacing(cKDTree(np.asarray(fine.points)), np.asarray(fine.points)) / np.sqrt(
+        thinning
+    )
     return PreparedScan(points, fine, voxel, float(spacing), size, sigma_mm)
 
 
@@ -116,40 +130,54 @@ def scale_of(size: float) -> float:
 
 
 def _check_arrays(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
-    """Raise InputError for arrays of wrong shapes, too few points, or points that are not finite."""
+    """Raise InputError for arrays of wrong shapes, too few points, or points that are not
+    finite."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
     if len(points) < LEAST_POINTS:
-        raise InputError(f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it.")
+        raise InputError(
+            f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it."
+        )
     if not np.isfinite(points).all():
-        raise InputError(f"The {name} holds points that are not finite: exclude its invalid pixels first.")
+        raise InputError(
+            f"The {name} holds points that are not finite: exclude its invalid pixels first."
+        )
     if normals is not None and normals.shape != points.shape:
-        raise InputError(f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one each.")
+        raise InputError(
+            f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one"
+            " each."
+        )
 
 
 def measure_size(points: np.ndarray) -> float:
-    """Return the longest side in mm of the points' bounding box between their 1st and 99th percentiles."""
+    """Return the longest side in mm of the points' bounding box between their 1st and 99th
+    percentiles."""
     low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
     return float((high - low).max())
 
 
 def _spacing(tree: cKDTree, points: np.ndarray) -> float:
-    """Return the median distance in mm of a subset of points (n, 3) to the nearest other point of the tree."""
+    """Return the median distance in mm of a subset of points (n, 3) to the nearest other point of
+    the tree."""
     distance, _ = tree.query(points[:: max(1, len(points) // 2000)], k=2)
     return float(np.median(distance[:, 1]))
 
 
 def sort_spatially(cloud: Any) -> Any:
-    """Return Open3D's cloud with neighbours beside each other in memory, which halves the time of searches in it."""
+    """Return Open3D's cloud with neighbours beside each other in memory, which halves the time of
+    searches in it."""
     return cloud.select_by_index(cKDTree(np.asarray(cloud.points)).indices)
 
 
 def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
-    """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the origin."""
+    """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
+    origin."""
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     if normals is not None:
-        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))  # a NaN normal weighs nothing in a voxel's mean
+        finite = np.nan_to_num(
+            np.asarray(normals, dtype=np.float64)
+        )  # a NaN normal weighs nothing in a voxel's mean
         cloud.normals = o3d.utility.Vector3dVector(finite)
         cloud = cloud.voxel_down_sample(voxel)
         known = lengths(np.asarray(cloud.normals)) > 0.1

@@ -4,15 +4,18 @@ from typing import Literal
 
 from slviewer.errors import SlviewerError
 
-Reason = Literal["overlap", "disagree", "plane", "sphere", "cylinder", "slides", "turns", "ambiguous", "picks"]
+Reason = Literal[
+    "overlap", "disagree", "plane", "sphere", "cylinder", "slides", "turns", "ambiguous", "picks"
+]
 
 
 class Refused(SlviewerError):
     """A refused registration, with its ``reason``.
 
-    overlap: the overlap is too small; disagree: the surfaces agree at no pose; plane, sphere, cylinder, slides (along
-    one direction), turns (about one axis): the shared shape leaves the pose undetermined; ambiguous: two poses fit
-    equally well; picks: picked points that determine no pose or contradict one another.
+    overlap: the overlap is too small; disagree: the surfaces agree at no pose; plane, sphere,
+    cylinder, slides (along one direction), turns (about one axis): the shared shape leaves the pose
+    undetermined; ambiguous: two poses fit equally well; picks: picked points that determine no pose
+    or contradict one another.
     """
 
     def __init__(self, reason: Reason, message: str) -> None:

@@ -1,4 +1,5 @@
-"""One scan as registration takes it: its points, and which of them can be trusted to lie on the surface."""
+"""One scan as registration takes it: its points, and which of them can be trusted to lie on the
+surface."""
 
 from dataclasses import dataclass
 
@@ -12,7 +13,8 @@ from slviewer.reconstruction.reconstruct import normals as grid_normals
 _RIM_PX = 2
 """So near to the edge of the measured surface, a pixel may have seen two surfaces at once."""
 _STEEPEST = 6.0
-"""Rise over the pixels' pitch beyond which neighbours do not belong to one surface, or to one seen too obliquely."""
+"""Rise over the pixels' pitch beyond which neighbours do not belong to one surface, or to one seen
+too obliquely."""
 _NOISE = 4.0
 """Standard deviations that noise alone may add to a step."""
 
@@ -21,9 +23,10 @@ _NOISE = 4.0
 class Scan:
     """The valid points of one scan, in its camera's frame.
 
-    ``points`` (n, 3) mm and ``normals`` (n, 3) towards the camera, float32 without NaN in the points; a normal is NaN
-    where the grid gives none. ``colours`` (n, 3) uint8 or None; ``sigma_mm`` the median expected error of a point.
-    ``trusted`` (n,) bool: the points away from edges, which alone decide how the scan lies; None trusts all.
+    ``points`` (n, 3) mm and ``normals`` (n, 3) towards the camera, float32 without NaN in the
+    points; a normal is NaN where the grid gives none. ``colours`` (n, 3) uint8 or None;
+    ``sigma_mm`` the median expected error of a point. ``trusted`` (n,) bool: the points away from
+    edges, which alone decide how the scan lies; None trusts all.
     """
 
     points: np.ndarray
@@ -48,13 +51,16 @@ class Scan:
 
 
 def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np.ndarray:
-    """Return the pixels (h, w) bool of an organised cloud (h, w, 3) mm that are two pixels or more inside the surface.
+    """Return the pixels (h, w) bool of an organised cloud (h, w, 3) mm that are two pixels or more
+    inside the surface.
 
-    Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch and exceed the noise
-    ``sigma_z`` (h, w) mm of both pixels, where it is known.
+    Edges are invalid pixels, the image's border, and steps that are steep for the pixels' pitch and
+    exceed the noise ``sigma_z`` (h, w) mm of both pixels, where it is known.
     """
     inside = np.isfinite(points[..., 2])
-    noise = np.zeros(inside.shape) if sigma_z is None else _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
+    noise = (
+        np.zeros(inside.shape) if sigma_z is None else _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
+    )
     for axis in (0, 1):
         before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
         pitch = lengths((points[after] - points[before])[..., :2])
@@ -70,4 +76,8 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
 
 def _rgb(colours: np.ndarray | None) -> np.ndarray | None:
     """Return colours (n, 3) from grey values (n,) or colours (n, 3)."""
-    return np.repeat(colours[:, None], 3, axis=1) if colours is not None and colours.ndim == 1 else colours
+    return (
+        np.repeat(colours[:, None], 3, axis=1)
+        if colours is not None and colours.ndim == 1
+        else colours
+    )

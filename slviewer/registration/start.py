@@ -1,4 +1,5 @@
-"""Where to start ICP from: candidate poses from matched FPFH features, and from the centroids; or one that is known.
+"""Where to start ICP from: candidate poses from matched FPFH features, and from the centroids; or
+one that is known.
 
 RANSAC is our own, in NumPy, because Open3D's parallel one gives another answer at every call.
 """
@@ -16,7 +17,8 @@ from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.prepared import PreparedScan
 
 Start = Literal["features", "centroids", "initial", "picked", "turntable", "markers"]
-"""How a start was found: searched for (the first two); the last pose, picked points, the turntable's angle, markers."""
+"""How a start was found: searched for (the first two); the last pose, picked points, the
+turntable's angle, markers."""
 SEARCHED: tuple[Start, ...] = ("features", "centroids")
 
 _TRIPLETS = 60_000
@@ -24,14 +26,16 @@ _SEED = 0
 _CANDIDATES = 6
 _LEAST_VOTES = 0.15  # of those for the best pose
 _COARSE_POINTS = 2000
-"""Of a scan in the coarse ICP, or up to twice as many: only scans much larger than the reference have more."""
+"""Of a scan in the coarse ICP, or up to twice as many: only scans much larger than the reference
+have more."""
 
 
 @dataclass(frozen=True)
 class Candidate:
     """An initial pose ``T`` (4, 4), T_reference_scan, and its origin ``start``.
 
-    ``score``: 0 to 1, share of the thinned scan that fits the reference at this pose; NaN if not evaluated.
+    ``score``: 0 to 1, share of the thinned scan that fits the reference at this pose; NaN if not
+    evaluated.
     """
 
     T: np.ndarray
@@ -50,10 +54,11 @@ def candidates(scan: PreparedScan, reference: PreparedScan, voxel: float) -> Ite
 def rank_starts(
     scanned: PreparedScan, referred: PreparedScan, voxel: float, initial: Candidate | None = None
 ) -> list[Candidate]:
-    """Refine the candidates by a coarse ICP, and sort them by the part of the scan on the reference, largest first.
+    """Refine the candidates by a coarse ICP, and sort them by the part of the scan on the
+    reference, largest first.
 
-    Equal poses are listed once. ICP uses the clouds thinned to ``voxel`` mm. With ``initial``, only this candidate is
-    refined.
+    Equal poses are listed once. ICP uses the clouds thinned to ``voxel`` mm. With ``initial``, only
+    this candidate is refined.
     """
     tried = candidates(scanned, referred, voxel) if initial is None else iter([initial])
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
@@ -63,20 +68,25 @@ def rank_starts(
     for candidate in tried:
         T = candidate.T
         for gate in (6.0 * voxel, 3.0 * voxel, 1.5 * voxel):
-            T = align_icp(sparse_scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20)
+            T = align_icp(
+                sparse_scan, reference, T, gate, open3d().pipelines.registration.L2Loss(), 1e-5, 20
+            )
         if all(pose_distance(np.asarray(scan.points), T, other.T) > 0.5 * voxel for other in found):
-            found.append(Candidate(T, candidate.start, _score_pose(scan, reference, tree, T, voxel)))
+            found.append(
+                Candidate(T, candidate.start, _score_pose(scan, reference, tree, T, voxel))
+            )
     return sorted(found, key=lambda candidate: -candidate.score)
 
 
 def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
-    """Return the largest coordinate difference in mm of some 20 of the points (n, 3) between two poses (4, 4)."""
+    """Return the largest coordinate difference in mm of some 20 of the points (n, 3) between two
+    poses (4, 4)."""
     return float(np.abs(move_points(T - other, points[:: max(1, len(points) // 20)])).max())
 
 
 def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
-    """Return the share of the scan that overlaps the reference, times the share of agreement where the two face each
-    other."""
+    """Return the share of the scan that overlaps the reference, times the share of agreement where
+    the two face each other."""
     points = move_points(T, np.asarray(scan.points))
     normals = np.asarray(scan.normals) @ T[:3, :3].T
     distance, nearest = tree.query(points, distance_upper_bound=3.0 * voxel)
@@ -85,17 +95,22 @@ def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: 
         return 0.0
     other = nearest[near]
     their_normals = np.asarray(reference.normals)[other]
-    height = np.abs(np.sum(their_normals * (points[near] - np.asarray(reference.points)[other]), axis=1))
+    height = np.abs(
+        np.sum(their_normals * (points[near] - np.asarray(reference.points)[other]), axis=1)
+    )
     on = (height < 0.5 * voxel) & (np.sum(their_normals * normals[near], axis=1) > 0.9)
     return float(on.sum() / len(points) * on.sum() / near.sum())
 
 
 def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) -> list[np.ndarray]:
-    """Return up to six different poses, those on which most feature matches agree; none without matches."""
+    """Return up to six different poses, those on which most feature matches agree; none without
+    matches."""
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
     features = [one.features(voxel) for one in (scanned, referred)]
     pipeline = open3d().pipelines.registration
-    matches = np.asarray(pipeline.correspondences_from_features(features[0], features[1], mutual_filter=True))
+    matches = np.asarray(
+        pipeline.correspondences_from_features(features[0], features[1], mutual_filter=True)
+    )
     if len(matches) < 10:
         return []
     p, q = np.asarray(scan.points)[matches[:, 0]], np.asarray(reference.points)[matches[:, 1]]
@@ -128,7 +143,7 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
 
 
 def _match_triangles(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) -> np.ndarray:
-    """Return which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree within ``slack``
-    mm."""
+    """Return which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree
+    within ``slack`` mm."""
     a, b = (lengths(x - np.roll(x, 1, axis=1)) for x in (p, q))
     return np.all((a > shortest) & (np.abs(a - b) < slack), axis=1)

@@ -1,7 +1,9 @@
-"""Segmentation of a static background from a moving object in several scans, by free-space violations.
+"""Segmentation of a static background from a moving object in several scans, by free-space
+violations.
 
-A point of another scan that is in front of a scan's surface violates its free space. Where an object was turned before
-a background, the background's points violate free space under the object's motion, and agree without motion.
+A point of another scan that is in front of a scan's surface violates its free space. Where an
+object was turned before a background, the background's points violate free space under the object's
+motion, and agree without motion.
 """
 
 from collections.abc import Mapping
@@ -22,7 +24,8 @@ from slviewer.registration.prepared import LEAST_POINTS, measure_size, sort_spat
 from slviewer.registration.refusal import Refused
 
 SIGMAS = 5.0
-"""A point violates free space where its height exceeds this many standard deviations of the pair's own scatter."""
+"""A point violates free space where its height exceeds this many standard deviations of the pair's
+own scatter."""
 LEAST_SHARE = 0.01
 """Least share of static samples in a scan with a static background; fewer are scatter."""
 LEAST_PART = 0.05
@@ -49,9 +52,10 @@ _NEIGHBOURS = 15
 class SurfaceSamples:
     """A downsampled scan in its camera's frame, with search trees.
 
-    ``points`` (n, 3) mm, unit ``normals`` (n, 3) towards the camera, ``ray_tree`` of the rays (x/z, y/z),
-    ``ray_distance`` (n,) from each ray to the fourth nearest other one, ``point_tree`` of the points, and the indices
-    ``neighbours`` (n, 8) of each point's nearest ones. ``heights``: cached results of ``heights_above``.
+    ``points`` (n, 3) mm, unit ``normals`` (n, 3) towards the camera, ``ray_tree`` of the rays (x/z,
+    y/z), ``ray_distance`` (n,) from each ray to the fourth nearest other one, ``point_tree`` of the
+    points, and the indices ``neighbours`` (n, 8) of each point's nearest ones. ``heights``: cached
+    results of ``heights_above``.
     """
 
     points: np.ndarray
@@ -67,8 +71,8 @@ class SurfaceSamples:
 class SceneContradiction:
     """Free-space violations between two scans.
 
-    ``compared``: number of samples in the other scan's view; ``share`` of them that are more than ``gate_mm`` in front
-    of the other scan's surface.
+    ``compared``: number of samples in the other scan's view; ``share`` of them that are more than
+    ``gate_mm`` in front of the other scan's surface.
     """
 
     compared: int
@@ -91,13 +95,18 @@ class ObjectAlignment:
 
 
 def register_object(
-    clouds: Mapping[str, Cloud], reference: str, starts: Starts | None = None, progress: Progress | None = None
+    clouds: Mapping[str, Cloud],
+    reference: str,
+    starts: Starts | None = None,
+    progress: Progress | None = None,
 ) -> ObjectAlignment:
-    """Register the organised clouds of an object by ``register_all``, after removal of a static background.
+    """Register the organised clouds of an object by ``register_all``, after removal of a static
+    background.
 
-    A background that fills more of the image than the object would keep the scans where they are. So where parts of the
-    scans agree without motion, the other parts are registered first; each point is then assigned to the motion that it
-    agrees with, and the object's points alone are registered again. Raises as ``register_all`` does.
+    A background that fills more of the image than the object would keep the scans where they are.
+    So where parts of the scans agree without motion, the other parts are registered first; each
+    point is then assigned to the motion that it agrees with, and the object's points alone are
+    registered again. Raises as ``register_all`` does.
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
@@ -113,18 +122,29 @@ def register_object(
         candidate = remove_points(clouds, static)
         again = Starts(poses=alignment.T_reference_scan, markers=markers)
         refined = _try_register(candidate, reference, again, lambda share: report(0.9))
-        if refined is None:  # too few points remain of a scan: its background may be needed to determine its pose
+        if (
+            refined is None
+        ):  # too few points remain of a scan: its background may be needed to determine its pose
             moving, samples, static = clouds, all_samples, _no_points(clouds)
             break
-        pairs = {pair: replace(r, start=first_start.get(pair, r.start)) for pair, r in refined.pairs.items()}
-        alignment, moving, samples = replace(refined, pairs=pairs), candidate, _sample_clouds(candidate)
+        pairs = {
+            pair: replace(r, start=first_start.get(pair, r.start))
+            for pair, r in refined.pairs.items()
+        }
+        alignment, moving, samples = (
+            replace(refined, pairs=pairs),
+            candidate,
+            _sample_clouds(candidate),
+        )
         before, static = static, detect_static_points(clouds, all_samples, alignment)
         if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
             static = before
             break
     T = alignment.T_reference_scan
     contradictions = {
-        (a, b): measure_contradiction(samples[a], samples[b], np.linalg.inv(T[b]) @ T[a], registration.gate_mm)
+        (a, b): measure_contradiction(
+            samples[a], samples[b], np.linalg.inv(T[b]) @ T[a], registration.gate_mm
+        )
         for (a, b), registration in alignment.pairs.items()
     }
     report(1.0)
@@ -138,7 +158,8 @@ def _register_once(
     starts: Starts | None,
     report: Progress,
 ) -> tuple[MultiwayAlignment, dict[str, np.ndarray]]:
-    """Register the scans without what agrees without motion, or as they are where that does not separate two motions.
+    """Register the scans without what agrees without motion, or as they are where that does not
+    separate two motions.
 
     Returns the alignment and the static points, (h, w) bool by scan.
     """
@@ -146,7 +167,9 @@ def _register_once(
     is_marked = starts is not None and starts.markers
     unmoved = _no_points(clouds) if is_marked else _detect_unmoved_points(clouds, samples)
     if _has_points(unmoved):
-        first = _try_register(remove_points(clouds, unmoved), reference, starts, lambda share: report(0.5 * share))
+        first = _try_register(
+            remove_points(clouds, unmoved), reference, starts, lambda share: report(0.5 * share)
+        )
         if first is not None:
             static = detect_static_points(clouds, samples, first)
             if _has_points(static):
@@ -171,17 +194,22 @@ def _sample_clouds(clouds: Mapping[str, Cloud]) -> dict[str, SurfaceSamples]:
 
 
 def _select_precise(cloud: Cloud) -> np.ndarray:
-    """Return the points (n, 3) mm of a cloud but the noisiest, which on dark print lie further off than the others."""
+    """Return the points (n, 3) mm of a cloud but the noisiest, which on dark print lie further off
+    than the others."""
     mask = cloud.mask
     sigma = cloud.sigma_z[mask]
     usual = np.nanmedian(sigma) if np.isfinite(sigma).any() else np.inf
     return choose_pixels(cloud.points, mask)[~(sigma > NOISY * usual)]
 
 
-def remove_points(clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]) -> dict[str, Cloud]:
+def remove_points(
+    clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]
+) -> dict[str, Cloud]:
     """Return the clouds with the points at ``static`` (h, w) bool replaced by NaN."""
     return {
-        name: replace(cloud, points=np.where(static[name][..., None], np.float32(np.nan), cloud.points))
+        name: replace(
+            cloud, points=np.where(static[name][..., None], np.float32(np.nan), cloud.points)
+        )
         for name, cloud in clouds.items()
     }
 
@@ -196,8 +224,11 @@ def _try_register(
         return None
 
 
-def _detect_unmoved_points(clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples]) -> dict[str, np.ndarray]:
-    """Detect the points, (h, w) bool by scan, that agree with the next scan's or the previous one's without any motion.
+def _detect_unmoved_points(
+    clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples]
+) -> dict[str, np.ndarray]:
+    """Detect the points, (h, w) bool by scan, that agree with the next scan's or the previous one's
+    without any motion.
 
     All False where they are less than LEAST_PART of a scan, or leave too few points to register.
     """
@@ -218,7 +249,8 @@ def _detect_unmoved_points(clouds: Mapping[str, Cloud], samples: Mapping[str, Su
 
 
 def sample_surface(points: np.ndarray) -> SurfaceSamples:
-    """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are removed."""
+    """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are
+    removed."""
     o3d = open3d()
     points = np.asarray(points, np.float64)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -237,10 +269,11 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
 
 
 def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
-    """Return the heights (n,) mm of a scan's samples, moved by ``T`` (4, 4), above another scan's surface.
+    """Return the heights (n,) mm of a scan's samples, moved by ``T`` (4, 4), above another scan's
+    surface.
 
-    Heights are along that surface's normal, positive in front of it as seen from its camera, and medians over each
-    sample's neighbourhood; NaN outside the other scan's view. Cached.
+    Heights are along that surface's normal, positive in front of it as seen from its camera, and
+    medians over each sample's neighbourhood; NaN outside the other scan's view. Cached.
     """
     key = onto, T.tobytes()
     if key not in scan.heights:
@@ -254,11 +287,15 @@ def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) 
     in_front = points[:, 2] > 0
     rays = points[:, :2] / np.where(in_front, points[:, 2], 1.0)[:, None]
     reach = np.append(onto.ray_distance, -1.0)  # the last for rays without a sample nearby
-    distance, nearest = onto.ray_tree.query(rays, distance_upper_bound=1.001 * reach.max(), workers=-1)
+    distance, nearest = onto.ray_tree.query(
+        rays, distance_upper_bound=1.001 * reach.max(), workers=-1
+    )
     in_view = np.flatnonzero(in_front & (distance < reach[nearest]))
     nearest = nearest[in_view]
     height = np.full(len(points), np.nan)
-    height[in_view] = np.sum(onto.normals[nearest] * (points[in_view] - onto.points[nearest]), axis=1)
+    height[in_view] = np.sum(
+        onto.normals[nearest] * (points[in_view] - onto.points[nearest]), axis=1
+    )
     neighbourhood = np.sort(height[scan.neighbours[in_view]], axis=1)  # NaN last
     count = np.count_nonzero(np.isfinite(neighbourhood), axis=1)
     row = np.arange(len(count))
@@ -269,21 +306,25 @@ def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) 
 def measure_contradiction(
     scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray, widest_mm: float
 ) -> SceneContradiction:
-    """Measure the free-space violations between two scans with ``T_onto_scan`` (4, 4), in both directions.
+    """Measure the free-space violations between two scans with ``T_onto_scan`` (4, 4), in both
+    directions.
 
     ``widest_mm``: upper bound of the gate.
     """
-    height = np.concatenate([heights_above(scan, onto, T), heights_above(onto, scan, np.linalg.inv(T))])
+    height = np.concatenate(
+        [heights_above(scan, onto, T), heights_above(onto, scan, np.linalg.inv(T))]
+    )
     gate = estimate_gate(height, widest_mm)
     known = height[np.isfinite(height)]
     return SceneContradiction(len(known), float(np.mean(known > gate)) if len(known) else 0.0, gate)
 
 
 def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
-    """Estimate the gate in mm, SIGMAS times the scatter of heights (n,) of overlapping surfaces, up to ``widest_mm``.
+    """Estimate the gate in mm, SIGMAS times the scatter of heights (n,) of overlapping surfaces, up
+    to ``widest_mm``.
 
-    The scatter is estimated by the lower quartile of the heights within ``widest_mm``, as up to half of these may
-    belong to points with another motion. NaN heights do not count.
+    The scatter is estimated by the lower quartile of the heights within ``widest_mm``, as up to
+    half of these may belong to points with another motion. NaN heights do not count.
     """
     near = np.abs(height[np.abs(height) < widest_mm])
     scatter = float(np.quantile(near, 0.25)) / QUARTILE if len(near) >= LEAST_SAMPLES else widest_mm
@@ -293,17 +334,22 @@ def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
 def detect_static_points(
     clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples], alignment: MultiwayAlignment
 ) -> dict[str, np.ndarray]:
-    """Detect the points, (h, w) bool by scan, that are static in the camera's frame while the object moves.
+    """Detect the points, (h, w) bool by scan, that are static in the camera's frame while the
+    object moves.
 
-    A sample votes for static where it disagrees with another scan under the ``alignment`` and agrees without motion,
-    and against it in the opposite case; otherwise the nearest votes decide. All False without a static part, and where
-    the scans did not move, so that the two cases cannot be distinguished.
+    A sample votes for static where it disagrees with another scan under the ``alignment`` and
+    agrees without motion, and against it in the opposite case; otherwise the nearest votes decide.
+    All False without a static part, and where the scans did not move, so that the two cases cannot
+    be distinguished.
     """
     votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
     poses = alignment.T_reference_scan
     for (first, second), registration in alignment.pairs.items():
         T_second_first = np.linalg.inv(poses[second]) @ poses[first]
-        for scan, onto, T in ((first, second, T_second_first), (second, first, np.linalg.inv(T_second_first))):
+        for scan, onto, T in (
+            (first, second, T_second_first),
+            (second, first, np.linalg.inv(T_second_first)),
+        ):
             moved = heights_above(samples[scan], samples[onto], T)
             unmoved = heights_above(samples[scan], samples[onto], np.eye(4))
             gate = estimate_gate(moved, registration.gate_mm)
@@ -315,7 +361,8 @@ def detect_static_points(
 
 
 def _classify_pixels(cloud: Cloud, samples: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
-    """Return the static pixels (h, w) bool of a cloud, by the majority of the votes (n,) nearest to each sample.
+    """Return the static pixels (h, w) bool of a cloud, by the majority of the votes (n,) nearest to
+    each sample.
 
     A positive vote is for static, 0 none. All False for too few positive votes.
     """

@@ -9,8 +9,8 @@ import numpy as np
 class Uncertainty:
     """Uncertainty of a registered pose (1 sigma).
 
-    ``covariance`` (6, 6): of a small rotation vector (rad) about ``centre`` (3,) mm, the middle of the overlap in the
-    reference's frame, and of the translation (mm) there.
+    ``covariance`` (6, 6): of a small rotation vector (rad) about ``centre`` (3,) mm, the middle of
+    the overlap in the reference's frame, and of the translation (mm) there.
     """
 
     covariance: np.ndarray

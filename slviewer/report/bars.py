@@ -22,8 +22,8 @@ from slviewer.report.page import Figure
 
 
 def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
-    """Bars of every plane's RMS by model with the noise floor as a tick and the Letter's figure as a ring, and below
-    them the share of each plane in R1, R2 and R3."""
+    """Bars of every plane's RMS by model with the noise floor as a tick and the Letter's figure as
+    a ring, and below them the share of each plane in R1, R2 and R3."""
     if not rows:
         raise InputError("no plane was given: their RMS cannot be drawn")
     drawing = new_figure(FULL, 390)
@@ -32,9 +32,11 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     _draw_shares(lower, rows)
     return finish_figure(
         drawing,
-        "RMS distance of the flat board from its own plane, by model. Black ticks: what the capture's noise alone "
-        "would give. Rings: the Letter's own figures, from its rig. Below: the share of each board in R1, R2 and R3.",
-        "Bars of the plane RMS by pose and model, with noise floor, the Letter's figures and the depth ranges",
+        "RMS distance of the flat board from its own plane, by model. Black ticks: what the"
+        " capture's noise alone would give. Rings: the Letter's own figures, from its rig. Below:"
+        " the share of each board in R1, R2 and R3.",
+        "Bars of the plane RMS by pose and model, with noise floor, the Letter's figures and the"
+        " depth ranges",
     )
 
 
@@ -48,13 +50,21 @@ def _draw_rms(upper: Any, rows: Sequence[PlaneRow]) -> None:
         x = np.arange(len(rows)) + (i - (len(models) - 1) / 2) * width
         rms, floor, letter = np.array(
             [
-                [values.get(model, np.nan) for values in (row.rms_mm, row.noise_floor_mm, row.letter_rms_mm)]
+                [
+                    values.get(model, np.nan)
+                    for values in (row.rms_mm, row.noise_floor_mm, row.letter_rms_mm)
+                ]
                 for row in rows
             ]
         ).T
         upper.bar(x, rms, 0.92 * width, color=model_colour(model), label=model)
         upper.hlines(
-            floor, x - 0.46 * width, x + 0.46 * width, color=INK, linewidth=1.6, label="noise floor" if not i else None
+            floor,
+            x - 0.46 * width,
+            x + 0.46 * width,
+            color=INK,
+            linewidth=1.6,
+            label="noise floor" if not i else None,
         )
         if np.isfinite(letter).any():
             upper.plot(
@@ -106,5 +116,7 @@ def _draw_shares(lower: Any, rows: Sequence[PlaneRow]) -> None:
     lower.set_ylim(0, 1)
     lower.set_yticks([])
     lower.set_xlim(-0.6, len(rows) - 0.4)
-    lower.set_xticks(at, [row.name for row in rows], fontsize=SMALL_PT, rotation=45 if len(rows) > 14 else 0)
+    lower.set_xticks(
+        at, [row.name for row in rows], fontsize=SMALL_PT, rotation=45 if len(rows) > 14 else 0
+    )
     add_legend(lower, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, handlelength=1.0)

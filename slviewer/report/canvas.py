@@ -1,6 +1,7 @@
 """What all figures share: a canvas without global state, the palette, the styles of axes.
 
-matplotlib is used through its objects alone (no pyplot, no rcParams), so that reports may be written by any thread.
+matplotlib is used through its objects alone (no pyplot, no rcParams), so that reports may be
+written by any thread.
 """
 
 import threading
@@ -38,7 +39,12 @@ def new_figure(width: int, height: int) -> Any:
     """A matplotlib figure of ``width`` x ``height`` CSS px."""
     from matplotlib.figure import Figure as Drawing
 
-    return Drawing(figsize=(width / 100, height / 100), dpi=100 * DENSITY, facecolor="white", layout="constrained")
+    return Drawing(
+        figsize=(width / 100, height / 100),
+        dpi=100 * DENSITY,
+        facecolor="white",
+        layout="constrained",
+    )
 
 
 def finish_figure(drawing: Any, caption: str, alt: str) -> Figure:
@@ -52,8 +58,11 @@ def finish_figure(drawing: Any, caption: str, alt: str) -> Figure:
     return Figure(rgb, caption, alt, rgb.shape[1] // DENSITY)
 
 
-def style_axes(axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK) -> None:
-    """Style axes plainly: a light grid, two spines, labels in the page's sizes; ``x`` and ``y`` name the axes."""
+def style_axes(
+    axes: Any, title: str = "", x: str = "", y: str = "", *, grid: bool = True, colour: str = INK
+) -> None:
+    """Style axes plainly: a light grid, two spines, labels in the page's sizes; ``x`` and ``y``
+    name the axes."""
     axes.set_title(title, fontsize=TITLE_PT, color=colour, loc="left", fontweight="bold", pad=7)
     axes.set_xlabel(x, fontsize=TEXT_PT, color=SOFT)
     axes.set_ylabel(y, fontsize=TEXT_PT, color=SOFT)
@@ -90,8 +99,11 @@ def add_colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: A
     bar.outline.set_visible(False)
 
 
-def draw_map(axes: Any, image: NDArray[np.floating], colours: str, levels: int, low: float, high: float) -> Any:
-    """Draw a map (h, w), grey where NaN, with ``levels`` levels of a colour map ``low`` to ``high``; returns the image.
+def draw_map(
+    axes: Any, image: NDArray[np.floating], colours: str, levels: int, low: float, high: float
+) -> Any:
+    """Draw a map (h, w), grey where NaN, with ``levels`` levels of a colour map ``low`` to
+    ``high``; returns the image.
 
     Maps that are finer than the figure are averaged.
     """
@@ -108,11 +120,15 @@ def draw_map(axes: Any, image: NDArray[np.floating], colours: str, levels: int, 
 
 
 def round_up(value: float) -> float:
-    """The value rounded up to 1, 1.5, 2, 3, 4, 5, 6, 8 or 10 times a power of ten; 1 unless finite and positive."""
+    """The value rounded up to 1, 1.5, 2, 3, 4, 5, 6, 8 or 10 times a power of ten; 1 unless finite
+    and positive."""
     if not (np.isfinite(value) and value > 0):
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(s for s in (1, 1.5, 2, 3, 4, 5, 6, 8, 10, 15) if s * power >= value * (1 - 1e-9)) * power)
+    return float(
+        next(s for s in (1, 1.5, 2, 3, 4, 5, 6, 8, 10, 15) if s * power >= value * (1 - 1e-9))
+        * power
+    )
 
 
 def percentile(values: np.ndarray, share: float) -> float:

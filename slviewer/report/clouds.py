@@ -54,18 +54,27 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
         style_image_axes(ax, view.name)
         ax.imshow(picture)
         ax.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
-        add_colour_bar(drawing, ScalarMappable(Normalize(near, far), palette), ax, "z, mm", shrink=0.7, aspect=20)
+        add_colour_bar(
+            drawing,
+            ScalarMappable(Normalize(near, far), palette),
+            ax,
+            "z, mm",
+            shrink=0.7,
+            aspect=20,
+        )
     for ax in axes[len(views) :]:
         ax.set_axis_off()
     return finish_figure(
         drawing,
-        "Each scan as measured, seen from above and aside, shaded by its own surface normals and coloured by depth.",
+        "Each scan as measured, seen from above and aside, shaded by its own surface normals and"
+        " coloured by depth.",
         "Shaded views of " + ", ".join(f"{view.name} ({_format_count(view)})" for view in views),
     )
 
 
 def draw_merged_cloud(view: CloudView) -> Figure:
-    """The merged cloud: illuminated as one surface, and coloured by the scan that each point comes from."""
+    """The merged cloud: illuminated as one surface, and coloured by the scan that each point comes
+    from."""
     points, normals, source = _sample_points(view)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)
@@ -81,12 +90,19 @@ def draw_merged_cloud(view: CloudView) -> Figure:
     right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
     for i, name in enumerate(view.names):
         right.plot([], [], "s", color=SCANS[i % len(SCANS)], markersize=8, label=name)
-    add_legend(right, loc="upper left", bbox_to_anchor=(0, 0), ncols=max(len(view.names), 1), handletextpad=0.2)
+    add_legend(
+        right,
+        loc="upper left",
+        bbox_to_anchor=(0, 0),
+        ncols=max(len(view.names), 1),
+        handletextpad=0.2,
+    )
     return finish_figure(
         drawing,
-        "The merged cloud in the reference scan's frame. Right: each square shows the points of one scan alone, so "
-        "that a step where squares meet would be a misalignment.",
-        f"Shaded views of the merged cloud, {_format_count(view)}, as one surface and coloured by scan",
+        "The merged cloud in the reference scan's frame. Right: each square shows the points of one"
+        " scan alone, so that a step where squares meet would be a misalignment.",
+        f"Shaded views of the merged cloud, {_format_count(view)}, as one surface and coloured by"
+        " scan",
     )
 
 
@@ -105,15 +121,21 @@ def _sample_points(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         step = max(1, -(-len(points) // MOST_POINTS))
         points = points[::step]
         normals = np.full(points.shape, np.nan) if normals is None else normals[::step]
-        source = np.zeros(len(points), np.intp) if view.source is None else view.source[::step].astype(np.intp)
+        source = (
+            np.zeros(len(points), np.intp)
+            if view.source is None
+            else view.source[::step].astype(np.intp)
+        )
     known = np.isfinite(points).all(axis=1)
     return points[known], normals[known], source[known]
 
 
 def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Indices of the points of a chequered view, which shows one scan only in each square of x and y.
+    """Indices of the points of a chequered view, which shows one scan only in each square of x and
+    y.
 
-    The scans take turns from square to square, among those that measured there (decided on finer squares).
+    The scans take turns from square to square, among those that measured there (decided on finer
+    squares).
     """
     low, high = np.percentile(points[:, :2], [0.5, 99.5], axis=0)
     fine = float(np.max(high - low)) / (SQUARES * FINER)
@@ -123,7 +145,9 @@ def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
     present = np.zeros((int(place.max()) + 1, scans), bool)
     present[place, source] = True
     turn = (at // FINER).sum(axis=1) % np.maximum(present[place].sum(axis=1), 1)
-    rank = np.cumsum(present, axis=1) - 1  # the how-manieth of the scans that are present each one is
+    rank = (
+        np.cumsum(present, axis=1) - 1
+    )  # the how-manieth of the scans that are present each one is
     return np.flatnonzero(rank[place, source] == turn)
 
 

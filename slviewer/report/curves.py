@@ -1,4 +1,5 @@
-"""The Letter's picture of one pixel: z over phase, x and y over z, and the residuals of the fits."""
+"""The Letter's picture of one pixel: z over phase, x and y over z, and the residuals of the
+fits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,7 +8,17 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.report.canvas import FULL, HALF, INK, MODELS, SOFT, add_legend, finish_figure, new_figure, style_axes
+from slviewer.report.canvas import (
+    FULL,
+    HALF,
+    INK,
+    MODELS,
+    SOFT,
+    add_legend,
+    finish_figure,
+    new_figure,
+    style_axes,
+)
 from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
@@ -16,7 +27,8 @@ DATA = "#c2502e"
 
 @dataclass(frozen=True)
 class _FittedCurve:
-    """Values (n,) mm of a pixel over phases or depths (n,), and the function that was fitted to them."""
+    """Values (n,) mm of a pixel over phases or depths (n,), and the function that was fitted to
+    them."""
 
     title: str
     along: str
@@ -26,7 +38,8 @@ class _FittedCurve:
     fitted: Callable[[np.ndarray], np.ndarray]
 
     def draw(self, upper: Any, lower: Any) -> None:
-        """Draw the fit and the values into the upper axes, the residuals in um into the lower ones."""
+        """Draw the fit and the values into the upper axes, the residuals in um into the lower
+        ones."""
         at = self.at
         margin = 0.06 * (np.ptp(at) or 1.0)
         line = np.linspace(at.min() - margin, at.max() + margin, 200)
@@ -41,15 +54,19 @@ class _FittedCurve:
 
 
 def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
-    """The rational function and the two lines of one camera pixel with their data, residuals in um below.
+    """The rational function and the two lines of one camera pixel with their data, residuals in um
+    below.
 
     A narrow figure has one curve a row, its residuals beside it.
     """
     n = len(curve.phase)
-    if any(np.shape(v) != (n,) for v in (curve.z, curve.x, curve.y)) or np.shape(curve.coefficients) != (5,):
+    if any(np.shape(v) != (n,) for v in (curve.z, curve.x, curve.y)) or np.shape(
+        curve.coefficients
+    ) != (5,):
         raise InputError(
-            f"pixel {curve.pixel} has {n} phases, and depths {np.shape(curve.z)}, x {np.shape(curve.x)}, "
-            f"y {np.shape(curve.y)} with coefficients {np.shape(curve.coefficients)}: (n,) each and (5,) are needed"
+            f"pixel {curve.pixel} has {n} phases, and depths {np.shape(curve.z)}, x"
+            f" {np.shape(curve.x)}, y {np.shape(curve.y)} with coefficients"
+            f" {np.shape(curve.coefficients)}: (n,) each and (5,) are needed"
         )
     known = np.isfinite([curve.phase, curve.z, curve.x, curve.y]).all(axis=0)
     phase, z, x, y = (np.asarray(v, float)[known] for v in (curve.phase, curve.z, curve.x, curve.y))
@@ -89,12 +106,14 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
                 add_legend(upper, loc="best")
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel
-    listed = ", ".join(f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True))
+    listed = ", ".join(
+        f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True)
+    )
     return finish_figure(
         drawing,
-        f"Fit of camera pixel ({u}, {v}) to {phase.size} target poses: z as a rational function of the absolute "
-        f"phase of axis {curve.axis}, x and y as lines through the camera's centre. "
-        f"{'Beside' if narrow else 'Below'}: the residuals "
-        f"(RMS {listed}).",
-        f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with residuals; RMS {listed}",
+        f"Fit of camera pixel ({u}, {v}) to {phase.size} target poses: z as a rational function of"
+        f" the absolute phase of axis {curve.axis}, x and y as lines through the camera's centre."
+        f" {'Beside' if narrow else 'Below'}: the residuals (RMS {listed}).",
+        f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with residuals;"
+        f" RMS {listed}",
     )

@@ -1,7 +1,8 @@
-"""What a report is drawn from: plain values and arrays, so that whoever computed them needs to know no drawing.
+"""What a report is drawn from: plain values and arrays, so that whoever computed them needs to know
+no drawing.
 
-Lengths in mm, image errors in px; NaN is "unknown" everywhere. A mapping that is keyed by model holds the models in
-the order in which they are to be shown, the one to beat ("stereo") first.
+Lengths in mm, image errors in px; NaN is "unknown" everywhere. A mapping that is keyed by model
+holds the models in the order in which they are to be shown, the one to beat ("stereo") first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,8 @@ Region = Literal["R1", "R2", "R3"]
 
 @dataclass(frozen=True)
 class PlaneRow:
-    """A flat board at one pose. ``incidence``: its share in R1, R2 and R3, percent; ``letter_*``: the Letter's own."""
+    """A flat board at one pose. ``incidence``: its share in R1, R2 and R3, percent; ``letter_*``:
+    the Letter's own."""
 
     name: str
     incidence: Mapping[str, float]
@@ -88,7 +90,8 @@ class PixelCurve:
 
 @dataclass(frozen=True, eq=False)
 class ErrorMaps:
-    """Signed errors (h, w) mm, NaN at excluded pixels, of each model on one capture, with RMS and noise floor."""
+    """Signed errors (h, w) mm, NaN at excluded pixels, of each model on one capture, with RMS and
+    noise floor."""
 
     title: str
     maps: Mapping[str, np.ndarray]
@@ -100,8 +103,9 @@ class ErrorMaps:
 class CloudView:
     """A scan to look at: ``points`` (h, w, 3) organised, or (n, 3), mm, NaN where invalid.
 
-    ``normals`` like ``points``, or None (computed from the grid); ``source`` (n,) numbers the scan that each point of a
-    merged cloud comes from, ``names`` names these; ``note`` is shown beside the number of points.
+    ``normals`` like ``points``, or None (computed from the grid); ``source`` (n,) numbers the scan
+    that each point of a merged cloud comes from, ``names`` names these; ``note`` is shown beside
+    the number of points.
     """
 
     name: str
@@ -116,9 +120,10 @@ class CloudView:
 class ReproductionData:
     """The Letter's experiments on a simulated rig.
 
-    ``depth_range_mm`` bounds R2. ``rms_maps_mm`` (3, h, w) are the pixel-wise fits' RMS in z, x, y. ``plane_outlines``
-    holds, by plane, four or more points (n, 3) of it. ``reprojection_rms_px`` and the Letter's have the keys camera,
-    projector (and stereo, ours). ``notes`` are warnings of the run, one sentence each.
+    ``depth_range_mm`` bounds R2. ``rms_maps_mm`` (3, h, w) are the pixel-wise fits' RMS in z, x, y.
+    ``plane_outlines`` holds, by plane, four or more points (n, 3) of it. ``reprojection_rms_px``
+    and the Letter's have the keys camera, projector (and stereo, ours). ``notes`` are warnings of
+    the run, one sentence each.
     """
 
     camera: tuple[int, int]
@@ -148,7 +153,8 @@ class ReproductionData:
 
 @dataclass(frozen=True)
 class CaptureRow:
-    """One capture. ``state``: used, unused, excluded, waiting or scan; ``why``: why it is not used."""
+    """One capture. ``state``: used, unused, excluded, waiting or scan; ``why``: why it is not
+    used."""
 
     name: str
     role: str
@@ -163,9 +169,11 @@ class CaptureRow:
 
 @dataclass(frozen=True, eq=False)
 class PoseResiduals:
-    """Features of one board pose: camera ``pixels`` (n, 2) and ``camera``, ``projector`` residuals (n, 2) px.
+    """Features of one board pose: camera ``pixels`` (n, 2) and ``camera``, ``projector`` residuals
+    (n, 2) px.
 
-    ``projector_pixels`` (n, 2) is where the projector's residuals belong. NaN: excluded or not read.
+    ``projector_pixels`` (n, 2) is where the projector's residuals belong. NaN: excluded or not
+    read.
     """
 
     pixels: np.ndarray
@@ -176,7 +184,8 @@ class PoseResiduals:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFigures:
-    """A stereo calibration and the residuals of its poses' features, which may be empty where none were saved."""
+    """A stereo calibration and the residuals of its poses' features, which may be empty where none
+    were saved."""
 
     stereo: StereoModel
     residuals: Mapping[str, PoseResiduals] = field(default_factory=dict)
@@ -184,7 +193,8 @@ class CalibrationFigures:
 
 @dataclass(frozen=True, eq=False)
 class PixelFitView:
-    """The pixel-wise fits of one axis: ``rms_mm`` (3, h, w) in z, x, y; ``poses`` (h, w) that each pixel saw."""
+    """The pixel-wise fits of one axis: ``rms_mm`` (3, h, w) in z, x, y; ``poses`` (h, w) that each
+    pixel saw."""
 
     axis: str
     rms_mm: np.ndarray
@@ -202,9 +212,10 @@ class RecordsView:
 
 @dataclass(frozen=True, eq=False)
 class ModelsView:
-    """The models of a session: the one that is ``used`` and the one ``recommended``; their ``comparison`` on poses left
-    out, None where nobody compared them; ``splined`` as ``Bundle.summary`` gives it, None where there is none;
-    ``scales``: {model: what correction of scale was applied, in words}."""
+    """The models of a session: the one that is ``used`` and the one ``recommended``; their
+    ``comparison`` on poses left out, None where nobody compared them; ``splined`` as
+    ``Bundle.summary`` gives it, None where there is none; ``scales``: {model: what correction of
+    scale was applied, in words}."""
 
     used: str
     recommended: str
@@ -217,9 +228,10 @@ class ModelsView:
 class SessionData:
     """A session's captures, its calibrations, and the measurements made with them.
 
-    ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that made ``calibration``.
-    ``sections``: names, and lines (k, 2) mm, along and up; ``deviations`` from nominal models, with their arrays.
-    ``region``: the region of interest that is in effect, in words; ``edits`` of scans in their order: scan and words.
+    ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that
+    made ``calibration``. ``sections``: names, and lines (k, 2) mm, along and up; ``deviations``
+    from nominal models, with their arrays. ``region``: the region of interest that is in effect, in
+    words; ``edits`` of scans in their order: scan and words.
     """
 
     name: str

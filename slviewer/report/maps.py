@@ -37,7 +37,9 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
     A narrow figure has x and y below z.
     """
     if rms_mm.ndim != 3 or rms_mm.shape[0] != 3:
-        raise InputError(f"RMS maps of shape {rms_mm.shape} cannot be drawn: (3, h, w) in z, x, y is needed")
+        raise InputError(
+            f"RMS maps of shape {rms_mm.shape} cannot be drawn: (3, h, w) in z, x, y is needed"
+        )
     _, h, w = rms_mm.shape
     narrow = width <= HALF
     if narrow:
@@ -53,14 +55,22 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
         top = round_up(percentile(rms, 99))
         style_image_axes(axes, f"{name}: {_format_median(median)}")
         image = draw_map(axes, rms, "viridis", 100, 0, top)
-        add_colour_bar(drawing, image, axes, "" if narrow and name != "z" else "RMS of the fit, mm", extend="max")
+        add_colour_bar(
+            drawing,
+            image,
+            axes,
+            "" if narrow and name != "z" else "RMS of the fit, mm",
+            extend="max",
+        )
     named = f" along axis {axis}" if axis else ""
     return finish_figure(
         drawing,
-        f"RMS of each camera pixel's fit over the target poses{named}, in z, x and y. Each colour scale ends at the "
-        "99th percentile; grey pixels saw the board too rarely to be fitted.",
+        f"RMS of each camera pixel's fit over the target poses{named}, in z, x and y. Each colour"
+        " scale ends at the 99th percentile; grey pixels saw the board too rarely to be fitted.",
         "Three maps of the fit's RMS in z, x and y; "
-        + ", ".join(f"{name} {_format_median(median)}" for name, median in zip("zxy", medians, strict=True)),
+        + ", ".join(
+            f"{name} {_format_median(median)}" for name, median in zip("zxy", medians, strict=True)
+        ),
     )
 
 
@@ -74,23 +84,31 @@ def draw_error_maps(
     width: int = FULL,
     sign: str = "red is towards the camera",
 ) -> Figure:
-    """Signed errors (h, w) mm of each model on one colour scale, cropped to the data, and their histograms.
+    """Signed errors (h, w) mm of each model on one colour scale, cropped to the data, and their
+    histograms.
 
-    ``limit_mm`` ends the scale on either side (by default where 99 % of all errors lie within). A narrow figure has
-    the histogram below the maps.
+    ``limit_mm`` ends the scale on either side (by default where 99 % of all errors lie within). A
+    narrow figure has the histogram below the maps.
     """
     if not maps or len({m.shape for m in maps.values()}) != 1:
-        raise InputError(f"the error maps of '{title}' differ in size, or there are none: give each model's, one size")
+        raise InputError(
+            f"the error maps of '{title}' differ in size, or there are none: give each model's, one"
+            " size"
+        )
     rows, columns = _crop_slices(list(maps.values()))
     cropped = {model: errors[rows, columns] for model, errors in maps.items()}
     limit = limit_mm or error_limit(list(cropped.values()))
     h, w = next(iter(cropped.values())).shape
     drawing, axes, histogram, map_width = _arrange_axes(width, len(maps), h / w)
-    drawing.suptitle(title, x=0.004, ha="left", fontsize=TITLE_PT + 1.5, color=INK, fontweight="bold")
+    drawing.suptitle(
+        title, x=0.004, ha="left", fontsize=TITLE_PT + 1.5, color=INK, fontweight="bold"
+    )
     image = None
     for ax, (model, errors) in zip(axes, cropped.items(), strict=True):
         style_image_axes(
-            ax, f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm", model_colour(model)
+            ax,
+            f"{model}: {'RMS ' if map_width > WIDE_PX else ''}{rms_mm[model]:.3f} mm",
+            model_colour(model),
         )
         image = draw_map(ax, errors, "RdBu_r", 101, -limit, limit)
     add_colour_bar(drawing, image, axes, "error, mm", extend="both")
@@ -99,7 +117,8 @@ def draw_error_maps(
     floor = f"; dotted: noise alone ({floor_mm:.3f} mm)" if np.isfinite(floor_mm) else ""
     return finish_figure(
         drawing,
-        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus the RMS{floor}.",
+        f"{title}: errors on one colour scale, {sign}; grey: not measured. Dashed: plus and minus"
+        f" the RMS{floor}.",
         f"Error maps and histograms of {title}; RMS {listed}",
     )
 
@@ -108,17 +127,23 @@ SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
 """What a positive error of a shape means in its maps."""
 
 
-def verification_maps(title: str, found: Verification, arrays: Mapping[str, np.ndarray], width: int = FULL) -> Figure:
+def verification_maps(
+    title: str, found: Verification, arrays: Mapping[str, np.ndarray], width: int = FULL
+) -> Figure:
     """Error maps of a verification, with its arrays."""
     fits = {model: fit for model, fit in found.models.items() if f"error_{model}" in arrays}
     rms = {model: np.nan if fit.rms_mm is None else fit.rms_mm for model, fit in fits.items()}
-    floor = next((fit.noise_floor_mm for fit in reversed(fits.values()) if fit.noise_floor_mm is not None), np.nan)
+    floor = next(
+        (fit.noise_floor_mm for fit in reversed(fits.values()) if fit.noise_floor_mm is not None),
+        np.nan,
+    )
     maps = {model: arrays[f"error_{model}"] for model in fits}
     return draw_error_maps(title, maps, rms, floor, width=width, sign=SIGN[found.shape])
 
 
 def error_limit(maps: list[np.ndarray]) -> float:
-    """Upper limit, mm, of a symmetric colour scale for all of ``maps``: 99 % of the absolute errors are below it."""
+    """Upper limit, mm, of a symmetric colour scale for all of ``maps``: 99 % of the absolute errors
+    are below it."""
     samples = [m.ravel()[:: max(1, m.size // 300_000)] for m in maps]
     return round_up(percentile(np.abs(np.concatenate(samples)), 99))
 
@@ -151,9 +176,14 @@ def _arrange_axes(width: int, count: int, aspect: float) -> tuple[Any, Any, Any,
 
 
 def _draw_histogram(
-    axes: Any, maps: Mapping[str, np.ndarray], rms_mm: Mapping[str, float], floor_mm: float, limit: float
+    axes: Any,
+    maps: Mapping[str, np.ndarray],
+    rms_mm: Mapping[str, float],
+    floor_mm: float,
+    limit: float,
 ) -> None:
-    """Draw the histogram of each model's errors, mm, with its RMS; dotted: the distribution of noise alone."""
+    """Draw the histogram of each model's errors, mm, with its RMS; dotted: the distribution of
+    noise alone."""
     reach = 1.25 * limit
     edges = np.linspace(-reach, reach, BINS)
     centres = (edges[1:] + edges[:-1]) / 2
@@ -173,11 +203,19 @@ def _draw_histogram(
     axes.set_xlim(-reach, reach)
     axes.set_ylim(bottom=0)
     axes.set_yticks([])
-    add_legend(axes, loc="lower left", bbox_to_anchor=(-0.02, 1.0), borderaxespad=0.3, ncols=4, columnspacing=1.1)
+    add_legend(
+        axes,
+        loc="lower left",
+        bbox_to_anchor=(-0.02, 1.0),
+        borderaxespad=0.3,
+        ncols=4,
+        columnspacing=1.1,
+    )
 
 
 def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
-    """Rows and columns around the finite pixels of any map, with a small margin; everything where there is none."""
+    """Rows and columns around the finite pixels of any map, with a small margin; everything where
+    there is none."""
     finite = np.logical_or.reduce([np.isfinite(m) for m in maps])
     if not finite.any():
         return slice(None), slice(None)

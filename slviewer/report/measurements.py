@@ -1,4 +1,5 @@
-"""Measurements on scans, and deviations of scans from nominal models: tables, sections, coloured surfaces."""
+"""Measurements on scans, and deviations of scans from nominal models: tables, sections, coloured
+surfaces."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -40,21 +41,32 @@ FLAT = 0.1
 MOST_DRAWN = 4000
 
 
-def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[str, Lines]]) -> Section:
-    """The section with every measurement, its unit and uncertainty, and a plot of each cross-section."""
+def measurements_section(
+    rows: Sequence[Measurement], sections: Sequence[tuple[str, Lines]]
+) -> Section:
+    """The section with every measurement, its unit and uncertainty, and a plot of each
+    cross-section."""
     items: list[Item] = [
-        PageNotice(f"{row.name} is out of date: its surface has changed. Measure again.") for row in rows if row.stale
+        PageNotice(f"{row.name} is out of date: its surface has changed. Measure again.")
+        for row in rows
+        if row.stale
     ]
     items += [
-        PageNotice(f"{row.name}: {note}.") for row in rows for note in row.data.get("fit", {}).get("warnings", ())
+        PageNotice(f"{row.name}: {note}.")
+        for row in rows
+        for note in row.data.get("fit", {}).get("warnings", ())
     ]
     body = [cells for row in rows for cells in _measurement_rows(row)]
-    columns = [Column("measurement", align="left"), Column("kind", align="left"), Column("scan", align="left")]
+    columns = [
+        Column("measurement", align="left"),
+        Column("kind", align="left"),
+        Column("scan", align="left"),
+    ]
     columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
     columns += [Column("U, k = 2"), Column("of", align="left")]
     notes = [
-        "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty. –: a "
-        "residual or a plain reading, which has none."
+        "U is the expanded uncertainty: the scatter of the points, and the calibration's"
+        " uncertainty. –: a residual or a plain reading, which has none."
     ]
     if any(q.U is not None and not q.whole for row in rows for q in row.quantities):
         notes.append("* without the calibration's part, which is unknown.")
@@ -65,7 +77,8 @@ def measurements_section(rows: Sequence[Measurement], sections: Sequence[tuple[s
 
 
 def _measurement_rows(measured: Measurement) -> Iterator[list[str | Cell]]:
-    """Yield the cells of each quantity of a measurement; what they share stands in the first row."""
+    """Yield the cells of each quantity of a measurement; what they share stands in the first
+    row."""
     name = Cell(f"{measured.name} (stale)", "worse") if measured.stale else measured.name
     named: list[str | Cell] = [name, measured.kind, measured.source]
     data = measured.data
@@ -85,7 +98,8 @@ def section_plot(
     *,
     width: int = FULL,
 ) -> Figure:
-    """The lines (k, 2) mm of a section, along and up, with named ``cursors`` (2,) mm; heights of flat ones enlarged."""
+    """The lines (k, 2) mm of a section, along and up, with named ``cursors`` (2,) mm; heights of
+    flat ones enlarged."""
     length, height = np.maximum(np.ptp(np.concatenate(lines), axis=0), 1e-6)
     enlarged = height < FLAT * length
     high = int(np.clip(width * height / length + 90, LEAST_HIGH, MOST_HIGH))
@@ -97,7 +111,15 @@ def section_plot(
     for (letter, cursor), colour in zip((cursors or {}).items(), CURSOR_COLOURS, strict=False):
         axes.axvline(cursor[0], color=colour, linewidth=0.9, linestyle=":")
         axes.plot(*cursor, "o", color=colour, markersize=5)
-        axes.annotate(letter, cursor, (4, 5), textcoords="offset points", color=colour, fontsize=10, weight="bold")
+        axes.annotate(
+            letter,
+            cursor,
+            (4, 5),
+            textcoords="offset points",
+            color=colour,
+            fontsize=10,
+            weight="bold",
+        )
     axes.set_aspect("auto" if enlarged else "equal", adjustable="datalim")
     axes.margins(y=0.15)
     return finish_figure(
@@ -108,14 +130,17 @@ def section_plot(
     )
 
 
-def deviations_section(deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]]) -> Section:
-    """Return the section with each comparison with a nominal model: verdict, picture and statistics."""
+def deviations_section(
+    deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]],
+) -> Section:
+    """Return the section with each comparison with a nominal model: verdict, picture and
+    statistics."""
     items: list[Item] = []
     for measured, arrays in deviations:
         items += _deviation_items(measured, arrays)
     text = (
-        "Scans against nominal models, after the best fit of the one to the other: distances from the nominal surface, "
-        "positive outside it. The tolerance is " + RULE + "."
+        "Scans against nominal models, after the best fit of the one to the other: distances from"
+        " the nominal surface, positive outside it. The tolerance is " + RULE + "."
     )
     return Section("Deviation from nominal", text, items)
 
@@ -131,13 +156,18 @@ def _deviation_items(view: Measurement, arrays: Mapping[str, np.ndarray]) -> lis
             PageNotice(f"{view.name}, tolerance ± {verdict['tolerance_mm']:g} mm: {words}.", kind)  # type: ignore[arg-type]
         )
     if view.stale:
-        items.append(PageNotice(f"{view.name}: the scan or its calibration has changed since; compare it again."))
+        items.append(
+            PageNotice(
+                f"{view.name}: the scan or its calibration has changed since; compare it again."
+            )
+        )
     items += [draw_deviation(view, arrays), _deviation_table(view)]
     return items
 
 
 def _deviation_table(view: Measurement) -> Table:
-    """Table of the statistics of one comparison, with the decision for each where a tolerance is set."""
+    """Table of the statistics of one comparison, with the decision for each where a tolerance is
+    set."""
     data, verdict = view.data, view.data["verdict"]
     numbers = data["statistics_mm"]
     columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
@@ -151,7 +181,12 @@ def _deviation_table(view: Measurement) -> Table:
         ["mean", format_number(numbers["mean"], 4, signed=True), "mm", ""],
         ["RMS", format_number(numbers["rms"], 4), "mm", ""],
         ["RMS of the scan's noise alone", format_number(data["noise_mm"], 4), "mm", ""],
-        ["95 % of the points deviate by less than", format_number(numbers["within_95"], 4), "mm", ""],
+        [
+            "95 % of the points deviate by less than",
+            format_number(numbers["within_95"], 4),
+            "mm",
+            "",
+        ],
         [
             "range of 99.7 % of the points, lower end",
             format_number(numbers["p_low"], 4, signed=True),
@@ -164,22 +199,39 @@ def _deviation_table(view: Measurement) -> Table:
             "mm",
             end("highest"),
         ],
-        ["lowest, highest point", f"{numbers['lowest']:+.3f}, {numbers['highest']:+.3f}".replace("-", "−"), "mm", ""],
+        [
+            "lowest, highest point",
+            f"{numbers['lowest']:+.3f}, {numbers['highest']:+.3f}".replace("-", "−"),
+            "mm",
+            "",
+        ],
     ]
     if verdict is not None:
         rows += [
-            ["expanded uncertainty U of a point, k = 2", format_number(verdict["U_mm"], 4), "mm", ""],
-            [f"within ± {verdict['tolerance_mm']:g} mm", format_number(verdict["within"], 2), "%", ""],
+            [
+                "expanded uncertainty U of a point, k = 2",
+                format_number(verdict["U_mm"], 4),
+                "mm",
+                "",
+            ],
+            [
+                f"within ± {verdict['tolerance_mm']:g} mm",
+                format_number(verdict["within"], 2),
+                "%",
+                "",
+            ],
             ["inside by more than U", format_number(verdict["inside"], 2), "%", ""],
             ["outside by more than U", format_number(verdict["outside"], 2), "%", ""],
             ["undecided", format_number(verdict["close"], 2), "%", ""],
         ]
-    rows.append(["area of the nominal that was measured", format_number(100 * data["coverage"], 1), "%", ""])
+    rows.append(
+        ["area of the nominal that was measured", format_number(100 * data["coverage"], 1), "%", ""]
+    )
     share = 100 * numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
     notes = [
-        f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than "
-        f"{data['reach_mm']:.3g} mm from the nominal or face another direction, and are excluded. The best fit adds "
-        f"{data['alignment_mm']:.4f} mm (1 sigma)."
+        f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than"
+        f" {data['reach_mm']:.3g} mm from the nominal or face another direction, and are excluded."
+        f" The best fit adds {data['alignment_mm']:.4f} mm (1 sigma)."
     ]
     return Table(columns, rows, f"{view.source} against {view.data['nominal']['name']}", notes)
 
@@ -189,11 +241,14 @@ def _decision_cell(decision: str) -> Cell:
     return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
 
 
-def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None) -> None:
-    """Draw the histogram of deviations as bars of counts (n,) between edges (n + 1,) mm, as shares of all.
+def draw_deviations(
+    axes: Any, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None
+) -> None:
+    """Draw the histogram of deviations as bars of counts (n,) between edges (n + 1,) mm, as shares
+    of all.
 
-    The bars have the colours of the surface, whose scale ends at ``limit`` mm; lines mark plus and minus ``tolerance``
-    mm.
+    The bars have the colours of the surface, whose scale ends at ``limit`` mm; lines mark plus and
+    minus ``tolerance`` mm.
     """
     middles = (edges[1:] + edges[:-1]) / 2
     axes.bar(
@@ -207,15 +262,24 @@ def draw_deviations(axes: Any, edges: np.ndarray, counts: np.ndarray, limit: flo
     if tolerance is not None:
         for side in (-tolerance, tolerance):
             axes.axvline(side, color=TOLERANCE, linewidth=1.2, linestyle="--")
-        axes.plot([], [], color=TOLERANCE, linewidth=1.2, linestyle="--", label=f"tolerance ± {tolerance:g} mm")
+        axes.plot(
+            [],
+            [],
+            color=TOLERANCE,
+            linewidth=1.2,
+            linestyle="--",
+            label=f"tolerance ± {tolerance:g} mm",
+        )
         add_legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
 
 
 def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
-    """Figure of the scan coloured by its deviation, unmeasured parts of the nominal in grey, and the histogram.
+    """Figure of the scan coloured by its deviation, unmeasured parts of the nominal in grey, and
+    the histogram.
 
-    ``arrays``: some ``points`` (n, 3) mm of the scan with the nominal's ``normals`` there and ``signed`` (n,) mm
-    deviations; ``uncovered`` (k, 3) mm; ``counts`` (m,) of all points between ``edges`` (m + 1,) mm.
+    ``arrays``: some ``points`` (n, 3) mm of the scan with the nominal's ``normals`` there and
+    ``signed`` (n,) mm deviations; ``uncovered`` (k, 3) mm; ``counts`` (m,) of all points between
+    ``edges`` (m + 1,) mm.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
@@ -234,20 +298,34 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     colours = np.concatenate([deviation_colours(arrays["signed"], limit), grey]) / 255.0
     style_image_axes(left, f"{view.source} against {view.data['nominal']['name']}")
     left.imshow(
-        render_points(points, normals, colours, (DENSITY * width, DENSITY * height), view_rotation(YAW_DEG, PITCH_DEG))
+        render_points(
+            points,
+            normals,
+            colours,
+            (DENSITY * width, DENSITY * height),
+            view_rotation(YAW_DEG, PITCH_DEG),
+        )
     )
     mapped = ScalarMappable(Normalize(-limit, limit), palette)
-    add_colour_bar(drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02)
+    add_colour_bar(
+        drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02
+    )
     numbers = view.data["statistics_mm"]
     style_axes(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
     edges = arrays["edges"]
     draw_deviations(right, edges, arrays["counts"], limit, tolerance)
     far = max(edges[-1], 0.0 if tolerance is None else 1.15 * tolerance)
     right.set_xlim(-far, far)
-    left.set_xlabel("grey: parts of the nominal that were not measured", fontsize=TEXT_PT, color=SOFT, loc="left")
+    left.set_xlabel(
+        "grey: parts of the nominal that were not measured",
+        fontsize=TEXT_PT,
+        color=SOFT,
+        loc="left",
+    )
     return finish_figure(
         drawing,
         f"{view.name}: red lies outside the nominal surface, blue inside it. Right: the "
         "distribution of the deviations.",
-        f"{view.source} coloured by its deviation from {view.data['nominal']['name']}, with their histogram",
+        f"{view.source} coloured by its deviation from {view.data['nominal']['name']}, with their"
+        " histogram",
     )

@@ -1,4 +1,5 @@
-"""One HTML file that holds everything it shows: text, tables, and figures as embedded images. No script, no network."""
+"""One HTML file that holds everything it shows: text, tables, and figures as embedded images. No
+script, no network."""
 
 import base64
 import contextlib
@@ -25,14 +26,15 @@ from slviewer.records.table import Mark, Table
 from slviewer.session.atomic import rename
 
 CERTIFICATE = '<template id="certificate">', "</template>"
-"""What stands before and after a page's certificate: what it was made from, as escaped JSON; browsers neither show nor
-run it."""
+"""What stands before and after a page's certificate: what it was made from, as escaped JSON;
+browsers neither show nor run it."""
 _WRITTEN = "<footer>", "</footer>"
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A picture: ``pixels`` (h, w, 3) uint8 RGB, a caption, a text ``alt`` that describes it; ``width`` in CSS px."""
+    """A picture: ``pixels`` (h, w, 3) uint8 RGB, a caption, a text ``alt`` that describes it;
+    ``width`` in CSS px."""
 
     pixels: NDArray[np.uint8]
     caption: str
@@ -46,9 +48,12 @@ class Figure:
 
 
 def _encode_webp(figure: Figure) -> str:
-    """The picture in 64 levels a channel as base64 of a lossless WebP file, two thirds of the PNG's size."""
+    """The picture in 64 levels a channel as base64 of a lossless WebP file, two thirds of the PNG's
+    size."""
     levels = np.asarray(figure.pixels & 0xFC | figure.pixels >> 6, np.uint8)
-    return base64.b64encode(_encode_image(levels, format="WEBP", lossless=True, method=1, quality=0)).decode()
+    return base64.b64encode(
+        _encode_image(levels, format="WEBP", lossless=True, method=1, quality=0)
+    ).decode()
 
 
 def _encode_image(pixels: NDArray[np.uint8], **options: Any) -> bytes:
@@ -82,7 +87,9 @@ class Section:
     @property
     def paragraphs(self) -> tuple[str, ...]:
         """The text as a tuple of paragraphs; empty without text."""
-        return ((self.text,) if self.text else ()) if isinstance(self.text, str) else tuple(self.text)
+        return (
+            ((self.text,) if self.text else ()) if isinstance(self.text, str) else tuple(self.text)
+        )
 
     @property
     def anchor(self) -> str:
@@ -110,10 +117,12 @@ def write_page(
 ) -> None:
     """Write the page to ``path``, complete or not at all; every text is shown as typed, never run.
 
-    ``frame``: in what coordinates places are; ``certify``: returns the text of the certificate that the page keeps,
-    given its digest. Raises InputError where the file cannot be written.
+    ``frame``: in what coordinates places are; ``certify``: returns the text of the certificate that
+    the page keeps, given its digest. Raises InputError where the file cannot be written.
     """
-    page = _render(title, subtitle, [Headline(*headline) for headline in headlines], sections, frame)
+    page = _render(
+        title, subtitle, [Headline(*headline) for headline in headlines], sections, frame
+    )
     if certify is not None:
         kept = html.escape(certify(page_digest(page))).join(CERTIFICATE)
         page = page.replace("</body>", f"{kept}</body>")
@@ -127,21 +136,25 @@ def write_page(
             os.fsync(file.fileno())
         rename(temporary, path)
     except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}): choose another place or free it") from error
+        raise InputError(
+            f"{path} cannot be written ({error.strerror}): choose another place or free it"
+        ) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
 
 
 def split_page(page: str, marks: tuple[str, str]) -> tuple[str, str | None, str]:
-    """Return what stands before the first pair of marks in a page, between them (None without them), and after."""
+    """Return what stands before the first pair of marks in a page, between them (None without
+    them), and after."""
     before, _, rest = page.partition(marks[0])
     content, end, after = rest.partition(marks[1])
     return before, content if end else None, after
 
 
 def page_digest(page: str) -> str:
-    """Return the digest of a page without its certificate, and without the line that says when it was written."""
+    """Return the digest of a page without its certificate, and without the line that says when it
+    was written."""
     body = page
     for marks in (CERTIFICATE, _WRITTEN):
         before, content, after = split_page(body, marks)
@@ -149,7 +162,13 @@ def page_digest(page: str) -> str:
     return hashlib.blake2b(body.encode(), digest_size=20).hexdigest()
 
 
-def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: Sequence[Section], frame: str) -> str:
+def _render(
+    title: str,
+    subtitle: str,
+    headlines: Sequence[Headline],
+    sections: Sequence[Section],
+    frame: str,
+) -> str:
     """The page as HTML, from the template."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
@@ -163,7 +182,9 @@ def _render(title: str, subtitle: str, headlines: Sequence[Headline], sections: 
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: escape_controls(value) if type(value) is str else value,  # not of Markup
+        finalize=lambda value: (
+            escape_controls(value) if type(value) is str else value
+        ),  # not of Markup
     )
     environment.tests["figure"] = lambda item: isinstance(item, Figure)
     environment.tests["table"] = lambda item: isinstance(item, Table)

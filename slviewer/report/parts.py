@@ -1,4 +1,5 @@
-"""The report on many parts: the table of part by characteristic, capability, and a trend chart of each."""
+"""The report on many parts: the table of part by characteristic, capability, and a trend chart of
+each."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,28 +32,49 @@ def write_parts_page(
     counts = {decision: sum(each.decision == decision for each in parts) for decision in MARKS}
     headlines = [
         Headline(str(len(parts)), "parts"),
-        *(Headline(str(count), decision, "", _headline_mark(decision, count)) for decision, count in counts.items()),
+        *(
+            Headline(str(count), decision, "", _headline_mark(decision, count))
+            for decision, count in counts.items()
+        ),
     ]
     unmeasured: dict[tuple[str, str], list[str]] = {}
     for each in parts:
         for result in each.results:
             if result.reason:
                 unmeasured.setdefault((result.name, result.reason), []).append(each.part)
-    reasons = [PageNotice(f"{name}: {why} ({', '.join(named)})") for (name, why), named in unmeasured.items()]
+    reasons = [
+        PageNotice(f"{name}: {why} ({', '.join(named)})")
+        for (name, why), named in unmeasured.items()
+    ]
     whole = all(result.whole for each in parts for result in each.results)
-    partial = [] if whole else ["Some U hold no part of the calibration's uncertainty: the model does not predict it."]
+    partial = (
+        []
+        if whole
+        else [
+            "Some U hold no part of the calibration's uncertainty: the model does not predict it."
+        ]
+    )
     charts = [
         _trend_chart(wanted, [each.part for each in parts], [each.results[k] for each in parts])
         for k, wanted in enumerate(plan.characteristic)
     ]
     sections = [
-        Section("Parts and characteristics", [rule[0].upper() + rule[1:] + ".", *partial], _part_tables(plan, parts)),
+        Section(
+            "Parts and characteristics",
+            [rule[0].upper() + rule[1:] + ".", *partial],
+            _part_tables(plan, parts),
+        ),
         Section(
             "Capability",
-            "Cp and Cpk with their 95 % confidence intervals; the spread of the values includes the measurement's.",
+            "Cp and Cpk with their 95 % confidence intervals; the spread of the values includes the"
+            " measurement's.",
             [_capability_table(plan, capabilities)],
         ),
-        Section("Trends", "Values with U (k = 2) in the order of the parts; lines are the limits.", charts),
+        Section(
+            "Trends",
+            "Values with U (k = 2) in the order of the parts; lines are the limits.",
+            charts,
+        ),
     ]
     if reasons:
         sections.insert(1, Section("Not measured", "", reasons))
@@ -75,14 +97,26 @@ def _part_tables(plan: Plan, parts: Sequence[PartResult]) -> list[Table]:
         columns = [Column("part", align="left"), Column("part is", align="left")]
         columns += [Column(wanted[k].name, wanted[k].unit) for k in some]
         rows = [
-            [each.part, Cell(each.decision, MARKS[each.decision]), *(_value_cell(each.results[k]) for k in some)]
+            [
+                each.part,
+                Cell(each.decision, MARKS[each.decision]),
+                *(_value_cell(each.results[k]) for k in some),
+            ]
             for each in parts
         ]
         footer = [
-            [name, "", *(UNKNOWN if (v := getattr(wanted[k], name)) is None else f"{v:g}" for k in some)]
+            [
+                name,
+                "",
+                *(UNKNOWN if (v := getattr(wanted[k], name)) is None else f"{v:g}" for k in some),
+            ]
             for name in ("lower", "nominal", "upper")
         ]
-        last = f"{some.start + 1} to {some.stop} of {len(wanted)}" if len(wanted) > COLUMNS_PER_TABLE else "all"
+        last = (
+            f"{some.start + 1} to {some.stop} of {len(wanted)}"
+            if len(wanted) > COLUMNS_PER_TABLE
+            else "all"
+        )
         tables.append(Table(columns, rows, f"Characteristics, {last}", footer=footer))
     return tables
 
@@ -92,7 +126,9 @@ def _value_cell(result: CharacteristicResult) -> str | Cell:
     if result.value is None or result.U is None:
         return Cell("not measured", "strong")
     text = f"{result.value:.4f} ± {result.U:.4f}".replace("-", "−")
-    return Cell(text if result.decision == "pass" else f"{text} {result.decision}", MARKS[result.decision])
+    return Cell(
+        text if result.decision == "pass" else f"{text} {result.decision}", MARKS[result.decision]
+    )
 
 
 def _capability_table(plan: Plan, capabilities: Sequence[Capability | None]) -> Table:
@@ -106,22 +142,45 @@ def _capability_table(plan: Plan, capabilities: Sequence[Capability | None]) -> 
         row: list[str | Cell] = [wanted.name, wanted.unit, str(c.parts), format_number(c.mean, 4)]
         row.append(format_number(c.sigma, 4))
         for index in (c.cp, c.cpk):
-            row += [UNKNOWN, UNKNOWN] if index is None else [f"{index[0]:.2f}", f"{index[1]:.2f} to {index[2]:.2f}"]
+            row += (
+                [UNKNOWN, UNKNOWN]
+                if index is None
+                else [f"{index[0]:.2f}", f"{index[1]:.2f} to {index[2]:.2f}"]
+            )
         rows.append(row)
-    columns = [Column("characteristic", align="left"), Column("unit", align="left"), *(Column(t) for t in titles)]
+    columns = [
+        Column("characteristic", align="left"),
+        Column("unit", align="left"),
+        *(Column(t) for t in titles),
+    ]
     note = "A dash: fewer than 3 parts, no limit, or values that do not vary; Cp needs both limits."
     return Table(columns, rows, "Capability", [note])
 
 
-def _trend_chart(wanted: Characteristic, names: Sequence[str], results: Sequence[CharacteristicResult]) -> Figure:
+def _trend_chart(
+    wanted: Characteristic, names: Sequence[str], results: Sequence[CharacteristicResult]
+) -> Figure:
     """The values of one characteristic over the parts, with U and the limits."""
     drawing = new_figure(HALF, 260)
     axes = drawing.add_subplot()
     style_axes(axes, wanted.name, "part", f"{wanted.kind}, {wanted.unit}")
     for decision, colour in COLOURS.items():
-        at = [k for k, each in enumerate(results) if each.value is not None and each.decision == decision]
+        at = [
+            k
+            for k, each in enumerate(results)
+            if each.value is not None and each.decision == decision
+        ]
         values, U = ([getattr(results[k], what) for k in at] for what in ("value", "U"))
-        axes.errorbar(np.array(at) + 1, values, U, fmt="o", color=colour, markersize=3.6, linewidth=0.9, capsize=1.5)
+        axes.errorbar(
+            np.array(at) + 1,
+            values,
+            U,
+            fmt="o",
+            color=colour,
+            markersize=3.6,
+            linewidth=0.9,
+            capsize=1.5,
+        )
     for limit, style, colour in (
         (wanted.lower, "--", INK),
         (wanted.upper, "--", INK),
@@ -131,8 +190,12 @@ def _trend_chart(wanted: Characteristic, names: Sequence[str], results: Sequence
             axes.axhline(limit, color=colour, linewidth=0.9, linestyle=style)
     axes.set_xlim(0.5, len(results) + 0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
-    listed = ", ".join(f"{k + 1} {names[k]}" for k, each in enumerate(results) if each.decision == "fail")
+    listed = ", ".join(
+        f"{k + 1} {names[k]}" for k, each in enumerate(results) if each.decision == "fail"
+    )
     words = f"Fail: {listed}." if listed else "No part fails."
     return finish_figure(
-        drawing, f"{wanted.name}. {words}", f"Trend of {wanted.name} over {len(results)} parts. {words}"
+        drawing,
+        f"{wanted.name}. {words}",
+        f"Trend of {wanted.name} over {len(results)} parts. {words}",
     )

@@ -1,4 +1,5 @@
-"""Pictures of decoded captures: the projector coordinate of each camera pixel, or why there is none."""
+"""Pictures of decoded captures: the projector coordinate of each camera pixel, or why there is
+none."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -45,7 +46,8 @@ def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
 
 
 def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
-    """The coordinates of each axis side by side; masked pixels in the colour of their reason, with their shares."""
+    """The coordinates of each axis side by side; masked pixels in the colour of their reason, with
+    their shares."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
@@ -55,17 +57,27 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     drawing = new_figure(FULL, height)
     drawing.suptitle(title, x=0.004, ha="left", fontsize=SMALL_PT + 3, color=INK, fontweight="bold")
     step = max(1, -(-w // (DENSITY * map_px)))
-    for axes, (axis, phase) in zip(np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True):
+    for axes, (axis, phase) in zip(
+        np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True
+    ):
         shares = reason_shares(phase)
-        style_image_axes(axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid")
+        style_image_axes(
+            axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid"
+        )
         coordinate, reason = phase.coordinate[::step, ::step], phase.reason[::step, ::step]
-        image = axes.imshow(_mask_invalid(coordinate), cmap="viridis", aspect="equal", interpolation="nearest")
+        image = axes.imshow(
+            _mask_invalid(coordinate), cmap="viridis", aspect="equal", interpolation="nearest"
+        )
         cover = np.zeros((*reason.shape, 4), np.float32)
         for code, colour in REASON_COLOURS.items():
             cover[reason == code] = (*to_rgb(colour), 1.0)
         axes.imshow(cover, aspect="equal", interpolation="nearest")
         add_colour_bar(
-            drawing, image, axes, f"projector {'column' if axis == 'x' else 'row'}, px", orientation="vertical"
+            drawing,
+            image,
+            axes,
+            f"projector {'column' if axis == 'x' else 'row'}, px",
+            orientation="vertical",
         )
         patches = [
             Patch(
@@ -77,13 +89,21 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
             for code, colour in REASON_COLOURS.items()
         ]
         axes.legend(
-            handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, fontsize=SMALL_PT, frameon=False
+            handles=patches,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.01),
+            ncols=2,
+            fontsize=SMALL_PT,
+            frameon=False,
         )
-    listed = ", ".join(f"axis {axis} {100 * float(phase.mask.mean()):.1f} % valid" for axis, phase in phases.items())
+    listed = ", ".join(
+        f"axis {axis} {100 * float(phase.mask.mean()):.1f} % valid"
+        for axis, phase in phases.items()
+    )
     return finish_figure(
         drawing,
-        f"{title}: the projector coordinate that each camera pixel sees, in px; masked pixels in the colour of their "
-        "reason.",
+        f"{title}: the projector coordinate that each camera pixel sees, in px; masked pixels in"
+        " the colour of their reason.",
         f"Maps of the decoded projector coordinates of {title}: {listed}",
     )
 

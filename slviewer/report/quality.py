@@ -29,8 +29,14 @@ def verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
     for finding in verdict.findings:
         is_corrected = finding.severity == "note"
         what = "Already corrected." if is_corrected else f"What to do: {finding.remedy}."
-        items.append(PageNotice(f"{finding.sentence}. {what}", "plain" if is_corrected else "warning"))
-    text = "" if of_calibration else "This verdict is on the last attempt to calibrate, which gave no calibration."
+        items.append(
+            PageNotice(f"{finding.sentence}. {what}", "plain" if is_corrected else "warning")
+        )
+    text = (
+        ""
+        if of_calibration
+        else "This verdict is on the last attempt to calibrate, which gave no calibration."
+    )
     return Section("Verdict", text, items)
 
 
@@ -38,12 +44,17 @@ def verdict_headline(verdict: Verdict) -> Headline:
     """The headline with the verdict's level and the number of findings."""
     mark: Mark = "better" if verdict.level == "good" else "worse"
     count = len(verdict.findings)
-    return Headline(verdict.level, "verdict on the calibration", f"{count} finding{'s' * (count != 1)}", mark)
+    return Headline(
+        verdict.level, "verdict on the calibration", f"{count} finding{'s' * (count != 1)}", mark
+    )
 
 
 def models_section(models: ModelsView) -> Section:
-    """The section about the models: comparison on held-out poses, and results of the joint adjustment."""
-    items: list[Item] = [PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()]
+    """The section about the models: comparison on held-out poses, and results of the joint
+    adjustment."""
+    items: list[Item] = [
+        PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()
+    ]
     used = f"Measured with {models.used}"
     used += (
         "."
@@ -63,7 +74,8 @@ def models_section(models: ModelsView) -> Section:
 
 
 def comparison_table(compared: CrossValidation, bold: str) -> Table:
-    """Table of the models' RMS on held-out poses; the model ``bold`` in bold, the smallest errors marked."""
+    """Table of the models' RMS on held-out poses; the model ``bold`` in bold, the smallest errors
+    marked."""
     figures = {
         "plane_mm": (Column("plane", "mm"), 4),
         "board_mm": (Column("board", "mm"), 4),
@@ -71,19 +83,32 @@ def comparison_table(compared: CrossValidation, bold: str) -> Table:
         "camera_px": (Column("camera", "px"), 3),
         "projector_px": (Column("projector", "px"), 3),
     }
-    rms = {figure: {model: compared.rms(model, figure) for model in compared.models} for figure in figures}
+    rms = {
+        figure: {model: compared.rms(model, figure) for model in compared.models}
+        for figure in figures
+    }
     rows: list[list[str | Cell]] = []
     for model in compared.models:
         row: list[str | Cell] = [Cell(model, "strong") if model == bold else model]
         for figure, (_, digits) in figures.items():
-            text, comparable = f"{rms[figure][model]:.{digits}f}", figure in ("plane_mm", "board_mm", "camera_px")
+            text, comparable = (
+                f"{rms[figure][model]:.{digits}f}",
+                figure
+                in (
+                    "plane_mm",
+                    "board_mm",
+                    "camera_px",
+                ),
+            )
             is_least = len(compared.models) > 1 and rms[figure][model] == min(rms[figure].values())
             row.append(Cell(text, "better") if comparable and is_least else text)
         rows.append(row)
     notes = [
-        f"{len(next(iter(compared.poses.values())))} poses, each measured by calibrations without it "
-        f"({len(compared.folds)} folds). Plane: distance of the board's features from their plane; board: from their "
-        "true positions.",
+        (
+            f"{len(next(iter(compared.poses.values())))} poses, each measured by calibrations"
+            f" without it ({len(compared.folds)} folds). Plane: distance of the board's features"
+            " from their plane; board: from their true positions."
+        ),
         *(f"{model} could not be compared: {why}." for model, why in compared.failed.items()),
     ]
     columns = [Column("model", align="left"), *(column for column, _ in figures.values())]
@@ -92,15 +117,30 @@ def comparison_table(compared: CrossValidation, bold: str) -> Table:
 
 def splined_table(summary: Mapping[str, Any]) -> Table:
     """Table of the results of the joint adjustment, as `SplinedModel.summary` gives them."""
-    noise, local, covered = summary["noise_px"], summary["local_distortion_rms_px"], summary["cells_lit"]
+    noise, local, covered = (
+        summary["noise_px"],
+        summary["local_distortion_rms_px"],
+        summary["cells_lit"],
+    )
     low, high = summary["board_height_mm"]
     rows = [
         ["Residual noise, camera", f"{noise['camera']:.4f} px"],
         ["Residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
-        ["Local distortion, camera / projector", f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"],
+        [
+            "Local distortion, camera / projector",
+            f"{local['camera']:.3f} / {local['projector']:.3f} px RMS",
+        ],
         ["Board height, peak to valley", f"{high - low:.3f} mm"],
         ["Board feature offsets", f"{summary['board_offsets_rms_mm']:.4f} mm RMS"],
-        ["Covered, camera / projector", f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %"],
+        [
+            "Covered, camera / projector",
+            f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %",
+        ],
     ]
     columns = [Column("quantity", align="left"), Column("value")]
-    return Table(columns, rows, "Joint adjustment (splined)", ["Pixels outside the calibrated region are masked."])
+    return Table(
+        columns,
+        rows,
+        "Joint adjustment (splined)",
+        ["Pixels outside the calibrated region are masked."],
+    )

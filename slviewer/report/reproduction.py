@@ -1,4 +1,5 @@
-"""Report sections of the Letter's experiments, repeated: figures and tables, the Letter's values beside ours."""
+"""Report sections of the Letter's experiments, repeated: figures and tables, the Letter's values
+beside ours."""
 
 from collections.abc import Sequence
 
@@ -25,10 +26,11 @@ from slviewer.report.tables import (
 
 BASE, OURS = "stereo", "pixelwise"
 INSIDE_PERCENT = 87.0
-"""A plane with this share in R2 counts as inside the calibrated depths, as do the Letter's poses 3, 4, 9 and 10."""
+"""A plane with this share in R2 counts as inside the calibrated depths, as do the Letter's poses 3,
+4, 9 and 10."""
 LETTER = (
-    "The Letter: Vargas, Romero, Zhang and Marrugo, Pixel-wise rational model for a structured light system, "
-    "Optics Letters 2023"
+    "The Letter: Vargas, Romero, Zhang and Marrugo, Pixel-wise rational model for a structured"
+    " light system, Optics Letters 2023"
 )
 
 
@@ -38,20 +40,29 @@ def reproduction_title(data: ReproductionData) -> tuple[str, str]:
     quick = "Quick run at reduced resolution: its figures are its own. " if data.quick else ""
     return (
         "The Letter's experiments, repeated on a simulated rig",
-        f"{quick}A rig of the Letter's geometry with local lens distortion and camera noise, seed {data.seed}: {size}, "
-        f"calibrated by {data.poses} target poses at {_format_depths(data)}. {LETTER}.",
+        (
+            f"{quick}A rig of the Letter's geometry with local lens distortion and camera noise,"
+            f" seed {data.seed}: {size}, calibrated by {data.poses} target poses at"
+            f" {_format_depths(data)}. {LETTER}."
+        ),
     )
 
 
 def reproduction_headlines(data: ReproductionData) -> list[Headline]:
-    """Headlines: flatness, flatness inside R2, sphere radius and spacing of spheres: stereo against pixelwise."""
+    """Headlines: flatness, flatness inside R2, sphere radius and spacing of spheres: stereo against
+    pixelwise."""
     mean = {m: known_mean([row.rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
-    letter = {m: known_mean([row.letter_rms_mm.get(m, np.nan) for row in data.planes]) for m in (BASE, OURS)}
+    letter = {
+        m: known_mean([row.letter_rms_mm.get(m, np.nan) for row in data.planes])
+        for m in (BASE, OURS)
+    }
     floor = known_mean([row.noise_floor_mm.get(OURS, np.nan) for row in data.planes])
     ratio, count = inside_ratio(data.planes)
     wins = sum(row.rms_mm.get(OURS, np.inf) < row.rms_mm.get(BASE, -np.inf) for row in data.planes)
     radius = {
-        m: known_mean([abs(row.radius_mm.get(m, np.nan) - row.true_radius_mm) for row in data.spheres])
+        m: known_mean(
+            [abs(row.radius_mm.get(m, np.nan) - row.true_radius_mm) for row in data.spheres]
+        )
         for m in (BASE, OURS)
     }
     spacing = {m: spacing_error(data.spacings, m) for m in (BASE, OURS)}
@@ -59,30 +70,43 @@ def reproduction_headlines(data: ReproductionData) -> list[Headline]:
         _pair_headline(
             "mean plane RMS, all poses",
             mean,
-            f"stereo → pixelwise; noise floor {_format_mm(floor)}. The Letter: {_format_pair(letter)}",
+            f"stereo → pixelwise; noise floor {_format_mm(floor)}. The Letter:"
+            f" {_format_pair(letter)}",
         ),
         Headline(
             f"{ratio:.2f} ×" if np.isfinite(ratio) else "–",
             "flatter inside R2, pixelwise against stereo",
-            f"mean of the {count} planes at least {INSIDE_PERCENT:.0f} % inside; pixelwise is ahead on {wins} of all "
-            f"{len(data.planes)}",
+            f"mean of the {count} planes at least {INSIDE_PERCENT:.0f} % inside; pixelwise is ahead"
+            f" on {wins} of all {len(data.planes)}",
             "better" if ratio > 1 else "worse" if ratio < 1 else "",
         ),
     ]
     if data.spheres:
         headlines.append(
-            _pair_headline("error of the sphere's radius", radius, "stereo → pixelwise; mean size over the spheres")
+            _pair_headline(
+                "error of the sphere's radius",
+                radius,
+                "stereo → pixelwise; mean size over the spheres",
+            )
         )
     if data.spacings:
         headlines.append(
-            _pair_headline("error of spheres' spacing", spacing, "stereo → pixelwise; mean size over the pairs")
+            _pair_headline(
+                "error of spheres' spacing", spacing, "stereo → pixelwise; mean size over the pairs"
+            )
         )
     return headlines
 
 
 def reproduction_sections(data: ReproductionData) -> list[Section]:
-    """Sections: the calibration, the planes, the spheres and the merged object, in the Letter's order."""
-    return [_calibration_section(data), _planes_section(data), _spheres_section(data), _merged_section(data)]
+    """Sections: the calibration, the planes, the spheres and the merged object, in the Letter's
+    order."""
+    return [
+        _calibration_section(data),
+        _planes_section(data),
+        _spheres_section(data),
+        _merged_section(data),
+    ]
 
 
 def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
@@ -93,9 +117,12 @@ def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
 
 
 def _calibration_section(data: ReproductionData) -> Section:
-    """The section about the calibration: notices, reprojection errors, per-pixel fits and curves."""
+    """The section about the calibration: notices, reprojection errors, per-pixel fits and
+    curves."""
     items: list[Item] = [PageNotice(note) for note in data.notes]
-    items += [PageNotice(f"{name} was excluded: {why}") for name, why in data.poses_left_out.items()]
+    items += [
+        PageNotice(f"{name} was excluded: {why}") for name, why in data.poses_left_out.items()
+    ]
     rows: list[list[str | Cell]] = [
         [
             f"reprojection, {device}",
@@ -126,9 +153,10 @@ def _calibration_section(data: ReproductionData) -> Section:
     items.append(rms_maps(data.rms_maps_mm, data.pixel_curve.axis if data.pixel_curve else ""))
     return Section(
         "Experiment 1: calibration",
-        f"Stereo calibration: both lenses and their poses from {data.poses - len(data.poses_left_out)} target "
-        "poses. The pixel-wise model then learns, for every camera pixel, how depth follows from the absolute phase, "
-        "from the same poses projected onto their ideal planes.",
+        "Stereo calibration: both lenses and their poses from"
+        f" {data.poses - len(data.poses_left_out)} target poses. The pixel-wise model then learns,"
+        " for every camera pixel, how depth follows from the absolute phase, from the same poses"
+        " projected onto their ideal planes.",
         items,
     )
 
@@ -136,30 +164,39 @@ def _calibration_section(data: ReproductionData) -> Section:
 def _planes_section(data: ReproductionData) -> Section:
     """The section about the planes: table, bars, positions in space and error maps."""
     near, far = data.depth_range_mm
-    lost = [row.name for row in data.planes if row.rms_mm.get(OURS, 0.0) > row.rms_mm.get(BASE, np.inf)]
+    lost = [
+        row.name for row in data.planes if row.rms_mm.get(OURS, 0.0) > row.rms_mm.get(BASE, np.inf)
+    ]
     text = [
-        f"A flat board is measured in front of (R1, nearer than {near:.0f} mm), inside (R2) and behind (R3, beyond "
-        f"{far:.0f} mm) the depths that were calibrated, and each cloud is compared with its own best plane."
+        f"A flat board is measured in front of (R1, nearer than {near:.0f} mm), inside (R2) and"
+        f" behind (R3, beyond {far:.0f} mm) the depths that were calibrated, and each cloud is"
+        " compared with its own best plane."
     ]
     items: list[Item] = []
     ratio, count = inside_ratio(data.planes)
     if count and np.isfinite(ratio):
-        compared = f"{ratio:.2f} times flatter" if ratio >= 1 else f"{1 / ratio:.2f} times less flat"
+        compared = (
+            f"{ratio:.2f} times flatter" if ratio >= 1 else f"{1 / ratio:.2f} times less flat"
+        )
         items.append(
             PageNotice(
-                f"Inside the calibrated depths the pixel-wise model is {compared} than stereo in the mean.",
+                f"Inside the calibrated depths the pixel-wise model is {compared} than stereo in"
+                " the mean.",
                 "good" if ratio >= 1 else "warning",
             )
         )
     if lost:
         items.append(
             PageNotice(
-                f"Stereo is flatter on {', '.join(lost)}: a pixel's rational function extrapolates beyond the depths "
-                "that it was fitted to."
+                f"Stereo is flatter on {', '.join(lost)}: a pixel's rational function extrapolates"
+                " beyond the depths that it was fitted to."
             )
         )
     if data.planes:
-        items += [rms_bars(data.planes), plane_table(data.planes, "Table 1: RMS distance from the best plane")]
+        items += [
+            rms_bars(data.planes),
+            plane_table(data.planes, "Table 1: RMS distance from the best plane"),
+        ]
     items += [draw_error_maps(m.title, m.maps, m.rms_mm, m.noise_floor_mm) for m in data.plane_maps]
     if data.plane_outlines:
         items.append(planes_in_space(data.plane_outlines, data.depth_range_mm))
@@ -170,22 +207,31 @@ def _spheres_section(data: ReproductionData) -> Section:
     """The section about the spheres: table, distances between centres, and error maps."""
     items: list[Item] = []
     if data.spheres:
-        items.append(sphere_table(data.spheres, "Table 2: RMS distance from the best sphere, and its radius"))
+        items.append(
+            sphere_table(data.spheres, "Table 2: RMS distance from the best sphere, and its radius")
+        )
     if data.spacings:
         items.append(spacing_table(data.spacings, "Distances between the centres of spheres"))
     if data.sphere_maps:
         limit = error_limit([errors for m in data.sphere_maps for errors in m.maps.values()])
         items += [
             draw_error_maps(
-                m.title, m.maps, m.rms_mm, m.noise_floor_mm, limit_mm=limit, width=HALF, sign="red is outwards"
+                m.title,
+                m.maps,
+                m.rms_mm,
+                m.noise_floor_mm,
+                limit_mm=limit,
+                width=HALF,
+                sign="red is outwards",
             )
             for m in data.sphere_maps
         ]
     return Section(
         "Experiment 2b: spheres",
-        "Flatness is no measure of scale: a projector turned by a tenth of a milliradian leaves a plane flat and bends "
-        "space. A sphere of known radius, and the distances between spheres, show it. The fitted radius is free. All "
-        "error maps of this experiment share one colour scale.",
+        "Flatness is no measure of scale: a projector turned by a tenth of a milliradian leaves a"
+        " plane flat and bends space. A sphere of known radius, and the distances between spheres,"
+        " show it. The fitted radius is free. All error maps of this experiment share one colour"
+        " scale.",
         items,
     )
 
@@ -205,23 +251,29 @@ def _merged_section(data: ReproductionData) -> Section:
         letter = f" The Letter's clouds held {counts} points, of another object."
     return Section(
         "Experiment 3: a complex object at three depths",
-        "One object is scanned in front of, inside and behind the calibrated depths by the pixel-wise model; ICP "
-        f"brings the scans into one frame.{letter}",
+        "One object is scanned in front of, inside and behind the calibrated depths by the"
+        f" pixel-wise model; ICP brings the scans into one frame.{letter}",
         items,
     )
 
 
 def _pair_headline(label: str, values: dict[str, float], note: str) -> Headline:
-    """Headline that compares the pixel-wise error with the stereo error, mm, marked better or worse."""
+    """Headline that compares the pixel-wise error with the stereo error, mm, marked better or
+    worse."""
     better = values[OURS] < values[BASE]
     known = np.isfinite(list(values.values())).all()
-    return Headline(_format_pair(values), label, note, ("better" if better else "worse") if known else "")
+    return Headline(
+        _format_pair(values), label, note, ("better" if better else "worse") if known else ""
+    )
 
 
 def _format_pair(values: dict[str, float]) -> str:
     """Text "stereo → pixelwise mm" of an error by model, mm."""
     base, ours = (format_number(values[model]) for model in (BASE, OURS))
-    return f"{base if isinstance(base, str) else base.value} → {ours if isinstance(ours, str) else ours.value} mm"
+    return (
+        f"{base if isinstance(base, str) else base.value} →"
+        f" {ours if isinstance(ours, str) else ours.value} mm"
+    )
 
 
 def _format_mm(value: float) -> str:

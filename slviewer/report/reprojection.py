@@ -24,9 +24,13 @@ CAMERA, PROJECTOR = "#3c6e9e", "#c98a1b"
 
 
 def pose_bars(
-    pose_rms_px: Mapping[str, tuple[float, float]], rms_px: Mapping[str, float], *, width: int = FULL
+    pose_rms_px: Mapping[str, tuple[float, float]],
+    rms_px: Mapping[str, float],
+    *,
+    width: int = FULL,
 ) -> Figure:
-    """Reprojection RMS of each pose, camera and projector side by side; ``rms_px``: the RMS over all features."""
+    """Reprojection RMS of each pose, camera and projector side by side; ``rms_px``: the RMS over
+    all features."""
     if not pose_rms_px:
         raise InputError("no pose was given: its reprojection error cannot be drawn")
     names = list(pose_rms_px)
@@ -39,35 +43,65 @@ def pose_bars(
     at = np.arange(len(names))
     for i, (device, colour) in enumerate((("camera", CAMERA), ("projector", PROJECTOR))):
         rms = rms_px.get(device, np.nan)
-        label = f"{device}, {'all' if narrow else 'all poses'} {rms:.3f} px" if np.isfinite(rms) else device
+        label = (
+            f"{device}, {'all' if narrow else 'all poses'} {rms:.3f} px"
+            if np.isfinite(rms)
+            else device
+        )
         axes.bar(at + 0.4 * i - 0.2, values[:, i], 0.38, color=colour, label=label)
         if np.isfinite(rms):
             axes.axhline(rms, color=colour, linewidth=1, linestyle=(0, (4, 2)))
     crowded = len(names) * max(map(len, names)) > width / 9
     axes.set_xticks(at, names, rotation=90 if crowded else 0, fontsize=SMALL_PT)
     axes.set_xlim(-0.7, len(names) - 0.3)
-    add_legend(axes, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, columnspacing=1.2)
+    add_legend(
+        axes,
+        loc="lower left",
+        bbox_to_anchor=(0, 1.0),
+        ncols=2,
+        borderaxespad=0.2,
+        columnspacing=1.2,
+    )
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]
     return finish_figure(
         drawing,
-        f"Reprojection error of each target pose. Dashed: the RMS over all poses. The worst pose is {worst}.",
-        f"Bars of the reprojection error of {len(names)} poses, camera and projector; worst {worst}",
+        "Reprojection error of each target pose. Dashed: the RMS over all poses. The worst pose is"
+        f" {worst}.",
+        f"Bars of the reprojection error of {len(names)} poses, camera and projector; worst"
+        f" {worst}",
     )
 
 
-def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size: tuple[int, int]) -> Figure:
-    """Residuals (n, 2) px as arrows at ``pixels`` (n, 2) in an image of ``size`` = (width, height), magnified."""
+def residual_arrows(
+    title: str, pixels: np.ndarray, residuals: np.ndarray, size: tuple[int, int]
+) -> Figure:
+    """Residuals (n, 2) px as arrows at ``pixels`` (n, 2) in an image of ``size`` = (width, height),
+    magnified."""
     if pixels.shape != residuals.shape or pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise InputError(f"{pixels.shape} pixels and {residuals.shape} residuals cannot be drawn: (n, 2) are needed")
+        raise InputError(
+            f"{pixels.shape} pixels and {residuals.shape} residuals cannot be drawn: (n, 2) are"
+            " needed"
+        )
     known = np.isfinite(pixels).all(axis=1) & np.isfinite(residuals).all(axis=1)
     at, away = pixels[known], residuals[known]
     lengths = np.hypot(away[:, 0], away[:, 1])
     rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")
-    scale = round_up(0.05 * size[0] / max(float(np.percentile(lengths, 95)), 1e-3)) if len(lengths) else 1.0
+    scale = (
+        round_up(0.05 * size[0] / max(float(np.percentile(lengths, 95)), 1e-3))
+        if len(lengths)
+        else 1.0
+    )
     drawing, axes = _new_image_axes(size, f"{title}: RMS {rms:.3f} px")
     if len(at):
         arrows = axes.quiver(
-            *at.T, *(scale * away.T), lengths, angles="xy", scale_units="xy", scale=1, cmap="plasma", width=0.0035
+            *at.T,
+            *(scale * away.T),
+            lengths,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            cmap="plasma",
+            width=0.0035,
         )
         arrows.set_clim(0, round_up(float(np.percentile(lengths, 98))))
         arrows.set_clip_on(False)
@@ -86,14 +120,16 @@ def residual_arrows(title: str, pixels: np.ndarray, residuals: np.ndarray, size:
         )
     return finish_figure(
         drawing,
-        f"{title}: measured minus predicted features, arrows drawn {scale:g} times as long as they are. Arrows "
-        "without a pattern are noise; a swirl or a common direction means a lens, board or pose that the model lacks.",
+        f"{title}: measured minus predicted features, arrows drawn {scale:g} times as long as they"
+        " are. Arrows without a pattern are noise; a swirl or a common direction means a lens,"
+        " board or pose that the model lacks.",
         f"Residual arrows of {len(at)} features in {title}; RMS {rms:.3f} px",
     )
 
 
 def coverage(title: str, size: tuple[int, int], poses: Sequence[np.ndarray]) -> Figure:
-    """Figure of the features (n, 2) px of each pose in an image of ``size``, their hulls and covered share."""
+    """Figure of the features (n, 2) px of each pose in an image of ``size``, their hulls and
+    covered share."""
     import cv2
 
     coverage_count = np.zeros((size[1], size[0]), np.uint8)

@@ -1,8 +1,9 @@
-"""Access rules: the right Host and Origin, and for each role a token, a path of its own and a cookie for that path.
+"""Access rules: the right Host and Origin, and for each role a token, a path of its own and a
+cookie for that path.
 
-A token is exchanged for a cookie once, at `/login`. Browsers send the cookies of a host to all its ports, but only to
-the paths that a cookie names: each role has a path that cannot be guessed, so that no other server on the machine is
-sent the cookie, and the cookies of two roles never meet.
+A token is exchanged for a cookie once, at `/login`. Browsers send the cookies of a host to all its
+ports, but only to the paths that a cookie names: each role has a path that cannot be guessed, so
+that no other server on the machine is sent the cookie, and the cookies of two roles never meet.
 """
 
 import hashlib
@@ -23,7 +24,8 @@ from websockets.datastructures import Headers
 from slviewer.errors import UsageError
 
 Role = Literal["operate", "watch", "project", "camera"]
-"""Who may do what: operate the wizard, watch it, or be the page of the projector or of the camera."""
+"""Who may do what: operate the wizard, watch it, or be the page of the projector or of the
+camera."""
 ROLES: tuple[Role, ...] = get_args(Role)
 
 ONE_TIME_SECONDS = 120.0
@@ -46,7 +48,8 @@ class Refusal(Exception):
 class MessageRefused(Exception):
     """A message that is dropped; `correct`: the client is sent the true value again.
 
-    A number outside its range is not corrected: whoever types 50 into a field that starts at 10 passes through 5.
+    A number outside its range is not corrected: whoever types 50 into a field that starts at 10
+    passes through 5.
     """
 
     def __init__(self, reason: str, correct: bool = False) -> None:
@@ -56,10 +59,12 @@ class MessageRefused(Exception):
 
 @dataclass(frozen=True)
 class Grant:
-    """What the token of one role opens: `path`, without a final slash, to whoever sends the cookie `value`.
+    """What the token of one role opens: `path`, without a final slash, to whoever sends the cookie
+    `value`.
 
-    Path and value are derived from the token, so that browsers stay logged in when a server with the same tokens
-    starts again. `chosen`: a person chose the token, which may therefore be guessed.
+    Path and value are derived from the token, so that browsers stay logged in when a server with
+    the same tokens starts again. `chosen`: a person chose the token, which may therefore be
+    guessed.
     """
 
     role: Role
@@ -74,7 +79,8 @@ class Grant:
 
     @property
     def cookie_name(self) -> str:
-        """Name of the cookie, with port and role: browsers do not tell the cookies of two ports apart."""
+        """Name of the cookie, with port and role: browsers do not tell the cookies of two ports
+        apart."""
         return f"slviewer_{self.port}_{self.role}"
 
     @property
@@ -83,27 +89,37 @@ class Grant:
         return self._derive("cookie")
 
     def set_cookie(self, secure: bool) -> str:
-        """Return the Set-Cookie header: for scripts and other sites invisible, for this browser session."""
+        """Return the Set-Cookie header: for scripts and other sites invisible, for this browser
+        session."""
         attributes = "; HttpOnly; SameSite=Strict" + ("; Secure" if secure else "")
         return f"{self.cookie_name}={self.value}; Path={self.path}{attributes}"
 
     def accepts(self, headers: Headers) -> bool:
         """Whether one of the request's cookies is this one, compared in constant time."""
-        parts = (part.strip().partition("=") for header in headers.get_all("Cookie") for part in header.split(";"))
-        return any(name == self.cookie_name and _is_equal(value, self.value) for name, _, value in parts)
+        parts = (
+            part.strip().partition("=")
+            for header in headers.get_all("Cookie")
+            for part in header.split(";")
+        )
+        return any(
+            name == self.cookie_name and _is_equal(value, self.value) for name, _, value in parts
+        )
 
     def _derive(self, purpose: str) -> str:
-        """Return the HMAC of port, role and purpose with the token as its key, in hexadecimal digits."""
-        return hmac.new(self.token.encode(), f"{purpose} {self.role} {self.port}".encode(), hashlib.sha256).hexdigest()
+        """Return the HMAC of port, role and purpose with the token as its key, in hexadecimal
+        digits."""
+        return hmac.new(
+            self.token.encode(), f"{purpose} {self.role} {self.port}".encode(), hashlib.sha256
+        ).hexdigest()
 
 
 class Access:
     """The rules of one server at one port. Every method may be called from any thread.
 
-    `tokens` by role are fixed ones; the others are random. `names` are further host names, `name` or `name:port`,
-    under which this server is reached (behind a proxy, say); the address that a connection came in at is always one,
-    and so is the machine's own name unless it serves itself alone. `tls`: the server itself encrypts. `clock` returns
-    seconds that never run backwards.
+    `tokens` by role are fixed ones; the others are random. `names` are further host names, `name`
+    or `name:port`, under which this server is reached (behind a proxy, say); the address that a
+    connection came in at is always one, and so is the machine's own name unless it serves itself
+    alone. `tls`: the server itself encrypts. `clock` returns seconds that never run backwards.
     """
 
     def __init__(
@@ -120,17 +136,24 @@ class Access:
         self.names = frozenset(name.lower() for name in names)
         given = [] if tokens is None else list(tokens.values())
         if not all(map(_TOKEN.fullmatch, given)):
-            raise UsageError("A token has 16 or more letters, digits, - and _: leave it out and slviewer makes one.")
+            raise UsageError(
+                "A token has 16 or more letters, digits, - and _: leave it out and slviewer makes"
+                " one."
+            )
         if len(set(given)) < len(given):
             raise UsageError("Two roles have the same token: choose different ones.")
         self._wrong: dict[str, list[float]] = {}
         self.renew(tokens or {})
 
     def renew(self, tokens: Mapping[Role, str] = MappingProxyType({})) -> None:
-        """Replace all tokens, by those given, else random ones: the links given out so far open nothing any more."""
+        """Replace all tokens, by those given, else random ones: the links given out so far open
+        nothing any more."""
         self._one_time: dict[str, float] = {}
         self.grants: dict[Role, Grant] = {
-            role: Grant(role, tokens.get(role, secrets.token_urlsafe(24)), self.port, role in tokens) for role in ROLES
+            role: Grant(
+                role, tokens.get(role, secrets.token_urlsafe(24)), self.port, role in tokens
+            )
+            for role in ROLES
         }
 
     def issue_one_time_token(self) -> str:
@@ -144,10 +167,11 @@ class Access:
         return self._clock() < self._one_time.get(token, 0.0)
 
     def exchange(self, token: str, address: str) -> Grant:
-        """Return what a token opens; raises Refusal for a wrong one, and for an address that sent too many.
+        """Return what a token opens; raises Refusal for a wrong one, and for an address that sent
+        too many.
 
-        An address with too many wrong tokens is still granted random ones, which cannot be guessed: else whoever
-        shares the operator's address could keep the operator out.
+        An address with too many wrong tokens is still granted random ones, which cannot be guessed:
+        else whoever shares the operator's address could keep the operator out.
         """
         now = self._clock()
         recent = [t for t in self._wrong.get(address, []) if now - t < WRONG_TOKENS_SECONDS]
@@ -160,15 +184,20 @@ class Access:
         if limited:
             raise Refusal(
                 HTTPStatus.TOO_MANY_REQUESTS,
-                f"Too many wrong links came from this address: wait {WRONG_TOKENS_SECONDS:.0f} s, then try again.",
+                f"Too many wrong links came from this address: wait {WRONG_TOKENS_SECONDS:.0f} s,"
+                " then try again.",
             )
         if address not in self._wrong and len(self._wrong) >= _MOST_ADDRESSES:
             self._wrong.pop(next(iter(self._wrong)))
         self._wrong[address] = [*recent, now]
-        raise Refusal(HTTPStatus.FORBIDDEN, "This link is not, or no longer, valid: open the one last printed.")
+        raise Refusal(
+            HTTPStatus.FORBIDDEN,
+            "This link is not, or no longer, valid: open the one last printed.",
+        )
 
     def authorise(self, path: str, headers: Headers) -> tuple[Grant, str]:
-        """Return the grant that a path and the request's cookie belong to, and the rest of the path, without a slash.
+        """Return the grant that a path and the request's cookie belong to, and the rest of the
+        path, without a slash.
 
         Raises Refusal without a valid cookie.
         """
@@ -178,32 +207,41 @@ class Access:
                 return grant, (match[2] or "/")[1:]
         raise Refusal(
             HTTPStatus.FORBIDDEN,
-            "This page belongs to whoever started slviewer: open the link that it printed where it was started.",
+            "This page belongs to whoever started slviewer: open the link that it printed where it"
+            " was started.",
         )
 
     def is_encrypted(self, headers: Headers) -> bool:
-        """Whether the browser's side of the connection is encrypted, by this server or by a proxy that says so."""
-        return self.tls or [value.lower() for value in headers.get_all("X-Forwarded-Proto")] == ["https"]
+        """Whether the browser's side of the connection is encrypted, by this server or by a proxy
+        that says so."""
+        return self.tls or [value.lower() for value in headers.get_all("X-Forwarded-Proto")] == [
+            "https"
+        ]
 
     def host(self, headers: Headers, local_address: str) -> str:
-        """The request's Host if it is one of this server's names; raises Refusal otherwise (DNS rebinding)."""
+        """The request's Host if it is one of this server's names; raises Refusal otherwise (DNS
+        rebinding)."""
         hosts = headers.get_all("Host")
         if len(hosts) != 1 or hosts[0].lower() not in self._list_hosts(local_address):
             raise Refusal(
                 HTTPStatus.MISDIRECTED_REQUEST,
-                "This server is not reached by that host name: start slviewer with --name and this name, if it is one.",
+                "This server is not reached by that host name: start slviewer with --name and this"
+                " name, if it is one.",
             )
         return hosts[0].lower()
 
     def check_origin(self, headers: Headers, host: str, websocket: bool) -> None:
-        """Raise Refusal if another site's page sent the request; a WebSocket must say which page opened it."""
+        """Raise Refusal if another site's page sent the request; a WebSocket must say which page
+        opened it."""
         origins, site, mode, destination = map(
             headers.get_all, ("Origin", "Sec-Fetch-Site", "Sec-Fetch-Mode", "Sec-Fetch-Dest")
         )
         own = {f"http://{host}", f"https://{host}"}
-        foreign = any(origin.lower() not in own for origin in origins) or (websocket and len(origins) != 1)
-        # SameSite ignores ports, so a page of another port of this machine is detected only here. Following a link is
-        # no harm: it shows the page to the person who clicked it.
+        foreign = any(origin.lower() not in own for origin in origins) or (
+            websocket and len(origins) != 1
+        )
+        # SameSite ignores ports, so a page of another port of this machine is detected only here.
+        # Following a link is no harm: it shows the page to the person who clicked it.
         if (mode, destination) != (["navigate"], ["document"]):
             foreign = foreign or not {*site} <= {"same-origin", "none"}
         if foreign:

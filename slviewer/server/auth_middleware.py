@@ -17,16 +17,25 @@ from slviewer.server.downloads import PREFIX, Downloads
 from slviewer.server.help_pages import PREFIX as HELP_PREFIX
 from slviewer.server.help_pages import HelpPages
 from slviewer.server.limits import Admissions, address_group
-from slviewer.server.responses import HELP_POLICY, harden, page_policy, respond, script_hash, viser_policy
+from slviewer.server.responses import (
+    HELP_POLICY,
+    harden,
+    page_policy,
+    respond,
+    script_hash,
+    viser_policy,
+)
 from slviewer.server.viser_internals import PAGE_SCRIPT, SUBPROTOCOL, VISER_SCRIPTS, client_page
 
 logger = logging.getLogger("slviewer.server")
 
 LOGIN = "/login"
 HEALTH = "/healthz"
-"""Answered with 204 and nothing else, without a link: the server runs. Limits and checks of hosts hold for it too."""
+"""Answered with 204 and nothing else, without a link: the server runs. Limits and checks of hosts
+hold for it too."""
 DEVICE_PATHS: dict[str, Role] = {"projector": "project", "camera": "camera"}
-"""Below the operator's path: they lead to the page of a device with the rights of that page alone."""
+"""Below the operator's path: they lead to the page of a device with the rights of that page
+alone."""
 _SCRIPTS = (*VISER_SCRIPTS, script_hash(PAGE_SCRIPT))
 """Hashes of the scripts that viser's page may run."""
 _PATH = re.compile(r"/|(/[A-Za-z0-9_-][A-Za-z0-9._-]*)+/?")
@@ -42,10 +51,11 @@ class DevicePage:
 
 @dataclass(eq=False)
 class AuthMiddleware:
-    """Authorises and answers a server's requests: viser's page, our own pages and files, and WebSockets.
+    """Authorises and answers a server's requests: viser's page, our own pages and files, and
+    WebSockets.
 
-    ``device_pages``: those that are served, which may change. ``strict_transport``: browsers are told to use this host
-    encrypted from now on.
+    ``device_pages``: those that are served, which may change. ``strict_transport``: browsers are
+    told to use this host encrypted from now on.
     """
 
     access: Access
@@ -63,7 +73,9 @@ class AuthMiddleware:
         """Return the response to a request, hardened; None to open a WebSocket."""
         host = ""
         try:
-            host = self.access.host(request.headers, connection.transport.get_extra_info("sockname")[0])
+            host = self.access.host(
+                request.headers, connection.transport.get_extra_info("sockname")[0]
+            )
             response = await self._answer(connection, request, host)
         except Refusal as refusal:
             response = self._refuse(refusal, request, host)
@@ -75,23 +87,31 @@ class AuthMiddleware:
         return response
 
     async def _answer(self, connection: Connection, request: Request, host: str) -> Response | None:
-        """Return the response to an authorised request, None to open a WebSocket; raises Refusal otherwise."""
+        """Return the response to an authorised request, None to open a WebSocket; raises Refusal
+        otherwise."""
         headers, access = request.headers, self.access
         websocket = any(value.lower() == "websocket" for value in headers.get_all("Upgrade"))
         access.check_origin(headers, host, websocket)
         path, _, _ = request.path.partition("?")
         if not _PATH.fullmatch(path):
             raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-        if "?" in request.path:  # some parameters make viser's page load messages, and so code, from elsewhere
+        if (
+            "?" in request.path
+        ):  # some parameters make viser's page load messages, and so code, from elsewhere
             raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
-        if not websocket and (response := self._answer_anyone(connection, request, path, host)) is not None:
+        if (
+            not websocket
+            and (response := self._answer_anyone(connection, request, path, host)) is not None
+        ):
             return response
         grant, rest = access.authorise(path, headers)
         self.admissions.admit(connection, grant.role)
         if websocket:
             self._check_websocket(request, grant, rest)
             return None
-        if rest == "favicon.ico":  # asked for by the page of "/" too, which so learns whether its cookie is valid
+        if (
+            rest == "favicon.ico"
+        ):  # asked for by the page of "/" too, which so learns whether its cookie is valid
             return respond(HTTPStatus.NO_CONTENT)
         if grant.role in DEVICE_PATHS.values():
             if rest or grant.role not in self.device_pages:
@@ -108,11 +128,16 @@ class AuthMiddleware:
             return self._lead_to(access.grants[DEVICE_PATHS[rest]], request)
         raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here for this link.")
 
-    def _answer_anyone(self, connection: Connection, request: Request, path: str, host: str) -> Response | None:
+    def _answer_anyone(
+        self, connection: Connection, request: Request, path: str, host: str
+    ) -> Response | None:
         """Return the response that needs no cookie; None where the path needs one."""
         if path == "/":
             return self._show_login(host)
-        if path in ("/favicon.ico", HEALTH):  # browsers ask for the icon by themselves, and would report its absence
+        if path in (
+            "/favicon.ico",
+            HEALTH,
+        ):  # browsers ask for the icon by themselves, and would report its absence
             return respond(HTTPStatus.NO_CONTENT)
         return self._log_in(connection, request) if path == LOGIN else None
 
@@ -121,7 +146,8 @@ class AuthMiddleware:
         return _respond_page(self._login_page, page_policy(self._login_page, host), status)
 
     def _show_help(self, name: str) -> Response:
-        """Respond with a page or a picture of the documentation; raises Refusal where there is none of this name."""
+        """Respond with a page or a picture of the documentation; raises Refusal where there is none
+        of this name."""
         file = self._help.file(name)
         if file is None:
             raise Refusal(HTTPStatus.NOT_FOUND, "There is no such page in the help.")
@@ -136,13 +162,18 @@ class AuthMiddleware:
             raise Refusal(HTTPStatus.BAD_REQUEST, "This page is of another version: reload it.")
 
     def _log_in(self, connection: Connection, request: Request) -> Response:
-        """Respond to the token in the Authorization header with the cookie and the path that it opens, as JSON."""
+        """Respond to the token in the Authorization header with the cookie and the path that it
+        opens, as JSON."""
         scheme, _, token = " ".join(request.headers.get_all("Authorization")).partition(" ")
         if scheme.lower() != "bearer":
-            raise Refusal(HTTPStatus.UNAUTHORIZED, "There is no token: open the link that slviewer printed.")
+            raise Refusal(
+                HTTPStatus.UNAUTHORIZED, "There is no token: open the link that slviewer printed."
+            )
         peer = connection.transport.get_extra_info("peername")
         grant = self.access.exchange(token.strip(), address_group(peer[0]))
-        response = respond(HTTPStatus.OK, json.dumps({"path": f"{grant.path}/"}), "application/json")
+        response = respond(
+            HTTPStatus.OK, json.dumps({"path": f"{grant.path}/"}), "application/json"
+        )
         response.headers["Set-Cookie"] = grant.set_cookie(self.access.is_encrypted(request.headers))
         return response
 
@@ -154,7 +185,8 @@ class AuthMiddleware:
         return response
 
     def _refuse(self, refusal: Refusal, request: Request, host: str) -> Response:
-        """Respond with the reason of a refusal; where a person reads it, on the page that takes a link."""
+        """Respond with the reason of a refusal; where a person reads it, on the page that takes a
+        link."""
         person = any("text/html" in value for value in request.headers.get_all("Accept"))
         if host and person and refusal.status == HTTPStatus.FORBIDDEN:
             return self._show_login(host, HTTPStatus.FORBIDDEN)
@@ -164,7 +196,10 @@ class AuthMiddleware:
         """Stream an offered file; raises Refusal where it is no longer offered."""
         opened = self.downloads.open(path)
         if opened is None:
-            raise Refusal(HTTPStatus.NOT_FOUND, "This file is no longer offered: request it again in slviewer.")
+            raise Refusal(
+                HTTPStatus.NOT_FOUND,
+                "This file is no longer offered: request it again in slviewer.",
+            )
         headers, file = opened
         harden(headers)
         headers["Connection"] = "close"

@@ -1,4 +1,5 @@
-"""The listening socket, bound before viser starts: a failure is an error, not another port and not a hang."""
+"""The listening socket, bound before viser starts: a failure is an error, not another port and not
+a hang."""
 
 import errno
 import os
@@ -13,20 +14,25 @@ RESOLVE_SECONDS = 1.5
 
 
 def listen(host: str, port: int, resolve_s: float = RESOLVE_SECONDS) -> Listener:
-    """A TCP socket listening at exactly this address, with limits for strangers; port 0 takes any free one.
+    """A TCP socket listening at exactly this address, with limits for strangers; port 0 takes any
+    free one.
 
-    A name server has `resolve_s` to answer. Raises SlviewerError at the latest then, where the port is in use or the
-    address is not this machine's.
+    A name server has `resolve_s` to answer. Raises SlviewerError at the latest then, where the port
+    is in use or the address is not this machine's.
     """
     if not host or not 0 <= port <= 65535:
-        raise SlviewerError(f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port 8080.")
+        raise SlviewerError(
+            f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port"
+            " 8080."
+        )
     family, address = _resolve(host, port, resolve_s)
     sock = Listener(family, socket.SOCK_STREAM)
     try:
         if os.name == "posix":  # elsewhere this option lets two programs share a port
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address)
-        # Two sockets may bind the same port as long as neither listens: only listening tells that it is ours.
+        # Two sockets may bind the same port as long as neither listens: only listening tells that
+        # it is ours.
         sock.listen(128)
     except (OSError, OverflowError) as error:
         sock.close()
@@ -35,17 +41,21 @@ def listen(host: str, port: int, resolve_s: float = RESOLVE_SECONDS) -> Listener
 
 
 def network_address() -> str | None:
-    """Return the address of this machine in its network, which the system would send from; None without a network."""
+    """Return the address of this machine in its network, which the system would send from; None
+    without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         try:
-            sock.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737); nothing is sent
+            sock.connect(
+                ("192.0.2.1", 9)
+            )  # an address for documentation (RFC 5737); nothing is sent
         except OSError:
             return None
         return str(sock.getsockname()[0])
 
 
 def _resolve(host: str, port: int, resolve_s: float) -> tuple[int, tuple]:
-    """Address family and socket address of host and port; raises SlviewerError if the name does not resolve in time."""
+    """Address family and socket address of host and port; raises SlviewerError if the name does not
+    resolve in time."""
     candidates: list[tuple[int, tuple]] = []
 
     def look_up() -> None:
@@ -72,8 +82,8 @@ def _format_remedy(host: str, port: int, error: OSError | OverflowError) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.EADDRINUSE, getattr(errno, "WSAEADDRINUSE", -1)):
         return (
-            f"Port {port} at {host} is in use, perhaps by another slviewer: close that one, or choose another port "
-            "with --port (--port 0 takes any free one)."
+            f"Port {port} at {host} is in use, perhaps by another slviewer: close that one, or"
+            " choose another port with --port (--port 0 takes any free one)."
         )
     if number in (errno.EACCES, errno.EPERM):
         return f"This account may not open port {port}: choose a port above 1023 with --port."

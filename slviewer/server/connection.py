@@ -1,4 +1,5 @@
-"""One browser's connection: its request awaited for a limited time, its messages gated, its files streamed."""
+"""One browser's connection: its request awaited for a limited time, its messages gated, its files
+streamed."""
 
 import asyncio
 import logging
@@ -33,13 +34,18 @@ class Connection(ServerConnection):
     _request_bytes = 0
 
     def __init__(
-        self, *args: Any, request_s: float = REQUEST_SECONDS, stall_s: float = STALL_SECONDS, **options: Any
+        self,
+        *args: Any,
+        request_s: float = REQUEST_SECONDS,
+        stall_s: float = STALL_SECONDS,
+        **options: Any,
     ) -> None:
         super().__init__(*args, **options)
         self._request_s, self._stall_s = request_s, stall_s
 
     def data_received(self, data: bytes) -> None:
-        """As websockets, but a request that is too long ends the connection before it takes up memory."""
+        """As websockets, but a request that is too long ends the connection before it takes up
+        memory."""
         if self.request is None:
             self._request_bytes += len(data)
             if self._request_bytes > REQUEST_BYTES:
@@ -48,7 +54,8 @@ class Connection(ServerConnection):
         super().data_received(data)
 
     async def handshake(self, *args: Any, **kwargs: Any) -> None:
-        """As websockets, whose own limit would cut a long download too: here it covers the request alone."""
+        """As websockets, whose own limit would cut a long download too: here it covers the request
+        alone."""
         await asyncio.wait(
             [self.request_rcvd, self.connection_lost_waiter],
             timeout=self._request_s,
@@ -69,10 +76,11 @@ class Connection(ServerConnection):
                 return passed
 
     async def stream(self, headers: Headers, file: BinaryIO) -> Response:
-        """Send an answer whose body is this open file, chunk by chunk; returns what process_request must return.
+        """Send an answer whose body is this open file, chunk by chunk; returns what process_request
+        must return.
 
-        The reader's pace is kept, so that a file of any size takes one chunk of memory. A reader who takes nothing for
-        ``stall_s``, or a server that stops, ends it.
+        The reader's pace is kept, so that a file of any size takes one chunk of memory. A reader
+        who takes nothing for ``stall_s``, or a server that stops, ends it.
         """
         tail: bytes = b"HTTP/1.1 200 OK\r\n" + headers.serialize()
         try:
@@ -85,7 +93,8 @@ class Connection(ServerConnection):
                     tail = chunk
                     limit.reschedule(asyncio.get_running_loop().time() + self._stall_s)
         except (TimeoutError, OSError):
-            # The answer has begun, so there is no other to give; a cancelled handshake ends the connection silently.
+            # The answer has begun, so there is no other to give; a cancelled handshake ends the
+            # connection silently.
             self.transport.abort()
             raise asyncio.CancelledError from None
         return _Tail(200, "OK", Headers(), tail)
@@ -100,7 +109,8 @@ class _Tail(Response):
 
 
 def quiet_logger() -> logging.Logger:
-    """The websockets logger of this server, which drops errors that clients cause, such as failed handshakes."""
+    """The websockets logger of this server, which drops errors that clients cause, such as failed
+    handshakes."""
     logger = logging.getLogger("slviewer.server.websockets")
     logger.setLevel(logging.WARNING)  # else every connection is logged
     if _is_server_error not in logger.filters:

@@ -16,14 +16,16 @@ from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.secure import SafeServer
 
 ANOTHER_WINDOW, NOT_UNDERSTOOD = 4001, 1008
-"""Why the connection was closed: the page then waits for somebody to ask for it, or connects again."""
+"""Why the connection was closed: the page then waits for somebody to ask for it, or connects
+again."""
 _HELLO_S = 5.0
 _SHARED = "device_page.js"
 """Script of both pages, put into each of them: their roles are served nothing but their page."""
 
 
 def serve_device_pages(server: SafeServer, channels: PageChannels) -> None:
-    """Serve the pages at `server.link("project")` and `server.link("camera")`, and connect them to `channels`."""
+    """Serve the pages at `server.link("project")` and `server.link("camera")`, and connect them to
+    `channels`."""
     _serve_page(server, "project", "projector.html", channels.projector)
     _serve_page(server, "camera", "camera.html", channels.camera)
 
@@ -36,8 +38,13 @@ def _serve_page(server: SafeServer, role: Role, name: str, channel: PageChannel[
         with contextlib.suppress(ConnectionClosed):
             await _talk(connection, channel)
 
-    html, script = (resources.files("slviewer.server").joinpath(file).read_text("utf-8") for file in (name, _SHARED))
-    server.device_pages[role] = DevicePage(html.replace(f"/* {_SHARED} */", script).encode(), handle)
+    html, script = (
+        resources.files("slviewer.server").joinpath(file).read_text("utf-8")
+        for file in (name, _SHARED)
+    )
+    server.device_pages[role] = DevicePage(
+        html.replace(f"/* {_SHARED} */", script).encode(), handle
+    )
 
 
 async def _talk(connection: ServerConnection, channel: PageChannel[Any]) -> None:
@@ -46,7 +53,9 @@ async def _talk(connection: ServerConnection, channel: PageChannel[Any]) -> None
 
     def send(message: bytes | None) -> None:
         """Queue a message to the page; None: close the connection."""
-        with contextlib.suppress(RuntimeError):  # the server has stopped, and the page is gone with it
+        with contextlib.suppress(
+            RuntimeError
+        ):  # the server has stopped, and the page is gone with it
             loop.call_soon_threadsafe(outbox.put_nowait, message)
 
     async def write() -> None:

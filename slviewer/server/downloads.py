@@ -15,12 +15,14 @@ from slviewer.errors import InputError
 from slviewer.server.text import safe_file_name
 
 PREFIX = "download/"
-"""Of addresses, which are relative to the page: the path of the role that may fetch the file stands before it."""
+"""Of addresses, which are relative to the page: the path of the role that may fetch the file stands
+before it."""
 
 
 @dataclass(frozen=True)
 class Offer:
-    """One file: its path, the folder that it must not leave, and the name under which it is saved."""
+    """One file: its path, the folder that it must not leave, and the name under which it is
+    saved."""
 
     path: Path
     within: Path
@@ -36,10 +38,13 @@ class Downloads:
     def offer(self, path: Path, *, within: Path, name: str | None = None) -> str:
         """The address, relative to the wizard's page, at which this file is fetched until `clear`.
 
-        `within` is the folder that it belongs to (the session's); InputError where the file is missing or, through
-        links or "..", is elsewhere. It is read when it is fetched, so that the newest content arrives.
+        `within` is the folder that it belongs to (the session's); InputError where the file is
+        missing or, through links or "..", is elsewhere. It is read when it is fetched, so that the
+        newest content arrives.
         """
-        offer = Offer(Path(path), Path(within).resolve(), safe_file_name(name or Path(path).name, "download"))
+        offer = Offer(
+            Path(path), Path(within).resolve(), safe_file_name(name or Path(path).name, "download")
+        )
         _open_offer(offer).close()
         key = secrets.token_urlsafe(16)
         self._offers[key] = offer
@@ -50,34 +55,46 @@ class Downloads:
         self._offers.clear()
 
     def open(self, address: str) -> tuple[Headers, BinaryIO] | None:
-        """The headers and the open file for an address; None if it is not offered or no longer exists."""
+        """The headers and the open file for an address; None if it is not offered or no longer
+        exists."""
         try:
             offer = self._offers[address.removeprefix(PREFIX)]
             file = _open_offer(offer)
         except (KeyError, InputError):
             return None
-        ascii_name = offer.name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_")
+        ascii_name = (
+            offer.name.encode("ascii", "replace").decode().replace("?", "_").replace('"', "_")
+        )
         size = os.fstat(file.fileno()).st_size
         headers = Headers(
             {
                 "Content-Type": "application/octet-stream",
                 "Content-Length": str(size),
-                "Content-Disposition": f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(offer.name)}",
+                "Content-Disposition": (
+                    f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(offer.name)}"
+                ),
             }
         )
         return headers, file
 
 
 def _open_offer(offer: Offer) -> BinaryIO:
-    """The opened file, checked after opening to be a regular one inside its folder, so that no link can change it."""
+    """The opened file, checked after opening to be a regular one inside its folder, so that no link
+    can change it."""
     with contextlib.suppress(OSError, ValueError):
         real = offer.path.resolve(strict=True)
         if real.is_relative_to(offer.within):
             flags = (
-                os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+                os.O_RDONLY
+                | getattr(os, "O_NOFOLLOW", 0)
+                | getattr(os, "O_NONBLOCK", 0)
+                | getattr(os, "O_BINARY", 0)
             )
             file = os.fdopen(os.open(real, flags), "rb")
             if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 return file
             file.close()
-    raise InputError(f"{offer.path.name} can't be offered for download: it is no file inside {offer.within.name}.")
+    raise InputError(
+        f"{offer.path.name} can't be offered for download: it is no file inside"
+        f" {offer.within.name}."
+    )

@@ -1,4 +1,5 @@
-"""Which messages of clients pass: those that the page offers to that client at this moment, with valid values."""
+"""Which messages of clients pass: those that the page offers to that client at this moment, with
+valid values."""
 
 import asyncio
 import logging
@@ -16,7 +17,8 @@ from slviewer.server.uploads import UploadBudget, Uploads
 logger = logging.getLogger("slviewer.server")
 
 VIEWER_LIMIT = 4096
-"""Bytes of a message from someone who only watches: more than the longest that says where they look from."""
+"""Bytes of a message from someone who only watches: more than the longest that says where they look
+from."""
 MESSAGES: dict[Role, frozenset[type]] = {
     "operate": frozenset(inside.FROM_CLIENTS.values()),
     # viewpoint, and confirmation that something was drawn where that is requested
@@ -24,7 +26,8 @@ MESSAGES: dict[Role, frozenset[type]] = {
     "project": frozenset(),
     "camera": frozenset(),
 }
-"""The messages of viser that each role may send; all others, and those of later versions, are refused."""
+"""The messages of viser that each role may send; all others, and those of later versions, are
+refused."""
 TEXT_LIMIT = 20_000
 """Characters; no input of the wizard needs a tenth of it."""
 
@@ -32,10 +35,13 @@ TEXT_LIMIT = 20_000
 class ViserGate:
     """Filters the messages of one client, and passes on to viser those that this client may send.
 
-    A refused message is dropped: it may be no attack at all, but a click on a button that was disabled a moment ago.
+    A refused message is dropped: it may be no attack at all, but a click on a button that was
+    disabled a moment ago.
     """
 
-    def __init__(self, server: viser.ViserServer, connection: Connection, role: Role, budget: UploadBudget) -> None:
+    def __init__(
+        self, server: viser.ViserServer, connection: Connection, role: Role, budget: UploadBudget
+    ) -> None:
         self._server = server
         self._connection = connection
         self._role = role
@@ -43,7 +49,8 @@ class ViserGate:
         self._uploads = Uploads(budget, self._forget_upload)
 
     def __call__(self, raw: Any) -> bytes | None:
-        """Return the bytes of a client's message to pass on to viser; None where it is refused and dropped."""
+        """Return the bytes of a client's message to pass on to viser; None where it is refused and
+        dropped."""
         if self._client is None:
             self._client = inside.ViserClient.of(self._server, self._connection)
         usable = isinstance(raw, bytes) and (self._role == "operate" or len(raw) < VIEWER_LIMIT)
@@ -65,7 +72,8 @@ class ViserGate:
         self._uploads.close()
 
     def _check_message(self, message: Any, raw: bytes) -> bytes:
-        """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not allowed."""
+        """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not
+        allowed."""
         client = self._client
         assert client is not None
         if type(message) not in MESSAGES[self._role]:
@@ -104,8 +112,14 @@ class ViserGate:
         _check(scene is not None)
         match message:
             case messages.TransformControlsUpdateMessage():
-                _check(client.listens_to_gizmo(scene, message.name) and math.hypot(*message.wxyz) > 1e-6)
-            case messages.TransformControlsDragStartMessage() | messages.TransformControlsDragEndMessage():
+                _check(
+                    client.listens_to_gizmo(scene, message.name)
+                    and math.hypot(*message.wxyz) > 1e-6
+                )
+            case (
+                messages.TransformControlsDragStartMessage()
+                | messages.TransformControlsDragEndMessage()
+            ):
                 _check(client.listens_to_gizmo(scene, message.name))
             case messages.SceneNodeClickMessage():
                 _check(inside.listens_to_clicks(scene, message.name))
@@ -126,7 +140,9 @@ class ViserGate:
         """Notify the client that its upload was refused, or send it the true value of an input."""
         assert self._client is not None
         if isinstance(message, messages.FileTransferStartUpload):
-            self._client.refuse_upload(message.source_component_uuid, message.transfer_uuid, message.size_bytes)
+            self._client.refuse_upload(
+                message.source_component_uuid, message.transfer_uuid, message.size_bytes
+            )
             self._client.show_error("Not uploaded", f"The file was refused: {refused}.")
         elif isinstance(message, messages.GuiUpdateMessage) and refused.correct:
             handle = self._client.gui_input(message.uuid)
@@ -134,15 +150,21 @@ class ViserGate:
                 self._client.send_value(handle)
 
     def _forget_upload(self, transfer: str) -> None:
-        """Let viser discard what was received of an upload, after the messages that are already waiting."""
-        # viser handles what passed in tasks of its own, in their order: after those that are waiting.
+        """Let viser discard what was received of an upload, after the messages that are already
+        waiting."""
+        # viser handles what passed in tasks of its own, in their order: after those that are
+        # waiting.
         assert self._client is not None
         asyncio.get_running_loop().call_soon(self._client.forget_upload, transfer)
 
 
 def _check_camera(message: messages.ViewerCameraMessage) -> None:
     """Raise MessageRefused unless image size and orientation of the camera are plausible."""
-    usable = 0 < message.image_height < 2**15 and 0 < message.image_width < 2**15 and math.hypot(*message.wxyz) > 1e-6
+    usable = (
+        0 < message.image_height < 2**15
+        and 0 < message.image_width < 2**15
+        and math.hypot(*message.wxyz) > 1e-6
+    )
     if not usable:
         raise MessageRefused("no camera")
 
@@ -166,15 +188,28 @@ def check_value(handle: Any, value: Any) -> None:
         case viser.GuiCheckboxHandle():
             _check(isinstance(value, bool), "not yes or no")
         case viser.GuiDropdownHandle() | viser.GuiButtonGroupHandle():
-            _check(isinstance(value, str) and value in handle.options, "not an option", correct=True)
+            _check(
+                isinstance(value, str) and value in handle.options, "not an option", correct=True
+            )
         case viser.GuiTextHandle():
-            _check(isinstance(value, str) and _is_plain_text(value, handle.multiline), "not plain text")
+            _check(
+                isinstance(value, str) and _is_plain_text(value, handle.multiline), "not plain text"
+            )
         case viser.GuiNumberHandle() | viser.GuiSliderHandle():
             _check_number(value, handle.value, handle.min, handle.max)
         case viser.GuiVector3Handle():
-            _check(isinstance(value, list | tuple) and len(value) == 3, "not three numbers", correct=True)
+            _check(
+                isinstance(value, list | tuple) and len(value) == 3,
+                "not three numbers",
+                correct=True,
+            )
             for i, number in enumerate(value):
-                _check_number(number, handle.value[i], handle.min and handle.min[i], handle.max and handle.max[i])
+                _check_number(
+                    number,
+                    handle.value[i],
+                    handle.min and handle.min[i],
+                    handle.max and handle.max[i],
+                )
         case _:  # uploads have messages of their own, and the wizard has no other inputs
             raise MessageRefused("this input takes no value")
 
@@ -186,8 +221,11 @@ def _check(condition: bool, reason: str = "nothing listens to that", correct: bo
 
 
 def _check_number(value: Any, current: float, low: float | None, high: float | None) -> None:
-    """Raise MessageRefused unless the value is a finite number of the input's type within its range."""
-    _check(isinstance(value, int | float) and not isinstance(value, bool), "not a number", correct=True)
+    """Raise MessageRefused unless the value is a finite number of the input's type within its
+    range."""
+    _check(
+        isinstance(value, int | float) and not isinstance(value, bool), "not a number", correct=True
+    )
     _check(abs(value) < 2**53 and math.isfinite(value), "not a finite number", correct=True)
     # viser would cut the fraction off in silence.
     _check(isinstance(current, float) or value == int(value), "not a whole number", correct=True)
@@ -195,6 +233,9 @@ def _check_number(value: Any, current: float, low: float | None, high: float | N
 
 
 def _is_plain_text(text: str, multiline: bool) -> bool:
-    """Whether the text is short enough and free of control characters; line breaks only if ``multiline``."""
+    """Whether the text is short enough and free of control characters; line breaks only if
+    ``multiline``."""
     allowed = "\n\r\t" if multiline else "\t"
-    return len(text) <= TEXT_LIMIT and all(c.isprintable() or c in allowed or ord(c) > 159 for c in text)
+    return len(text) <= TEXT_LIMIT and all(
+        c.isprintable() or c in allowed or ord(c) > 159 for c in text
+    )

@@ -1,7 +1,9 @@
-"""The pages of the documentation, which the server shows to whoever may see the wizard, without a network.
+"""The pages of the documentation, which the server shows to whoever may see the wizard, without a
+network.
 
-They are the Markdown files of `docs`, at addresses that end as their paths do, so that their links to each other hold.
-Only files listed at the start are served: an address is looked up in that list, and never becomes a path.
+They are the Markdown files of `docs`, at addresses that end as their paths do, so that their links
+to each other hold. Only files listed at the start are served: an address is looked up in that list,
+and never becomes a path.
 """
 
 import posixpath
@@ -16,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 PREFIX = "help/"
-"""Below the path of the operator and of viewers; relative to their page, so that one link serves both."""
+"""Below the path of the operator and of viewers; relative to their page, so that one link serves
+both."""
 _PACKAGE = Path(__file__).resolve().parent.parent
 _GROUPS = {
     "": "Start",
@@ -28,7 +31,12 @@ _GROUPS = {
 }
 """{folder: title}, in the order of the list; the folders whose pages are shown."""
 _DEVELOPMENT = ("index.md", "architecture.md", "reference/python.md")
-_PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp", ".svg": "image/svg+xml"}
+_PICTURES = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".webp": "image/webp",
+    ".svg": "image/svg+xml",
+}
 _HTML = "text/html; charset=utf-8"
 _COMMENT = re.compile(r"<!--.*?-->\n?", re.DOTALL)
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:|//", re.I)
@@ -52,12 +60,17 @@ class _Heading:
 
 
 class HelpPages:
-    """The pages and pictures below one folder; without the folder there are none. May be used from any thread."""
+    """The pages and pictures below one folder; without the folder there are none. May be used from
+    any thread."""
 
     def __init__(self, folder: Path | None = None) -> None:
         """``folder``: that of the documentation, by default the one that ships with the program."""
         folder = folder or docs_folder()
-        names = {} if folder is None else {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*.*"))}
+        names = (
+            {}
+            if folder is None
+            else {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*.*"))}
+        )
         served = {name: path for name, path in names.items() if _is_served(name) and path.is_file()}
         self._pages = {name: path for name, path in served.items() if name.endswith(".md")}
         self._pictures = {name: path for name, path in served.items() if path.suffix in _PICTURES}
@@ -70,7 +83,8 @@ class HelpPages:
         return tuple(sorted(self._pages, key=lambda name: (folders.index(_top_folder(name)), name)))
 
     def file(self, name: str) -> HelpFile | None:
-        """Return what is at this place below PREFIX: the list of pages where it is empty; None where nothing is."""
+        """Return what is at this place below PREFIX: the list of pages where it is empty; None
+        where nothing is."""
         if name in self._pictures:
             path = self._pictures[name]
             return HelpFile(path.read_bytes(), _PICTURES[path.suffix])
@@ -98,7 +112,14 @@ class HelpPages:
                 token.type, token.content = "html_block", draw_equation(token.content)
         root = "../" * name.count("/")
         groups = [
-            (title, [(root + page, self._title(page), page == name) for page in self.names if _top_folder(page) == key])
+            (
+                title,
+                [
+                    (root + page, self._title(page), page == name)
+                    for page in self.names
+                    if _top_folder(page) == key
+                ],
+            )
             for key, title in _GROUPS.items()
         ]
         return str(
@@ -119,7 +140,9 @@ class HelpPages:
                 if _SCHEME.match(address):
                     token.attrSet("target", "_blank")
                     token.attrSet("rel", "noopener noreferrer")
-                elif not address.startswith("#") and not self._is_known(address.partition("#")[0], name):
+                elif not address.startswith("#") and not self._is_known(
+                    address.partition("#")[0], name
+                ):
                     del token.attrs["href"]
             elif token.type == "image" and not self._is_known(str(token.attrs["src"]), name):
                 del token.attrs["src"]  # its description is shown
@@ -135,12 +158,16 @@ class HelpPages:
 
 
 def docs_folder() -> Path | None:
-    """Return the folder of the documentation: in the package or, in a checkout, beside it; None if absent."""
-    return next((path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), None)
+    """Return the folder of the documentation: in the package or, in a checkout, beside it; None if
+    absent."""
+    return next(
+        (path for path in (_PACKAGE / "docs", _PACKAGE.parent / "docs") if path.is_dir()), None
+    )
 
 
 def draw_equation(latex: str) -> str:
-    """Return an equation as HTML: an SVG in the colour of the text, which needs neither a script nor a network.
+    """Return an equation as HTML: an SVG in the colour of the text, which needs neither a script
+    nor a network.
 
     ``latex``: what matplotlib's mathtext reads of LaTeX. Raises ValueError for anything else.
     """
@@ -153,13 +180,18 @@ def draw_equation(latex: str) -> str:
     letters = {1: "M", 2: "L", 3: "Q", 4: "C", 79: "Z"}
     drawn = "".join(
         letters[int(code)]
-        + ("" if code == path.CLOSEPOLY else " ".join(f"{(-x if k % 2 else x):.2f}" for k, x in enumerate(points)))
+        + (
+            ""
+            if code == path.CLOSEPOLY
+            else " ".join(f"{(-x if k % 2 else x):.2f}" for k, x in enumerate(points))
+        )
         for points, code in path.iter_segments(simplify=False)
     )
     return (
-        f'<p class="equation"><svg role="img" aria-label="{escape(source)}" width="{box.width / 10:.2f}em" '
-        f'height="{box.height / 10:.2f}em" viewBox="{box.x0:.1f} {-box.y1:.1f} {box.width:.1f} {box.height:.1f}" '
-        f'fill="currentColor"><path d="{drawn}"/></svg></p>\n'
+        f'<p class="equation"><svg role="img" aria-label="{escape(source)}"'
+        f' width="{box.width / 10:.2f}em" height="{box.height / 10:.2f}em" viewBox="{box.x0:.1f}'
+        f' {-box.y1:.1f} {box.width:.1f} {box.height:.1f}" fill="currentColor"><path'
+        f' d="{drawn}"/></svg></p>\n'
     )
 
 
@@ -169,7 +201,8 @@ def _top_folder(name: str) -> str:
 
 
 def _is_served(name: str) -> bool:
-    """Whether a file of this name is one of the pages or pictures that a user of the program reads."""
+    """Whether a file of this name is one of the pages or pictures that a user of the program
+    reads."""
     folder = _top_folder(name)
     if name.endswith(".md"):
         return folder in _GROUPS and name not in _DEVELOPMENT and not name.endswith("/index.md")
@@ -206,7 +239,8 @@ def _parse(page: Path) -> list[Any]:
 
 
 def _list_headings(tokens: list[Any]) -> list[_Heading]:
-    """List the headings among a page's tokens, with the anchors that GitHub and Sphinx give them."""
+    """List the headings among a page's tokens, with the anchors that GitHub and Sphinx give
+    them."""
     headings, used = [], Counter[str]()
     for opening, inline in pairwise(tokens):
         if opening.type == "heading_open":

@@ -16,12 +16,14 @@ from slviewer.server.access import Refusal, Role
 logger = logging.getLogger("slviewer.server")
 
 STRANGERS, STRANGERS_PER_ADDRESS = 256, 128
-"""Connections without a valid cookie, in all and from one address; beyond, the oldest one is closed."""
+"""Connections without a valid cookie, in all and from one address; beyond, the oldest one is
+closed."""
 CONNECTIONS: dict[Role, int] = {"operate": 64, "watch": 64, "project": 16, "camera": 16}
 """Connections with the cookie of a role; beyond, another one is refused."""
 ACCEPTED_AT_ONCE = 4
-"""Connections accepted before those that are open are served again: about eight turns of the event loop serve a
-request, and its connection must not give way to others before, of the crowd's address though it may be."""
+"""Connections accepted before those that are open are served again: about eight turns of the event
+loop serve a request, and its connection must not give way to others before, of the crowd's address
+though it may be."""
 _CLOSING = 32
 _LOG_SECONDS = 60.0
 
@@ -29,8 +31,9 @@ _LOG_SECONDS = 60.0
 class Listener(socket.socket):
     """A listening socket that hands out a limited number of connections without a valid cookie.
 
-    A browser sends its request at once, so that the oldest connection that has not is closed for a new one, of the
-    address that has most of them. What is handed out counts as a stranger's until `admit` is called for its address.
+    A browser sends its request at once, so that the oldest connection that has not is closed for a
+    new one, of the address that has most of them. What is handed out counts as a stranger's until
+    `admit` is called for its address.
     """
 
     def __init__(self, *args: Any, strangers: int = STRANGERS, **options: Any) -> None:
@@ -43,7 +46,8 @@ class Listener(socket.socket):
         self._closed_count, self._log_time = 0, float("-inf")
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """As socket's. Raises BlockingIOError where others should be served, or be closed, before."""
+        """As socket's. Raises BlockingIOError where others should be served, or be closed,
+        before."""
         now = time.monotonic()
         self._closing = {peer: begun for peer, begun in self._closing.items() if now - begun < 1.0}
         if self._batch >= ACCEPTED_AT_ONCE or len(self._closing) >= _CLOSING:
@@ -60,7 +64,8 @@ class Listener(socket.socket):
         return accepted, peer
 
     def count(self, accepted: "_Accepted", peer: Any) -> None:
-        """Count a connection from this socket address as a stranger's, and close another one where it is too many."""
+        """Count a connection from this socket address as a stranger's, and close another one where
+        it is too many."""
         accepted.listener, accepted.peer, accepted.group = self, peer, address_group(peer[0])
         self._strangers[peer] = accepted
         self._counts[accepted.group] += 1
@@ -72,7 +77,8 @@ class Listener(socket.socket):
         self._closing.pop(peer, None)
 
     def admit(self, peer: Any) -> "_Accepted | None":
-        """Count the connection from this socket address, which has a valid cookie, no longer among the unauthenticated.
+        """Count the connection from this socket address, which has a valid cookie, no longer among
+        the unauthenticated.
 
         Returns it; None where it is not among them.
         """
@@ -87,14 +93,19 @@ class Listener(socket.socket):
         busiest, count = self._counts.most_common(1)[0]
         if count <= STRANGERS_PER_ADDRESS and len(self._strangers) <= self._max_strangers:
             return
-        oldest = self.admit(next(peer for peer, one in self._strangers.items() if one.group == busiest))
+        oldest = self.admit(
+            next(peer for peer, one in self._strangers.items() if one.group == busiest)
+        )
         assert oldest is not None
         self._closing[oldest.peer] = time.monotonic()
         with contextlib.suppress(OSError):  # it is closed as soon as its transport reads the end
             oldest.shutdown(socket.SHUT_RDWR)
         self._closed_count += 1
         if time.monotonic() - self._log_time >= _LOG_SECONDS:
-            logger.warning("%d connections without a valid link were closed: too many at a time", self._closed_count)
+            logger.warning(
+                "%d connections without a valid link were closed: too many at a time",
+                self._closed_count,
+            )
             self._closed_count, self._log_time = 0, time.monotonic()
 
 
@@ -112,21 +123,28 @@ class _Accepted(socket.socket):
 
 
 class Admissions:
-    """The connections with a valid cookie, by role, at most ``limits``. Only for the server's own thread."""
+    """The connections with a valid cookie, by role, at most ``limits``. Only for the server's own
+    thread."""
 
     def __init__(self, listener: socket.socket, limits: Mapping[Role, int] = CONNECTIONS) -> None:
         self._listener, self._limits = listener, limits
         self._connections: dict[Role, set[Any]] = {role: set() for role in limits}
 
     def admit(self, connection: Any, role: Role) -> None:
-        """Count a connection (with `transport` and `role`) among those of a role; raises Refusal for one too many."""
+        """Count a connection (with `transport` and `role`) among those of a role; raises Refusal
+        for one too many."""
         if len(self._connections[role]) >= self._limits[role]:
-            raise Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "Too many pages are open by this link: close some of them.")
+            raise Refusal(
+                HTTPStatus.SERVICE_UNAVAILABLE,
+                "Too many pages are open by this link: close some of them.",
+            )
         if isinstance(self._listener, Listener):
             self._listener.admit(connection.transport.get_extra_info("peername"))
         connection.role = role
         self._connections[role].add(connection)
-        connection.connection_lost_waiter.add_done_callback(lambda _: self._connections[role].discard(connection))
+        connection.connection_lost_waiter.add_done_callback(
+            lambda _: self._connections[role].discard(connection)
+        )
 
     def close_all(self, but: Any = None, only: Any = None) -> None:
         """Abort all connections with a cookie but one; `only` this one where one is given."""
@@ -137,7 +155,8 @@ class Admissions:
 
 
 class OncePerSecond(logging.Filter):
-    """Drops a log record where one of the same message and error was logged within the last second."""
+    """Drops a log record where one of the same message and error was logged within the last
+    second."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -151,7 +170,9 @@ class OncePerSecond(logging.Filter):
         fault = record.name, record.levelno, str(record.msg)[:200], error
         if now - self._times.get(fault, float("-inf")) < 1.0:
             return False
-        self._times = {one: logged for one, logged in self._times.items() if now - logged < 1.0} | {fault: now}
+        self._times = {one: logged for one, logged in self._times.items() if now - logged < 1.0} | {
+            fault: now
+        }
         return True
 
 
@@ -164,7 +185,8 @@ def limit_log() -> None:
 
 
 def address_group(address: str) -> str:
-    """The address, or of an IPv6 address the network of 64 bits, which one subscriber has all of."""
+    """The address, or of an IPv6 address the network of 64 bits, which one subscriber has all
+    of."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     if isinstance(parsed, ipaddress.IPv6Address) and not parsed.ipv4_mapped:
         return str(ipaddress.ip_network((parsed, 64), strict=False))
@@ -172,7 +194,8 @@ def address_group(address: str) -> str:
 
 
 def raise_descriptor_limit() -> None:
-    """Let this process open 1,024 files where it may: some systems start with fewer than all limits together need."""
+    """Let this process open 1,024 files where it may: some systems start with fewer than all limits
+    together need."""
     if sys.platform == "win32":
         return
     with contextlib.suppress(ImportError, ValueError, OSError):

@@ -10,7 +10,8 @@ from websockets.http11 import Response
 
 _CLOSED = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 HELP_POLICY = f"{_CLOSED}; style-src 'unsafe-inline'; img-src 'self'"
-"""Content-Security-Policy of the documentation: nothing runs there, and only this server's pictures are shown."""
+"""Content-Security-Policy of the documentation: nothing runs there, and only this server's pictures
+are shown."""
 
 
 def respond(
@@ -27,7 +28,8 @@ def respond(
 
 
 def harden(headers: Headers, policy: str = _CLOSED) -> None:
-    """Add the headers that keep an answer out of other sites' pages, caches and histories (in place)."""
+    """Add the headers that keep an answer out of other sites' pages, caches and histories (in
+    place)."""
     for name, value in {
         "Content-Security-Policy": policy,
         "X-Content-Type-Options": "nosniff",
@@ -41,8 +43,12 @@ def harden(headers: Headers, policy: str = _CLOSED) -> None:
 
 
 def page_policy(html: bytes, host: str) -> str:
-    """Content-Security-Policy of our own pages: inline scripts, images and connections to this server only."""
-    scripts = " ".join(script_hash(m) for m in re.findall(rb"<script[^>]*>(.*?)</script>", html, re.S)) or "'none'"
+    """Content-Security-Policy of our own pages: inline scripts, images and connections to this
+    server only."""
+    scripts = (
+        " ".join(script_hash(m) for m in re.findall(rb"<script[^>]*>(.*?)</script>", html, re.S))
+        or "'none'"
+    )
     return (
         f"{_CLOSED}; script-src {scripts}; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
         f"media-src data:; connect-src 'self' ws://{host} wss://{host}"
@@ -50,11 +56,12 @@ def page_policy(html: bytes, host: str) -> str:
 
 
 def viser_policy(scripts: tuple[str, ...], host: str) -> str:
-    """Return the content security policy of viser's page, which unpacks itself with WebAssembly in a blob worker.
+    """Return the content security policy of viser's page, which unpacks itself with WebAssembly in
+    a blob worker.
 
-    Only viser's own scripts (given by their hashes) run, so that HTML in a label, a script or an event handler in it,
-    does nothing even where someone forgot to escape it. They may evaluate text: parts of them are compiled so, and
-    Plotly is sent as text.
+    Only viser's own scripts (given by their hashes) run, so that HTML in a label, a script or an
+    event handler in it, does nothing even where someone forgot to escape it. They may evaluate
+    text: parts of them are compiled so, and Plotly is sent as text.
     """
     return (
         f"{_CLOSED}; script-src {' '.join(scripts)} 'unsafe-eval'; style-src 'unsafe-inline'; "

@@ -1,4 +1,5 @@
-"""A viser server that only invited browsers reach, and that changes only what its page offers them to change."""
+"""A viser server that only invited browsers reach, and that changes only what its page offers them
+to change."""
 
 import ipaddress
 import re
@@ -18,7 +19,12 @@ from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
 from slviewer.server.binding import RESOLVE_SECONDS, listen, network_address
 from slviewer.server.connection import REQUEST_SECONDS, STALL_SECONDS, Connection, quiet_logger
-from slviewer.server.credentials import TlsCertificate, load_tokens, save_tokens, self_made_certificate
+from slviewer.server.credentials import (
+    TlsCertificate,
+    load_tokens,
+    save_tokens,
+    self_made_certificate,
+)
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
 from slviewer.server.limits import CONNECTIONS, Admissions, limit_log, raise_descriptor_limit
@@ -27,7 +33,9 @@ from slviewer.server.viser_internals import ViserClient
 
 MESSAGE_LIMIT = 32 * 2**20
 """Bytes of one message from a browser; the largest is a picture that the server requested."""
-_NAME = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,251}[A-Za-z0-9_])?)(:[0-9]{1,5})?")
+_NAME = re.compile(
+    r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,251}[A-Za-z0-9_])?)(:[0-9]{1,5})?"
+)
 LEAVING_SECONDS = 3.0
 """How long a browser that requested new links may take to open its own."""
 
@@ -36,9 +44,10 @@ LEAVING_SECONDS = 3.0
 class Serving:
     """Where and how to serve. `port` 0 takes any free one.
 
-    `names` are further host names (`name` or `name:port`) under which browsers reach the server, behind a proxy, say;
-    UsageError for what is none. `tls`: encrypt, with the files of a certificate (PEM: the chain, the key), else with a
-    self-made one. `token_file` holds tokens that stay the same.
+    `names` are further host names (`name` or `name:port`) under which browsers reach the server,
+    behind a proxy, say; UsageError for what is none. `tls`: encrypt, with the files of a
+    certificate (PEM: the chain, the key), else with a self-made one. `token_file` holds tokens that
+    stay the same.
     """
 
     host: str = "127.0.0.1"
@@ -52,14 +61,16 @@ class Serving:
         for name in self.names:
             if not _NAME.fullmatch(name):
                 raise UsageError(
-                    f"{name!r} is no host name as browsers send it: give one of letters, digits, '-' and '.', with "
-                    "its port if that is another one, and other letters as xn--…"
+                    f"{name!r} is no host name as browsers send it: give one of letters, digits,"
+                    " '-' and '.', with its port if that is another one, and other letters as"
+                    " xn--…"
                 )
 
 
 @dataclass(frozen=True)
 class SafeServer:
-    """A running server: build the page with `viser`, offer files with `downloads`, set the `device_pages` by role."""
+    """A running server: build the page with `viser`, offer files with `downloads`, set the
+    `device_pages` by role."""
 
     viser: viser.ViserServer
     device_pages: dict[Role, DevicePage]
@@ -81,14 +92,17 @@ class SafeServer:
 
     @property
     def shared_origin(self) -> str:
-        """Scheme, host and port for other devices: the address in the network, where all addresses are open."""
+        """Scheme, host and port for other devices: the address in the network, where all addresses
+        are open."""
         found = network_address() if self._address.is_unspecified else None
         return self._format_origin(found or self._format_host())
 
     def link(self, role: Role = "operate", origin: str | None = None) -> str:
-        """The link of a role, with its token behind the #, which browsers do not send; as secret as a password.
+        """The link of a role, with its token behind the #, which browsers do not send; as secret as
+        a password.
 
-        `origin` (scheme, host, port) is the address to use where that is another one than the server's own.
+        `origin` (scheme, host, port) is the address to use where that is another one than the
+        server's own.
         """
         own = self.origin if role == "operate" else self.shared_origin
         return f"{origin or own}/#{self.access.grants[role].token}"
@@ -98,10 +112,11 @@ class SafeServer:
         return f"{self.origin}/#{self.access.issue_one_time_token()}"
 
     def renew_links(self, client_id: int, leaving_s: float = LEAVING_SECONDS) -> None:
-        """Replace all tokens, close all connections, and lead the operator's client that requested it to its new page,
-        for which it has `leaving_s`.
+        """Replace all tokens, close all connections, and lead the operator's client that requested
+        it to its new page, for which it has `leaving_s`.
 
-        Raises OSError where the tokens come from a file that cannot be replaced; they are replaced here nevertheless.
+        Raises OSError where the tokens come from a file that cannot be replaced; they are replaced
+        here nevertheless.
         """
         client = ViserClient(self.viser, client_id)
         leaving = client.connection
@@ -110,7 +125,10 @@ class SafeServer:
         client.navigate(f"/#{self.access.issue_one_time_token()}")
         viser_internals.call_soon(self.viser, leaving_s, self.admissions.close_all, None, leaving)
         if self.serving.token_file is not None:
-            save_tokens(self.serving.token_file, {role: grant.token for role, grant in self.access.grants.items()})
+            save_tokens(
+                self.serving.token_file,
+                {role: grant.token for role, grant in self.access.grants.items()},
+            )
 
     @property
     def loopback(self) -> bool:
@@ -123,7 +141,8 @@ class SafeServer:
         return None if connection is None else connection.role
 
     def origin_of(self, client_id: int) -> str | None:
-        """The origin (scheme, host, port) of a client's page, which a proxy may serve; None once disconnected."""
+        """The origin (scheme, host, port) of a client's page, which a proxy may serve; None once
+        disconnected."""
         connection = ViserClient(self.viser, client_id).connection
         return None if connection is None else connection.request.headers["Origin"]
 
@@ -141,7 +160,8 @@ class SafeServer:
         return ipaddress.ip_address(self.viser.get_host().partition("%")[0])
 
     def _format_host(self) -> str:
-        """The host part of links: the address, in brackets for IPv6; loopback if all addresses are open."""
+        """The host part of links: the address, in brackets for IPv6; loopback if all addresses are
+        open."""
         address = self._address
         if address.is_unspecified:
             return "127.0.0.1" if address.version == 4 else "[::1]"
@@ -160,11 +180,11 @@ def serve(
 ) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
 
-    A browser has `request_s` to send its request, the reader of a file `stall_s` to take some of it, and a name server
-    `resolve_s` to answer; `connections` bounds the open ones by role.
+    A browser has `request_s` to send its request, the reader of a file `stall_s` to take some of
+    it, and a name server `resolve_s` to answer; `connections` bounds the open ones by role.
 
-    Raises SlviewerError within two seconds where the address can't be served, where viser is not the pinned one, and
-    where tokens or certificate cannot be used.
+    Raises SlviewerError within two seconds where the address can't be served, where viser is not
+    the pinned one, and where tokens or certificate cannot be used.
     """
     viser_internals.check_version()
     tokens = {} if serving.token_file is None else load_tokens(serving.token_file)
@@ -184,11 +204,15 @@ def serve(
         device_pages: dict[Role, DevicePage] = {}
         downloads = Downloads()
         is_trusted = certificate is not None and not certificate.self_made
-        middleware = AuthMiddleware(access, admissions, device_pages, downloads, strict_transport=is_trusted)
+        middleware = AuthMiddleware(
+            access, admissions, device_pages, downloads, strict_transport=is_trusted
+        )
         budget = UploadBudget(upload_limit)
         started: list[viser.ViserServer] = []
 
-        def serve_viser(viser_handler: Callable[..., Any], _host: str, _port: int, **options: Any) -> serve_websockets:
+        def serve_viser(
+            viser_handler: Callable[..., Any], _host: str, _port: int, **options: Any
+        ) -> serve_websockets:
             """Start viser's WebSocket server behind the middleware, in place of its own."""
 
             async def handle(connection: ServerConnection) -> None:
@@ -197,7 +221,9 @@ def serve(
                 if connection.role in device_pages:
                     await device_pages[connection.role].handler(connection)
                 elif connection.role in ("operate", "watch") and started:
-                    gate = connection.gate = ViserGate(started[0], connection, connection.role, budget)
+                    gate = connection.gate = ViserGate(
+                        started[0], connection, connection.role, budget
+                    )
                     try:
                         await viser_handler(connection)
                     finally:
@@ -209,7 +235,8 @@ def serve(
                 create_connection=partial(Connection, request_s=request_s, stall_s=stall_s),
                 max_size=MESSAGE_LIMIT,
                 server_header=None,
-                backlog=1024,  # of a crowd: a browser whose request does not fit in tries again after a second
+                # of a crowd: a browser whose request does not fit in tries again after a second
+                backlog=1024,
                 open_timeout=None,  # Connection limits the request alone
                 logger=quiet_logger(),
             )
@@ -222,4 +249,12 @@ def serve(
     except BaseException:
         sock.close()
         raise
-    return SafeServer(server, device_pages, downloads, replace(serving, port=port), access, admissions, certificate)
+    return SafeServer(
+        server,
+        device_pages,
+        downloads,
+        replace(serving, port=port),
+        access,
+        admissions,
+        certificate,
+    )

@@ -1,4 +1,5 @@
-"""Uploads of one client: within the size allowed, under a harmless name, in no parts but those announced."""
+"""Uploads of one client: within the size allowed, under a harmless name, in no parts but those
+announced."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -8,13 +9,15 @@ from slviewer.server.access import MessageRefused
 from slviewer.server.text import safe_file_name
 
 SMALLEST_PART = 4096
-"""Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than they carry."""
+"""Bytes; viser's page sends half a megabyte at a time. Smaller parts would cost more memory than
+they carry."""
 
 
 @dataclass
 class UploadBudget:
-    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps them in memory), and
-    the ``names`` of the transfers under way: viser keeps them in one place for all clients."""
+    """How many bytes of unfinished uploads the server holds for all clients together (viser keeps
+    them in memory), and the ``names`` of the transfers under way: viser keeps them in one place for
+    all clients."""
 
     limit: int
     used: int = 0
@@ -23,7 +26,8 @@ class UploadBudget:
 
 @dataclass
 class _Transfer:
-    """An announced upload: its input, its size in bytes, its number of parts, and what has been received."""
+    """An announced upload: its input, its size in bytes, its number of parts, and what has been
+    received."""
 
     source: str
     size: int
@@ -41,24 +45,29 @@ class Uploads:
         self._transfers: dict[str, _Transfer] = {}
 
     def start(self, message: Any) -> Any:
-        """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it is too large."""
+        """The announcement (a FileTransferStartUpload) with a safe file name; Refused where it is
+        too large."""
         size, parts = message.size_bytes, message.part_count
         if size < 0 or not (parts == 0 if size == 0 else 1 <= parts <= size // SMALLEST_PART + 1):
             raise MessageRefused("an upload whose parts cannot make up its size")
         if size > self._budget.limit - self._budget.used:
             raise MessageRefused(
-                f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are allowed"
+                f"an upload of {size / 1e6:.0f} MB where {self._budget.limit / 1e6:.0f} MB are"
+                " allowed"
             )
         if message.transfer_uuid in self._budget.names:
             raise MessageRefused("an upload that is under way")
         if size:  # an empty file is complete with its announcement
             self._budget.used += size
             self._budget.names.add(message.transfer_uuid)
-            self._transfers[message.transfer_uuid] = _Transfer(message.source_component_uuid, size, parts)
+            self._transfers[message.transfer_uuid] = _Transfer(
+                message.source_component_uuid, size, parts
+            )
         return replace(message, filename=safe_file_name(message.filename))
 
     def part(self, message: Any) -> None:
-        """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was not announced."""
+        """Count one part (a FileTransferPart) in; Refused, and the upload forgotten, where it was
+        not announced."""
         transfer = self._transfers.get(message.transfer_uuid)
         if transfer is None:
             raise MessageRefused("a part of no upload")

@@ -1,7 +1,8 @@
 """Which browsers have drawn the updates sent to them, so that each is updated at its own pace.
 
-A browser answers a question once all that was sent before it has been drawn, so that an answer tells more than any
-buffer of the network's: one that stalls, on the way or at its screen, has one picture on its way to it and no more.
+A browser answers a question once all that was sent before it has been drawn, so that an answer
+tells more than any buffer of the network's: one that stalls, on the way or at its screen, has one
+picture on its way to it and no more.
 """
 
 import threading
@@ -17,12 +18,15 @@ STALLED_S = 1.0
 
 
 class Viewers:
-    """The browsers of one server. Every method may be called from any thread; `answered()` is called on the server's
-    own, whenever one has caught up, and must return at once.
+    """The browsers of one server. Every method may be called from any thread; `answered()` is
+    called on the server's own, whenever one has caught up, and must return at once.
     """
 
     def __init__(
-        self, server: viser.ViserServer, answered: Callable[[], None], clock: Callable[[], float] = time.monotonic
+        self,
+        server: viser.ViserServer,
+        answered: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._server, self._answered, self._clock = server, answered, clock
         self._lock = threading.Lock()
@@ -36,7 +40,9 @@ class Viewers:
             for known in (self._request_times, self._durations):
                 for gone in known.keys() - clients.keys():
                     del known[gone]
-            return [client for number, client in clients.items() if number not in self._request_times]
+            return [
+                client for number, client in clients.items() if number not in self._request_times
+            ]
 
     def here(self) -> set[int]:
         """The numbers of all connected clients."""
@@ -50,14 +56,18 @@ class Viewers:
         viser_internals.request_answer(client, lambda: self._record_answer(number))
 
     def slowest_s(self) -> float:
-        """Time, s, that the slowest client took to draw its last update, stalled ones excluded; 0 if there is none."""
+        """Time, s, that the slowest client took to draw its last update, stalled ones excluded; 0
+        if there is none."""
         now = self._clock()
         with self._lock:
-            waiting = [now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S]
+            waiting = [
+                now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S
+            ]
             return max([*self._durations.values(), *waiting], default=0.0)
 
     def _record_answer(self, number: int) -> None:
-        """Record the duration, s, until the client answered request ``number``, and call ``answered``."""
+        """Record the duration, s, until the client answered request ``number``, and call
+        ``answered``."""
         with self._lock:
             sent_s = self._request_times.pop(number, None)
             if sent_s is not None:

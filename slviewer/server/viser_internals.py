@@ -1,7 +1,7 @@
 """All uses of viser's private interface, written for exactly one version of it.
 
-viser 1.1.1 has no hook for access, so its WebSocket server is created by ours, and its messages are read on their way
-in. A test compares what is used here with what it was when this was written.
+viser 1.1.1 has no hook for access, so its WebSocket server is created by ours, and its messages are
+read on their way in. A test compares what is used here with what it was when this was written.
 """
 
 import contextlib
@@ -33,7 +33,8 @@ VISER_SCRIPTS = (
     "'sha256-5iRcjB7VnwnYpbUpHa15FmjNIRu22hIQnvWuocHMxJw='",
     "'sha256-o/BTEGoB4UnTxqb+3RxwUFQZkWXpqUxouHkbDNrAkqE='",
 )
-"""The scripts that viser's page runs: the loader that stands in it, and the application that the loader unpacks."""
+"""The scripts that viser's page runs: the loader that stands in it, and the application that the
+loader unpacks."""
 
 Message = _messages.Message
 
@@ -57,13 +58,15 @@ FROM_CLIENTS: dict[str, type[Any]] = {
         "LocalStorageGetItemResponseMessage",
     )
 }
-"""The messages that a client has reason to send; opening and closing a share tunnel is not among them."""
+"""The messages that a client has reason to send; opening and closing a share tunnel is not among
+them."""
 
 _starting = threading.Lock()
 
 
 class _Websockets:
-    """Stands in for the websockets package inside viser while it starts, so that it serves with our function."""
+    """Stands in for the websockets package inside viser while it starts, so that it serves with our
+    function."""
 
     def __init__(self, serve: Callable[..., Any]) -> None:
         self.asyncio = SimpleNamespace(server=SimpleNamespace(serve=serve))
@@ -73,7 +76,8 @@ class _Websockets:
 
 
 def start(serve: Callable[..., Any], host: str, port: int, label: str | None) -> viser.ViserServer:
-    """Start viser's server, listening through `serve` (called as websockets' own), without a share tunnel or output."""
+    """Start viser's server, listening through `serve` (called as websockets' own), without a share
+    tunnel or output."""
     with _starting, _silence_prints():
         _infra.websockets = _Websockets(serve)  # type: ignore[assignment]
         try:
@@ -90,11 +94,12 @@ def start(serve: Callable[..., Any], host: str, port: int, label: str | None) ->
 
 
 def check_version() -> None:
-    """Raise SlviewerError where another version of viser is installed: its access control was not tested."""
+    """Raise SlviewerError where another version of viser is installed: its access control was not
+    tested."""
     if viser.__version__ != VISER:
         raise SlviewerError(
-            f"viser {viser.__version__} is installed, but this slviewer serves safely only with viser {VISER}: "
-            f"install it with pip install viser=={VISER}."
+            f"viser {viser.__version__} is installed, but this slviewer serves safely only with"
+            f" viser {VISER}: install it with pip install viser=={VISER}."
         )
 
 
@@ -112,12 +117,16 @@ def stop(server: viser.ViserServer) -> None:
 
 def _refuse_tunnel(*_: Any, **__: Any) -> NoReturn:
     """Raise SlviewerError: replaces viser's request of a public share link."""
-    raise SlviewerError("slviewer opens no tunnel to the internet: use --host, or ssh -L, to reach it from elsewhere.")
+    raise SlviewerError(
+        "slviewer opens no tunnel to the internet: use --host, or ssh -L, to reach it from"
+        " elsewhere."
+    )
 
 
 @contextlib.contextmanager
 def _silence_prints() -> Iterator[None]:
-    """Suppress what viser prints: its own address, without the token, and its end, which only confuse the operator."""
+    """Suppress what viser prints: its own address, without the token, and its end, which only
+    confuse the operator."""
     printing = rich.print
     rich.print = lambda *_, **__: None
     try:
@@ -127,12 +136,15 @@ def _silence_prints() -> Iterator[None]:
 
 
 def decode_message(raw: bytes) -> Message | None:
-    """The message in these bytes with every field of its declared type; None if it is anything else."""
+    """The message in these bytes with every field of its declared type; None if it is anything
+    else."""
     try:
         fields = msgspec.msgpack.decode(raw)
         kind = FROM_CLIENTS[fields.pop("type")]
         known = {field.name for field in dataclasses.fields(kind)}
-        return msgspec.convert(fields, kind) if fields.keys() <= known else None  # viser fails on unknown fields
+        return (
+            msgspec.convert(fields, kind) if fields.keys() <= known else None
+        )  # viser fails on unknown fields
     except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 
@@ -156,7 +168,9 @@ class ViserClient:
     def of(cls, server: viser.ViserServer, connection: object) -> "ViserClient | None":
         """The client of this connection; None before and after."""
         live = server._websock_server._live_connections
-        return next((cls(server, number) for number, one in list(live.items()) if one is connection), None)
+        return next(
+            (cls(server, number) for number, one in list(live.items()) if one is connection), None
+        )
 
     @property
     def connection(self) -> Any:
@@ -175,7 +189,9 @@ class ViserClient:
 
     def navigate(self, address: str) -> None:
         """Let the client's page give way to another address of this server."""
-        self._queue_message(_messages.RunJavascriptMessage(f"location.replace({json.dumps(address)})"))
+        self._queue_message(
+            _messages.RunJavascriptMessage(f"location.replace({json.dumps(address)})")
+        )
 
     def send_private_values(self) -> None:
         """Show the client the values of all private inputs."""
@@ -186,22 +202,33 @@ class ViserClient:
     def gui_input(self, uuid: str) -> Any:
         """The input with this id that the client can see, or None."""
         candidates = (api._gui_input_handle_from_uuid.get(uuid) for api in self._guis)
-        return next((handle for handle in candidates if handle is not None and is_shown(handle)), None)
+        return next(
+            (handle for handle in candidates if handle is not None and is_shown(handle)), None
+        )
 
     def command(self, uuid: str) -> Any:
         """The command with this id that is not disabled, or None."""
         candidates = (api._command_handle_from_uuid.get(uuid) for api in self._guis)
-        return next((one for one in candidates if one is not None and not (one._impl.removed or one.disabled)), None)
+        return next(
+            (
+                one
+                for one in candidates
+                if one is not None and not (one._impl.removed or one.disabled)
+            ),
+            None,
+        )
 
     def scene_api(self, owner: str) -> Any:
-        """The scene that a message names by its owner: the shared one, or the client's own; None for anyone else's."""
+        """The scene that a message names by its owner: the shared one, or the client's own; None
+        for anyone else's."""
         if owner == "":
             return self.server.scene
         client = self._handle
         return client.scene if client is not None and client.scene._owner_id == owner else None
 
     def listens_to_gizmo(self, scene: Any, name: str) -> bool:
-        """Whether this gizmo exists and has a callback; also true while a removed one is still being dragged."""
+        """Whether this gizmo exists and has a callback; also true while a removed one is still
+        being dragged."""
         if (self.number, name) in scene._active_transform_drag_handles:
             return True
         handle = scene._handle_from_transform_controls_name.get(name)
@@ -211,10 +238,13 @@ class ViserClient:
         """Whether a callback for this pointer event over the whole scene is registered."""
         client = self._handle
         scenes = [self.server.scene] if client is None else [self.server.scene, client.scene]
-        return any(entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb)
+        return any(
+            entry.event_type == event for scene in scenes for entry in scene._scene_pointer_cb
+        )
 
     def is_awaited(self, kind: type[Message]) -> bool:
-        """Whether the server awaits this kind of message from the client, as the response to a request."""
+        """Whether the server awaits this kind of message from the client, as the response to a
+        request."""
         client = self._handle
         return client is not None and bool(client._websock_connection._incoming_handlers.get(kind))
 
@@ -245,7 +275,9 @@ class ViserClient:
             client._websock_connection.queue_message(message)
 
 
-def call_soon(server: viser.ViserServer, delay_s: float, function: Callable[..., Any], *args: Any) -> None:
+def call_soon(
+    server: viser.ViserServer, delay_s: float, function: Callable[..., Any], *args: Any
+) -> None:
     """Call a function on the server's own thread, after a delay."""
     loop = server._websock_server._background_event_loop
     assert loop is not None
@@ -254,7 +286,8 @@ def call_soon(server: viser.ViserServer, delay_s: float, function: Callable[...,
 
 
 def make_private(handle: Any) -> None:
-    """Send what is typed into this input to no other browser; `send_private_values` sends it to operators."""
+    """Send what is typed into this input to no other browser; `send_private_values` sends it to
+    operators."""
     handle._impl.sync_cb = None
 
 
@@ -264,7 +297,8 @@ def is_private(handle: Any) -> bool:
 
 
 def is_shown(handle: Any) -> bool:
-    """Whether this element, and every folder, tab, panel or modal that holds it, exists and is visible."""
+    """Whether this element, and every folder, tab, panel or modal that holds it, exists and is
+    visible."""
     while True:
         impl = handle._impl
         if impl.removed or not impl.props.visible:
@@ -301,7 +335,8 @@ def _is_visible(scene: Any, name: str) -> bool:
 
 
 def request_answer(client: viser.ClientHandle, answered: Callable[[], None]) -> None:
-    """Call `answered()`, on the server's thread, once this client has handled all that was queued for it alone."""
+    """Call `answered()`, on the server's thread, once this client has handled all that was queued
+    for it alone."""
     connection, kind = client._websock_connection, _messages.LocalStorageGetItemResponseMessage
     question = secrets.token_hex(8)
 

@@ -1,11 +1,12 @@
 """Folders and files that are complete or absent, also after `kill -9` or with a full disk.
 
-A folder is written as `.<name>.tmp-<pid>-<random>` next to its place, every file synced, then renamed in. Where it
-replaces another it is first renamed to `.<name>.new-<pid>-<random>`: from then on the replacement is decided, and
-`recover` finishes it if the program dies between moving the old folder away and moving the new one in. A folder that
-waits for others to be renamed with it is called `.<name>.done-<pid>-<random>`: it is complete, and `recover` renames it
-too. Folders that replace others in one step are listed in a file `.together.new-<pid>-<random>`: once it exists, all of
-these replacements are decided.
+A folder is written as `.<name>.tmp-<pid>-<random>` next to its place, every file synced, then
+renamed in. Where it replaces another it is first renamed to `.<name>.new-<pid>-<random>`: from then
+on the replacement is decided, and `recover` finishes it if the program dies between moving the old
+folder away and moving the new one in. A folder that waits for others to be renamed with it is
+called `.<name>.done-<pid>-<random>`: it is complete, and `recover` renames it too. Folders that
+replace others in one step are listed in a file `.together.new-<pid>-<random>`: once it exists, all
+of these replacements are decided.
 """
 
 import errno
@@ -32,7 +33,8 @@ _SPARE_BYTES = 1 << 20  # metadata, folders, the file system's own rounding
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder to disk, so that the names in it survive a power failure; Windows opens no folders for that."""
+    """Sync a folder to disk, so that the names in it survive a power failure; Windows opens no
+    folders for that."""
     if not _SYNCS_FOLDERS:
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -45,8 +47,8 @@ def sync_folder(folder: Path) -> None:
 def rename(source: Path, target: Path, patience_s: float = _PATIENCE_S) -> None:
     """Rename a file over another one, or a folder to a name that is free.
 
-    Windows refuses while another program has it open, such as a virus scanner, an indexer or a copy of the folder: it
-    is tried again for ``patience_s``.
+    Windows refuses while another program has it open, such as a virus scanner, an indexer or a copy
+    of the folder: it is tried again for ``patience_s``.
     """
     end = time.monotonic() + patience_s
     while True:
@@ -60,7 +62,8 @@ def rename(source: Path, target: Path, patience_s: float = _PATIENCE_S) -> None:
 
 
 def write_bytes(path: Path, *parts: Any) -> None:
-    """Write buffers one after another to a new file and sync it; its name is durable once its folder is synced."""
+    """Write buffers one after another to a new file and sync it; its name is durable once its
+    folder is synced."""
     with open(path, "xb") as file:
         for part in parts:
             file.write(part)
@@ -84,8 +87,8 @@ def replace_json(path: Path, data: Any) -> None:
 
 
 def replace_file(path: Path, data: bytes, patience_s: float = _PATIENCE_S) -> None:
-    """Replace a file by a new one in one step. Raises SessionError where the disk refuses, or another program still has
-    the old one open after ``patience_s``; the old one then stays."""
+    """Replace a file by a new one in one step. Raises SessionError where the disk refuses, or
+    another program still has the old one open after ``patience_s``; the old one then stays."""
     temporary = _staging_path(path, "tmp")
     with disk_errors(path.parent, len(data)):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,10 +103,11 @@ def replace_file(path: Path, data: bytes, patience_s: float = _PATIENCE_S) -> No
 
 @contextmanager
 def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
-    """A file to write that takes the place of `path` in one step when the block ends, and leaves no trace if it fails.
+    """A file to write that takes the place of `path` in one step when the block ends, and leaves no
+    trace if it fails.
 
-    For what is too large to be one `bytes`. Raises SessionError if the disk has not `needs_bytes` to spare, or refuses;
-    what stood there then stays.
+    For what is too large to be one `bytes`. Raises SessionError if the disk has not `needs_bytes`
+    to spare, or refuses; what stood there then stays.
     """
     with arriving_path(path, needs_bytes) as temporary, open(temporary, "xb") as file:
         yield file
@@ -111,7 +115,8 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
 
 @contextmanager
 def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
-    """As `arriving_file`, of a file that does not exist yet, for a library that creates it itself."""
+    """As `arriving_file`, of a file that does not exist yet, for a library that creates it
+    itself."""
     temporary = _staging_path(path, "tmp")
     with disk_errors(path.parent, needs_bytes):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -129,10 +134,11 @@ def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
 
 @contextmanager
 def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
-    """A new empty folder next to `target` to write into; synced when the block ends, gone if it fails.
+    """A new empty folder next to `target` to write into; synced when the block ends, gone if it
+    fails.
 
-    The caller then hands it to `commit`. Raises SessionError if the disk has not `needs_bytes` to spare, or fills up
-    or fails while the block writes.
+    The caller then hands it to `commit`. Raises SessionError if the disk has not `needs_bytes` to
+    spare, or fills up or fails while the block writes.
     """
     with disk_errors(target.parent, needs_bytes):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -149,7 +155,8 @@ def staged_folder(target: Path, needs_bytes: int) -> Iterator[Path]:
 
 
 def mark_complete(folder: Path) -> Path:
-    """Rename a staged folder so that `recover` keeps it if the program dies before `commit`; returns its new path."""
+    """Rename a staged folder so that `recover` keeps it if the program dies before `commit`;
+    returns its new path."""
     match = _LEFTOVER.fullmatch(folder.name)
     assert match is not None, folder
     complete = _staging_path(folder.with_name(match["name"]), "done")
@@ -159,7 +166,8 @@ def mark_complete(folder: Path) -> Path:
 
 
 def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
-    """Rename a staged folder to `target`. An existing one is moved to `old_to`, or deleted where that is None."""
+    """Rename a staged folder to `target`. An existing one is moved to `old_to`, or deleted where
+    that is None."""
     with disk_errors(target.parent):
         if target.exists():
             decided = _staging_path(target, "new")
@@ -172,15 +180,18 @@ def commit(folder: Path, target: Path, old_to: Path | None = None) -> None:
 
 
 class Together:
-    """Folders under ``root`` that replace others in one step; `recover` finishes it if the program dies meanwhile."""
+    """Folders under ``root`` that replace others in one step; `recover` finishes it if the program
+    dies meanwhile."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._changes: dict[Path, tuple[Path | None, Path | None]] = {}  # target: (what replaces it, where it goes)
+        self._changes: dict[
+            Path, tuple[Path | None, Path | None]
+        ] = {}  # target: (what replaces it, where it goes)
 
     def replace(self, target: Path, folder: Path | None, old_to: Path | None = None) -> None:
-        """Let a folder, staged or from the trash, or nothing become ``target``, whose present one goes to ``old_to`` or
-        is deleted."""
+        """Let a folder, staged or from the trash, or nothing become ``target``, whose present one
+        goes to ``old_to`` or is deleted."""
         replaced, first_to = self._changes.get(target, (None, None))
         self._changes[target] = folder, first_to or old_to
         if replaced is not None:
@@ -191,7 +202,8 @@ class Together:
         self.replace(target, None, old_to)
 
     def folder_for(self, target: Path) -> Path:
-        """Return where the content of ``target`` is now: a path that does not exist where it is to go."""
+        """Return where the content of ``target`` is now: a path that does not exist where it is to
+        go."""
         staged, _ = self._changes.get(target, (target, None))
         return target.with_name(f".{target.name}.absent") if staged is None else staged
 
@@ -202,15 +214,21 @@ class Together:
                 discard(staged)
 
     def commit(self) -> None:
-        """Make the changes. Raises SessionError where the disk refuses: nothing is changed then, and what was staged is
-        removed; or, where it refuses half-way, the next opening of the session finishes it."""
+        """Make the changes. Raises SessionError where the disk refuses: nothing is changed then,
+        and what was staged is removed; or, where it refuses half-way, the next opening of the
+        session finishes it."""
         if not self._changes:
             return
         listed = [
-            [None if path is None else path.relative_to(self._root).as_posix() for path in (target, staged, old_to)]
+            [
+                None if path is None else path.relative_to(self._root).as_posix()
+                for path in (target, staged, old_to)
+            ]
             for target, (staged, old_to) in self._changes.items()
         ]
-        temporary, decided = (_staging_path(self._root / _TOGETHER, state) for state in ("tmp", "new"))
+        temporary, decided = (
+            _staging_path(self._root / _TOGETHER, state) for state in ("tmp", "new")
+        )
         try:
             with disk_errors(self._root):
                 write_bytes(temporary, to_json({"changes": listed}))
@@ -223,7 +241,8 @@ class Together:
 
 
 def _finish_together(decided: Path) -> None:
-    """Make the changes that a file of `Together` lists, those that were not made yet, and remove the file."""
+    """Make the changes that a file of `Together` lists, those that were not made yet, and remove
+    the file."""
     root = decided.parent
     with disk_errors(root):
         sync_folder(root)
@@ -240,7 +259,8 @@ def _finish_together(decided: Path) -> None:
 
 
 def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
-    """The changes that a file of `Together` lists; DamagedError where it lists anything but paths in its folder."""
+    """The changes that a file of `Together` lists; DamagedError where it lists anything but paths
+    in its folder."""
 
     def inside(name: str) -> Path:
         """Return the path of a name below the file's folder; raises ValueError for others."""
@@ -257,14 +277,18 @@ def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
 
 
 def _check_unlinked(decided: Path) -> None:
-    """Raise DamagedError where a link leads a change that a file of `Together` lists out of the file's folder.
+    """Raise DamagedError where a link leads a change that a file of `Together` lists out of the
+    file's folder.
 
-    The file may have come with the session from somebody else, who would so delete any folder of this user.
+    The file may have come with the session from somebody else, who would so delete any folder of
+    this user.
     """
     root = decided.parent.resolve()
     for path in (path for change in _read_changes(decided) for path in change if path is not None):
         if not path.parent.resolve().is_relative_to(root):
-            raise DamagedError(f"{decided} is damaged ({path} is outside of {root}): nothing was changed there")
+            raise DamagedError(
+                f"{decided} is damaged ({path} is outside of {root}): nothing was changed there"
+            )
 
 
 def move(folder: Path, target: Path) -> None:
@@ -288,18 +312,23 @@ def list_leftovers(root: Path) -> list[Path]:
     """Unfinished files and folders under `root`, of writers that died or are still writing."""
     unfinished = []
     for parent, folders, files in os.walk(root):
-        unfinished += [Path(parent, name) for name in (*folders, *files) if _LEFTOVER.fullmatch(name)]
+        unfinished += [
+            Path(parent, name) for name in (*folders, *files) if _LEFTOVER.fullmatch(name)
+        ]
         # neither into leftovers nor into stacks, which hold a folder a frame
-        folders[:] = [name for name in folders if not _LEFTOVER.fullmatch(name) and not name.endswith(".zarr")]
+        folders[:] = [
+            name for name in folders if not _LEFTOVER.fullmatch(name) and not name.endswith(".zarr")
+        ]
     return unfinished
 
 
 def recover(root: Path, trash_place: Callable[[Path], Path]) -> list[Path]:
-    """Finish what dead writers began: rename complete folders to their places, which are returned, and remove the rest.
+    """Finish what dead writers began: rename complete folders to their places, which are returned,
+    and remove the rest.
 
-    Call with the session's lock held, nothing writing. A replacement that was decided moves the old folder to
-    `trash_place(target)`; a complete folder whose place is taken is itself moved there. Raises SessionError where the
-    disk refuses.
+    Call with the session's lock held, nothing writing. A replacement that was decided moves the old
+    folder to `trash_place(target)`; a complete folder whose place is taken is itself moved there.
+    Raises SessionError where the disk refuses.
     """
     completed = []
     for path in list_leftovers(root):
@@ -351,7 +380,11 @@ def _disk_full_error(folder: Path, needs_bytes: int) -> SessionError:
     """Return the error for a full disk, with the needed and the free space in words."""
     folder = next(each for each in (folder, *folder.parents) if each.exists())
     free = shutil.disk_usage(folder).free
-    needs = f"needs {format_bytes(needs_bytes)} and {format_bytes(_SPARE_BYTES)} to spare, " if needs_bytes else ""
+    needs = (
+        f"needs {format_bytes(needs_bytes)} and {format_bytes(_SPARE_BYTES)} to spare, "
+        if needs_bytes
+        else ""
+    )
     return SessionError(
         f"the disk is full: the save {needs}{format_bytes(free)} are free on {folder}: "
         "free some space or choose another folder"
@@ -370,10 +403,13 @@ def format_bytes(count: int) -> str:
 
 @contextmanager
 def disk_errors(folder: Path, needs_bytes: int = 0) -> Iterator[None]:
-    """Context manager: raise errors of the disk as SessionError; ``needs_bytes`` of a save that it refuses."""
+    """Context manager: raise errors of the disk as SessionError; ``needs_bytes`` of a save that it
+    refuses."""
     try:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise _disk_full_error(folder, needs_bytes) from error
-        raise SessionError(f"{folder} cannot be written ({error}): check its permissions and the disk") from error
+        raise SessionError(
+            f"{folder} cannot be written ({error}): check its permissions and the disk"
+        ) from error

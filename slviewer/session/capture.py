@@ -33,15 +33,18 @@ Role = Literal["calibration", "scan"]
 Comparison = Literal["absent", "same", "damaged", "different"]
 """Of a stored capture with a new one: "damaged" was the same when it was saved."""
 
-_FRAMES_IN_MEMORY = 8  # frames of an exposure that are in memory together while their peaks are computed
+_FRAMES_IN_MEMORY = (
+    8  # frames of an exposure that are in memory together while their peaks are computed
+)
 
 
 @dataclass(frozen=True)
 class TurnStep:
-    """One capture of a turn on a turntable: the turn's name, which step of how many, from 1, and the angle of a step.
+    """One capture of a turn on a turntable: the turn's name, which step of how many, from 1, and
+    the angle of a step.
 
-    Angles of one turn belong together; the object may have been moved between two turns. `position_deg` is what the
-    table itself counted there.
+    Angles of one turn belong together; the object may have been moved between two turns.
+    `position_deg` is what the table itself counted there.
     """
 
     turn: str
@@ -69,57 +72,69 @@ class Capture:
     role: Role
     sequence: PatternSequence
     size: tuple[int, int]  # (width, height) of the camera's frames, px
-    hash: str  # of frames, exposures, texture, sequence: equal where every result computed from them is equal
+    # of frames, exposures, texture, sequence: equal where every result computed from them is equal
+    hash: str
     folder: Path
-    meta: dict[str, Any] = field(repr=False, compare=False)  # content of capture.json: source, settings, board, ...
+    meta: dict[str, Any] = field(
+        repr=False, compare=False
+    )  # content of capture.json: source, settings, board, ...
 
     @property
     def frames(self) -> np.ndarray:
-        """All frames (n, h, w), uint8 or uint16, in the sequence's order; read anew at every access."""
+        """All frames (n, h, w), uint8 or uint16, in the sequence's order; read anew at every
+        access."""
         return self.stack()
 
     def stack(self, indices: Sequence[int] | None = None) -> np.ndarray:
-        """Frames (n, h, w) at `indices` into the sequence, in that order (all where None); reads only these.
+        """Frames (n, h, w) at `indices` into the sequence, in that order (all where None); reads
+        only these.
 
-        Those of a capture in several exposures are merged, pixel by pixel, by `exposure_choice`. Raises
-        DamagedError where a frame is not what was saved (of an older capture, whose frames have no checksums, only
-        where all are read), SessionError where the capture was replaced since it was loaded.
+        Those of a capture in several exposures are merged, pixel by pixel, by `exposure_choice`.
+        Raises DamagedError where a frame is not what was saved (of an older capture, whose frames
+        have no checksums, only where all are read), SessionError where the capture was replaced
+        since it was loaded.
         """
         path = self.folder / "frames.zarr"
         n, (width, height) = len(self.sequence.frames) * max(1, len(self.exposures_ms)), self.size
         if (shape := describe_stack(path)[0]) != (n, height, width):
             raise DamagedError(
-                f"{self.name}: {self.folder} is damaged: its description states {n} frames of {width}x{height} px, and "
-                f"frames.zarr holds {shape[0]} of {shape[2]}x{shape[1]} px: restore the folder from a copy, or import "
-                "or record the capture again"
+                f"{self.name}: {self.folder} is damaged: its description states {n} frames of"
+                f" {width}x{height} px, and frames.zarr holds {shape[0]} of {shape[2]}x{shape[1]}"
+                " px: restore the folder from a copy, or import or record the capture again"
             )
-        if (indices is None or self.exposures_ms) and (identity := identify_stack(path)) is not None:
+        if (indices is None or self.exposures_ms) and (
+            identity := identify_stack(path)
+        ) is not None:
             _verify_once(self.folder, self.hash, identity)
         stack = self._merged(path, indices) if self.exposures_ms else read_stack(path, indices)
         if read_json(self.folder / "capture.json").get("hash") != self.hash:
-            raise SessionError(f"capture {self.name!r} was replaced while it was in use: load it again")
+            raise SessionError(
+                f"capture {self.name!r} was replaced while it was in use: load it again"
+            )
         return stack
 
     def verify(self) -> list[str]:
-        """Read everything; returns the hash of each stored frame. Raises DamagedError unless the frames and their
-        description are those that were saved."""
+        """Read everything; returns the hash of each stored frame. Raises DamagedError unless the
+        frames and their description are those that were saved."""
         content, frames = hash_stack(self.folder / "frames.zarr")
         described, exposures_ms = self.meta["sequence"], self.meta.get("exposures_ms")
         if _hash_content(content, described, exposures_ms, self.texture) != self.hash:
             raise DamagedError(
-                f"{self.name}: what {self.folder} holds is not what was saved (its hash differs): restore the folder "
-                "from a copy, or import or record the capture again"
+                f"{self.name}: what {self.folder} holds is not what was saved (its hash differs):"
+                " restore the folder from a copy, or import or record the capture again"
             )
         return frames
 
     @property
     def exposures_ms(self) -> tuple[float, ...]:
-        """The exposure times of a sequence that was captured repeatedly; empty for a single exposure."""
+        """The exposure times of a sequence that was captured repeatedly; empty for a single
+        exposure."""
         return tuple(float(exposure) for exposure in self.meta.get("exposures_ms") or ())
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The files that an importer read, one a frame of every exposure in turn; empty of captures without files."""
+        """The files that an importer read, one a frame of every exposure in turn; empty of captures
+        without files."""
         return tuple(self.meta.get("files") or ())
 
     @property
@@ -130,22 +145,32 @@ class Capture:
 
     @property
     def exposure_choice(self) -> np.ndarray | None:
-        """(h, w) uint8: which of `exposures_ms` each pixel's frames are of; None for a single exposure."""
+        """(h, w) uint8: which of `exposures_ms` each pixel's frames are of; None for a single
+        exposure."""
         if not self.exposures_ms:
             return None
-        return _choose_exposures(self.folder / "frames.zarr", self.exposures_ms, self.sequence, self.hash)
+        return _choose_exposures(
+            self.folder / "frames.zarr", self.exposures_ms, self.sequence, self.hash
+        )
 
     def _merged(self, path: Path, indices: Sequence[int] | None) -> np.ndarray:
-        """The merged frames (n, h, w) at `indices`; with one frame of each exposure in memory at most."""
+        """The merged frames (n, h, w) at `indices`; with one frame of each exposure in memory at
+        most."""
         n, choice = len(self.sequence.frames), self.exposure_choice
         assert choice is not None
         wanted = list(range(n)) if indices is None else [int(index) for index in indices]
         if any(not 0 <= index < n for index in wanted):
-            raise InputError(f"frames {wanted} were requested, {self.name} has {n} frames: count from 0")
+            raise InputError(
+                f"frames {wanted} were requested, {self.name} has {n} frames: count from 0"
+            )
         masks = chosen(choice, len(self.exposures_ms))
         stack = np.empty((len(wanted), *choice.shape), describe_stack(path)[1])
         for slot, index in enumerate(wanted):
-            pick(list(read_stack(path, [index + n * e for e in range(len(masks))])), masks, stack[slot])
+            pick(
+                list(read_stack(path, [index + n * e for e in range(len(masks))])),
+                masks,
+                stack[slot],
+            )
         return stack
 
     @property
@@ -165,8 +190,8 @@ class Capture:
             fault = "" if image.shape == shape else f"its shape is {image.shape}, not {shape}"
         if fault:
             raise DamagedError(
-                f"{self.name}: its texture is damaged ({path}: {fault}): restore this file from a copy, or import or "
-                "record the capture again"
+                f"{self.name}: its texture is damaged ({path}: {fault}): restore this file from a"
+                " copy, or import or record the capture again"
             )
         return np.ascontiguousarray(image[..., ::-1])
 
@@ -199,9 +224,11 @@ class _Description:
 
 @dataclass(frozen=True)
 class NewCapture:
-    """A capture in memory, to be saved: ``frames`` (n, h, w) uint8 or uint16 in the order of ``sequence``, or
-    (k n, h, w) of the k ``exposures_ms``, one exposure after the other; ``texture`` (h, w, 3) RGB where the scene is
-    known in colour; ``source``: where it comes from; ``files``: of an import, relative to that, one a frame."""
+    """A capture in memory, to be saved: ``frames`` (n, h, w) uint8 or uint16 in the order of
+    ``sequence``, or (k n, h, w) of the k ``exposures_ms``, one exposure after the other;
+    ``texture`` (h, w, 3) RGB where the scene is known in colour; ``source``: where it comes from;
+    ``files``: of an import, relative to that, one a frame.
+    """
 
     name: str
     sequence: PatternSequence
@@ -214,7 +241,8 @@ class NewCapture:
 
     @property
     def hash(self) -> str:
-        """The content hash that the capture will have once it is saved: of frames, exposures, texture, sequence."""
+        """The content hash that the capture will have once it is saved: of frames, exposures,
+        texture, sequence."""
         described, exposures_ms = self.sequence.to_dict(), list(self.exposures_ms)
         return _hash_content(hash_frames(self.frames), described, exposures_ms, self.texture)
 
@@ -231,17 +259,27 @@ class NewCapture:
         return merge_exposures(stacks, self.exposures_ms, self.sequence.full_scale)[0]
 
     def check(self) -> None:
-        """Raise InputError unless frames, exposures and texture fit the sequence and one another."""
+        """Raise InputError unless frames, exposures and texture fit the sequence and one
+        another."""
         exposures, texture, shape = self.exposures_ms, self.texture, self.frames.shape
         check_stack_array(self.frames)
-        if len(exposures) == 1 or len(set(exposures)) < len(exposures) or min(exposures, default=1) <= 0:
-            raise InputError(f"exposures of {list(exposures)} ms: give two or more, each once, or none")
+        if (
+            len(exposures) == 1
+            or len(set(exposures)) < len(exposures)
+            or min(exposures, default=1) <= 0
+        ):
+            raise InputError(
+                f"exposures of {list(exposures)} ms: give two or more, each once, or none"
+            )
         if len(self.frames) != len(self.sequence.frames) * max(1, len(exposures)):
             times = f" in {len(exposures)} exposures" if exposures else ""
             raise InputError(
-                f"{shape[0]} frames for a sequence of {len(self.sequence.frames)}{times}: give one image a pattern"
+                f"{shape[0]} frames for a sequence of {len(self.sequence.frames)}{times}: give one"
+                " image a pattern"
             )
-        if texture is not None and (texture.shape != (*shape[1:], 3) or texture.dtype not in (np.uint8, np.uint16)):
+        if texture is not None and (
+            texture.shape != (*shape[1:], 3) or texture.dtype not in (np.uint8, np.uint16)
+        ):
             raise InputError(
                 f"a colour texture of shape {(*shape[1:], 3)}, uint8 or uint16, is needed, "
                 f"got {texture.shape} {texture.dtype}"
@@ -275,16 +313,19 @@ def write_capture(folder: Path, capture: NewCapture, role: Role, board: str | No
 
 
 def read_stored_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[str, str]]:
-    """The captures in these folders, and of every other {its name: what is wrong with it, and the remedy}."""
+    """The captures in these folders, and of every other {its name: what is wrong with it, and the
+    remedy}."""
     captures, faults = [], {}
     for folder in folders:
         if not is_safe_name(folder.name):
             faults[folder.name] = (
-                f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move it away"
+                f"{folder} is not read: rename it, with letters, digits, '_', '-' and '.', or move"
+                " it away"
             )
         elif not (folder / "capture.json").is_file():
             faults[folder.name] = (
-                f"{folder} is no capture (it holds no capture.json): restore the file, or move it away"
+                f"{folder} is no capture (it holds no capture.json): restore the file, or move it"
+                " away"
             )
         else:
             try:
@@ -295,14 +336,17 @@ def read_stored_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[s
 
 
 def read_capture(folder: Path) -> Capture:
-    """The capture in a folder; its frames stay there. SessionError where its description is damaged."""
+    """The capture in a folder; its frames stay there. SessionError where its description is
+    damaged."""
     meta = read_json(folder / "capture.json")
     with decoding(folder / "capture.json"):
         described = from_plain(meta, _Description)
         sequence = _read_sequence(json.dumps(described.sequence))
         if "turntable" in described.settings:
             from_plain(described.settings["turntable"], TurnStep)
-    return Capture(folder.name, described.role, sequence, described.camera.size, described.hash, folder, meta)
+    return Capture(
+        folder.name, described.role, sequence, described.camera.size, described.hash, folder, meta
+    )
 
 
 def compare_stored(folder: Path, new: NewCapture, role: Role) -> Comparison:
@@ -329,9 +373,13 @@ def _read_sequence(text: str) -> PatternSequence:
 
 
 def _hash_content(
-    frames_hash: str, described: Mapping[str, Any], exposures_ms: Sequence[float] | None, texture: np.ndarray | None
+    frames_hash: str,
+    described: Mapping[str, Any],
+    exposures_ms: Sequence[float] | None,
+    texture: np.ndarray | None,
 ) -> str:
-    """Return the content hash of a capture from that of its frames, its sequence as plain values, and the rest."""
+    """Return the content hash of a capture from that of its frames, its sequence as plain values,
+    and the rest."""
     whole = hashlib.blake2b(frames_hash.encode() + to_json(described), digest_size=20)
     if exposures_ms:
         whole.update(to_json(exposures_ms))
@@ -342,9 +390,12 @@ def _hash_content(
 
 @lru_cache(maxsize=1024)
 def _verify_once(folder: Path, content_hash: str, identity: object) -> None:
-    """Verify a capture whose frames have no checksums, once a process while its files stay the same."""
+    """Verify a capture whose frames have no checksums, once a process while its files stay the
+    same."""
     capture = read_capture(folder)
-    if capture.hash == content_hash:  # else it is being replaced, which the reader of the frames reports
+    if (
+        capture.hash == content_hash
+    ):  # else it is being replaced, which the reader of the frames reports
         capture.verify()
 
 
@@ -352,18 +403,23 @@ def _verify_once(folder: Path, content_hash: str, identity: object) -> None:
 def _choose_exposures(
     path: Path, exposures_ms: tuple[float, ...], sequence: PatternSequence, content_hash: str
 ) -> np.ndarray:
-    """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its content."""
+    """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its
+    content."""
     n = len(sequence.frames)
 
     def frames(exposure: int) -> Iterator[np.ndarray]:
         """Yield the frames (h, w) of one exposure, a few in memory at a time."""
         for first in range(0, n, _FRAMES_IN_MEMORY):
-            yield from read_stack(path, range(exposure * n + first, exposure * n + min(first + _FRAMES_IN_MEMORY, n)))
+            yield from read_stack(
+                path, range(exposure * n + first, exposure * n + min(first + _FRAMES_IN_MEMORY, n))
+            )
 
     highest = np.stack([peaks(frames(e)) for e in range(len(exposures_ms))])
     choice = choose_exposure(highest, exposures_ms, sequence.full_scale)
     if read_json(path.parent / "capture.json").get("hash") != content_hash:
-        raise SessionError(f"capture {path.parent.name!r} was replaced while it was in use: load it again")
+        raise SessionError(
+            f"capture {path.parent.name!r} was replaced while it was in use: load it again"
+        )
     choice.flags.writeable = False
     return choice
 
@@ -373,7 +429,11 @@ def _encode_png(texture: np.ndarray) -> Any:
     import cv2
 
     # the fastest setting: level 1 halves nothing that matters and PNG stays readable everywhere
-    done, data = cv2.imencode(".png", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    done, data = cv2.imencode(
+        ".png", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    )
     if not done:
-        raise InputError("the texture could not be encoded as PNG: give a colour image of 8 or 16 bits")
+        raise InputError(
+            "the texture could not be encoded as PNG: give a colour image of 8 or 16 bits"
+        )
     return data.data

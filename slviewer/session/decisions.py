@@ -1,6 +1,7 @@
 """What the operator decided: `decisions.json`, an entry each, with its type.
 
-An entry that is damaged concerns only those that need it; the others are read, and stay when one is written.
+An entry that is damaged concerns only those that need it; the others are read, and stay when one is
+written.
 """
 
 import contextlib
@@ -56,7 +57,9 @@ _Decisions = TypedDict(
 )
 REGION_INPUT = "decision/region"
 """The region of interest as an input of results."""
-_REMEDY = "restore it from a copy, or move this file away, which forgets exclusions, names and settings"
+_REMEDY = (
+    "restore it from a copy, or move this file away, which forgets exclusions, names and settings"
+)
 
 
 class Decisions:
@@ -68,25 +71,31 @@ class Decisions:
 
     def include(self, name: str) -> None:
         """Include a capture again. Does nothing where it was not excluded."""
-        self._decide("excluded", lambda: {other: why for other, why in self.excluded().items() if other != name})
+        self._decide(
+            "excluded",
+            lambda: {other: why for other, why in self.excluded().items() if other != name},
+        )
 
     def excluded(self) -> dict[str, str]:
         """{capture: reason} of the captures that the operator excluded."""
         return dict(self.decision("excluded") or {})
 
     def decide(self, what: str, value: Any) -> None:
-        """Remember a decision, such as the rig or the target, as a plain value that JSON can hold."""
+        """Remember a decision, such as the rig or the target, as a plain value that JSON can
+        hold."""
         self._decide(what, lambda: value)
 
     def decision(self, what: str) -> Any:
-        """What was decided last; None where nothing was. Raises DamagedError where it cannot be read."""
+        """What was decided last; None where nothing was. Raises DamagedError where it cannot be
+        read."""
         decisions, faults = _read_all(self.folder / "decisions.json")
         if what in faults:
             raise DamagedError(faults[what])
         return decisions.get(what)
 
     def valid_decision(self, what: str) -> Any:
-        """What was decided last, for what does without; None also where it is damaged, as `decision_faults` states."""
+        """What was decided last, for what does without; None also where it is damaged, as
+        `decision_faults` states."""
         with contextlib.suppress(DamagedError):
             return self.decision(what)
         return None
@@ -99,14 +108,16 @@ class Decisions:
             return [str(error)]
 
     def decision_hashes(self, name: str) -> list[str]:
-        """Hash of the decision that results name as their input ``decision/...``; none where it is not in effect."""
+        """Hash of the decision that results name as their input ``decision/...``; none where it is
+        not in effect."""
         region = self.decision("region") if name == REGION_INPUT else None
         if not region or not region["on"]:
             return []
         return [hashlib.blake2b(json.dumps(region).encode(), digest_size=20).hexdigest()]
 
     def _decide(self, what: str, make: Callable[[], Any]) -> None:
-        """Replace a decision by what ``make`` returns, which nobody else changes meanwhile; the others stay."""
+        """Replace a decision by what ``make`` returns, which nobody else changes meanwhile; the
+        others stay."""
         self._require_writer()
         path = self.folder / "decisions.json"
         with self._decisions_lock:
@@ -121,7 +132,9 @@ class Decisions:
 
     def rigs(self) -> dict[str, Path]:
         """The files of the operator's own rigs by name."""
-        files = sorted((self.folder / "rigs").glob("[!.]*.toml"), key=lambda path: natural_key(path.stem))
+        files = sorted(
+            (self.folder / "rigs").glob("[!.]*.toml"), key=lambda path: natural_key(path.stem)
+        )
         return {path.stem: path for path in files}
 
     def _require_writer(self) -> None:
@@ -130,7 +143,8 @@ class Decisions:
 
 
 def _read_all(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return all decisions in a file, and of every one that is not of its type {decision: what is wrong, the remedy}.
+    """Return all decisions in a file, and of every one that is not of its type {decision: what is
+    wrong, the remedy}.
 
     None where the file is missing; DamagedError where it holds no decisions at all.
     """

@@ -1,4 +1,5 @@
-"""Files for other programs: calibrations for OpenCV and for people, pattern images for any projector."""
+"""Files for other programs: calibrations for OpenCV and for people, pattern images for any
+projector."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,12 +16,16 @@ from slviewer.session.reading import expand_user
 from slviewer.session.toml import describe_sequence
 
 
-def write_calibration(path: Path, entries: Mapping[str, Any], meanings: Mapping[str, str] | None = None) -> None:
-    """Write named matrices, numbers, words, and lists of such mappings (poses by name); the suffix selects the format.
+def write_calibration(
+    path: Path, entries: Mapping[str, Any], meanings: Mapping[str, str] | None = None
+) -> None:
+    """Write named matrices, numbers, words, and lists of such mappings (poses by name); the suffix
+    selects the format.
 
-    .yml, .yaml and .xml are OpenCV FileStorage, .json is plain JSON with matrices as nested lists; `import
-    opencv-calibration` reads them all. ``meanings``: {name: meaning and unit of the entry}, as comments; JSON,
-    which knows none, gets them under "meanings". Replaces a file of that name in one step.
+    .yml, .yaml and .xml are OpenCV FileStorage, .json is plain JSON with matrices as nested lists;
+    `import opencv-calibration` reads them all. ``meanings``: {name: meaning and unit of the entry},
+    as comments; JSON, which knows none, gets them under "meanings". Replaces a file of that name in
+    one step.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -30,24 +35,31 @@ def write_calibration(path: Path, entries: Mapping[str, Any], meanings: Mapping[
     elif suffix in (".yml", ".yaml", ".xml"):
         data = _format_file_storage(suffix, entries, meanings).encode()
     else:
-        raise InputError(f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these")
+        raise InputError(
+            f"{path.name}: a calibration is written as .yml, .xml or .json: choose one of these"
+        )
     replace_file(path, data)
 
 
 def write_pattern_folder(folder: Path, sequence: PatternSequence) -> None:
-    """Write each frame of the sequence as PNG, and `sequence.toml`, which `import frames` reads back.
+    """Write each frame of the sequence as PNG, and `sequence.toml`, which `import frames` reads
+    back.
 
     Raises InputError where the folder holds something already, so that two sequences never mix.
     """
     folder = expand_user(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} is not empty: choose a new folder for the patterns")
-    names = [f"{index:02d}_{_describe_frame(frame)}.png" for index, frame in enumerate(sequence.frames)]
+    names = [
+        f"{index:02d}_{_describe_frame(frame)}.png" for index, frame in enumerate(sequence.frames)
+    ]
     with staged_folder(folder, len(names) * 4096) as staged:
         for index, name in enumerate(names):
             done, data = cv2.imencode(".png", render_pattern(sequence, index))
             if not done:
-                raise InputError(f"pattern {name} could not be encoded as PNG: is the projector's size right?")
+                raise InputError(
+                    f"pattern {name} could not be encoded as PNG: is the projector's size right?"
+                )
             write_bytes(staged / name, data.data)
         write_bytes(staged / "sequence.toml", describe_sequence(sequence, names).encode())
     commit(staged, folder)
@@ -63,8 +75,11 @@ def _describe_frame(frame: Frame) -> str:
     return "_".join(str(part) for part in parts if part)
 
 
-def _format_file_storage(suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]) -> str:
-    """Return entries as the text of an OpenCV FileStorage file, each with its meaning as a comment."""
+def _format_file_storage(
+    suffix: str, entries: Mapping[str, Any], meanings: Mapping[str, str]
+) -> str:
+    """Return entries as the text of an OpenCV FileStorage file, each with its meaning as a
+    comment."""
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for key, value in entries.items():
         if key in meanings:
@@ -90,7 +105,12 @@ def _write_entry(storage: Any, key: str, value: Any) -> None:
     else:
         matrix = np.asarray(value)
         if matrix.ndim not in (1, 2) or matrix.dtype.kind not in "iuf":
-            raise InputError(f"{key} is no number, word or matrix: an OpenCV file cannot hold it, write .json instead")
+            raise InputError(
+                f"{key} is no number, word or matrix: an OpenCV file cannot hold it, write .json"
+                " instead"
+            )
         # a vector as a column: OpenCV's own files hold T so, and D is read either way
         column = matrix if matrix.ndim == 2 else matrix[:, None]
-        storage.write(key, np.ascontiguousarray(column, np.float64 if matrix.dtype.kind == "f" else np.int32))
+        storage.write(
+            key, np.ascontiguousarray(column, np.float64 if matrix.dtype.kind == "f" else np.int32)
+        )

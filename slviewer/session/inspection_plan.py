@@ -1,4 +1,5 @@
-"""An inspection plan as a TOML file: how a part is aligned, its features, and the characteristics with their limits."""
+"""An inspection plan as a TOML file: how a part is aligned, its features, and the characteristics
+with their limits."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,8 +35,8 @@ Row = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class PlanRegion:
-    """A ball (``size``: radius) or a box (``size``: half sides) in part coordinates, mm; ``axes``: the directions of a
-    box's sides, where they are not the part's axes."""
+    """A ball (``size``: radius) or a box (``size``: half sides) in part coordinates, mm; ``axes``:
+    the directions of a box's sides, where they are not the part's axes."""
 
     kind: Literal["ball", "box"]
     centre: Vector
@@ -45,7 +46,9 @@ class PlanRegion:
     def __post_init__(self) -> None:
         wanted = 1 if self.kind == "ball" else 3
         if len(self.size) != wanted or not all(0 < s < np.inf for s in self.size):
-            raise ValueError(f"a {self.kind} needs {wanted} sizes above 0 mm, not {list(self.size)}")
+            raise ValueError(
+                f"a {self.kind} needs {wanted} sizes above 0 mm, not {list(self.size)}"
+            )
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool: which points (n, 3) mm in part coordinates lie in it."""
@@ -61,13 +64,16 @@ class PlanRegion:
         directions = (np.eye(3) if region.axes is None else region.axes) @ T_part_scan[:3, :3].T
         turned = region.kind == "box" and not np.allclose(directions, np.eye(3))
         x, y, z = (_vector(each, 9) for each in directions)
-        return cls(region.kind, _vector(centre), tuple(region.size.tolist()), (x, y, z) if turned else None)
+        return cls(
+            region.kind, _vector(centre), tuple(region.size.tolist()), (x, y, z) if turned else None
+        )
 
 
 @dataclass(frozen=True)
 class PlanFeature:
-    """A feature to fit: its ``kind`` in a ``region``; ``place``, ``direction`` and ``radius``: nominal, in part
-    coordinates, for positions. A ``surface`` is compared with the nominal model."""
+    """A feature to fit: its ``kind`` in a ``region``; ``place``, ``direction`` and ``radius``:
+    nominal, in part coordinates, for positions. A ``surface`` is compared with the nominal
+    model."""
 
     name: str
     kind: Literal["plane", "sphere", "cylinder", "surface"]
@@ -78,9 +84,14 @@ class PlanFeature:
 
     def nominal(self) -> Feature:
         """The nominal feature. Raises InputError where the plan does not give it."""
-        if self.kind == "surface" or self.place is None or (self.kind != "sphere" and self.direction is None):
+        if (
+            self.kind == "surface"
+            or self.place is None
+            or (self.kind != "sphere" and self.direction is None)
+        ):
             raise InputError(
-                f"The nominal of {self.name} is not known: give place, direction and radius of the feature in the plan."
+                f"The nominal of {self.name} is not known: give place, direction and radius of the"
+                " feature in the plan."
             )
         direction = None
         if self.direction is not None:
@@ -90,8 +101,10 @@ class PlanFeature:
 
 @dataclass(frozen=True)
 class Characteristic:
-    """What is measured and judged: its ``kind``, the names of its ``features`` (the second is the datum), ``nominal``
-    value and limits ``lower`` and ``upper`` in ``unit``, as absolute values, of which one or both may be absent."""
+    """What is measured and judged: its ``kind``, the names of its ``features`` (the second is the
+    datum), ``nominal`` value and limits ``lower`` and ``upper`` in ``unit``, as absolute values, of
+    which one or both may be absent.
+    """
 
     name: str
     kind: str
@@ -105,17 +118,24 @@ class Characteristic:
         if self.kind not in KINDS:
             raise ValueError(f"there is no kind {self.kind!r}: choose one of {', '.join(KINDS)}")
         if len(self.features) != KINDS[self.kind]:
-            raise ValueError(f"a {self.kind} takes {KINDS[self.kind]} features, not {len(self.features)}")
+            raise ValueError(
+                f"a {self.kind} takes {KINDS[self.kind]} features, not {len(self.features)}"
+            )
         if self.lower is not None and self.upper is not None and not self.lower < self.upper:
-            raise ValueError(f"the lower limit {self.lower:g} of {self.name} is not below the upper {self.upper:g}")
+            raise ValueError(
+                f"the lower limit {self.lower:g} of {self.name} is not below the upper"
+                f" {self.upper:g}"
+            )
         if self.unit != ("deg" if self.kind == "angle" else "mm"):
             raise ValueError(f"a {self.kind} is not measured in {self.unit!r}")
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """From scans to part coordinates: "none" (parts lie in a fixture), "best fit" to the ``nominal`` model, or "3-2-1"
-    by three ``datums``, features' names, which are looked for from ``start``, T_part_scan (4, 4) of the plan's scan."""
+    """From scans to part coordinates: "none" (parts lie in a fixture), "best fit" to the
+    ``nominal`` model, or "3-2-1" by three ``datums``, features' names, which are looked for from
+    ``start``, T_part_scan (4, 4) of the plan's scan.
+    """
 
     kind: Literal["none", "best fit", "3-2-1"] = "none"
     nominal: str | None = None
@@ -124,9 +144,14 @@ class Alignment:
 
     def __post_init__(self) -> None:
         if (self.kind == "best fit") != (self.nominal is not None):
-            raise ValueError("a best fit needs the file of its nominal model, and other alignments take none")
+            raise ValueError(
+                "a best fit needs the file of its nominal model, and other alignments take none"
+            )
         if (self.kind == "3-2-1") != (self.start is not None):
-            raise ValueError("3-2-1 needs the pose of the plan's own scan as start, and other alignments take none")
+            raise ValueError(
+                "3-2-1 needs the pose of the plan's own scan as start, and other alignments take"
+                " none"
+            )
         if len(self.datums) != (3 if self.kind == "3-2-1" else 0):
             raise ValueError("3-2-1 takes three datums, and other alignments take none")
 
@@ -143,24 +168,35 @@ class Plan:
 
     def __post_init__(self) -> None:
         if self.version != VERSION:
-            raise ValueError(f"the plan has version {self.version}, and this program reads {VERSION}")
+            raise ValueError(
+                f"the plan has version {self.version}, and this program reads {VERSION}"
+            )
         for what, listed in (("feature", self.feature), ("characteristic", self.characteristic)):
             names = [each.name for each in listed]
             if not names or len(set(names)) < len(names):
-                raise ValueError(f"each {what} needs a name of its own, and there must be one: {', '.join(names)}")
+                raise ValueError(
+                    f"each {what} needs a name of its own, and there must be one:"
+                    f" {', '.join(names)}"
+                )
         known = {each.name for each in self.feature}
-        asked = {name for each in self.characteristic for name in each.features} | set(self.alignment.datums)
+        asked = {name for each in self.characteristic for name in each.features} | set(
+            self.alignment.datums
+        )
         if unknown := sorted(asked - known):
-            raise ValueError(f"there is no feature {', '.join(unknown)}: there are {', '.join(sorted(known))}")
+            raise ValueError(
+                f"there is no feature {', '.join(unknown)}: there are {', '.join(sorted(known))}"
+            )
 
 
 def read_plan(path: Path | str) -> Plan:
-    """The plan in a TOML file; a relative path of its nominal model refers to the file's folder. Raises InputError that
-    names what does not fit."""
+    """The plan in a TOML file; a relative path of its nominal model refers to the file's folder.
+    Raises InputError that names what does not fit."""
     data = read_toml(path)
     unknown = [key for key in data if key not in Plan.__dataclass_fields__]
     if unknown:
-        raise InputError(f"{path}: a plan has no {', '.join(unknown)}: remove it, or correct its name")
+        raise InputError(
+            f"{path}: a plan has no {', '.join(unknown)}: remove it, or correct its name"
+        )
     try:
         plan = from_plain(data, Plan)
     except InputError as error:
@@ -185,7 +221,10 @@ def write_plan(plan: Plan, path: Path | str) -> None:
 def plan_toml(plan: Plan) -> str:
     """The TOML text of a plan."""
     lines = [
-        "# Inspection plan of slviewer; lengths in mm, angles in degrees, places in part coordinates.",
+        (
+            "# Inspection plan of slviewer; lengths in mm, angles in degrees, places in part"
+            " coordinates."
+        ),
         "# Limits are absolute values; leave one out where there is none.",
         *table_lines({"version": plan.version, "name": plan.name}),
         "",

@@ -11,7 +11,9 @@ from filelock import FileLock, Timeout
 from slviewer.errors import DamagedError, SessionError
 from slviewer.session.reading import read_json
 
-_PATIENCE_S = 0.3  # outlasts a reader that holds the lock for the moment it needs to clear leftovers
+_PATIENCE_S = (
+    0.3  # outlasts a reader that holds the lock for the moment it needs to clear leftovers
+)
 
 
 class WriterLock:
@@ -19,7 +21,9 @@ class WriterLock:
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._lock = FileLock(folder / ".lock", thread_local=False)  # closed by another thread than opened it
+        self._lock = FileLock(
+            folder / ".lock", thread_local=False
+        )  # closed by another thread than opened it
         self._holder = folder / ".lock-holder"
 
     def acquire(self, patience_s: float = _PATIENCE_S) -> None:
@@ -28,10 +32,13 @@ class WriterLock:
             self._lock.acquire(timeout=patience_s, poll_interval=0.02)
         except Timeout as error:
             raise SessionError(
-                f"{self._folder} is open for writing in {self._who()}: close it there, or wait until it has finished"
+                f"{self._folder} is open for writing in {self._who()}: close it there, or wait"
+                " until it has finished"
             ) from error
         except OSError as error:
-            raise SessionError(f"{self._folder} cannot be written ({error}): check its permissions") from error
+            raise SessionError(
+                f"{self._folder} cannot be written ({error}): check its permissions"
+            ) from error
         with contextlib.suppress(OSError):  # it is only for the message to others
             self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
 
@@ -43,7 +50,8 @@ class WriterLock:
             self._lock.release()
 
     def release_and_remove(self) -> None:
-        """Remove the lock's files and release it: a writer that waits for it then begins with a new file.
+        """Remove the lock's files and release it: a writer that waits for it then begins with a new
+        file.
 
         Only for a folder that is no session any more.
         """

@@ -1,4 +1,5 @@
-"""What was measured on a session's scans: each is a result of its own, numbered as they were made."""
+"""What was measured on a session's scans: each is a result of its own, numbered as they were
+made."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,9 +21,10 @@ NAMES = "measurement names"
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measurement: its ``id`` (m1, m2, …), ``name``, ``kind``, the scan (or merged surface) ``source`` that it was
-    made on, the calibration ``model``, ``time`` (ISO 8601, UTC), what its kind needs in ``data``, and whether what it
-    was made from has changed since (``stale``). ``of``: the measurements that it was made from, by id.
+    """One measurement: its ``id`` (m1, m2, …), ``name``, ``kind``, the scan (or merged surface)
+    ``source`` that it was made on, the calibration ``model``, ``time`` (ISO 8601, UTC), what its
+    kind needs in ``data``, and whether what it was made from has changed since (``stale``). ``of``:
+    the measurements that it was made from, by id.
     """
 
     id: str
@@ -37,7 +39,8 @@ class Measurement:
 
     @cached_property
     def quantities(self) -> list[Quantity]:
-        """The measured values, the most important first, such as the radius and the diameter of a sphere."""
+        """The measured values, the most important first, such as the radius and the diameter of a
+        sphere."""
         return from_plain(self.data["quantities"], list[Quantity])
 
     def __getitem__(self, name: str) -> Quantity:
@@ -45,7 +48,10 @@ class Measurement:
         for quantity in self.quantities:
             if quantity.name == name:
                 return quantity
-        raise InputError(f"{self.name} has no {name!r}: it has {', '.join(each.name for each in self.quantities)}")
+        raise InputError(
+            f"{self.name} has no {name!r}: it has"
+            f" {', '.join(each.name for each in self.quantities)}"
+        )
 
 
 def save_measurement(
@@ -60,9 +66,11 @@ def save_measurement(
     of: tuple[str, ...] = (),
     name: str = "",
 ) -> Measurement:
-    """Save a new measurement. ``inputs``: {capture or result: hash} of all that it was made from, so that it becomes
-    stale when one changes; the measurements ``of`` are added to them."""
-    numbers = [int(each.removeprefix("m")) for each in _list_ids(store)] + _list_trashed_numbers(store)
+    """Save a new measurement. ``inputs``: {capture or result: hash} of all that it was made from,
+    so that it becomes stale when one changes; the measurements ``of`` are added to them."""
+    numbers = [int(each.removeprefix("m")) for each in _list_ids(store)] + _list_trashed_numbers(
+        store
+    )
     identity = f"m{1 + max(numbers, default=0)}"
     used = dict(inputs) | store.input_hashes(*(_result_name(store, each) for each in of))
     meta = {
@@ -88,11 +96,16 @@ def load_measurement(store: Session, identity: str) -> Measurement:
     """One measurement. Raises InputError where there is none of that id."""
     result = _result_name(store, identity)
     meta = store.load_result(result, only=())[0]
-    return measurement_from_meta(identity, meta, store.valid_decision(NAMES) or {}, store.state_of(result) == "stale")
+    return measurement_from_meta(
+        identity, meta, store.valid_decision(NAMES) or {}, store.state_of(result) == "stale"
+    )
 
 
-def measurement_from_meta(identity: str, meta: Mapping[str, Any], names: Mapping[str, str], stale: bool) -> Measurement:
-    """The measurement of that id from its result's ``meta`` and the ``names`` that were given since."""
+def measurement_from_meta(
+    identity: str, meta: Mapping[str, Any], names: Mapping[str, str], stale: bool
+) -> Measurement:
+    """The measurement of that id from its result's ``meta`` and the ``names`` that were given
+    since."""
     kind = meta["kind"]
     return Measurement(
         identity,
@@ -120,12 +133,14 @@ def rename_measurement(store: Session, identity: str, name: str) -> Measurement:
 
 
 def trash_measurement(store: Session, identity: str) -> None:
-    """Move a measurement to the trash; ``restore_measurement`` brings it back. What was made from it becomes stale."""
+    """Move a measurement to the trash; ``restore_measurement`` brings it back. What was made from
+    it becomes stale."""
     store.trash_result(_result_name(store, identity))
 
 
 def restore_measurement(store: Session, identity: str = "") -> Measurement:
-    """Bring a deleted measurement back, by default the last one deleted. Raises InputError where there is none."""
+    """Bring a deleted measurement back, by default the last one deleted. Raises InputError where
+    there is none."""
     if not identity:
         deleted = [each for each in store.deleted_results() if each.startswith(f"{FOLDER}/")]
         if not deleted:
@@ -143,7 +158,11 @@ def _list_ids(store: Session) -> list[str]:
 
 def _list_trashed_numbers(store: Session) -> list[int]:
     """Numbers of deleted measurements, which may be restored and are not used again."""
-    numbers = [each.removeprefix(f"{FOLDER}/m") for each in store.deleted_results() if each.startswith(f"{FOLDER}/m")]
+    numbers = [
+        each.removeprefix(f"{FOLDER}/m")
+        for each in store.deleted_results()
+        if each.startswith(f"{FOLDER}/m")
+    ]
     return [int(number) for number in numbers if number.isdecimal()]
 
 
@@ -151,5 +170,8 @@ def _result_name(store: Session, identity: str) -> str:
     """Return the name of a measurement's result; InputError where it does not exist."""
     result = f"{FOLDER}/{identity}"
     if not store.has_result(result):
-        raise InputError(f"there is no measurement {identity!r}: there are {', '.join(_list_ids(store)) or 'none'}")
+        raise InputError(
+            f"there is no measurement {identity!r}: there are"
+            f" {', '.join(_list_ids(store)) or 'none'}"
+        )
     return result

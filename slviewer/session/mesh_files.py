@@ -1,4 +1,5 @@
-"""Points and meshes for other programs; the suffix selects the format, and files keep the size of the object.
+"""Points and meshes for other programs; the suffix selects the format, and files keep the size of
+the object.
 
 =======  ===========================================================================================================
 `.ply`   binary, float32, mm: normals, colours, the expected errors (sigma) and other values of each point
@@ -10,9 +11,9 @@
 `.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most readers would not bear
 =======  ===========================================================================================================
 
-Plugins add other formats, an `Exporter` each. Files appear whole or not at all. In glTF y points up and the viewer
-looks along -z: its node turns the camera's frame, whose y points down and whose z points away, by half a turn about x,
-so that an object stands as the camera saw it.
+Plugins add other formats, an `Exporter` each. Files appear whole or not at all. In glTF y points up
+and the viewer looks along -z: its node turns the camera's frame, whose y points down and whose z
+points away, by half a turn about x, so that an object stands as the camera saw it.
 """
 
 import io
@@ -49,15 +50,17 @@ _GLB_LIMIT = 2**32 - 1
 DECIMALS = 6
 """Of lengths in text: a nanometre, below what a float32 of some hundred mm resolves."""
 _NUMBER, _SMALL, _GREY = 11, 9, 4
-"""Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with the blank."""
+"""Characters that a coordinate, a sigma or a part of a normal, and a grey level take in text, with
+the blank."""
 
 
 @dataclass(frozen=True)
 class Exporter:
     """A file format that a plugin adds; ``name`` is its suffix in lower case, without the dot.
 
-    ``what``: unit and content, in a few words. ``encode(shape, scalars, notes)`` returns the content of the file, of a
-    `PointSet` or, with ``takes_meshes``, a `Mesh`, in mm; scalars and notes as in `write_shape`.
+    ``what``: unit and content, in a few words. ``encode(shape, scalars, notes)`` returns the
+    content of the file, of a `PointSet` or, with ``takes_meshes``, a `Mesh`, in mm; scalars and
+    notes as in `write_shape`.
     """
 
     name: str
@@ -94,15 +97,19 @@ def write_shape(
 ) -> int:
     """Write points or a mesh in the format of the suffix, and return the file's size in bytes.
 
-    ``scalars``: values (n,) of each point by name, such as ``sigma_noise`` mm or ``deviation`` mm, for the formats that
-    hold them (PLY); the shape's own ``sigma_mm`` is called ``sigma``. ``notes``: sentences for the comments.
+    ``scalars``: values (n,) of each point by name, such as ``sigma_noise`` mm or ``deviation`` mm,
+    for the formats that hold them (PLY); the shape's own ``sigma_mm`` is called ``sigma``.
+    ``notes``: sentences for the comments.
 
-    Raises InputError for another suffix, for points where a format takes only triangles, for NaN points and for an
-    empty shape; SessionError where the disk refuses (a file of that name stays unchanged).
+    Raises InputError for another suffix, for points where a format takes only triangles, for NaN
+    points and for an empty shape; SessionError where the disk refuses (a file of that name stays
+    unchanged).
     """
     path = Path(path)
     file_format = path.suffix.lower().removeprefix(".")
-    points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
+    points, faces = (
+        (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, None)
+    )
     _check_format(path, is_mesh=faces is not None)
     if not len(points) or (faces is not None and not len(faces)):
         raise InputError(f"{path.name} would be empty: there is nothing to write")
@@ -122,7 +129,9 @@ def write_shape(
     elif added := exporters().get(file_format):
         replace_file(path, added.encode(shape, values, notes))
     else:
-        encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[file_format]
+        encode = {"stl": _encode_stl, "obj": _encode_obj, "glb": _encode_glb, "3mf": _encode_3mf}[
+            file_format
+        ]
         replace_file(path, encode(shape, notes))
     return path.stat().st_size
 
@@ -138,11 +147,14 @@ def _check_format(path: Path, is_mesh: bool) -> None:
         raise InputError(f"{path.name}: {what} cannot be written so{why}; choose one of {listed}")
 
 
-def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndarray, notes: Sequence[str] = ()) -> int:
-    """Write a mesh with texture coordinates ``uv`` (n, 2) and its image (h, w, 3) uint8, and return the size in bytes.
+def write_textured(
+    path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndarray, notes: Sequence[str] = ()
+) -> int:
+    """Write a mesh with texture coordinates ``uv`` (n, 2) and its image (h, w, 3) uint8, and return
+    the size in bytes.
 
-    As .glb one file in metres; as .obj in mm with an .mtl and a .png of that name beside it. Raises InputError for
-    another suffix.
+    As .glb one file in metres; as .obj in mm with an .mtl and a .png of that name beside it. Raises
+    InputError for another suffix.
     """
     from PIL import Image
     from trimesh.visual.material import PBRMaterial
@@ -151,11 +163,15 @@ def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndar
     path = Path(path)
     picture = Image.fromarray(image)
     if (file_format := path.suffix.lower()) == ".glb":
-        material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+        material = PBRMaterial(
+            baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+        )
         replace_file(path, _encode_glb(shape, notes, TextureVisuals(uv=uv, material=material)))
         return path.stat().st_size
     if file_format != ".obj":
-        raise InputError(f"{path.name}: a texture is kept by .glb and .obj: end its name in one of these")
+        raise InputError(
+            f"{path.name}: a texture is kept by .glb and .obj: end its name in one of these"
+        )
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG")
     png, mtl = path.with_suffix(".png"), path.with_suffix(".mtl")
@@ -172,8 +188,11 @@ def write_textured(path: str | Path, shape: Mesh, uv: np.ndarray, image: np.ndar
     return sum(each.stat().st_size for each in (path, mtl, png))
 
 
-def estimated_bytes(file_format: str, points: int, faces: int = 0, *, colours: bool = True, scalars: int = 0) -> int:
-    """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20 % of texts."""
+def estimated_bytes(
+    file_format: str, points: int, faces: int = 0, *, colours: bool = True, scalars: int = 0
+) -> int:
+    """Estimate the size of a file of so many points and faces: within 1 % of binary files, some 20
+    % of texts."""
     if file_format == "ply":
         return 300 + points * (24 + 3 * colours + 4 * scalars) + faces * FACE.itemsize
     if file_format == "stl":
@@ -194,23 +213,41 @@ def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> No
     """Write points (n, 3) mm, with colours (n, 3) if given, as text, one point a line."""
     columns = np.round(points.astype(np.float64), DECIMALS) + 0.0  # no "-0.000000"
     lengths = [f"%.{DECIMALS}f"] * 3
-    with arriving_file(path, estimated_bytes("xyz", len(points), colours=colours is not None)) as file:
+    with arriving_file(
+        path, estimated_bytes("xyz", len(points), colours=colours is not None)
+    ) as file:
         if colours is None:
             np.savetxt(file, columns, lengths)
         else:
-            np.savetxt(file, np.concatenate([columns, colours], axis=1), [*lengths, "%d", "%d", "%d"])
+            np.savetxt(
+                file, np.concatenate([columns, colours], axis=1), [*lengths, "%d", "%d", "%d"]
+            )
 
 
-def _write_e57(path: Path, points: np.ndarray, colours: np.ndarray | None, notes: Sequence[str]) -> None:
-    """Write points (n, 3) mm, with colours (n, 3) if given, as an E57 file in metres; needs the package pye57."""
+def _write_e57(
+    path: Path, points: np.ndarray, colours: np.ndarray | None, notes: Sequence[str]
+) -> None:
+    """Write points (n, 3) mm, with colours (n, 3) if given, as an E57 file in metres; needs the
+    package pye57."""
     if find_spec("pye57") is None:
-        raise InputError(f"{path.name}: .e57 files need the package pye57: install it with pip install 'slviewer[e57]'")
+        raise InputError(
+            f"{path.name}: .e57 files need the package pye57: install it with pip install"
+            " 'slviewer[e57]'"
+        )
     import pye57
 
-    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), 1e-3 * points.T.astype(np.float64), strict=True))
+    fields = dict(
+        zip(
+            ("cartesianX", "cartesianY", "cartesianZ"),
+            1e-3 * points.T.astype(np.float64),
+            strict=True,
+        )
+    )
     if colours is not None:
         fields |= dict(zip(("colorRed", "colorGreen", "colorBlue"), colours.T, strict=True))
-    with arriving_path(path, estimated_bytes("e57", len(points), colours=colours is not None)) as arriving:
+    with arriving_path(
+        path, estimated_bytes("e57", len(points), colours=colours is not None)
+    ) as arriving:
         file = pye57.E57(str(arriving), mode="w")
         try:
             file.write_scan_raw(fields, name=to_ascii(notes[0]) if notes else None)
@@ -249,12 +286,15 @@ def _encode_obj(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
 
     header = "\n# ".join(to_ascii(line) for line in (f"slviewer {__version__}: units mm", *notes))
     has_normals = shape.normals is not None
-    text: str = export_obj(_to_trimesh(shape), include_normals=has_normals, digits=DECIMALS, header=header)
+    text: str = export_obj(
+        _to_trimesh(shape), include_normals=has_normals, digits=DECIMALS, header=header
+    )
     return text.encode("ascii")
 
 
 def _encode_3mf(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
-    """Return a mesh as the bytes of a 3MF file in mm; SessionError where its packages are missing."""
+    """Return a mesh as the bytes of a 3MF file in mm; SessionError where its packages are
+    missing."""
     require_packages("3mf")
     from trimesh.exchange.threemf import export_3MF
 
@@ -263,20 +303,28 @@ def _encode_3mf(shape: PointSet | Mesh, notes: Sequence[str]) -> bytes:
 
 
 def _encode_glb(shape: PointSet | Mesh, notes: Sequence[str], texture: Any = None) -> bytes:
-    """Binary glTF 2.0 in metres; normals only if all are known, since glTF has no unknown ones. ``texture``: trimesh's
-    visual that replaces the colours of the vertices."""
+    """Binary glTF 2.0 in metres; normals only if all are known, since glTF has no unknown ones.
+    ``texture``: trimesh's visual that replaces the colours of the vertices."""
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
     points, faces = (shape.vertices, shape.faces) if isinstance(shape, Mesh) else (shape.points, ())
     size = estimated_bytes("glb", len(points), len(faces))
     if size > _GLB_LIMIT:
-        raise InputError(f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3: write a .ply instead")
+        raise InputError(
+            f"{size / 1e9:.1f} GB do not fit into a .glb, which ends at 4.3: write a .ply instead"
+        )
 
     def describe(tree: dict[str, Any]) -> None:
         """Add generator, notes, material and axis convention to the glTF tree in place."""
-        words = ["vertices in metres, in the frame of the camera", "the node turns y up and z towards the viewer"]
-        tree["asset"] |= {"generator": f"slviewer {__version__}", "extras": {"notes": [*words, *notes]}}
+        words = [
+            "vertices in metres, in the frame of the camera",
+            "the node turns y up and z towards the viewer",
+        ]
+        tree["asset"] |= {
+            "generator": f"slviewer {__version__}",
+            "extras": {"notes": [*words, *notes]},
+        }
         # scanned surfaces are open: they have no inside that need not be drawn
         roughness = {"metallicFactor": 0, "roughnessFactor": 1}
         if texture is None:

@@ -1,4 +1,5 @@
-"""Names of captures and results: safe as folder names on every system, sorted as a person counts."""
+"""Names of captures and results: safe as folder names on every system, sorted as a person
+counts."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -11,12 +12,15 @@ _DEVICE = re.compile(r"(?i:con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 
 def safe_name(name: str) -> str:
-    """Return `name` itself if it is valid as a folder name: letters, digits, `_`, `-`, `.`, no dot or dash first.
+    """Return `name` itself if it is valid as a folder name: letters, digits, `_`, `-`, `.`, no dot
+    or dash first.
 
     Raises InputError otherwise.
     """
     if not is_safe_name(name):
-        raise InputError(f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', with no path in it")
+        raise InputError(
+            f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', with no path in it"
+        )
     return name
 
 
@@ -26,31 +30,37 @@ def is_safe_name(name: str) -> bool:
 
 
 def new_name(name: str, others: Iterable[str] = ()) -> str:
-    """Return a `safe_name` for something new: none that Windows keeps for a device, and none that differs from one of
-    ``others`` in its case alone, so that sessions can be copied there. Raises InputError otherwise. What has such a
-    name already can be read."""
+    """Return a `safe_name` for something new: none that Windows keeps for a device, and none that
+    differs from one of ``others`` in its case alone, so that sessions can be copied there. Raises
+    InputError otherwise. What has such a name already can be read."""
     if _DEVICE.fullmatch(safe_name(name)):
-        raise InputError(f"{name!r} cannot be a name: Windows keeps it for a device: choose another one")
+        raise InputError(
+            f"{name!r} cannot be a name: Windows keeps it for a device: choose another one"
+        )
     for other in others:
         if other != name and other.lower() == name.lower():
             raise InputError(
-                f"{name!r} cannot be a name beside {other!r}: Windows and macOS do not tell them apart: choose another"
+                f"{name!r} cannot be a name beside {other!r}: Windows and macOS do not tell them"
+                " apart: choose another"
             )
     return name
 
 
 def safe_path(name: str) -> str:
-    """Return `name` if every part between its slashes is a safe name, as in `calibration/stereo`; else InputError."""
+    """Return `name` if every part between its slashes is a safe name, as in `calibration/stereo`;
+    else InputError."""
     if not isinstance(name, str) or not name:
-        raise InputError(f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', parts joined by '/'")
+        raise InputError(
+            f"{name!r} cannot be a name: use letters, digits, '_', '-' and '.', parts joined by '/'"
+        )
     for part in name.split("/"):
         safe_name(part)
     return name
 
 
 def clean_label(text: str) -> str:
-    """Return an operator's name for something, without surplus space. Raises InputError for characters that are not
-    printable: controls, and marks that change the direction of writing."""
+    """Return an operator's name for something, without surplus space. Raises InputError for
+    characters that are not printable: controls, and marks that change the direction of writing."""
     label = " ".join(text.split())
     if not label.isprintable():
         raise InputError(f"{label!r} holds characters that cannot be printed: type the name again")

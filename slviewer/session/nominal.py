@@ -39,8 +39,10 @@ MAX_DEGENERATE_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """A nominal model: its ``mesh`` in mm, the file's ``name`` and content ``hash``, the ``units`` that it was read in
-    (None: none were given, and mm assumed), whether it is ``closed``, and ``notes``, one for each repair."""
+    """A nominal model: its ``mesh`` in mm, the file's ``name`` and content ``hash``, the ``units``
+    that it was read in (None: none were given, and mm assumed), whether it is ``closed``, and
+    ``notes``, one for each repair.
+    """
 
     mesh: Mesh
     name: str
@@ -61,12 +63,15 @@ class Nominal:
         return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"
 
 
-def read_nominal(path: Path | str, units: Units | None = None, max_triangles: int = MAX_TRIANGLES) -> Nominal:
-    """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given in mm; or in a STEP
-    or 3MF file, which states its units.
+def read_nominal(
+    path: Path | str, units: Units | None = None, max_triangles: int = MAX_TRIANGLES
+) -> Nominal:
+    """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given
+    in mm; or in a STEP or 3MF file, which states its units.
 
-    Raises SessionError for a file that cannot be used, with the reason: one that is absent, too large, damaged,
-    truncated, of another format, without triangles, or with more than ``max_triangles``.
+    Raises SessionError for a file that cannot be used, with the reason: one that is absent, too
+    large, damaged, truncated, of another format, without triangles, or with more than
+    ``max_triangles``.
     """
     path = expand_user(path)
     data = _read_bytes(path)
@@ -83,8 +88,8 @@ def read_nominal(path: Path | str, units: Units | None = None, max_triangles: in
         vertices = vertices * MM[units or "mm"]
     if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
-            f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to {MAX_COORDINATE_MM:g} mm are read; "
-            "give its units, or move it to its origin"
+            f"{path.name} reaches {np.abs(vertices).max():.3g} mm: models up to"
+            f" {MAX_COORDINATE_MM:g} mm are read; give its units, or move it to its origin"
         )
     vertices, faces = _drop_degenerate(path.name, vertices, faces, notes)
     faces, closed = _orient_faces(vertices, faces, notes)
@@ -93,8 +98,10 @@ def read_nominal(path: Path | str, units: Units | None = None, max_triangles: in
 
 
 def check_size(nominal: Nominal, points: np.ndarray) -> None:
-    """Raise InputError where a model, without stated units, is so much smaller or larger than a scan's points (n, 3)
-    mm that they may be others: the message states both sizes and the units that fit. Nothing is scaled."""
+    """Raise InputError where a model, without stated units, is so much smaller or larger than a
+    scan's points (n, 3) mm that they may be others: the message states both sizes and the units
+    that fit. Nothing is scaled.
+    """
     if nominal.units is not None:
         return
     some = points[:: max(1, len(points) // 100_000)]
@@ -104,16 +111,29 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
     if 1 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
         return
     fitting = [
-        name for name, mm in MM.items() if 1 / MATCHING_SIZE_RATIO < ratio / mm < MATCHING_SIZE_RATIO and name != "mm"
+        name
+        for name, mm in MM.items()
+        if 1 / MATCHING_SIZE_RATIO < ratio / mm < MATCHING_SIZE_RATIO and name != "mm"
     ]
     many = (
-        f"about {_format_size(ratio)} times larger" if ratio > 1 else f"about {_format_size(1 / ratio)} times smaller"
+        f"about {_format_size(ratio)} times larger"
+        if ratio > 1
+        else f"about {_format_size(1 / ratio)} times smaller"
     )
-    sizes = f"{_format_size(model)} mm across if its numbers are mm, and the scan {_format_size(scan)} mm"
+    sizes = (
+        f"{_format_size(model)} mm across if its numbers are mm, and the scan"
+        f" {_format_size(scan)} mm"
+    )
     comparison = f"{nominal.name} measures {sizes}, {many}"
     if fitting:
-        raise InputError(f"{comparison}: give --units {' or --units '.join(fitting)} if it is so, else --units mm")
-    raise InputError(f"{comparison}: see that it is the same part; give --units mm if its numbers are mm all the same")
+        raise InputError(
+            f"{comparison}: give --units {' or --units '.join(fitting)} if it is so, else"
+            " --units mm"
+        )
+    raise InputError(
+        f"{comparison}: see that it is the same part; give --units mm if its numbers are mm all the"
+        " same"
+    )
 
 
 def _format_size(size: float) -> str:
@@ -122,18 +142,25 @@ def _format_size(size: float) -> str:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Return the content of a model's file; SessionError for another format, or one too large to read."""
+    """Return the content of a model's file; SessionError for another format, or one too large to
+    read."""
     if path.suffix.lower() not in FORMATS:
-        raise SessionError(f"{path.name} is no nominal model that can be read: give an STL, PLY, OBJ, STEP or 3MF file")
+        raise SessionError(
+            f"{path.name} is no nominal model that can be read: give an STL, PLY, OBJ, STEP or 3MF"
+            " file"
+        )
     try:
         return read_file(path, MAX_BYTES)
     except OSError as error:
         reason = error.strerror or error
-        raise SessionError(f"{path} cannot be read ({reason}): give a file of up to {MAX_BYTES >> 20} MiB") from error
+        raise SessionError(
+            f"{path} cannot be read ({reason}): give a file of up to {MAX_BYTES >> 20} MiB"
+        ) from error
 
 
 def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged duplicate vertices."""
+    """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged
+    duplicate vertices."""
     import trimesh
 
     form = name.rpartition(".")[2].lower()
@@ -141,38 +168,58 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # from memory, so that other files that it may name are not opened; unprocessed, or points that are no
-            # numbers would be dropped
-            mesh: Any = trimesh.load(io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False)
-            vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+            # from memory, so that other files that it may name are not opened; unprocessed, or
+            # points that are no numbers would be dropped
+            mesh: Any = trimesh.load(
+                io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False
+            )
+            vertices, faces = _weld(
+                np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+            )
     except MemoryError as error:
         raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
     except Exception as error:  # a file from anywhere may make its reader fail in any way
         raise SessionError(
-            f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model again, as triangles"
+            f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model"
+            " again, as triangles"
         ) from error
     declared = re.search(rb"element face (\d{1,12})\b", data[:65536]) if form == "ply" else None
-    if declared and len(faces) < int(declared[1]):  # a text that breaks off is read as far as it goes
+    if declared and len(faces) < int(
+        declared[1]
+    ):  # a text that breaks off is read as far as it goes
         raise SessionError(
-            f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read; export the model again"
+            f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read;"
+            " export the model again"
         )
     return vertices, faces
 
 
-def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray, max_triangles: int) -> None:
-    """Raise SessionError where vertices and faces are no triangles, too many, or reach beyond what is read."""
-    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
+def _check_triangles(
+    name: str, vertices: np.ndarray, faces: np.ndarray, max_triangles: int
+) -> None:
+    """Raise SessionError where vertices and faces are no triangles, too many, or reach beyond what
+    is read."""
+    if (
+        vertices.ndim != 2
+        or vertices.shape[1:] != (3,)
+        or faces.ndim != 2
+        or faces.shape[1:] != (3,)
+        or not len(faces)
+    ):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
     if len(faces) > max_triangles:
         raise _too_many(name, f"{len(faces):,} triangles", max_triangles)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     if not np.isfinite(vertices).all():
-        raise SessionError(f"{name} holds points that are no numbers (NaN or infinite): export the model again")
+        raise SessionError(
+            f"{name} holds points that are no numbers (NaN or infinite): export the model again"
+        )
 
 
 def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
-    """Return a file without what only costs time: the groups of an OBJ, all but one of the sections of a text STL.
+    """Return a file without what only costs time: the groups of an OBJ, all but one of the sections
+    of a text STL.
 
     Raises SessionError for one of more triangles than are read, counted before anything is loaded.
     """
@@ -180,10 +227,18 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
     if is_text and len(data) > MAX_TEXT_BYTES:
         raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text", max_triangles)
     if form == "obj":
-        data = b"\n".join(re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE))
-        corners = max(map(len, map(bytes.split, re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE))), default=0)
+        data = b"\n".join(
+            re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE)
+        )
+        corners = max(
+            map(len, map(bytes.split, re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE))),
+            default=0,
+        )
         if corners > MAX_CORNERS:
-            raise SessionError(f"{name} has a face of {corners - 1:,} corners: export the model again, as triangles")
+            raise SessionError(
+                f"{name} has a face of {corners - 1:,} corners: export the model again, as"
+                " triangles"
+            )
         count = data.count(b"f ") + data.count(b"f\t")
     elif form == "ply":
         declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
@@ -195,7 +250,8 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
         count = int.from_bytes(data[80:84], "little")
         if len(data) < 84 + 50 * count:
             raise SessionError(
-                f"{name} holds no triangles, or is truncated: it announces {count:,} triangles; export the model again"
+                f"{name} holds no triangles, or is truncated: it announces {count:,} triangles;"
+                " export the model again"
             )
     if count > max_triangles:
         raise _too_many(name, f"{count:,} triangles", max_triangles)
@@ -203,75 +259,102 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) without those that repeat others to 8 decimals, and faces (m, 3) with their new indices."""
+    """Vertices (n, 3) without those that repeat others to 8 decimals, and faces (m, 3) with their
+    new indices."""
     rounded = np.round(vertices, 8) + 0.0  # no negative zeros
     mixed = np.zeros(len(rounded), np.uint64)
     for column in rounded.T.copy().view(np.uint64):
         mixed = (mixed ^ column) * np.uint64(11400714819323198485)
         mixed ^= mixed >> np.uint64(29)
     _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-    if not np.array_equal(rounded[first[inverse]], rounded, equal_nan=True):  # two points share a hash: all are kept
+    if not np.array_equal(
+        rounded[first[inverse]], rounded, equal_nan=True
+    ):  # two points share a hash: all are kept
         return vertices, faces
     return vertices[first], inverse[faces]
 
 
 def _is_text_stl(data: bytes) -> bool:
-    """Return whether an STL is text: it begins with "solid", and is not of the size that a binary one announces."""
+    """Return whether an STL is text: it begins with "solid", and is not of the size that a binary
+    one announces."""
     binary = len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
     return data[:512].lstrip().lower().startswith(b"solid") and not binary
 
 
 def _too_many(name: str, amount: str, max_triangles: int) -> SessionError:
     """Return the error for a model that is too large."""
-    return SessionError(f"{name} has {amount}, and at most {max_triangles:,} triangles are read: decimate it first")
+    return SessionError(
+        f"{name} has {amount}, and at most {max_triangles:,} triangles are read: decimate it first"
+    )
 
 
 def _drop_degenerate(
     name: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces without triangles that have no area, and without the vertices that only those had."""
+    """Vertices and faces without triangles that have no area, and without the vertices that only
+    those had."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     sides = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
     sound = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9 * sides**2
     flat = len(faces) - int(np.count_nonzero(sound))
     if flat > MAX_DEGENERATE_SHARE * len(faces):
-        raise SessionError(f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model again")
+        raise SessionError(
+            f"{flat:,} of the {len(faces):,} triangles in {name} have no area: export the model"
+            " again"
+        )
     if flat:
         notes.append(f"{flat:,} of {len(faces):,} triangles without area were removed")
     faces = faces[sound]
     # the smallest index first, so that equal triangles have equal rows
-    rolled = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    rolled = np.take_along_axis(
+        faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1
+    )
     order = np.lexsort(rolled.T[::-1])
     repeated = order[1:][(np.diff(rolled[order], axis=0) == 0).all(axis=1)]
     if len(repeated):
-        notes.append(f"{len(repeated):,} of {len(faces):,} triangles were repetitions of others: they were removed")
+        notes.append(
+            f"{len(repeated):,} of {len(faces):,} triangles were repetitions of others: they were"
+            " removed"
+        )
         faces = np.delete(faces, repeated, axis=0)
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 
 
-def _orient_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, bool]:
-    """Return the faces wound consistently, outwards where the model is closed; and whether it is closed."""
+def _orient_faces(
+    vertices: np.ndarray, faces: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, bool]:
+    """Return the faces wound consistently, outwards where the model is closed; and whether it is
+    closed."""
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     forward = directed[:, 0] < directed[:, 1]
-    keys = np.where(forward, directed[:, 0], directed[:, 1]) * (len(vertices) + 1) + directed.max(axis=1)
+    keys = np.where(forward, directed[:, 0], directed[:, 1]) * (len(vertices) + 1) + directed.max(
+        axis=1
+    )
     order = np.argsort(keys, kind="stable")
     sides = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(keys[order]) != 0, [True]])))
     closed, manifold = bool((sides == 2).all()), bool((sides <= 2).all())
-    pair = np.flatnonzero(np.diff(keys[order]) == 0)  # of a manifold: the places of each edge that two faces share
+    pair = np.flatnonzero(
+        np.diff(keys[order]) == 0
+    )  # of a manifold: the places of each edge that two faces share
     one, other = order[pair], order[pair + 1]
-    alike = forward[one] == forward[other]  # neighbours that turn alike run along their side in opposite directions
+    alike = (
+        forward[one] == forward[other]
+    )  # neighbours that turn alike run along their side in opposite directions
     if alike.any():
         turned = _turn_alike(vertices, faces, one // 3, other // 3, alike) if manifold else None
         if turned is None:
             notes.append(
-                "its triangles do not all turn one way, and cannot be turned: some deviations may have the wrong sign"
+                "its triangles do not all turn one way, and cannot be turned: some deviations may"
+                " have the wrong sign"
             )
             return faces, False
         faces = turned
         notes.append("its triangles did not all turn one way: they were turned")
     if closed:
-        a, b, c = (vertices[faces[:, k]].astype(np.float64) - vertices.mean(axis=0) for k in range(3))
+        a, b, c = (
+            vertices[faces[:, k]].astype(np.float64) - vertices.mean(axis=0) for k in range(3)
+        )
         if float(np.sum(a * np.cross(b, c))) < 0:
             faces = faces[:, ::-1].copy()
             notes.append("its triangles faced inwards: they were turned")
@@ -283,10 +366,13 @@ def _orient_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> 
 def _turn_alike(
     vertices: np.ndarray, faces: np.ndarray, one: np.ndarray, other: np.ndarray, alike: np.ndarray
 ) -> np.ndarray | None:
-    """Faces (m, 3) turned one way, each part of the surface the way in which most of its area faces; None where that is
-    impossible. ``one``, ``other`` (k,): faces that share an edge, ``alike`` (k,): one of the two has to be turned."""
+    """Faces (m, 3) turned one way, each part of the surface the way in which most of its area
+    faces; None where that is impossible. ``one``, ``other`` (k,): faces that share an edge,
+    ``alike`` (k,): one of the two has to be turned.
+    """
     m = len(faces)
-    # a node for each face as it is, and one for it turned: two components a part, which are its two orientations
+    # a node for each face as it is, and one for it turned: two components a part, which are its two
+    # orientations
     start = np.concatenate([one, one + m])
     end = np.concatenate([np.where(alike, other + m, other), np.where(alike, other, other + m)])
     links = coo_matrix((np.ones(len(start), np.int8), (start, end)), (2 * m, 2 * m))
@@ -296,7 +382,9 @@ def _turn_alike(
         return None
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    kept = np.bincount(as_is, area, int(labels.max()) + 1)  # area that an orientation leaves as it is
+    kept = np.bincount(
+        as_is, area, int(labels.max()) + 1
+    )  # area that an orientation leaves as it is
     wrong = kept[as_is] < kept[turned]
     wrong |= (kept[as_is] == kept[turned]) & (as_is > turned)
     return np.where(wrong[:, None], faces[:, ::-1], faces)

@@ -21,9 +21,9 @@ UNKNOWN_SIGMA = -1.0
 
 @dataclass(frozen=True, eq=False)
 class Ply:
-    """A PLY's content: ``points`` (n, 3) float32 mm, ``colours`` (n, 3) uint8, ``normals`` (n, 3) float32, ``faces``
-    (m, 3) int32, each None where absent, and every other property of the vertices in ``scalars`` by name, (n,). Unknown
-    normals and sigmas are NaN."""
+    """A PLY's content: ``points`` (n, 3) float32 mm, ``colours`` (n, 3) uint8, ``normals`` (n, 3)
+    float32, ``faces`` (m, 3) int32, each None where absent, and every other property of the
+    vertices in ``scalars`` by name, (n,). Unknown normals and sigmas are NaN."""
 
     points: np.ndarray
     colours: np.ndarray | None = None
@@ -41,20 +41,26 @@ def write_ply(
     faces: np.ndarray | None = None,
     notes: Sequence[str] = (),
 ) -> None:
-    """Writes points (n, 3) mm, and what else is given, as one binary PLY that appears whole or not at all.
+    """Writes points (n, 3) mm, and what else is given, as one binary PLY that appears whole or not
+    at all.
 
-    ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3); one that is not known (NaN) is written as 0 0 0.
-    ``scalars``: named (n,), as float32 properties of the vertices; a sigma that is not known is written as -1.
-    ``faces``: (m, 3) indices into the points. ``notes``: sentences for the file's comments, besides those that state
-    the program and the units. Raises InputError for shapes that do not fit together and for NaN elsewhere;
-    SessionError where the file cannot be written (an older file of that name stays unchanged).
+    ``colours``: (n,) grey or (n, 3) RGB, uint8. ``normals``: (n, 3); one that is not known (NaN) is
+    written as 0 0 0. ``scalars``: named (n,), as float32 properties of the vertices; a sigma that
+    is not known is written as -1. ``faces``: (m, 3) indices into the points. ``notes``: sentences
+    for the file's comments, besides those that state the program and the units. Raises InputError
+    for shapes that do not fit together and for NaN elsewhere; SessionError where the file cannot be
+    written (an older file of that name stays unchanged).
     """
     points = np.asarray(points)
     fields = _vertex_fields(points, colours, normals, dict(scalars or {}))
-    vertex = np.dtype([("+".join(names), code, (len(names),)) for names, code, _ in fields])  # grouped: written faster
+    vertex = np.dtype(
+        [("+".join(names), code, (len(names),)) for names, code, _ in fields]
+    )  # grouped: written faster
     types = {code: name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
-    header += [f"comment {to_ascii(note)}" for note in (f"written by slviewer {__version__}", *notes)]
+    header += [
+        f"comment {to_ascii(note)}" for note in (f"written by slviewer {__version__}", *notes)
+    ]
     header.append(f"element vertex {len(points)}")
     header += [f"property {types[code]} {name}" for names, code, _ in fields for name in names]
     size = len(points) * vertex.itemsize
@@ -68,7 +74,9 @@ def write_ply(
         file.write("\n".join(header).encode("ascii"))
         records = np.empty(len(points), vertex)
         for names, _, values in fields:
-            records["+".join(names)] = replace_nan(names[0], values if values.ndim == 2 else values[:, None])
+            records["+".join(names)] = replace_nan(
+                names[0], values if values.ndim == 2 else values[:, None]
+            )
         file.write(records.data)
         if faces is not None:
             triangles = np.empty(len(faces), FACE)
@@ -79,17 +87,23 @@ def write_ply(
 def read_ply(path: str | Path) -> Ply:
     """Read the content of a PLY that ``write_ply`` wrote.
 
-    Raises InputError for an absent or truncated file and for other kinds of PLY (text, big endian, polygons).
+    Raises InputError for an absent or truncated file and for other kinds of PLY (text, big endian,
+    polygons).
     """
     path = Path(path)
     try:
         data = read_file(path, MAX_CLOUD_BYTES)
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror or error}): check its name.") from None
+        raise InputError(
+            f"{path} cannot be read ({error.strerror or error}): check its name."
+        ) from None
     end = data.find(b"end_header\n")
     lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
-        raise InputError(f"{path} is no binary little-endian PLY: only files that slviewer wrote can be read back.")
+        raise InputError(
+            f"{path} is no binary little-endian PLY: only files that slviewer wrote can be read"
+            " back."
+        )
     with decoding(path, InputError):
         return _parse_ply(path, data, end, lines[2:])
 
@@ -106,12 +120,20 @@ def _parse_ply(path: Path, data: bytes, end: int, lines: list[list[str]]) -> Ply
         elif words[0] == "property" and list(counts) == ["vertex"] and words[1] in TYPES:
             properties.append((words[2], TYPES[words[1]]))
         elif words[0] == "property" and words[1:] != ["list", "uchar", "int", "vertex_indices"]:
-            raise InputError(f"{path} holds '{' '.join(words)}', which slviewer does not write: convert it first.")
+            raise InputError(
+                f"{path} holds '{' '.join(words)}', which slviewer does not write: convert it"
+                " first."
+            )
     vertex = np.dtype(properties)
     start = end + len(b"end_header\n")
     middle = start + counts.get("vertex", 0) * vertex.itemsize
-    if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not {"x", "y", "z"} <= set(vertex.names or ()):
-        raise InputError(f"{path} is {len(data)} bytes, not the size in its header: it is truncated, or has polygons.")
+    if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not {"x", "y", "z"} <= set(
+        vertex.names or ()
+    ):
+        raise InputError(
+            f"{path} is {len(data)} bytes, not the size in its header: it is truncated, or has"
+            " polygons."
+        )
     vertices = np.frombuffer(data[start:middle], dtype=vertex)
     faces = np.frombuffer(data[middle:], dtype=FACE)
     if (faces["count"] != 3).any():
@@ -128,24 +150,36 @@ def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
     """Replace unknown values of a vertex property by their code in the file: see ``write_ply``."""
     if values.dtype.kind != "f" or name in ("x", "y", "z"):
         return values
-    return np.where(np.isfinite(values), values, 0.0 if name in ("nx", "ny", "nz") else UNKNOWN_SIGMA)
+    return np.where(
+        np.isfinite(values), values, 0.0 if name in ("nx", "ny", "nz") else UNKNOWN_SIGMA
+    )
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
     """Raise InputError for faces that are no triangles between ``count`` points."""
-    if faces.ndim != 2 or faces.shape[1] != 3 or (faces.size and not 0 <= faces.min() <= faces.max() < count):
+    if (
+        faces.ndim != 2
+        or faces.shape[1] != 3
+        or (faces.size and not 0 <= faces.min() <= faces.max() < count)
+    ):
         raise InputError(
-            f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of points."
+            f"Faces of shape {faces.shape} were given: (m, 3) indices below {count}, the number of"
+            " points."
         )
 
 
 def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
-    """Return points, colours, normals, scalars and faces from the file's vertex and face records."""
+    """Return points, colours, normals, scalars and faces from the file's vertex and face
+    records."""
     names = vertices.dtype.names or ()
 
     def join(*fields: str) -> np.ndarray | None:
         """Return the named vertex fields as columns (n, k); None where one is missing."""
-        return np.stack([vertices[name] for name in fields], axis=1) if set(fields) <= set(names) else None
+        return (
+            np.stack([vertices[name] for name in fields], axis=1)
+            if set(fields) <= set(names)
+            else None
+        )
 
     known = {"x", "y", "z", "nx", "ny", "nz", *COLOURS}
     scalars = {name: vertices[name].copy() for name in names if name not in known}
@@ -160,11 +194,18 @@ def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
 
 
 def _vertex_fields(
-    points: np.ndarray, colours: np.ndarray | None, normals: np.ndarray | None, scalars: dict[str, np.ndarray]
+    points: np.ndarray,
+    colours: np.ndarray | None,
+    normals: np.ndarray | None,
+    scalars: dict[str, np.ndarray],
 ) -> list[tuple[tuple[str, ...], str, np.ndarray]]:
-    """(names, type, values (n,) or (n, k)) of the properties of a vertex, in the order in which PLY lays them out."""
+    """(names, type, values (n,) or (n, k)) of the properties of a vertex, in the order in which PLY
+    lays them out."""
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"Points of shape {points.shape} were given: a PLY holds (n, 3); select the valid ones first.")
+        raise InputError(
+            f"Points of shape {points.shape} were given: a PLY holds (n, 3); select the valid ones"
+            " first."
+        )
     if not np.isfinite(points).all():
         raise InputError("Some points are NaN: select the valid ones first.")
     fields: list[tuple[tuple[str, ...], str, np.ndarray]] = [(("x", "y", "z"), "<f4", points)]
@@ -172,19 +213,27 @@ def _vertex_fields(
         _check_length(normals.shape == points.shape, "normals", normals, len(points))
         fields.append((("nx", "ny", "nz"), "<f4", normals))
     if colours is not None:
-        _check_length(colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points))
+        _check_length(
+            colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points)
+        )
         if colours.dtype != np.uint8:
             raise InputError(f"Colours of {colours.dtype} were given: they must be uint8.")
         fields.append((COLOURS, "u1", colours))
     for name, given in scalars.items():
         values = np.asarray(given)
         _check_length(values.shape == points.shape[:1], name, values, len(points))
-        if not (name.isascii() and name.isidentifier()) or any(name in names for names, _, _ in fields):
+        if not (name.isascii() and name.isidentifier()) or any(
+            name in names for names, _, _ in fields
+        ):
             raise InputError(
-                f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new name."
+                f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a"
+                " new name."
             )
         if not name.startswith("sigma") and not np.isfinite(values).all():
-            raise InputError(f"{name} is not known of {np.count_nonzero(~np.isfinite(values))} points: leave them out.")
+            raise InputError(
+                f"{name} is not known of {np.count_nonzero(~np.isfinite(values))} points: leave"
+                " them out."
+            )
         fields.append(((name,), "<f4", values))
     return fields
 
@@ -192,4 +241,7 @@ def _vertex_fields(
 def _check_length(fits: bool, what: str, values: np.ndarray, count: int) -> None:
     """Raise InputError unless ``fits``: the values do not belong to ``count`` points."""
     if not fits:
-        raise InputError(f"{what} of shape {values.shape} do not belong to {count} points: give one for each point.")
+        raise InputError(
+            f"{what} of shape {values.shape} do not belong to {count} points: give one for each"
+            " point."
+        )

@@ -1,8 +1,9 @@
-"""Files from outside: the one place that opens and parses them, within limits of size, depth and numbers.
+"""Files from outside: the one place that opens and parses them, within limits of size, depth and
+numbers.
 
-Only regular files are read (a pipe or a device would never end), and none larger than its kind may be. What JSON and
-TOML hold is limited to what a record needs: `MAX_DEPTH` levels and integers of 64 bits, so that nothing that walks it
-later runs out of stack or range.
+Only regular files are read (a pipe or a device would never end), and none larger than its kind may
+be. What JSON and TOML hold is limited to what a record needs: `MAX_DEPTH` levels and integers of 64
+bits, so that nothing that walks it later runs out of stack or range.
 """
 
 import json
@@ -26,14 +27,26 @@ _MAX_INTEGER = 1 << 63
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
 _DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){32}""")
 _REMEDY = "restore it from a copy, or compute or import it again"
-_INVALID = (KeyError, TypeError, ValueError, AttributeError, IndexError, ArithmeticError, RecursionError, MemoryError)
+_INVALID = (
+    KeyError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    IndexError,
+    ArithmeticError,
+    RecursionError,
+    MemoryError,
+)
 """What a decoder raises that meets a value that it does not expect."""
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading. Raises OSError for anything else: a folder, a pipe, a device."""
+    """Open a regular file for reading. Raises OSError for anything else: a folder, a pipe, a
+    device."""
     # without O_NONBLOCK, opening a pipe waits for its writer; for regular files it changes nothing
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    descriptor = os.open(
+        path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    )
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(f"it is no regular file: {path}")
@@ -44,16 +57,22 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_file(path: Path, max_bytes: int) -> bytes:
-    """Return the content of a regular file. Raises OSError for any other, and for one of more than ``max_bytes``."""
+    """Return the content of a regular file. Raises OSError for any other, and for one of more than
+    ``max_bytes``."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > max_bytes:
-            raise OSError(f"it has {size / 1e6:.0f} MB, and {max_bytes / 1e6:.0f} MB are read at most")
+            raise OSError(
+                f"it has {size / 1e6:.0f} MB, and {max_bytes / 1e6:.0f} MB are read at most"
+            )
         return file.read(size)  # of a growing file, what it had
 
 
-def read_json(path: Path, remedy: str = "restore it from a copy, or move its folder away") -> dict[str, Any]:
-    """The object in a JSON file; DamagedError, with the remedy, where the file is damaged or holds no object."""
+def read_json(
+    path: Path, remedy: str = "restore it from a copy, or move its folder away"
+) -> dict[str, Any]:
+    """The object in a JSON file; DamagedError, with the remedy, where the file is damaged or holds
+    no object."""
     try:
         data = _check_values(json.loads(read_file(path, MAX_JSON_BYTES)))
     except (ValueError, OSError, RecursionError, MemoryError) as error:
@@ -72,7 +91,9 @@ def read_toml(path: Path | str) -> dict[str, Any]:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         data: dict[str, Any] = _check_values(tomllib.loads(text))
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({_reason(error)}): give the TOML file that is needed here") from error
+        raise InputError(
+            f"{path} cannot be read ({_reason(error)}): give the TOML file that is needed here"
+        ) from error
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{path} is not TOML ({_reason(error)}): correct it there") from error
     return data
@@ -83,7 +104,9 @@ def expand_user(path: Path | str) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
-        raise InputError(f"{path} names a user that does not exist here: give the whole path") from error
+        raise InputError(
+            f"{path} names a user that does not exist here: give the whole path"
+        ) from error
 
 
 @contextmanager
@@ -91,17 +114,21 @@ def decoding(
     place: Path | str,
     error: Callable[[str], Exception] = DamagedError,
 ) -> Iterator[None]:
-    """Context manager for decoding values read from ``place``: raise what unexpected ones cause as ``error``."""
+    """Context manager for decoding values read from ``place``: raise what unexpected ones cause as
+    ``error``."""
     try:
         yield
     except InputError as fault:
         raise error(f"{place} is damaged ({fault}): {_REMEDY}") from fault
     except _INVALID as fault:
-        raise error(f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): {_REMEDY}") from fault
+        raise error(
+            f"{place} is damaged ({type(fault).__name__}: {_reason(fault)}): {_REMEDY}"
+        ) from fault
 
 
 def _check_values(data: Any) -> Any:
-    """Return plain values unchanged. Raises ValueError for nesting, integers or text that no record has."""
+    """Return plain values unchanged. Raises ValueError for nesting, integers or text that no record
+    has."""
     level = [data]
     for _ in range(MAX_DEPTH):
         inner: list[Any] = []

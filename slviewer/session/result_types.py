@@ -1,8 +1,9 @@
-"""The types of what `meta.json` and `decisions.json` hold, by kind: what is read is checked against them first.
+"""The types of what `meta.json` and `decisions.json` hold, by kind: what is read is checked against
+them first.
 
-Every entry that a reader uses is named here with its type; a reader then needs no check of its own. An entry may be
-absent, as older versions had fewer: reading one that is needed raises DamagedError (`Meta`). Others are ignored. Arrays
-have their shapes checked by the classes that are made of them.
+Every entry that a reader uses is named here with its type; a reader then needs no check of its own.
+An entry may be absent, as older versions had fewer: reading one that is needed raises DamagedError
+(`Meta`). Others are ignored. Arrays have their shapes checked by the classes that are made of them.
 """
 
 from collections.abc import Mapping
@@ -24,14 +25,17 @@ _Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
 
 
 class Meta(dict[str, Any]):
-    """The entries of a `meta.json`; DamagedError, with its path, for one that is read and missing."""
+    """The entries of a `meta.json`; DamagedError, with its path, for one that is read and
+    missing."""
 
     def __init__(self, place: Path, entries: Mapping[str, Any]) -> None:
         super().__init__(entries)
         self._place = place
 
     def __missing__(self, key: str) -> Any:
-        raise DamagedError(f"{self._place} lacks the entry {key!r}: restore it from a copy, or compute it again")
+        raise DamagedError(
+            f"{self._place} lacks the entry {key!r}: restore it from a copy, or compute it again"
+        )
 
 
 class ResultMeta(TypedDict, total=False):
@@ -56,7 +60,8 @@ class _Imported(TypedDict):
 
 
 class _Stereo(ResultMeta, total=False):
-    """`calibration/stereo`: computed (``model``, ``settings``), or imported with its source and sizes."""
+    """`calibration/stereo`: computed (``model``, ``settings``), or imported with its source and
+    sizes."""
 
     model: dict[str, Any]
     settings: dict[str, Any]
@@ -200,7 +205,8 @@ _TYPES: dict[str, Any] = {
 
 
 def check_meta(name: str, meta: Mapping[str, Any]) -> None:
-    """Raise InputError, which names the entry, unless ``meta`` is what a result of this name holds."""
+    """Raise InputError, which names the entry, unless ``meta`` is what a result of this name
+    holds."""
     from_plain(meta, _TYPES.get(name) or _TYPES.get(name.partition("/")[0]) or ResultMeta)
     if (kind := RECORDS.get(name.partition("/")[0])) is not None:
         from_plain(kind.upgrade(meta), kind)

@@ -1,7 +1,8 @@
-"""A result: what was computed, from which inputs, with which settings. `meta.json` and one `.npy` an array.
+"""A result: what was computed, from which inputs, with which settings. `meta.json` and one `.npy`
+an array.
 
-`meta.json` holds the CRC-32C of the file of each array, which is checked when the array is read; older results have
-none, and only `verify_result` tells whether they are damaged.
+`meta.json` holds the CRC-32C of the file of each array, which is checked when the array is read;
+older results have none, and only `verify_result` tells whether they are damaged.
 """
 
 import hashlib
@@ -45,22 +46,33 @@ def check_place(root: Path, name: str) -> None:
     """Raise InputError where a result called `name` would be inside another, or hold others."""
     for other in list_results(root):
         if name.startswith(f"{other}/") or other.startswith(f"{name}/"):
-            raise InputError(f"result {name!r} and result {other!r} would lie inside each other: choose another name")
+            raise InputError(
+                f"result {name!r} and result {other!r} would lie inside each other: choose another"
+                " name"
+            )
 
 
-def check_result(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays as plain NumPy arrays; InputError for names that cannot be files or values that are no arrays."""
+def check_result(
+    meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The arrays as plain NumPy arrays; InputError for names that cannot be files or values that
+    are no arrays."""
     if reserved := _RESERVED & set(meta):
-        raise InputError(f"meta holds {sorted(reserved)}, which the session writes itself: use other keys")
+        raise InputError(
+            f"meta holds {sorted(reserved)}, which the session writes itself: use other keys"
+        )
     checked = {safe_path(name): np.asarray(array) for name, array in arrays.items()}
     for name, array in checked.items():
         if array.dtype.hasobject:
-            raise InputError(f"array {name!r} holds Python objects: give numbers, or put it into meta")
+            raise InputError(
+                f"array {name!r} holds Python objects: give numbers, or put it into meta"
+            )
     return checked
 
 
 def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a checked result into an empty folder, every file synced. Its hash covers meta and arrays."""
+    """Write a checked result into an empty folder, every file synced. Its hash covers meta and
+    arrays."""
 
     def write(name: str) -> tuple[bytes, int]:
         """Write one array as .npy, synced, and return digest and CRC-32C of the file."""
@@ -78,7 +90,10 @@ def write_result(folder: Path, meta: Mapping[str, Any], arrays: Mapping[str, np.
         digests = dict(zip(names, pool.map(write, names), strict=True))
     content_hash = _combine_digests(meta, {name: digest for name, (digest, _) in digests.items()})
     checksums = {name: checksum for name, (_, checksum) in digests.items()}
-    write_synced_json(folder / "meta.json", {**meta, "hash": content_hash, "arrays": names, "checksums": checksums})
+    write_synced_json(
+        folder / "meta.json",
+        {**meta, "hash": content_hash, "arrays": names, "checksums": checksums},
+    )
 
 
 def read_meta(folder: Path) -> dict[str, Any]:
@@ -100,18 +115,26 @@ def verify_result(folder: Path) -> None:
     names = meta.get("arrays", [])
     try:
         digests = {
-            n: hashlib.blake2b(read_file(_array_path(folder, n), MAX_ARRAY_BYTES), digest_size=20).digest()
+            n: (
+                hashlib.blake2b(
+                    read_file(_array_path(folder, n), MAX_ARRAY_BYTES), digest_size=20
+                ).digest()
+            )
             for n in names
         }
     except OSError as error:
         raise _damage(folder, str(error)) from error
-    if _combine_digests({key: meta[key] for key in meta if key not in _RESERVED}, digests) != meta.get("hash"):
+    if _combine_digests(
+        {key: meta[key] for key in meta if key not in _RESERVED}, digests
+    ) != meta.get("hash"):
         raise _damage(folder, "its hash differs from the saved one")
 
 
-def read_arrays(folder: Path, meta: Mapping[str, Any], only: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of a result with that meta (those named in `only`); DamagedError where one is missing or not what was
-    saved."""
+def read_arrays(
+    folder: Path, meta: Mapping[str, Any], only: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
+    """The arrays of a result with that meta (those named in `only`); DamagedError where one is
+    missing or not what was saved."""
     names, checksums = meta.get("arrays", []), meta.get("checksums", {})
     if only is not None and (unknown := set(only) - set(names)):
         raise InputError(f"{folder.name} holds no array {sorted(unknown)}: it holds {names}")
@@ -121,15 +144,27 @@ def read_arrays(folder: Path, meta: Mapping[str, Any], only: Collection[str] | N
             continue
         try:
             arrays[name] = _read_array(_array_path(folder, name))
-        except (OSError, ValueError, EOFError, KeyError, SyntaxError, tokenize.TokenError, MemoryError) as error:
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            KeyError,
+            SyntaxError,
+            tokenize.TokenError,
+            MemoryError,
+        ) as error:
             raise _damage(folder, f"array {name}: {error}") from error
-        if name in checksums and _checksum(_make_header(arrays[name]), arrays[name]) != checksums[name]:
+        if (
+            name in checksums
+            and _checksum(_make_header(arrays[name]), arrays[name]) != checksums[name]
+        ):
             raise _damage(folder, f"array {name} differs from its checksum")
     return arrays
 
 
 def _read_array(path: Path) -> np.ndarray:
-    """Read a .npy file. Raises ValueError unless it holds exactly the numbers or texts that its header announces."""
+    """Read a .npy file. Raises ValueError unless it holds exactly the numbers or texts that its
+    header announces."""
     with open_regular(path) as file:
         header = np.lib.format
         read_header = {(1, 0): header.read_array_header_1_0, (2, 0): header.read_array_header_2_0}
@@ -163,7 +198,8 @@ def _checksum(header: bytes, array: np.ndarray) -> int:
 
 
 def _combine_digests(meta: Mapping[str, Any], digests: Mapping[str, bytes]) -> str:
-    """Return the content hash of a result from its meta and the digests of its arrays in the order of their names."""
+    """Return the content hash of a result from its meta and the digests of its arrays in the order
+    of their names."""
     whole = hashlib.blake2b(to_json(dict(meta)), digest_size=20)
     for name, digest in digests.items():
         whole.update(name.encode() + digest)
@@ -172,4 +208,6 @@ def _combine_digests(meta: Mapping[str, Any], digests: Mapping[str, bytes]) -> s
 
 def _damage(folder: Path, fault: str) -> DamagedError:
     """Return the error for a damaged result, with its folder and the remedy."""
-    return DamagedError(f"the result in {folder} is damaged ({fault}): compute it again, or restore it from a copy")
+    return DamagedError(
+        f"the result in {folder} is damaged ({fault}): compute it again, or restore it from a copy"
+    )

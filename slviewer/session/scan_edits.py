@@ -1,4 +1,5 @@
-"""What restricts scans to a part of their points: the edits of each scan, `edits/SCAN`, and the session's region.
+"""What restricts scans to a part of their points: the edits of each scan, `edits/SCAN`, and the
+session's region.
 
 Results that are made of such points name both as inputs, so that they are stale once one changes.
 """
@@ -31,19 +32,25 @@ def load_edits(store: Session, scan: str) -> EditHistory:
         return EditHistory()
     try:
         if tuple(meta["size"]) != tuple(capture.size):
-            raise InputError(f"they are of {meta['size']} pixels, the capture has {list(capture.size)}")
+            raise InputError(
+                f"they are of {meta['size']} pixels, the capture has {list(capture.size)}"
+            )
         return EditHistory(
-            tuple(_read_edit(i, entry, meta["size"], arrays) for i, entry in enumerate(meta["edits"])), meta["applied"]
+            tuple(
+                _read_edit(i, entry, meta["size"], arrays) for i, entry in enumerate(meta["edits"])
+            ),
+            meta["applied"],
         )
     except (InputError, KeyError) as error:
         raise DamagedError(
-            f"the edits of {scan} are damaged ({error}): restore {store.folder / 'results' / name} from a copy, or "
-            "delete it, which forgets them"
+            f"the edits of {scan} are damaged ({error}): restore {store.folder / 'results' / name}"
+            " from a copy, or delete it, which forgets them"
         ) from error
 
 
 def list_edits(store: Session, scan: str) -> tuple[tuple[str, ...], int]:
-    """Return (the edits of a scan that are in effect, in words; the number of those that were undone)."""
+    """Return (the edits of a scan that are in effect, in words; the number of those that were
+    undone)."""
     name = f"{FOLDER}/{scan}"
     meta = store.load_result(name, only=())[0] if store.has_result(name) else {}
     if not meta or meta["capture"] != store.load_capture(scan).hash:
@@ -55,7 +62,11 @@ def list_edits(store: Session, scan: str) -> tuple[tuple[str, ...], int]:
 def save_edits(store: Session, scan: str, history: EditHistory) -> None:
     """Save the edits of a scan, with those that were undone, in place of those before."""
     capture = store.load_capture(scan)
-    arrays = {str(i): pack_mask(edit.pixels) for i, edit in enumerate(history.edits) if edit.pixels is not None}
+    arrays = {
+        str(i): pack_mask(edit.pixels)
+        for i, edit in enumerate(history.edits)
+        if edit.pixels is not None
+    }
     entries = [_to_plain(edit) for edit in history.edits]
     content = hashlib.blake2b(digest_size=20)
     for i, entry in enumerate(entries[: history.applied]):
@@ -82,7 +93,9 @@ def load_region(store: Session, *, even_if_off: bool = False) -> RegionOfInteres
     try:
         return RegionOfInterest(stored["centre_mm"], stored["size_mm"], stored["rotation_deg"])
     except InputError as error:
-        raise DamagedError(f"{store.folder / 'decisions.json'} is damaged: {error}; set the region again") from error
+        raise DamagedError(
+            f"{store.folder / 'decisions.json'} is damaged: {error}; set the region again"
+        ) from error
 
 
 def save_region(store: Session, region: RegionOfInterest | None, on: bool = True) -> None:
@@ -98,12 +111,19 @@ def save_region(store: Session, region: RegionOfInterest | None, on: bool = True
     store.decide("region", stored)
 
 
-def restriction_inputs(store: Session, scans: Iterable[str], *, with_region: bool = True) -> dict[str, str]:
-    """Return {input: hash} of the edits of scans, and of the region, for `meta["inputs"]`; "" for what there is not."""
+def restriction_inputs(
+    store: Session, scans: Iterable[str], *, with_region: bool = True
+) -> dict[str, str]:
+    """Return {input: hash} of the edits of scans, and of the region, for `meta["inputs"]`; "" for
+    what there is not."""
     inputs = {}
     for scan in scans:
         name = f"{FOLDER}/{scan}"
-        inputs[name] = str(store.load_result(name, only=())[0].get("content", "")) if store.has_result(name) else ""
+        inputs[name] = (
+            str(store.load_result(name, only=())[0].get("content", ""))
+            if store.has_result(name)
+            else ""
+        )
     if with_region:
         inputs[REGION_INPUT] = "".join(store.decision_hashes(REGION_INPUT))
     return inputs
@@ -123,7 +143,9 @@ def _to_plain(edit: Edit) -> dict[str, object]:
     }
 
 
-def _read_edit(index: int, entry: dict[str, object], size: tuple[int, int], arrays: dict[str, np.ndarray]) -> Edit:
+def _read_edit(
+    index: int, entry: dict[str, object], size: tuple[int, int], arrays: dict[str, np.ndarray]
+) -> Edit:
     """Return the edit of an entry; InputError, KeyError for one that does not fit the arrays."""
     what, points = str(entry["what"]), int(entry["points"])  # type: ignore[call-overload]
     made = str(entry.get("made", ""))
@@ -131,7 +153,11 @@ def _read_edit(index: int, entry: dict[str, object], size: tuple[int, int], arra
         return Edit(what, points, unpack_mask(arrays[str(index)], size), made=made)
     numbers = [*(entry["normal"] or ()), entry["offset_mm"], entry["margin_mm"]]  # type: ignore[misc]
     values = np.array(numbers, float)
-    if values.shape != (5,) or not np.isfinite(values).all() or abs(np.linalg.norm(values[:3]) - 1) > 1e-3:
+    if (
+        values.shape != (5,)
+        or not np.isfinite(values).all()
+        or abs(np.linalg.norm(values[:3]) - 1) > 1e-3
+    ):
         raise InputError(f"the plane of edit {index + 1} has the numbers {numbers}")
     x, y, z, offset, margin = values.tolist()
     return Edit(what, points, plane=SupportPlane((x, y, z), offset, margin), made=made)

@@ -1,9 +1,10 @@
 """A stack of frames as a Zarr v3 array: one uncompressed chunk a frame, with a checksum.
 
-Zarr's own library writes the array's description. The chunks are raw little-endian frames, each followed by its
-CRC-32C (Zarr's codec `crc32c`), and we move them ourselves: each is hashed, written and synced by the same thread, and
-a missing chunk is an error when read, where Zarr would hand back a black frame. Stacks without checksums, of older
-sessions, are read too: only `hash_stack` tells whether they are damaged.
+Zarr's own library writes the array's description. The chunks are raw little-endian frames, each
+followed by its CRC-32C (Zarr's codec `crc32c`), and we move them ourselves: each is hashed, written
+and synced by the same thread, and a missing chunk is an error when read, where Zarr would hand back
+a black frame. Stacks without checksums, of older sessions, are read too: only `hash_stack` tells
+whether they are damaged.
 """
 
 import hashlib
@@ -25,15 +26,19 @@ from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
 
-_THREADS = 4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
+_THREADS = (
+    4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
+)
 _SEPARATOR = "."
-"""Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be synced too."""
+"""Between the parts of a chunk's name: with Zarr's default, "/", every frame has two folders to be
+synced too."""
 _CHECKSUM_BYTES = 4
 _DTYPES = {np.dtype(np.uint8): "uint8", np.dtype(np.uint16): "uint16"}
 
 
 def write_stack(path: Path, frames: np.ndarray) -> str:
-    """Write frames (n, h, w), uint8 or uint16, as a new Zarr v3 array, synced; returns their content hash.
+    """Write frames (n, h, w), uint8 or uint16, as a new Zarr v3 array, synced; returns their
+    content hash.
 
     Raises InputError for any other shape or type.
     """
@@ -52,16 +57,19 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
 
 
 def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
-    """Frames (n, h, w) in the order of `indices` (all of them where None), C-contiguous; reads only these.
+    """Frames (n, h, w) in the order of `indices` (all of them where None), C-contiguous; reads only
+    these.
 
-    Raises DamagedError where a frame is missing, cut short or differs from its checksum, InputError for an index
-    outside the stack.
+    Raises DamagedError where a frame is missing, cut short or differs from its checksum, InputError
+    for an index outside the stack.
     """
     stack = _StoredStack.open(path)
     n = stack.shape[0]
     wanted = list(range(n)) if indices is None else [int(index) for index in indices]
     if any(not 0 <= index < n for index in wanted):
-        raise InputError(f"frames {wanted} were requested, {path.parent.name} has {n} frames: count from 0")
+        raise InputError(
+            f"frames {wanted} were requested, {path.parent.name} has {n} frames: count from 0"
+        )
     for index in wanted:  # before memory is allocated for what the description announces
         stack.check_size(index)
     frames = np.empty((len(wanted), *stack.shape[1:]), stack.dtype)
@@ -71,8 +79,8 @@ def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
 
 
 def hash_stack(path: Path) -> tuple[str, list[str]]:
-    """Read a whole stack; returns its content hash, as `write_stack` does, and the hash of each frame, BLAKE2b of 160
-    bits. Raises DamagedError as `read_stack`."""
+    """Read a whole stack; returns its content hash, as `write_stack` does, and the hash of each
+    frame, BLAKE2b of 160 bits. Raises DamagedError as `read_stack`."""
     stack = _StoredStack.open(path)
 
     def digest(index: int) -> bytes:
@@ -88,23 +96,32 @@ def hash_stack(path: Path) -> tuple[str, list[str]]:
 
 
 def hash_frames(frames: np.ndarray) -> str:
-    """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are written."""
+    """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are
+    written."""
     with ThreadPoolExecutor(_THREADS) as pool:
-        digests = list(pool.map(lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames))
+        digests = list(
+            pool.map(lambda frame: _digest(_to_little_endian(np.ascontiguousarray(frame))), frames)
+        )
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
 def identify_stack(path: Path) -> tuple[tuple[int, ...], ...] | None:
-    """Return what changes whenever a frame's file does (number, size, time), or None where every frame has a checksum.
+    """Return what changes whenever a frame's file does (number, size, time), or None where every
+    frame has a checksum.
 
     Raises DamagedError where a file is missing.
     """
     stack = _StoredStack.open(path)
-    return None if stack.has_checksums else tuple(stack.identify(index) for index in range(stack.shape[0]))
+    return (
+        None
+        if stack.has_checksums
+        else tuple(stack.identify(index) for index in range(stack.shape[0]))
+    )
 
 
 def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
-    """Return shape (n, h, w) and type of a stack; SessionError where its layout is not the one written here."""
+    """Return shape (n, h, w) and type of a stack; SessionError where its layout is not the one
+    written here."""
     stack = _StoredStack.open(path)
     return stack.shape, stack.dtype
 
@@ -169,16 +186,24 @@ class _StoredStack:
         codecs = [codec.name for codec in described.codecs]
         known = codecs in (["bytes"], ["bytes", "crc32c"])
         if described.chunk_grid.configuration.chunk_shape != (1, height, width) or not known:
-            raise SessionError(f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it again")
+            raise SessionError(
+                f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it"
+                " again"
+            )
         separator = described.chunk_key_encoding.configuration.separator
-        return cls(path, (n, height, width), np.dtype(described.data_type), separator, "crc32c" in codecs)
+        return cls(
+            path, (n, height, width), np.dtype(described.data_type), separator, "crc32c" in codecs
+        )
 
     def read(self, index: int, frame: np.ndarray) -> None:
-        """Read one frame, little-endian, into `frame` (h, w). Raises DamagedError where it is not what was saved."""
+        """Read one frame, little-endian, into `frame` (h, w). Raises DamagedError where it is not
+        what was saved."""
         chunk, checksum = self._chunk_path(index), bytearray(_CHECKSUM_BYTES * self.has_checksums)
         try:
             with open(chunk, "rb", buffering=0) as file:  # regular, as its size was right
-                whole = _read_into(file, frame.data.cast("B")) and _read_into(file, memoryview(checksum))
+                whole = _read_into(file, frame.data.cast("B")) and _read_into(
+                    file, memoryview(checksum)
+                )
         except OSError as error:
             raise self._error(index, error) from error
         if not whole:
@@ -193,7 +218,8 @@ class _StoredStack:
             raise self._damage(index, "is cut short, or longer than it was")
 
     def identify(self, index: int) -> tuple[int, ...]:
-        """Return number, size and time of a frame's file. Raises DamagedError where it is missing."""
+        """Return number, size and time of a frame's file. Raises DamagedError where it is
+        missing."""
         try:
             status = self._chunk_path(index).stat()
         except OSError as error:
@@ -205,11 +231,16 @@ class _StoredStack:
         return _chunk_path(self.path, self.separator, index)
 
     def _error(self, index: int, error: OSError) -> SessionError:
-        """Return the error for a chunk that cannot be read: damage, unless it is for want of permission."""
+        """Return the error for a chunk that cannot be read: damage, unless it is for want of
+        permission."""
         if isinstance(error, PermissionError):
-            return SessionError(f"{self._chunk_path(index)} cannot be read ({error}): check its permissions")
+            return SessionError(
+                f"{self._chunk_path(index)} cannot be read ({error}): check its permissions"
+            )
         missing = isinstance(error, FileNotFoundError | NotADirectoryError)
-        return self._damage(index, "is missing" if missing else f"cannot be read ({error.strerror or error})")
+        return self._damage(
+            index, "is missing" if missing else f"cannot be read ({error.strerror or error})"
+        )
 
     def _damage(self, index: int, fault: str) -> DamagedError:
         """Return the error for a damaged frame, with the capture's name and the remedy."""
@@ -221,7 +252,8 @@ class _StoredStack:
 
 
 def check_stack_array(frames: np.ndarray) -> None:
-    """Raise InputError unless `frames` is a stack (n, h, w) of uint8 or uint16 with something in it."""
+    """Raise InputError unless `frames` is a stack (n, h, w) of uint8 or uint16 with something in
+    it."""
     if not isinstance(frames, np.ndarray) or frames.ndim != 3 or frames.size == 0:
         raise InputError(f"a stack of frames (n, h, w) is needed, got shape {np.shape(frames)}")
     if frames.dtype not in _DTYPES:
@@ -229,7 +261,8 @@ def check_stack_array(frames: np.ndarray) -> None:
 
 
 def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
-    """Create the metadata of an uncompressed Zarr v3 array with one chunk, and its checksum, a frame."""
+    """Create the metadata of an uncompressed Zarr v3 array with one chunk, and its checksum, a
+    frame."""
     import zarr  # half a second; needed only to write
     from zarr.codecs import Crc32cCodec
 

@@ -25,7 +25,14 @@ from slviewer.session.decisions import Decisions
 from slviewer.session.lock import WriterLock
 from slviewer.session.names import is_safe_name, natural_key, new_name, safe_name, safe_path
 from slviewer.session.reading import decoding
-from slviewer.session.results import check_place, check_result, list_results, read_arrays, read_meta, write_result
+from slviewer.session.results import (
+    check_place,
+    check_result,
+    list_results,
+    read_arrays,
+    read_meta,
+    write_result,
+)
 from slviewer.session.trash import Trashed, list_trash, trash_place
 
 _MAX_INPUTS_CHAIN = 32
@@ -35,10 +42,11 @@ State = Literal["absent", "fresh", "stale"]
 
 
 class Session(Decisions):
-    """An open session folder. Use `Session.create`, `Session.open` or `Session.open_or_create`, in a `with` block.
+    """An open session folder. Use `Session.create`, `Session.open` or `Session.open_or_create`, in
+    a `with` block.
 
-    Readers need no lock and may be many; one writer at a time holds the folder. Saving from several threads of the
-    writer is safe.
+    Readers need no lock and may be many; one writer at a time holds the folder. Saving from several
+    threads of the writer is safe.
     """
 
     def __init__(self, folder: Path, lock: WriterLock | None):
@@ -47,13 +55,16 @@ class Session(Decisions):
         self._allow: Callable[[], None] | None = None
         self._created: Literal["", "session", "folder"] = ""  # what this object made
         self._together: atomic.Together | None = None
-        self.recovered: tuple[str, ...] = ()  # captures that a writer died before it could finish, completed on opening
+        self.recovered: tuple[
+            str, ...
+        ] = ()  # captures that a writer died before it could finish, completed on opening
 
     # opening and closing
 
     @classmethod
     def create(cls, path: str | Path) -> Self:
-        """A new session, open for writing, in a new or empty folder; SessionError where something is there already."""
+        """A new session, open for writing, in a new or empty folder; SessionError where something
+        is there already."""
         folder, is_new_folder = layout.new_folder(path)
         lock = WriterLock(folder)
         lock.acquire()
@@ -71,15 +82,17 @@ class Session(Decisions):
     def open(cls, path: str | Path, write: bool = False) -> Self:
         """Open an existing session, for reading, or for writing by this process alone.
 
-        Raises SessionError where there is no session, where it is damaged or of a newer schema, or where another
-        process is writing to it.
+        Raises SessionError where there is no session, where it is damaged or of a newer schema, or
+        where another process is writing to it.
         """
         folder = layout.session_folder(path)
         session = cls(folder, WriterLock(folder) if write else None)
         try:
             if session._lock is not None:
                 session._lock.acquire()
-                layout.session_folder(path)  # its creator may have removed it before the lock was taken
+                layout.session_folder(
+                    path
+                )  # its creator may have removed it before the lock was taken
             session._recover()
         except BaseException:
             session.close()
@@ -100,7 +113,8 @@ class Session(Decisions):
         return cls.create(path)
 
     def remove_if_new(self) -> None:
-        """Close a session that this object created, and remove it, unless something was saved in it."""
+        """Close a session that this object created, and remove it, unless something was saved in
+        it."""
         if not self._created or self._lock is None or not self._lock.held:
             return
         with contextlib.suppress(OSError):  # what cannot be removed stays
@@ -115,9 +129,11 @@ class Session(Decisions):
             self._lock.release()
 
     def guarded(self, allow: Callable[[], None]) -> Self:
-        """This session for one piece of work: `allow` is called before each save takes effect; it may raise to stop it.
+        """This session for one piece of work: `allow` is called before each save takes effect; it
+        may raise to stop it.
 
-        So work that was given up can run on without ever changing the folder. Closing it closes this session too.
+        So work that was given up can run on without ever changing the folder. Closing it closes
+        this session too.
         """
         view = type(self)(self.folder, self._lock)
         view._decisions_lock = self._decisions_lock
@@ -133,33 +149,46 @@ class Session(Decisions):
     # captures
 
     def capture_names(self, role: Role | None = None) -> list[str]:
-        """Names of the captures (of one role, as far as they can be read), `pose_2` before `pose_10`."""
+        """Names of the captures (of one role, as far as they can be read), `pose_2` before
+        `pose_10`."""
         if role is not None:
             return [capture.name for capture in self.captures(role)]
-        return [name for name in self.taken_names() if is_safe_name(name) and self._has_description(name)]
+        return [
+            name
+            for name in self.taken_names()
+            if is_safe_name(name) and self._has_description(name)
+        ]
 
     def taken_names(self) -> list[str]:
-        """Names that a new capture cannot have: of the captures, and of other folders in their place."""
+        """Names that a new capture cannot have: of the captures, and of other folders in their
+        place."""
         return sorted(layout.inner_folders(self.folder / "captures"), key=natural_key)
 
     def captures(self, role: Role | None = None) -> list[Capture]:
-        """The captures (of one role) in the order of `capture_names`, without damaged ones; frames stay on disk."""
+        """The captures (of one role) in the order of `capture_names`, without damaged ones; frames
+        stay on disk."""
         return [capture for capture in self.read_captures()[0] if role in (None, capture.role)]
 
     def read_captures(self) -> tuple[list[Capture], dict[str, str]]:
-        """The captures, and of every other folder in their place {name: what is wrong with it, and the remedy}."""
-        return read_stored_captures([self.folder / "captures" / name for name in self.taken_names()])
+        """The captures, and of every other folder in their place {name: what is wrong with it, and
+        the remedy}."""
+        return read_stored_captures(
+            [self.folder / "captures" / name for name in self.taken_names()]
+        )
 
     def compare_capture(self, new: NewCapture, role: Role) -> Comparison:
         """How the capture of the name of `new`, checked, compares with it."""
         return compare_stored(self._capture_folder(new.name), new, role)
 
     def load_capture(self, name: str) -> Capture:
-        """A capture; its frames stay on disk until they are read. InputError where it does not exist."""
+        """A capture; its frames stay on disk until they are read. InputError where it does not
+        exist."""
         folder = self._capture_folder(name)
         if not folder.is_dir():
             there = ", ".join(self.capture_names()) or "none"
-            raise InputError(f"there is no capture {name!r} in {self.folder}: the captures are {there}")
+            raise InputError(
+                f"there is no capture {name!r} in {self.folder}: the captures are {there}"
+            )
         return read_capture(folder)
 
     def save_capture(
@@ -176,12 +205,15 @@ class Session(Decisions):
         exposures_ms: Sequence[float] = (),
         force: bool = False,
     ) -> Capture:
-        """Save frames (n, h, w), uint8 or uint16, in the order of the sequence, with an optional colour texture.
+        """Save frames (n, h, w), uint8 or uint16, in the order of the sequence, with an optional
+        colour texture.
 
-        Of two or more `exposures_ms`, the frames are (k n, h, w): the whole sequence in the first, then in the second.
+        Of two or more `exposures_ms`, the frames are (k n, h, w): the whole sequence in the first,
+        then in the second.
 
-        Complete on disk when this returns; absent if it raises: InputError for a name that is in use (unless `force`,
-        which moves the old capture to the trash) or frames that do not fit, SessionError where the disk refuses.
+        Complete on disk when this returns; absent if it raises: InputError for a name that is in
+        use (unless `force`, which moves the old capture to the trash) or frames that do not fit,
+        SessionError where the disk refuses.
         """
         capture = NewCapture(name, sequence, frames, texture, source, settings or {}, exposures_ms)
         return self.save_captures([capture], role, board=board, force=force)[0]
@@ -196,9 +228,9 @@ class Session(Decisions):
     ) -> list[Capture]:
         """Save all of `captures` or, where any of them fails (or the iterable raises), none.
 
-        Takes them one at a time, so that a generator needs memory for one; returns them in that order. `force`: whether
-        those of the same name are replaced, or the names of those that are. If the program dies, the next one to open
-        the session completes those that were written.
+        Takes them one at a time, so that a generator needs memory for one; returns them in that
+        order. `force`: whether those of the same name are replaced, or the names of those that are.
+        If the program dies, the next one to open the session completes those that were written.
         """
         self._require_writer()
         layout.raise_schema(self.folder)
@@ -207,10 +239,14 @@ class Session(Decisions):
         try:
             for new in captures:
                 if new.name in staged:
-                    raise InputError(f"two captures are named {new.name!r}: rename one of their folders")
+                    raise InputError(
+                        f"two captures are named {new.name!r}: rename one of their folders"
+                    )
                 new_name(new.name, (*taken, *staged))
                 replace = force if isinstance(force, bool) else new.name in force
-                staged[new.name] = self._stage(new, role, None if board is None else str(board), replace)
+                staged[new.name] = self._stage(
+                    new, role, None if board is None else str(board), replace
+                )
                 del new  # before the next one is made
         except BaseException:
             for folder in staged.values():
@@ -230,10 +266,15 @@ class Session(Decisions):
         return target
 
     def deleted_captures(self, role: Role | None = None) -> list[str]:
-        """Names of the captures in the trash that `restore_last` can bring back, the last deleted first."""
+        """Names of the captures in the trash that `restore_last` can bring back, the last deleted
+        first."""
         names = list[str]()
         for each in self.trashed():
-            if each.is_capture and each.name not in names and not self._capture_folder(each.name).exists():
+            if (
+                each.is_capture
+                and each.name not in names
+                and not self._capture_folder(each.name).exists()
+            ):
                 with contextlib.suppress(DamagedError):
                     if role is None or read_capture(each.place).role == role:
                         names.append(each.name)
@@ -244,20 +285,28 @@ class Session(Decisions):
         return list_trash(self.folder / "trash")
 
     def restore(self, entries: Iterable[Trashed]) -> None:
-        """Bring captures and results back from the trash, in one step; what has their names now takes their places."""
+        """Bring captures and results back from the trash, in one step; what has their names now
+        takes their places."""
         self._require_writer()
         changes = atomic.Together(self.folder)
         for each in entries:
-            target = self._capture_folder(each.name) if each.is_capture else self._result_folder(each.name)
+            target = (
+                self._capture_folder(each.name)
+                if each.is_capture
+                else self._result_folder(each.name)
+            )
             target.parent.mkdir(parents=True, exist_ok=True)
             changes.replace(target, each.place, self._trash_place(target))
         changes.commit()
 
     def restore_last(self, name: str) -> None:
-        """Bring the last deleted capture or result of that name back. InputError without one, or where it is in use."""
+        """Bring the last deleted capture or result of that name back. InputError without one, or
+        where it is in use."""
         found = next((each for each in self.trashed() if each.name == name), None)
         if found is None:
-            raise InputError(f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}")
+            raise InputError(
+                f"there is no deleted {'result' if '/' in name else 'capture'} {name!r}"
+            )
         if (self._capture_folder if found.is_capture else self._result_folder)(name).exists():
             raise InputError(f"there is a {name!r} again: delete that one first")
         self.restore([found])
@@ -266,10 +315,11 @@ class Session(Decisions):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Context manager: results that are saved or moved to the trash in it change in one step, at its end.
+        """Context manager: results that are saved or moved to the trash in it change in one step,
+        at its end.
 
-        Where it raises, or the program dies or the disk refuses before the end, all stay as they were. Within it this
-        session already reads the new ones. For one thread.
+        Where it raises, or the program dies or the disk refuses before the end, all stay as they
+        were. Within it this session already reads the new ones. For one thread.
         """
         if self._together is not None:  # part of a larger step
             yield
@@ -287,7 +337,8 @@ class Session(Decisions):
         changes.commit()
 
     def _result_folder(self, name: str) -> Path:
-        """Return the folder of a result, where `together` has staged it; InputError for an unsafe name."""
+        """Return the folder of a result, where `together` has staged it; InputError for an unsafe
+        name."""
         target = self.folder / "results" / safe_path(name)
         return target if self._together is None else self._together.folder_for(target)
 
@@ -296,13 +347,17 @@ class Session(Decisions):
         return sorted(list_results(self.folder / "results"), key=natural_key)
 
     def has_result(self, name: str) -> bool:
-        """Whether there is a result of that name, fresh or stale: `state_of` reads all that it was made from."""
+        """Whether there is a result of that name, fresh or stale: `state_of` reads all that it was
+        made from."""
         return (self._result_folder(name) / "meta.json").is_file()
 
-    def save_result(self, name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    def save_result(
+        self, name: str, meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> None:
         """Save a result; it replaces one of that name in one step, which stays if this fails.
 
-        `meta["inputs"]` = {capture or result: its hash} is what `state_of` goes by; `input_hashes` gives it.
+        `meta["inputs"]` = {capture or result: its hash} is what `state_of` goes by; `input_hashes`
+        gives it.
         """
         self._require_writer()
         target = self.folder / "results" / safe_path(name)
@@ -327,7 +382,9 @@ class Session(Decisions):
         folder = self._result_folder(name)
         if not (folder / "meta.json").is_file():
             there = ", ".join(self.result_names()) or "none"
-            raise InputError(f"there is no result {name!r} in {self.folder}: the results are {there}")
+            raise InputError(
+                f"there is no result {name!r} in {self.folder}: the results are {there}"
+            )
         return (meta := read_meta(folder)), read_arrays(folder, meta, only)
 
     def decode_result(
@@ -338,7 +395,8 @@ class Session(Decisions):
     ) -> T:
         """Return what ``decode(meta, arrays)`` makes of a result.
 
-        Raises as `load_result`, and DamagedError where ``decode`` meets a value that it does not expect.
+        Raises as `load_result`, and DamagedError where ``decode`` meets a value that it does not
+        expect.
         """
         meta, arrays = self.load_result(name, only)
         with decoding(self._result_folder(name)):
@@ -361,7 +419,8 @@ class Session(Decisions):
         return list(dict.fromkeys(each.name for each in self.trashed() if not each.is_capture))
 
     def input_hashes(self, *names: str) -> dict[str, str]:
-        """Return {name: content hash} of captures and results, for `meta["inputs"]`. Raises InputError where absent."""
+        """Return {name: content hash} of captures and results, for `meta["inputs"]`. Raises
+        InputError where absent."""
         hashes = {}
         for name in names:
             content_hashes = self._hashes(name)
@@ -371,22 +430,30 @@ class Session(Decisions):
         return hashes
 
     def state_of(self, name: str) -> State:
-        """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has the hash it had.
+        """Return `fresh`, `stale` or `absent`; fresh if every input of the result is fresh and has
+        the hash it had.
 
-        An absent input has the hash "", a damaged one makes it stale, as do inputs in a circle. Raises DamagedError.
+        An absent input has the hash "", a damaged one makes it stale, as do inputs in a circle.
+        Raises DamagedError.
         """
         return self._state_of(name, {}, 0)
 
     def _state_of(self, name: str, known: dict[str, State], depth: int) -> State:
-        """Return the state of a result ``depth`` inputs away; ``known``: states of those that were met before."""
+        """Return the state of a result ``depth`` inputs away; ``known``: states of those that were
+        met before."""
         folder = self._result_folder(name)
         if name in known or not (folder / "meta.json").is_file():
             return known.get(name, "absent")
-        inputs, known[name] = read_meta(folder).get("inputs", {}), "stale"  # while it is examined, or if that fails
+        inputs, known[name] = (
+            read_meta(folder).get("inputs", {}),
+            "stale",
+        )  # while it is examined, or if that fails
         with contextlib.suppress(DamagedError, InputError):
             for other, used in inputs.items():
                 changed = used not in (self._hashes(other) or [""]) or depth == _MAX_INPUTS_CHAIN
-                if changed or (other != name and self._state_of(other, known, depth + 1) == "stale"):
+                if changed or (
+                    other != name and self._state_of(other, known, depth + 1) == "stale"
+                ):
                     return "stale"
             known[name] = "fresh"
         return known[name]
@@ -394,7 +461,8 @@ class Session(Decisions):
     def load_fresh(
         self, name: str, only: Collection[str] | None = None
     ) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-        """What `load_result` returns for a result that is fresh and whole; None for any other, to be computed again."""
+        """What `load_result` returns for a result that is fresh and whole; None for any other, to
+        be computed again."""
         return self.decode_fresh(name, lambda meta, arrays: (meta, arrays), only)
 
     def decode_fresh(
@@ -403,7 +471,8 @@ class Session(Decisions):
         decode: Callable[[dict[str, Any], dict[str, np.ndarray]], T],
         only: Collection[str] | None = None,
     ) -> T | None:
-        """What `decode_result` returns for a result that is fresh and whole; None for any other, as `load_fresh`."""
+        """What `decode_result` returns for a result that is fresh and whole; None for any other, as
+        `load_fresh`."""
         with contextlib.suppress(DamagedError):
             if self.state_of(name) == "fresh":
                 return self.decode_result(name, decode, only)
@@ -426,7 +495,8 @@ class Session(Decisions):
 
     @contextmanager
     def staged_export(self, name: str) -> Iterator[Path]:
-        """Context manager: a path for a file that goes to the exports at the end, unless that fails or is given up."""
+        """Context manager: a path for a file that goes to the exports at the end, unless that fails
+        or is given up."""
         target = self.exports / safe_name(name)
         with atomic.staged_folder(target, 0) as folder:
             yield folder / name
@@ -438,7 +508,8 @@ class Session(Decisions):
     # inside
 
     def _recover(self) -> None:
-        """Finish what dead writers began; a reader does so only without a writer, in a writable folder."""
+        """Finish what dead writers began; a reader does so only without a writer, in a writable
+        folder."""
         if not atomic.list_leftovers(self.folder):
             return
         lock = WriterLock(self.folder)  # a reader's, for the moment
@@ -449,7 +520,9 @@ class Session(Decisions):
                 completed = atomic.recover(self.folder, self._trash_place)
             finally:
                 lock.release()
-            self.recovered = tuple(path.name for path in completed if path.parent == self.folder / "captures")
+            self.recovered = tuple(
+                path.name for path in completed if path.parent == self.folder / "captures"
+            )
 
     @property
     def is_writable(self) -> bool:
@@ -464,11 +537,13 @@ class Session(Decisions):
             self._allow()
 
     def _stage(self, capture: NewCapture, role: Role, board: str | None, force: bool) -> Path:
-        """Write a capture next to its place, and return the folder, which `atomic.commit` renames."""
+        """Write a capture next to its place, and return the folder, which `atomic.commit`
+        renames."""
         target = self._capture_folder(capture.name)
         if target.exists() and not force:
             raise InputError(
-                f"there is a capture {capture.name!r} already: choose another name, or replace it with --force"
+                f"there is a capture {capture.name!r} already: choose another name, or replace it"
+                " with --force"
             )
         if role not in get_args(Role):
             raise InputError(f"role {role!r} is unknown: use 'calibration' or 'scan'")
@@ -486,14 +561,18 @@ class Session(Decisions):
         return (self._capture_folder(name) / "capture.json").is_file()
 
     def _trash_place(self, folder: Path) -> Path:
-        """Return a new path in the trash for the folder of a capture or result, with the time of deletion."""
+        """Return a new path in the trash for the folder of a capture or result, with the time of
+        deletion."""
         parts = folder.relative_to(self.folder).parts
         return trash_place(self.folder / "trash", "-".join(parts[1:]) or parts[0])
 
     def _hashes(self, name: str) -> list[str]:
-        """Content hashes of the capture, decision and result of that name; of a result its ``content`` where stated."""
+        """Content hashes of the capture, decision and result of that name; of a result its
+        ``content`` where stated."""
         is_capture = "/" not in name and self._has_description(name)
-        content_hashes = [self.load_capture(name).hash] if is_capture else self.decision_hashes(name)
+        content_hashes = (
+            [self.load_capture(name).hash] if is_capture else self.decision_hashes(name)
+        )
         if self.has_result(name):
             meta = read_meta(self._result_folder(name))
             content_hashes.append(str(meta.get("content", meta.get("hash"))))

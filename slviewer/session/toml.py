@@ -14,7 +14,9 @@ def to_toml(table: Mapping[str, Any]) -> str:
 
     Raises InputError for values that TOML does not hold.
     """
-    lines = table_lines({key: value for key, value in table.items() if not isinstance(value, Mapping)})
+    lines = table_lines(
+        {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+    )
     for key, inner in table.items():
         if isinstance(inner, Mapping):
             lines += ["", f"[{_format_key(key)}]", *table_lines(inner)]
@@ -33,7 +35,11 @@ def describe_sequence(sequence: PatternSequence, files: list[str]) -> str:
 
 def table_lines(table: Mapping[str, Any]) -> list[str]:
     """Return the line ``key = value`` of each entry that is not None."""
-    return [f"{_format_key(key)} = {format_value(value)}" for key, value in table.items() if value is not None]
+    return [
+        f"{_format_key(key)} = {format_value(value)}"
+        for key, value in table.items()
+        if value is not None
+    ]
 
 
 def format_value(value: Any) -> str:
@@ -48,10 +54,16 @@ def format_value(value: Any) -> str:
         return f"[{', '.join(format_value(each) for each in value)}]"
     if isinstance(value, Mapping):
         return f"{{{', '.join(table_lines(value))}}}"
-    raise InputError(f"{value!r} cannot stand in a TOML file: use text, numbers, true or false, or lists of them")
+    raise InputError(
+        f"{value!r} cannot stand in a TOML file: use text, numbers, true or false, or lists of them"
+    )
 
 
 def _format_key(key: Any) -> str:
     """Return a key in TOML's notation, quoted where it needs to be."""
     text = str(key)
-    return text if text and all(c.isascii() and (c.isalnum() or c in "-_") for c in text) else format_value(text)
+    return (
+        text
+        if text and all(c.isascii() and (c.isalnum() or c in "-_") for c in text)
+        else format_value(text)
+    )

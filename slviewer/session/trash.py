@@ -1,5 +1,5 @@
-"""The session's trash: captures and results that were deleted or replaced, each in a folder named after it and the
-time."""
+"""The session's trash: captures and results that were deleted or replaced, each in a folder named
+after it and the time."""
 
 import contextlib
 from dataclasses import dataclass
@@ -33,5 +33,9 @@ def list_trash(trash: Path) -> list[Trashed]:
         with contextlib.suppress(ValueError):
             time = datetime.strptime(when, _TIME).replace(tzinfo=UTC)
             if is_capture or (place / "meta.json").is_file():
-                entries.append(Trashed(name if is_capture else name.replace("-", "/", 1), is_capture, time, place))
+                entries.append(
+                    Trashed(
+                        name if is_capture else name.replace("-", "/", 1), is_capture, time, place
+                    )
+                )
     return sorted(entries, key=lambda each: each.time, reverse=True)

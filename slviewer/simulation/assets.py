@@ -1,4 +1,5 @@
-"""Where the things are that ship with slviewer and are not code: rigs to choose, the simulated rig, the demo object."""
+"""Where the things are that ship with slviewer and are not code: rigs to choose, the simulated rig,
+the demo object."""
 
 from pathlib import Path
 
@@ -8,8 +9,8 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def asset(name: str) -> Path:
-    """Path of a shipped file or folder, such as ``rigs/webcam.toml`` or ``rigs``: beside the package in a checkout,
-    inside it in a wheel.
+    """Path of a shipped file or folder, such as ``rigs/webcam.toml`` or ``rigs``: beside the
+    package in a checkout, inside it in a wheel.
 
     Raises `InputError` if the installation lacks it.
     """

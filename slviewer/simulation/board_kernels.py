@@ -7,16 +7,18 @@ import numpy as np
 
 from slviewer.geometry.jit import kernel
 
-_FIXED_POINT = 6  # each step gains the factor slope x tan(incidence), about 1e-3 for some tenths of a mm of bow
+# each step gains the factor slope x tan(incidence), about 1e-3 for some tenths of a mm of bow
+_FIXED_POINT = 6
 _SUBSAMPLES = 8
 
 
 @kernel(parallel=True)
 def intersect(rays, origin, axes, rotation, bounds, shape):
-    """Board coordinates (h, w, 2), points and normals (h, w, 3) of the camera rays (h, w, 2); NaN behind the camera.
+    """Board coordinates (h, w, 2), points and normals (h, w, 3) of the camera rays (h, w, 2); NaN
+    behind the camera.
 
-    origin: the camera in the board's frame; axes = R_board_camera; rotation = R_camera_board; bounds: the plate's
-    corner and size; shape: bow_x, bow_y, twist.
+    origin: the camera in the board's frame; axes = R_board_camera; rotation = R_camera_board;
+    bounds: the plate's corner and size; shape: bow_x, bow_y, twist.
     """
     h, w = rays.shape[:2]
     xy, points, normals = np.empty((h, w, 2)), np.empty((h, w, 3)), np.empty((h, w, 3))
@@ -41,7 +43,9 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
             length = math.sqrt(1 + zx * zx + zy * zy)
             xy[i, j, 0], xy[i, j, 1] = x, y
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = depth * r, depth * s, depth
-            for k in range(3):  # (zx, zy, -1) looks back at the camera, because the board's z points away from it
+            for k in range(
+                3
+            ):  # (zx, zy, -1) looks back at the camera, because the board's z points away from it
                 n = rotation[k, 0] * zx + rotation[k, 1] * zy - rotation[k, 2]
                 normals[i, j, k] = n / length if depth > 0 else np.nan
     return xy, points, normals
@@ -71,11 +75,13 @@ def _albedo(x, y, bounds, sheet):
 
 @kernel(parallel=True)
 def average_albedo(xy, bounds, sheet):
-    """Mean albedo (h, w) float32 of each pixel; `xy` (h, w, 2) are the board coordinates of the pixels' centres.
+    """Mean albedo (h, w) float32 of each pixel; `xy` (h, w, 2) are the board coordinates of the
+    pixels' centres.
 
-    sheet: kind, pitch, cells, circles, radius, mark, white, dark. kind: 0 blank, 1 circles (`cells` names the nearest
-    circle for each quarter pitch; `mark` (3,) is one more, x, y and radius, 0 for none), 2 chessboard (`cells` holds
-    its inner corners). A pixel whose centre and corners agree is taken as uniform; others are sampled 8x8 times.
+    sheet: kind, pitch, cells, circles, radius, mark, white, dark. kind: 0 blank, 1 circles (`cells`
+    names the nearest circle for each quarter pitch; `mark` (3,) is one more, x, y and radius, 0 for
+    none), 2 chessboard (`cells` holds its inner corners). A pixel whose centre and corners agree is
+    taken as uniform; others are sampled 8x8 times.
     """
     h, w = xy.shape[:2]
     out = np.empty((h, w), np.float32)

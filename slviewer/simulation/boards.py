@@ -22,7 +22,10 @@ class Pose:
 
     def __post_init__(self) -> None:
         if self.R.shape != (3, 3) or self.t.shape != (3,):
-            raise InputError(f"a pose needs R (3, 3) and t (3,), got the shapes {self.R.shape} and {self.t.shape}")
+            raise InputError(
+                f"a pose needs R (3, 3) and t (3,), got the shapes {self.R.shape} and"
+                f" {self.t.shape}"
+            )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -38,8 +41,8 @@ class Pose:
 class BoardShape:
     """How far a board departs from a plane, mm: z = bow_x (1 - X^2) + bow_y (1 - Y^2) + twist X Y.
 
-    X and Y run from -1 to 1 over the board; z points away from the camera. `misplaced_mm` is the standard deviation of
-    each circle's offset in x and y.
+    X and Y run from -1 to 1 over the board; z points away from the camera. `misplaced_mm` is the
+    standard deviation of each circle's offset in x and y.
     """
 
     bow_x_mm: float = 0.0
@@ -55,9 +58,9 @@ FLAT = BoardShape()
 class BoardScene:
     """A white plate at `pose`, printed with `board`'s features, or blank if `board` is None.
 
-    The plate reaches from `corner` to `corner + size` (x, y) in the board's frame, where the first feature is the
-    origin; `misplacement` (n, 2) mm is what has been added to the printed circles. Circles are `diameter_mm` wide;
-    `mark` is the dot that tells the first one.
+    The plate reaches from `corner` to `corner + size` (x, y) in the board's frame, where the first
+    feature is the origin; `misplacement` (n, 2) mm is what has been added to the printed circles.
+    Circles are `diameter_mm` wide; `mark` is the dot that tells the first one.
     """
 
     pose: Pose
@@ -73,7 +76,8 @@ class BoardScene:
 
     @cached_property
     def features(self) -> np.ndarray:
-        """True positions (n, 3) mm of the features in the board's frame, bow and misplacement included."""
+        """True positions (n, 3) mm of the features in the board's frame, bow and misplacement
+        included."""
         if self.board is None:
             return np.zeros((0, 3))
         xy = self.board.points[:, :2] + self.misplacement
@@ -90,11 +94,17 @@ class BoardScene:
         bounds = np.array([*self.corner, *self.plate])
         shape = np.array([self.shape.bow_x_mm, self.shape.bow_y_mm, self.shape.twist_mm])
         origin, axes = -self.pose.R.T @ self.pose.t, np.ascontiguousarray(self.pose.R.T)
-        xy, points, normals = intersect(np.ascontiguousarray(rays), origin, axes, self.pose.R, bounds, shape)
+        xy, points, normals = intersect(
+            np.ascontiguousarray(rays), origin, axes, self.pose.R, bounds, shape
+        )
         if self.board is None:
             kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
         elif self.board.kind == "chessboard":
-            kind, pitch, cells = 2, self.board.pitch_mm, np.array([[self.board.columns, self.board.rows]], np.int32)
+            kind, pitch, cells = (
+                2,
+                self.board.pitch_mm,
+                np.array([[self.board.columns, self.board.rows]], np.int32),
+            )
         else:
             kind, pitch, cells = 1, self.board.pitch_mm, self._cells
         mark = np.array([self.mark.x, self.mark.y, self.mark.radius]) if self.mark else np.zeros(3)
@@ -111,7 +121,8 @@ class BoardScene:
 
     @cached_property
     def _cells(self) -> np.ndarray:
-        """(rows, columns) int32: in cells of a quarter pitch, the nearest circle: the only one that can be there."""
+        """(rows, columns) int32: in cells of a quarter pitch, the nearest circle: the only one that
+        can be there."""
         assert self.board is not None
         step = self.board.pitch_mm / 4
         shape = [int(np.ceil(length / step)) for length in reversed(self.plate)]
@@ -127,26 +138,34 @@ def printed_board(
     margin_mm: float | None = None,
     marked: bool = False,
 ) -> BoardScene:
-    """Return the scene of `board` printed on a plate, `margin_mm` around its outer features (default 1.5 pitches).
+    """Return the scene of `board` printed on a plate, `margin_mm` around its outer features
+    (default 1.5 pitches).
 
-    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a pitch wide;
-    `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco boards, which the simulation does not
-    print.
+    `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a
+    pitch wide; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco
+    boards, which the simulation does not print.
     """
     if board.kind not in ("circles", "acircles", "chessboard"):
         kind = "ChArUco" if board.kind == "charuco" else board.kind
-        raise InputError(f"the simulation does not print {kind} boards: use circles, acircles or a chessboard")
+        raise InputError(
+            f"the simulation does not print {kind} boards: use circles, acircles or a chessboard"
+        )
     diameter = 0.0 if board.kind == "chessboard" else board.pitch_mm / 2
     margin = 1.5 * board.pitch_mm if margin_mm is None else margin_mm
     low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin
     corner, plate = ((float(x), float(y)) for x, y in (low, high - low))
-    misplacement = np.random.default_rng([seed, 0xB0A]).normal(0, 1, (len(board.points), 2)) * shape.misplaced_mm
+    misplacement = (
+        np.random.default_rng([seed, 0xB0A]).normal(0, 1, (len(board.points), 2))
+        * shape.misplaced_mm
+    )
     if board.kind == "chessboard":
         misplacement *= 0  # its corners share edges, so that they cannot move one by one
     mark = mark_geometry(board) if marked else None
     return BoardScene(pose, board, corner, plate, shape, misplacement, diameter, mark=mark)
 
 
-def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: BoardShape = FLAT) -> BoardScene:
+def blank_board(
+    pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: BoardShape = FLAT
+) -> BoardScene:
     """A white plate of `size` mm whose middle is the origin of its frame."""
     return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, shape, np.zeros((0, 2)))

@@ -1,9 +1,11 @@
-"""Surfaces that light themselves: a V-groove and a bowl with interreflections, and wax in which light scatters.
+"""Surfaces that light themselves: a V-groove and a bowl with interreflections, and wax in which
+light scatters.
 
-The light that a surface receives from itself is linear in the projected pattern. It is computed once per scene as a
-matrix from projector columns, or rows, to vertices, and multiplied by the profile of each frame. Radiosity of patches:
-Goral et al., "Modeling the interaction of light between diffuse surfaces", SIGGRAPH 1984; form factors from a point
-to a polygon: Lambert's formula; glossy lobes: Phong's, normalised.
+The light that a surface receives from itself is linear in the projected pattern. It is computed
+once per scene as a matrix from projector columns, or rows, to vertices, and multiplied by the
+profile of each frame. Radiosity of patches: Goral et al., "Modeling the interaction of light
+between diffuse surfaces", SIGGRAPH 1984; form factors from a point to a polygon: Lambert's formula;
+glossy lobes: Phong's, normalised.
 """
 
 from collections.abc import Callable
@@ -31,9 +33,10 @@ _FINEST_MM, _COARSEST_MM = 0.3, 3.0
 class Indirect:
     """Light that reaches a surface from itself.
 
-    ``bounces``: 0 to 2 reflections between patches. ``gloss``: share of the reflected light that forms a lobe about
-    the mirrored direction, of Phong's ``exponent``; the rest is diffuse, as is all light after the first bounce.
-    ``scattered``: share of the light that enters the material, and leaves it ``reach_mm`` away in the mean.
+    ``bounces``: 0 to 2 reflections between patches. ``gloss``: share of the reflected light that
+    forms a lobe about the mirrored direction, of Phong's ``exponent``; the rest is diffuse, as is
+    all light after the first bounce. ``scattered``: share of the light that enters the material,
+    and leaves it ``reach_mm`` away in the mean.
     """
 
     bounces: int = 2
@@ -45,21 +48,32 @@ class Indirect:
     def __post_init__(self) -> None:
         if self.bounces not in (0, 1, 2):
             raise InputError(f"{self.bounces} bounces cannot be simulated: choose 0, 1 or 2")
-        if not (0 <= self.gloss <= 1 and 0 <= self.scattered <= 1 and self.exponent > 0 and self.reach_mm > 0):
-            raise InputError("gloss and scattered light are shares from 0 to 1; exponent and reach must be above 0")
+        if not (
+            0 <= self.gloss <= 1
+            and 0 <= self.scattered <= 1
+            and self.exponent > 0
+            and self.reach_mm > 0
+        ):
+            raise InputError(
+                "gloss and scattered light are shares from 0 to 1; exponent and reach must be"
+                " above 0"
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class ConcaveScene(MeshScene):
-    """A mesh of quadrilateral patches (m, 4) each of which sees all others in front of it, and its indirect light."""
+    """A mesh of quadrilateral patches (m, 4) each of which sees all others in front of it, and its
+    indirect light."""
 
     patches: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), int))
     indirect: Indirect = field(default_factory=Indirect)
 
     def light_matrix(self, rig: SimulatedRig, axis: Axis) -> np.ndarray:
-        """Return (n, extent) float32: irradiance of each vertex by the surface itself, per projector column or row.
+        """Return (n, extent) float32: irradiance of each vertex by the surface itself, per
+        projector column or row.
 
-        In the unit of the renderer's direct light; its sum over the columns is that in full white light.
+        In the unit of the renderer's direct light; its sum over the columns is that in full white
+        light.
         """
         received = self._direct_matrix(rig, axis)
         total = np.zeros((len(self.vertices), received.shape[1]), np.float32)
@@ -74,24 +88,31 @@ class ConcaveScene(MeshScene):
         return total
 
     def pixel_weights(self, rays: np.ndarray) -> csr_matrix:
-        """Return the (h w, n) weights that interpolate values of vertices at the points that rays (h, w, 2) meet."""
+        """Return the (h w, n) weights that interpolate values of vertices at the points that rays
+        (h, w, 2) meet."""
         index, uv = self.cast(rays)
         pixel = np.flatnonzero(index >= 0)
         s, t = uv.reshape(-1, 2)[pixel].T
         corners = self.triangles[index.ravel()[pixel]]
         weights = np.stack([1 - s - t, s, t], axis=1)
         shape = (index.size, len(self.vertices))
-        return csr_matrix((weights.ravel(), (np.repeat(pixel, 3), corners.ravel())), shape=shape, dtype=np.float32)
+        return csr_matrix(
+            (weights.ravel(), (np.repeat(pixel, 3), corners.ravel())), shape=shape, dtype=np.float32
+        )
 
     def _direct_matrix(self, rig: SimulatedRig, axis: Axis) -> np.ndarray:
-        """Return (m, extent) float32: mean irradiance of each patch by each projector column or row.
+        """Return (m, extent) float32: mean irradiance of each patch by each projector column or
+        row.
 
-        Each patch is sampled at many places, so that stripes narrower than a patch are averaged rather than aliased.
+        Each patch is sampled at many places, so that stripes narrower than a patch are averaged
+        rather than aliased.
         """
         corners, normal = self._corners, self._normals_and_areas[0]
         k = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
         a, b = (each.ravel()[:, None] for each in np.meshgrid(k, k))
-        weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])[..., 0]  # (4, samples)
+        weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])[
+            ..., 0
+        ]  # (4, samples)
         points = np.einsum("mkd,ks->msd", corners, weights)
         way = rig.projector_centre - points
         distance = np.linalg.norm(way, axis=-1)
@@ -127,11 +148,13 @@ class ConcaveScene(MeshScene):
 
     @cached_property
     def _form_factors(self) -> np.ndarray:
-        """(n, m) float32 in 0 ... 1: irradiance of each vertex by each patch of radiosity 1, by Lambert's formula."""
+        """(n, m) float32 in 0 ... 1: irradiance of each vertex by each patch of radiosity 1, by
+        Lambert's formula."""
         return self.form_factors(np.arange(len(self.vertices)))
 
     def form_factors(self, chosen: np.ndarray) -> np.ndarray:
-        """Return (k, m) float32 in 0 ... 1: irradiance of the vertices ``chosen`` (k,) by each patch of radiosity 1."""
+        """Return (k, m) float32 in 0 ... 1: irradiance of the vertices ``chosen`` (k,) by each
+        patch of radiosity 1."""
         corners, facing = self._corners, self._normals_and_areas[0]
         out = np.zeros((len(chosen), len(corners)), np.float32)
         for first in range(0, len(chosen), _CHUNK):
@@ -146,14 +169,19 @@ class ConcaveScene(MeshScene):
             across = np.cross(to, after)
             sine = np.linalg.norm(across, axis=-1)
             angle = np.arctan2(sine, (to * after).sum(-1)) / np.maximum(sine, 1e-12)
-            factor = np.abs((angle[..., None] * across).sum(2) @ normals[:, :, None])[..., 0] / (2 * np.pi)
+            factor = np.abs((angle[..., None] * across).sum(2) @ normals[:, :, None])[..., 0] / (
+                2 * np.pi
+            )
             middle = corners.mean(axis=1)[None] - at[:, :, 0]
-            visible = ((middle * normals[:, None]).sum(-1) > 0) & ((middle * facing[None]).sum(-1) < 0)
+            visible = ((middle * normals[:, None]).sum(-1) > 0) & (
+                (middle * facing[None]).sum(-1) < 0
+            )
             out[first : first + _CHUNK] = np.where(visible & ~beside, factor, 0)
         return out
 
     def _lobe(self, rig: SimulatedRig) -> np.ndarray:
-        """Return (n, m) float32: radiosity of each patch as each vertex sees it, per irradiance by the projector."""
+        """Return (n, m) float32: radiosity of each patch as each vertex sees it, per irradiance by
+        the projector."""
         light = self.indirect
         if not light.gloss:
             return np.full((1, 1), self.albedo, np.float32)
@@ -167,17 +195,25 @@ class ConcaveScene(MeshScene):
 
     @cached_property
     def _scattering(self) -> np.ndarray:
-        """(n, m) float32: share of the light on a patch that leaves at a vertex, exponential in their distance."""
+        """(n, m) float32: share of the light on a patch that leaves at a vertex, exponential in
+        their distance."""
         area, middle = self._normals_and_areas[1], self._corners.mean(axis=1)
         distance = np.linalg.norm(self.placed[:, None] - middle[None], axis=-1)
-        length = self.indirect.reach_mm / 2  # the mean distance of exp(-r / length) over a plane is twice its length
+        length = (
+            self.indirect.reach_mm / 2
+        )  # the mean distance of exp(-r / length) over a plane is twice its length
         return (area / (2 * np.pi * length**2) * np.exp(-distance / length)).astype(np.float32)
 
 
 def groove(
-    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect(), length_mm: float = 90.0
+    pose: Pose,
+    angle_deg: float = 90.0,
+    albedo: float = 0.8,
+    indirect: Indirect = Indirect(),
+    length_mm: float = 90.0,
 ) -> ConcaveScene:
-    """Return a V-groove: two walls 60 mm wide that meet at ``angle_deg`` in a fold along y, open towards -z."""
+    """Return a V-groove: two walls 60 mm wide that meet at ``angle_deg`` in a fold along y, open
+    towards -z."""
     if not 20 <= angle_deg <= 170:
         raise InputError(f"a groove of {angle_deg:g} degrees cannot be simulated: choose 20 to 170")
     half = np.radians(angle_deg / 2)
@@ -192,10 +228,15 @@ def groove(
     return _make_scene(np.concatenate(walls), both, pose, albedo, indirect)
 
 
-def bowl(pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8) -> ConcaveScene:
-    """Return the inside of a sphere, up to ``opening_deg`` from its deepest point, which is the origin; open to -z."""
+def bowl(
+    pose: Pose, radius_mm: float = 60.0, opening_deg: float = 70.0, albedo: float = 0.8
+) -> ConcaveScene:
+    """Return the inside of a sphere, up to ``opening_deg`` from its deepest point, which is the
+    origin; open to -z."""
     if not 10 <= opening_deg <= 90:
-        raise InputError(f"a bowl open to {opening_deg:g} degrees cannot be simulated: choose 10 to 90")
+        raise InputError(
+            f"a bowl open to {opening_deg:g} degrees cannot be simulated: choose 10 to 90"
+        )
     edge = radius_mm * np.sin(np.radians(opening_deg))
     side = np.linspace(-1, 1, 2 * int(np.ceil(edge / 2.0)) + 1)
     a, b = np.meshgrid(side, side, indexing="ij")
@@ -240,7 +281,8 @@ def _graded_steps(width: float) -> np.ndarray:
 
 
 def _grid_patches(shape: tuple[int, ...]) -> np.ndarray:
-    """Return (m, 4) vertex indices of the cells of a grid whose x and y grow, in order, facing -z."""
+    """Return (m, 4) vertex indices of the cells of a grid whose x and y grow, in order, facing
+    -z."""
     index = np.arange(shape[0] * shape[1]).reshape(shape)
     corners = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     return np.stack([each.ravel() for each in corners], axis=1)

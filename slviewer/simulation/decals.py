@@ -20,8 +20,8 @@ _SAMPLES = 4  # by the square of which a pixel's area is averaged
 
 @dataclass(frozen=True, eq=False)
 class Decal:
-    """A marker ``number`` of side ``side_mm``, whose middle is the origin of ``pose``, T_object_decal: x to its right,
-    y down, z into the surface."""
+    """A marker ``number`` of side ``side_mm``, whose middle is the origin of ``pose``,
+    T_object_decal: x to its right, y down, z into the surface."""
 
     number: int
     side_mm: float
@@ -41,7 +41,8 @@ class Decal:
 
 @dataclass(frozen=True, eq=False)
 class MarkedScene:
-    """An object's scene at ``pose`` with decals on it, which follow its surface and do not change its shape."""
+    """An object's scene at ``pose`` with decals on it, which follow its surface and do not change
+    its shape."""
 
     scene: Scene
     pose: Pose
@@ -58,7 +59,9 @@ class MarkedScene:
             R = self.pose.R @ decal.pose.R  # of the decal in the camera's frame
             local = (surface.points - self.pose.to_camera(decal.pose.t)) @ R
             with np.errstate(invalid="ignore"):
-                near = (np.abs(local[..., :2]) < decal.side_mm).all(axis=-1) & (np.abs(local[..., 2]) < _THICK_MM)
+                near = (np.abs(local[..., :2]) < decal.side_mm).all(axis=-1) & (
+                    np.abs(local[..., 2]) < _THICK_MM
+                )
                 near &= surface.normals @ R[:, 2] < 0
             if not near.any():
                 continue
@@ -79,7 +82,9 @@ class MarkedScene:
 def marked_plate(pose: Pose) -> MarkedScene:
     """A blank plate with six markers."""
     places = ((-60.0, -45.0), (0.0, -50.0), (60.0, -45.0), (-60.0, 40.0), (5.0, 45.0), (60.0, 45.0))
-    decals = [Decal(i, 16.0, Pose(np.eye(3), np.array([x, y, 0.0]))) for i, (x, y) in enumerate(places)]
+    decals = [
+        Decal(i, 16.0, Pose(np.eye(3), np.array([x, y, 0.0]))) for i, (x, y) in enumerate(places)
+    ]
     return MarkedScene(blank_board(pose), pose, decals)
 
 
@@ -95,21 +100,31 @@ def marked_cylinder(pose: Pose) -> MarkedScene:
     """An open cylinder about the y axis with six markers on its front."""
     radius = 40.0
     places = ((-30, -40.0), (0, -45.0), (30, -40.0), (-25, 35.0), (5, 40.0), (30, 35.0))
-    decals = [_stick_on_front(i, 14.0, (around, 0), radius, y) for i, (around, y) in enumerate(places)]
+    decals = [
+        _stick_on_front(i, 14.0, (around, 0), radius, y) for i, (around, y) in enumerate(places)
+    ]
     return MarkedScene(MeshScene(*cylinder_mesh(radius, 150.0), pose), pose, decals)
 
 
-def _stick_on_front(number: int, side_mm: float, turn_deg: tuple[float, float], radius: float, y: float = 0.0) -> Decal:
-    """The marker on a front at ``radius`` from the y axis, turned about y and then x, and moved along y."""
+def _stick_on_front(
+    number: int, side_mm: float, turn_deg: tuple[float, float], radius: float, y: float = 0.0
+) -> Decal:
+    """The marker on a front at ``radius`` from the y axis, turned about y and then x, and moved
+    along y."""
     R = Rotation.from_euler("yx", turn_deg, degrees=True).as_matrix()
-    return Decal(number, side_mm, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0])))
+    return Decal(
+        number, side_mm, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0]))
+    )
 
 
 def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles (m, 3)."""
+    """An open cylinder along y with facets smaller than the noise: vertices (n, 3) mm, triangles
+    (m, 3)."""
     around = 720
     angles = np.arange(around) * 2 * np.pi / around
     ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
     vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
     i, j = np.arange(around), (np.arange(around) + 1) % around
-    return vertices, np.concatenate([np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)])
+    return vertices, np.concatenate(
+        [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
+    )

@@ -1,4 +1,5 @@
-"""One camera frame: light on the surface, through the camera's lens, with noise, to 8 or 16 bits."""
+"""One camera frame: light on the surface, through the camera's lens, with noise, to 8 or 16
+bits."""
 
 import numba
 import numpy as np
@@ -7,14 +8,16 @@ from scipy.special import ive, ndtri
 from slviewer.geometry.jit import kernel
 from slviewer.simulation.light import OVERSAMPLING
 
-_ROWS = 24  # rows per task: small enough for the cache, large enough that the PSF's overlap costs little
+# rows per task: small enough for the cache, large enough that the PSF's overlap costs little
+_ROWS = 24
 
 NORMAL_QUANTILES = ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
 """A standard normal deviate for each 16 random bits."""
 
 
 def psf_taps(sigma_px: float) -> np.ndarray:
-    """(2 r + 1,) float32: the discrete Gaussian, whose variance is sigma^2 at any sampling, also for small sigma."""
+    """(2 r + 1,) float32: the discrete Gaussian, whose variance is sigma^2 at any sampling, also
+    for small sigma."""
     radius = 0 if sigma_px == 0 else max(2, int(np.ceil(3 * sigma_px)))
     taps = ive(np.abs(np.arange(-radius, radius + 1)), sigma_px**2)
     return (taps / taps.sum()).astype(np.float32)
@@ -35,8 +38,9 @@ def _hash_bits(x):
 def image_light(coordinate, level, gain, table, offset, taps, stray, out):
     """Write the light of one frame into `out` (h, w) float32 grey levels above dark.
 
-    Light gain * table(level, coordinate) is blurred by `taps` (2 r + 1) in both directions; coordinate, level and gain
-    (h + 2 r, w + 2 r) reach r pixels beyond the frame. `stray` (h, w), blurred before, is added.
+    Light gain * table(level, coordinate) is blurred by `taps` (2 r + 1) in both directions;
+    coordinate, level and gain (h + 2 r, w + 2 r) reach r pixels beyond the frame. `stray` (h, w),
+    blurred before, is added.
     """
     h, w = out.shape
     radius = taps.size // 2
@@ -74,10 +78,11 @@ def image_light(coordinate, level, gain, table, offset, taps, stray, out):
 
 @kernel(parallel=True, fastmath=True)
 def digitise(light, noise, top, quantiles, keys, out):
-    """Write `light` (h, w) float32 with its noise into `out` (h, w) uint8 or uint16, clipped at 0 and `top`.
+    """Write `light` (h, w) float32 with its noise into `out` (h, w) uint8 or uint16, clipped at 0
+    and `top`.
 
-    noise: dark level, read variance, shot variance, in units of `out`. The noise depends on the pixel and on `keys`
-    (two uint32) alone, not on how the rows are shared among threads.
+    noise: dark level, read variance, shot variance, in units of `out`. The noise depends on the
+    pixel and on `keys` (two uint32) alone, not on how the rows are shared among threads.
     """
     h, w = out.shape
     dark, read, shot = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])

@@ -1,7 +1,8 @@
 """What real rigs do to a capture: faults, each at three severities, put where physics puts them.
 
-A fault may change the rig, the scene, the light before the sensor, the sensor's signal, or the frames as they are
-recorded: `hostile_light` renders the light, and `expose_frames` makes frames of it.
+A fault may change the rig, the scene, the light before the sensor, the sensor's signal, or the
+frames as they are recorded: `hostile_light` renders the light, and `expose_frames` makes frames of
+it.
 """
 
 import tomllib
@@ -27,7 +28,8 @@ from slviewer.simulation.scenes import Scene
 Severity = Literal["mild", "medium", "severe"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 Direction = Literal["scan", "calibration"]
-"""Where the fault strikes: scans measured with a sound calibration, or the target poses of the calibration."""
+"""Where the fault strikes: scans measured with a sound calibration, or the target poses of the
+calibration."""
 
 ALL = 1000
 """More poses than any session has."""
@@ -37,15 +39,17 @@ _SUBLEVELS = 256  # a 16-bit signal holds so many steps a grey level
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """One fault: what each severity is in ``words``, and the ``causes`` of which one must be named where it does harm.
+    """One fault: what each severity is in ``words``, and the ``causes`` of which one must be named
+    where it does harm.
 
-    Each of the functions takes and gives one stage of a capture, at ``levels[severity]``. ``rig(rig, level, number)``
-    and ``scene(scene, level, number)`` of the capture of this number; ``moving(scene, level)``: the scene in each of so
-    many equal parts of the capture; ``pattern``: what the projector makes of one; ``light`` and ``signal``: float32
-    grey levels (n, h, w), above dark and with dark; ``frames``: uint8 (n, h, w), as they are recorded.
+    Each of the functions takes and gives one stage of a capture, at ``levels[severity]``.
+    ``rig(rig, level, number)`` and ``scene(scene, level, number)`` of the capture of this number;
+    ``moving(scene, level)``: the scene in each of so many equal parts of the capture; ``pattern``:
+    what the projector makes of one; ``light`` and ``signal``: float32 grey levels (n, h, w), above
+    dark and with dark; ``frames``: uint8 (n, h, w), as they are recorded.
 
-    ``must_measure``: at mild severity the program has to reach the floor. ``struck``: how many of the target poses it
-    strikes, at each severity. ``directions``: where it can strike.
+    ``must_measure``: at mild severity the program has to reach the floor. ``struck``: how many of
+    the target poses it strikes, at each severity. ``directions``: where it can strike.
     """
 
     words: tuple[str, str, str]
@@ -73,25 +77,37 @@ class Fault:
 
 
 def render_light(
-    rig: SimulatedRig, scene: Scene, sequence: PatternSequence, change: Callable[[Pattern], Pattern] = lambda p: p
+    rig: SimulatedRig,
+    scene: Scene,
+    sequence: PatternSequence,
+    change: Callable[[Pattern], Pattern] = lambda p: p,
 ) -> tuple[np.ndarray, Renderer]:
-    """(n, h, w) float32: the light of every frame in grey levels above dark, before any noise; and its renderer."""
+    """(n, h, w) float32: the light of every frame in grey levels above dark, before any noise; and
+    its renderer."""
     renderer = Renderer(rig, scene)
     patterns = [change(profile(sequence, k)) for k in range(len(sequence.frames))]
     light = np.stack([renderer.light(pattern) for pattern in patterns])
     if isinstance(scene, MirrorTable):
         second = Renderer(scene.second_projector(rig), scene.scene)
         for k, pattern in enumerate(patterns):
-            light[k] += np.float32(scene.reflectivity) * second.light(pattern, exposure=renderer.exposure)
+            light[k] += np.float32(scene.reflectivity) * second.light(
+                pattern, exposure=renderer.exposure
+            )
     return light, renderer
 
 
 def hostile_light(
-    fault: Fault, severity: Severity, rig: SimulatedRig, scene: Scene, sequence: PatternSequence, number: int
+    fault: Fault,
+    severity: Severity,
+    rig: SimulatedRig,
+    scene: Scene,
+    sequence: PatternSequence,
+    number: int,
 ) -> tuple[np.ndarray, Renderer]:
     """Render the light as ``render_light``, with the fault's effects on rig, scene and patterns.
 
-    Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth comes from.
+    Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth
+    comes from.
     """
     level = fault.level(severity)
     rig = fault.rig(rig, level, number) if fault.rig else rig
@@ -99,9 +115,14 @@ def hostile_light(
     change = fault.pattern or (lambda pattern, level: pattern)
     places = fault.moving(scene, level) if fault.moving else [scene]
     parts = np.array_split(np.arange(len(sequence.frames)), len(places))
-    rendered = [render_light(rig, place, sequence, lambda pattern: change(pattern, level)) for place in places]
+    rendered = [
+        render_light(rig, place, sequence, lambda pattern: change(pattern, level))
+        for place in places
+    ]
     light = [light[part] for (light, _), part in zip(rendered, parts, strict=True)]
-    steps = [i for i, frame in enumerate(sequence.frames) if (frame.kind, frame.axis) == ("phase", "x")]
+    steps = [
+        i for i, frame in enumerate(sequence.frames) if (frame.kind, frame.axis) == ("phase", "x")
+    ]
     middle = next(k for k, part in enumerate(parts) if steps[len(steps) // 2] in part)
     return np.concatenate(light), rendered[middle][1]
 
@@ -116,10 +137,11 @@ def expose_frames(
     severity: Severity = "mild",
     seed: int = 0,
 ) -> np.ndarray:
-    """(n, h, w) uint8: frames that the camera records of the ``light`` (n, h, w), with the fault applied.
+    """(n, h, w) uint8: frames that the camera records of the ``light`` (n, h, w), with the fault
+    applied.
 
-    ``room_light`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the same noise, fault or
-    not.
+    ``room_light`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the
+    same noise, fault or not.
     """
     level = fault.level(severity) if fault else 0.0
     name = zlib.crc32(repr(fault.words).encode()) if fault else 0
@@ -127,8 +149,13 @@ def expose_frames(
     if fault and fault.light:
         light = fault.light(light, level, shot)
     sensor = rig.sensor
-    noise = np.array([sensor.dark_level, sensor.read_variance * _SUBLEVELS, sensor.shot_variance]) * _SUBLEVELS
-    keys = np.random.default_rng([rig.seed, seed, number, 0xF0]).integers(0, 2**32, (len(light), 2), dtype=np.uint32)
+    noise = (
+        np.array([sensor.dark_level, sensor.read_variance * _SUBLEVELS, sensor.shot_variance])
+        * _SUBLEVELS
+    )
+    keys = np.random.default_rng([rig.seed, seed, number, 0xF0]).integers(
+        0, 2**32, (len(light), 2), dtype=np.uint32
+    )
     signal = np.empty(light.shape, np.uint16)
     for k, frame in enumerate(light):
         frame = frame * np.float32(_SUBLEVELS)
@@ -141,7 +168,8 @@ def expose_frames(
 
 
 def _load_fault(row: dict[str, Any]) -> Fault:
-    """The fault of a table of ``faults.toml``, in which a stage is the name of a function of this package."""
+    """The fault of a table of ``faults.toml``, in which a stage is the name of a function of this
+    package."""
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
     for stage in _STAGES & row.keys():
         values[stage] = getattr(scene_faults, row[stage], None) or getattr(frame_faults, row[stage])

@@ -13,7 +13,8 @@ from slviewer.fringe.sequence import Kind, PatternSequence
 @dataclass(frozen=True, eq=False)
 class Shot:
     """The capture that a fault acts on: its number among its kind, its sequence, and a generator of
-    its own. ``room_light``: (h, w) float32, even light as strong as the projector's white, in grey levels.
+    its own. ``room_light``: (h, w) float32, even light as strong as the projector's white, in grey
+    levels.
     """
 
     number: int
@@ -48,7 +49,8 @@ def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
 
 
 def exposure_loop_gains(light: np.ndarray, off: float) -> np.ndarray:
-    """(n,) gains of an exposure control that starts too bright by ``off`` and follows the mean level of the last frame.
+    """(n,) gains of an exposure control that starts too bright by ``off`` and follows the mean
+    level of the last frame.
 
     Its target is the mean level of all frames; each frame it takes 15 % of the way that is left.
     """
@@ -62,7 +64,8 @@ def exposure_loop_gains(light: np.ndarray, off: float) -> np.ndarray:
 
 
 def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
-    """Add mains flicker under a rolling shutter: bands 1 + depth sin, at another phase in each frame."""
+    """Add mains flicker under a rolling shutter: bands 1 + depth sin, at another phase in each
+    frame."""
     n, height, _ = light.shape
     rows = 1.6 * np.arange(height) / height
     phase = 0.37 * np.arange(n)[:, None] + shot.rng.uniform(0, 1, (n, 1)) * 0.1
@@ -70,7 +73,8 @@ def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 
 
 def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
-    """Add ambient light, a fifth as strong as the projector's, that flickers by ``depth`` of its light."""
+    """Add ambient light, a fifth as strong as the projector's, that flickers by ``depth`` of its
+    light."""
     n, height, _ = light.shape
     rows = 1.6 * np.arange(height) / height
     bands = 0.2 * (1 + depth * np.sin(2 * np.pi * (rows + 0.29 * np.arange(n)[:, None])))
@@ -78,7 +82,8 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 
 
 def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
-    """Switch a lamp on half way through the phase steps of x: even light, ``share`` of the projector's."""
+    """Switch a lamp on half way through the phase steps of x: even light, ``share`` of the
+    projector's."""
     steps = _select_indices(shot, "phase", "x")
     illuminated = light.copy()
     illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room_light
@@ -86,12 +91,15 @@ def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
 
 
 def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
-    """Simulate a short exposure that sees part of the colour wheel's turn: fast bands of the projector's light."""
+    """Simulate a short exposure that sees part of the colour wheel's turn: fast bands of the
+    projector's light."""
     n, height, _ = light.shape
     dark = light.min(0, keepdims=True)
     rows = 5.0 * np.arange(height) / height
     phase = shot.rng.uniform(0, 1, (n, 1))
-    bands = 1 + depth * (np.sin(2 * np.pi * (rows + phase)) + 0.5 * np.sin(4 * np.pi * (rows + phase)))
+    bands = 1 + depth * (
+        np.sin(2 * np.pi * (rows + phase)) + 0.5 * np.sin(4 * np.pi * (rows + phase))
+    )
     return dark + (light - dark) * bands.astype(np.float32)[:, :, None]
 
 
@@ -108,13 +116,16 @@ def add_vignetting(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
 
 
 def add_lens_dust(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
-    """Blurred spots and scratches on the camera's lens, the same in every frame and every capture."""
+    """Blurred spots and scratches on the camera's lens, the same in every frame and every
+    capture."""
     _, height, width = light.shape
     rng = np.random.default_rng(0xD7)
     spots = np.zeros((height, width), np.float32)
     for _ in range(25):
         centre = (int(rng.integers(width)), int(rng.integers(height)))
-        cv2.circle(spots, centre, int(rng.integers(2, 9)) * width // 400, float(rng.uniform(0.3, 1)), -1)
+        cv2.circle(
+            spots, centre, int(rng.integers(2, 9)) * width // 400, float(rng.uniform(0.3, 1)), -1
+        )
     for _ in range(6):
         (a, b), (c, d) = rng.integers(0, [width, height], (2, 2)).tolist()
         cv2.line(spots, (a, b), (c, d), 0.6, max(1, width // 400))
@@ -123,7 +134,8 @@ def add_lens_dust(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
 
 
 def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.ndarray:
-    """Blur as a tilted lens does: sharp at the left edge, up to ``sigma_px`` (of 400 px of width) at the right."""
+    """Blur as a tilted lens does: sharp at the left edge, up to ``sigma_px`` (of 400 px of width)
+    at the right."""
     width = light.shape[2]
     widest = sigma_px * width / 400
     steps = 5
@@ -132,7 +144,9 @@ def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.n
     for k in range(steps):
         weight = np.clip(1 - np.abs(share - k), 0, 1).astype(np.float32)
         for i, frame in enumerate(light):
-            out[i] += weight * (cv2.GaussianBlur(frame, (0, 0), widest * k / (steps - 1)) if k else frame)
+            out[i] += weight * (
+                cv2.GaussianBlur(frame, (0, 0), widest * k / (steps - 1)) if k else frame
+            )
     return out
 
 
@@ -166,7 +180,9 @@ def compress_jpeg(frames: np.ndarray, quality: float, shot: Shot | None = None) 
 def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
     """Set this share of the pixels hot or dead, the same ones in every capture."""
     kind = np.random.default_rng(0x407).random(frames.shape[1:])
-    return np.where(kind < share / 2, np.uint8(255), np.where(kind > 1 - share / 2, np.uint8(0), frames))
+    return np.where(
+        kind < share / 2, np.uint8(255), np.where(kind > 1 - share / 2, np.uint8(0), frames)
+    )
 
 
 # Frames in another order than described
@@ -178,12 +194,14 @@ def delay_frames(frames: np.ndarray, by: float = 1, shot: Shot | None = None) ->
 
 
 def drop_frame(frames: np.ndarray, index: int) -> np.ndarray:
-    """The frames (n, h, w) with one dropped: later ones move forward by one, and the last is repeated."""
+    """The frames (n, h, w) with one dropped: later ones move forward by one, and the last is
+    repeated."""
     return np.concatenate([np.delete(frames, index, axis=0), frames[-1:]])
 
 
 def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[int]) -> np.ndarray:
-    """The frames (n, h, w) with those at the indices ``places`` replaced by those at ``sources``."""
+    """The frames (n, h, w) with those at the indices ``places`` replaced by those at
+    ``sources``."""
     out = frames.copy()
     out[list(places)] = frames[list(sources)]
     return out
@@ -195,7 +213,8 @@ def _select_indices(shot: Shot, kind: str, axis: str) -> list[int]:
 
 
 def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move forward."""
+    """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move
+    forward."""
     phase_x, gray_y = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "y")
     if level != 0:
         frames = drop_frame(frames, phase_x[3])
@@ -203,28 +222,32 @@ def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 
 
 def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Repeat the previous frame in place of a Gray frame of x (level 0), a phase step (1), or three of them (2)."""
+    """Repeat the previous frame in place of a Gray frame of x (level 0), a phase step (1), or three
+    of them (2)."""
     phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
     places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
     return show_instead(frames, places, [place - 1 for place in places])
 
 
 def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the first Gray frame (2)."""
+    """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the
+    first Gray frame (2)."""
     phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
     first = {0: gray[-2], 1: phase[1], 2: phase[-1]}[int(level)]
     return show_instead(frames, [first, first + 1], [first + 1, first])
 
 
 def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Exchange all frames of x and y (level 0), the phase steps alone (1), or the Gray frames alone (2)."""
+    """Exchange all frames of x and y (level 0), the phase steps alone (1), or the Gray frames alone
+    (2)."""
     kinds = {0: get_args(Kind), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
     x, y = ([i for kind in kinds for i in _select_indices(shot, kind, axis)] for axis in ("x", "y"))
     return show_instead(frames, x + y, y + x)
 
 
 def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary one (2)."""
+    """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary
+    one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
         places = _select_indices(shot, "gray", axis)
         if level == 2:
@@ -234,10 +257,15 @@ def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 
 
 def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
-    """Reorder phase steps: begin a quarter period late (level 0), run backwards (1), or 0 2 4 ... 1 3 5 (2)."""
+    """Reorder phase steps: begin a quarter period late (level 0), run backwards (1), or 0 2 4 ... 1
+    3 5 (2)."""
     for axis in ("x", "y"):
         places = _select_indices(shot, "phase", axis)
         n = len(places)
-        orders = ([(k + n // 4) % n for k in range(n)], [-k % n for k in range(n)], [*range(0, n, 2), *range(1, n, 2)])
+        orders = (
+            [(k + n // 4) % n for k in range(n)],
+            [-k % n for k in range(n)],
+            [*range(0, n, 2), *range(1, n, 2)],
+        )
         frames = show_instead(frames, places, [places[k] for k in orders[int(level)]])
     return frames

@@ -24,7 +24,8 @@ _THICKNESS_MM = 2.0  # more than any board's bow
 
 @dataclass(frozen=True, eq=False)
 class SceneGroup:
-    """Several scenes in one view: each ray meets the nearest surface, and each scene shades the others' points."""
+    """Several scenes in one view: each ray meets the nearest surface, and each scene shades the
+    others' points."""
 
     scenes: Sequence[Scene]
 
@@ -41,13 +42,18 @@ class SceneGroup:
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Whether any of the scenes blocks the way from a point to the source."""
         blocked = [scene.occluded(points, source) for scene in self.scenes]
-        blocked += [_is_behind_plate(scene, points, source) for scene in self.scenes if isinstance(scene, BoardScene)]
+        blocked += [
+            _is_behind_plate(scene, points, source)
+            for scene in self.scenes
+            if isinstance(scene, BoardScene)
+        ]
         return np.logical_or.reduce(blocked)
 
 
 @dataclass(frozen=True, eq=False)
 class DirtyBoard:
-    """A board with specks of dust and scratches: of the cells of its surface, `share` reflect only `left` of the light.
+    """A board with specks of dust and scratches: of the cells of its surface, `share` reflect only
+    `left` of the light.
 
     The dirt is fixed to the board; `seed` draws it.
     """
@@ -82,10 +88,12 @@ class DirtyBoard:
 
 @dataclass(frozen=True, eq=False)
 class MirrorTable:
-    """A polished table below an object: rays that miss the object and meet the table see the object mirrored.
+    """A polished table below an object: rays that miss the object and meet the table see the object
+    mirrored.
 
-    `normal` (3,) and `offset_mm`: the table is n . X = offset. `reflectivity` 0 ... 1. Points and normals of mirrored
-    pixels are those of the real surface, which the projector lights; `is_direct` says which pixels see it directly.
+    `normal` (3,) and `offset_mm`: the table is n . X = offset. `reflectivity` 0 ... 1. Points and
+    normals of mirrored pixels are those of the real surface, which the projector lights;
+    `is_direct` says which pixels see it directly.
     """
 
     scene: Scene
@@ -98,13 +106,16 @@ class MirrorTable:
         surface = self.scene.trace(rays)
         direct = np.isfinite(surface.points[..., 2])
         image = _mirror_scene(self.scene, self.normal, self.offset_mm).trace(rays)
-        # The table lies between camera and mirror image, so that the image's points are behind the mirror.
+        # The table lies between camera and mirror image, so that the image's points are behind the
+        # mirror.
         with np.errstate(invalid="ignore"):
             behind = image.points @ self.normal > self.offset_mm
         visible = ~direct & behind & np.isfinite(image.points[..., 2])
         M, shift = _compute_reflection(self.normal, self.offset_mm)
         albedo = np.float32(self.reflectivity) * image.albedo
-        return surface.overlay(Surface(image.points @ M.T + shift, image.normals @ M.T, albedo), visible)
+        return surface.overlay(
+            Surface(image.points @ M.T + shift, image.normals @ M.T, albedo), visible
+        )
 
     def is_direct(self, rays: np.ndarray) -> np.ndarray:
         """Return the pixels (h, w) bool that see the object itself, and not its mirror image."""
@@ -115,28 +126,39 @@ class MirrorTable:
         return self.scene.occluded(points, source)
 
     def second_projector(self, rig: SimulatedRig) -> SimulatedRig:
-        """The rig with the projector's mirror image in the table: its light is `reflectivity` as strong."""
+        """The rig with the projector's mirror image in the table: its light is `reflectivity` as
+        strong."""
         M, shift = _compute_reflection(self.normal, self.offset_mm)
         light = replace(rig.light, ambient=0.0)
         return replace(rig, R=rig.R @ M, t=rig.R @ shift + rig.t, light=light)
 
 
 def with_hand(scene: Scene, reach_mm: float, number: int = 0) -> Scene:
-    """The scene with a hand that reaches `reach_mm` over it: over a board's right edge, or over a sphere's front."""
+    """The scene with a hand that reaches `reach_mm` over it: over a board's right edge, or over a
+    sphere's front."""
     lengths = np.arange(0.0, reach_mm + 20.0, 12.0)
     offsets = np.array([(x, y, -_FINGER_RADIUS_MM - 3.0) for x in lengths for y in _FINGERS_MM])
     if isinstance(scene, BoardScene):
         (x, y), (width, height) = scene.corner, scene.plate
-        fingers = scene.pose.to_camera(offsets + np.array([x + width - reach_mm, y + 0.5 * height, 0.0]))
+        fingers = scene.pose.to_camera(
+            offsets + np.array([x + width - reach_mm, y + 0.5 * height, 0.0])
+        )
     elif isinstance(scene, Spheres):
-        fingers = offsets + scene.centres[0] + np.array([scene.radius_mm - reach_mm, 0.0, -scene.radius_mm])
+        fingers = (
+            offsets
+            + scene.centres[0]
+            + np.array([scene.radius_mm - reach_mm, 0.0, -scene.radius_mm])
+        )
     else:
-        raise InputError(f"no hand holds a scene of type {type(scene).__name__}: use a board or spheres")
+        raise InputError(
+            f"no hand holds a scene of type {type(scene).__name__}: use a board or spheres"
+        )
     return SceneGroup((scene, Spheres(fingers, _FINGER_RADIUS_MM, albedo=0.55)))
 
 
 def _is_behind_plate(board: BoardScene, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """(n,) bool: the way from `points` (n, 3) to `source` (3,) crosses the plate; points on it are not behind it."""
+    """(n,) bool: the way from `points` (n, 3) to `source` (3,) crosses the plate; points on it are
+    not behind it."""
     start, end = (points - board.pose.t) @ board.pose.R, (source - board.pose.t) @ board.pose.R
     with np.errstate(divide="ignore", invalid="ignore"):
         share = start[:, 2] / (start[:, 2] - end[2])
@@ -151,7 +173,9 @@ def moved_scene(scene: Scene, by_mm: np.ndarray, turn_rad: np.ndarray) -> Scene:
         return replace(scene, centres=scene.centres + by_mm)
     if isinstance(scene, BoardScene | MeshScene):
         return replace(scene, pose=Pose(rotation(turn_rad) @ scene.pose.R, scene.pose.t + by_mm))
-    raise InputError(f"a scene of type {type(scene).__name__} cannot be moved: use a board, spheres or a mesh")
+    raise InputError(
+        f"a scene of type {type(scene).__name__} cannot be moved: use a board, spheres or a mesh"
+    )
 
 
 def _compute_reflection(normal: np.ndarray, offset_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -161,13 +185,16 @@ def _compute_reflection(normal: np.ndarray, offset_mm: float) -> tuple[np.ndarra
 
 
 def _mirror_scene(scene: Scene, normal: np.ndarray, offset_mm: float) -> Scene:
-    """The mirror image of a scene in the plane n . X = offset, mm; InputError for other than boards and spheres."""
+    """The mirror image of a scene in the plane n . X = offset, mm; InputError for other than boards
+    and spheres."""
     M, shift = _compute_reflection(normal, offset_mm)
     if isinstance(scene, Spheres):
         return replace(scene, centres=scene.centres @ M.T + shift)
     if isinstance(scene, BoardScene):
         return replace(scene, pose=Pose(M @ scene.pose.R, M @ scene.pose.t + shift))
-    raise InputError(f"a scene of type {type(scene).__name__} has no mirror image: use a board or spheres")
+    raise InputError(
+        f"a scene of type {type(scene).__name__} has no mirror image: use a board or spheres"
+    )
 
 
 def set_gamma(rig: SimulatedRig, gamma: float, number: int) -> SimulatedRig:
@@ -176,9 +203,15 @@ def set_gamma(rig: SimulatedRig, gamma: float, number: int) -> SimulatedRig:
 
 
 def dim_projector(rig: SimulatedRig, amplitude: float, number: int) -> SimulatedRig:
-    """Return the rig with fringes of this amplitude in grey levels on white; the camera's exposure is unchanged."""
+    """Return the rig with fringes of this amplitude in grey levels on white; the camera's exposure
+    is unchanged."""
     white = 2 * amplitude / (1 - rig.light.black)
-    return replace(rig, sensor=replace(rig.sensor, peak_level=rig.sensor.dark_level + white * (1 + rig.light.ambient)))
+    return replace(
+        rig,
+        sensor=replace(
+            rig.sensor, peak_level=rig.sensor.dark_level + white * (1 + rig.light.ambient)
+        ),
+    )
 
 
 def overexpose(rig: SimulatedRig, times: float, number: int) -> SimulatedRig:
@@ -188,14 +221,16 @@ def overexpose(rig: SimulatedRig, times: float, number: int) -> SimulatedRig:
 
 
 def refocus_camera(rig: SimulatedRig, share: float, number: int) -> SimulatedRig:
-    """Return the rig with the camera refocused for each pose: its focal length changes by up to ``share``."""
+    """Return the rig with the camera refocused for each pose: its focal length changes by up to
+    ``share``."""
     factor = 1 + share * float(np.random.default_rng([rig.seed, number, 0xFB]).uniform(-1, 1))
     fx, fy = rig.camera.focal_px
     return replace(rig, camera=replace(rig.camera, focal_px=(fx * factor, fy * factor)))
 
 
 def drift_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig:
-    """The rig with its projector turned a little in each capture, by ``mrad`` over eight, as a warming mount does."""
+    """The rig with its projector turned a little in each capture, by ``mrad`` over eight, as a
+    warming mount does."""
     return knock_projector(rig, mrad * min(number, 8) / 8, number)
 
 
@@ -206,7 +241,8 @@ def knock_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig
 
 
 def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
-    """Return the scene with a board bent anew for each ``number``; scenes without a board are unchanged."""
+    """Return the scene with a board bent anew for each ``number``; scenes without a board are
+    unchanged."""
     if not isinstance(scene, BoardScene):
         return scene
     bow = bow_mm * np.random.default_rng([number, 0xF1]).uniform(-1, 1, 3)
@@ -214,13 +250,18 @@ def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
 
 
 def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
-    """Return eleven copies of a scene that moves by `by_mm` mm and turns slightly, as if held by hand."""
+    """Return eleven copies of a scene that moves by `by_mm` mm and turns slightly, as if held by
+    hand."""
     way, turn = np.array([0.7, 0.5, 0.5]), np.array([0.3, -0.5, 0.2]) / 100
-    return [moved_scene(scene, share * by_mm * way, share * by_mm * turn) for share in np.linspace(0, 1, 11)]
+    return [
+        moved_scene(scene, share * by_mm * way, share * by_mm * turn)
+        for share in np.linspace(0, 1, 11)
+    ]
 
 
 def dirty_scene(scene: Scene, share: float, number: int) -> Scene:
-    """The scene with dust and scratches on this share of its board; scenes without a board are unchanged."""
+    """The scene with dust and scratches on this share of its board; scenes without a board are
+    unchanged."""
     return DirtyBoard(scene, share) if isinstance(scene, BoardScene) else scene
 
 
@@ -238,9 +279,12 @@ def put_on_table(scene: Scene, reflectivity: float, number: int) -> Scene:
 
 
 def add_second_board(scene: Scene, size_mm: float, number: int) -> Scene:
-    """The scene with another white plate of this width 70 mm behind the object, to the left of it."""
+    """The scene with another white plate of this width 70 mm behind the object, to the left of
+    it."""
     if isinstance(scene, BoardScene):
-        middle = scene.pose.to_camera(np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0]))
+        middle = scene.pose.to_camera(
+            np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0])
+        )
     elif isinstance(scene, Spheres):
         middle = scene.centres[0]
     else:

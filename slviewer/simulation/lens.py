@@ -20,10 +20,12 @@ from slviewer.simulation.waves import Waves
 class SimulatedLens:
     """A lens described at full resolution and used at `scale`.
 
-    Pixel p = Brown(pinhole) in px of the full resolution, then p + W(p) with the waves W, then (p + 0.5) scale - 0.5:
-    pixel centres at whole numbers, and the image's outer edges stay where they are.
+    Pixel p = Brown(pinhole) in px of the full resolution, then p + W(p) with the waves W, then (p +
+    0.5) scale - 0.5: pixel centres at whole numbers, and the image's outer edges stay where they
+    are.
 
-    full_size: (width, height); focal_px, centre_px: (x, y) at full resolution; brown: k1, k2, p1, p2, k3.
+    full_size: (width, height); focal_px, centre_px: (x, y) at full resolution; brown: k1, k2, p1,
+    p2, k3.
     """
 
     full_size: tuple[int, int]
@@ -39,21 +41,26 @@ class SimulatedLens:
         return round(self.full_size[0] * self.scale), round(self.full_size[1] * self.scale)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (..., 2) of `points` (..., 3) mm in this device's frame; NaN where z <= 0 or a coordinate is NaN."""
+        """Pixels (..., 2) of `points` (..., 3) mm in this device's frame; NaN where z <= 0 or a
+        coordinate is NaN."""
         points = _check_shape(points, 3)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
             return self._map_points(_project_kernel, points[..., :2] / z)
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
-        """Normalised (..., 2) = (x/z, y/z) that project to `pixels` (..., 2), by Newton; NaN if it fails."""
+        """Normalised (..., 2) = (x/z, y/z) that project to `pixels` (..., 2), by Newton; NaN if it
+        fails."""
         return self._map_points(_undistort_kernel, _check_shape(pixels, 2))
 
     def rays(self, margin: int = 0) -> np.ndarray:
-        """(h + 2 margin, w + 2 margin, 2) float64: (x/z, y/z) of every pixel, and of so many beyond each edge."""
+        """(h + 2 margin, w + 2 margin, 2) float64: (x/z, y/z) of every pixel, and of so many beyond
+        each edge."""
         if margin not in self._ray_grids:
             width, height = self.size
-            u, v = np.meshgrid(*(np.arange(-margin, n + margin, dtype=float) for n in (width, height)))
+            u, v = np.meshgrid(
+                *(np.arange(-margin, n + margin, dtype=float) for n in (width, height))
+            )
             self._ray_grids[margin] = self.undistort(np.stack([u, v], -1))
         return self._ray_grids[margin]
 
@@ -70,7 +77,8 @@ class SimulatedLens:
 
 
 def _check_shape(values: np.ndarray, last: int) -> np.ndarray:
-    """The values as a float array; raises InputError unless the last axis has the length ``last``."""
+    """The values as a float array; raises InputError unless the last axis has the length
+    ``last``."""
     values = np.asarray(values, float)
     if values.ndim < 1 or values.shape[-1] != last:
         raise InputError(f"expected an array (..., {last}), got the shape {values.shape}")
@@ -79,11 +87,14 @@ def _check_shape(values: np.ndarray, last: int) -> np.ndarray:
 
 @kernel()
 def _project_point(x, y, numbers, waves):
-    """Pixel (u, v) at the lens's scale, and its derivatives by x and y (4 numbers), for one normalised point."""
+    """Pixel (u, v) at the lens's scale, and its derivatives by x and y (4 numbers), for one
+    normalised point."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3, scale = numbers
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d r2, twice: times x or y it is d radial / dx or dy
+    slope = 2 * (
+        k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    )  # d radial / d r2, twice: times x or y it is d radial / dx or dy
     u = cx + fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
     v = cy + fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
     ux = fx * (radial + x * x * slope + 2 * p1 * y + 6 * p2 * x)
@@ -96,7 +107,10 @@ def _project_point(x, y, numbers, waves):
         sine, cosine = math.sin(angle), math.cos(angle)
         wu += waves[i, 2] * sine + waves[i, 3] * cosine
         wv += waves[i, 4] * sine + waves[i, 5] * cosine
-        au, av = waves[i, 2] * cosine - waves[i, 3] * sine, waves[i, 4] * cosine - waves[i, 5] * sine
+        au, av = (
+            waves[i, 2] * cosine - waves[i, 3] * sine,
+            waves[i, 4] * cosine - waves[i, 5] * sine,
+        )
         wuu += au * waves[i, 0]
         wuv += au * waves[i, 1]
         wvu += av * waves[i, 0]
@@ -123,7 +137,8 @@ def _project_kernel(normalised, numbers, waves):
 
 @kernel(parallel=True)
 def _undistort_kernel(pixels, numbers, waves):
-    """Normalised points (n, 2) of pixels (n, 2) by Newton's method; NaN where it does not converge."""
+    """Normalised points (n, 2) of pixels (n, 2) by Newton's method; NaN where it does not
+    converge."""
     out = np.empty_like(pixels)
     fx, fy, cx, cy, scale = numbers[0], numbers[1], numbers[2], numbers[3], numbers[9]
     for i in numba.prange(pixels.shape[0]):
@@ -137,7 +152,9 @@ def _undistort_kernel(pixels, numbers, waves):
             x += (vy * du - uy * dv) / determinant
             y += (ux * dv - vx * du) / determinant
             error = abs(du) + abs(dv)
-            if not error > 1e-6:  # the step just taken squares this: 1e-12 px and better; also leaves on NaN
+            if (
+                not error > 1e-6
+            ):  # the step just taken squares this: 1e-12 px and better; also leaves on NaN
                 break
         if error <= 1e-6:
             out[i, 0], out[i, 1] = x, y

@@ -1,4 +1,5 @@
-"""What the projector throws on a surface: profiles blurred by its optics, tabulated for the frame kernel."""
+"""What the projector throws on a surface: profiles blurred by its optics, tabulated for the frame
+kernel."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,7 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import ndtr
 
 OVERSAMPLING = 8
-"""Table entries per projector px; linear between them costs 2e-4 of an 18 px fringe's modulation, and no phase."""
+"""Table entries per projector px; linear between them costs 2e-4 of an 18 px fringe's modulation,
+and no phase."""
 
 LEVELS = 9
 """Blurs that are tabulated, from sharpest to widest; linear between them."""
@@ -18,14 +20,16 @@ _MARGIN = 2  # px that a table holds beyond either end of the projector
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Relative light 0 ... 1 along one axis: table (LEVELS, n) float32, entry i at (i - offset) / OVERSAMPLING px."""
+    """Relative light 0 ... 1 along one axis: table (LEVELS, n) float32, entry i at (i - offset) /
+    OVERSAMPLING px."""
 
     table: np.ndarray
     offset: float
 
 
 def blur_levels(blur_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(sigmas (LEVELS,), level (...) float32): tabulated sigmas that span `blur_px`, and where between them each lies.
+    """(sigmas (LEVELS,), level (...) float32): tabulated sigmas that span `blur_px`, and where
+    between them each lies.
 
     `blur_px` in projector columns; NaN gives level 0.
     """
@@ -38,19 +42,24 @@ def blur_levels(blur_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def blurred_profile(values: np.ndarray, sigmas: np.ndarray) -> Profile:
-    """`values` (n,) in 0 ... 1, one per projector px, as light after the pixel's box and a Gaussian of each sigma (px).
+    """`values` (n,) in 0 ... 1, one per projector px, as light after the pixel's box and a Gaussian
+    of each sigma (px).
 
-    Beyond its ends the profile continues with its end values: `window` darkens what lies outside the projector.
+    Beyond its ends the profile continues with its end values: `window` darkens what lies outside
+    the projector.
     """
     weights, reach = _compute_weights(tuple(sigmas.tolist()))
-    windows = sliding_window_view(np.pad(values.astype(np.float32), reach + _MARGIN, mode="edge"), 2 * reach + 1)
+    windows = sliding_window_view(
+        np.pad(values.astype(np.float32), reach + _MARGIN, mode="edge"), 2 * reach + 1
+    )
     table = np.tensordot(windows, weights, 1)  # (px, within, sigma)
     return Profile(np.ascontiguousarray(table.reshape(-1, len(sigmas)).T), _MARGIN * OVERSAMPLING)
 
 
 @lru_cache(8)
 def _compute_weights(sigmas: tuple[float, ...]) -> tuple[np.ndarray, int]:
-    """(2 reach + 1, OVERSAMPLING, LEVELS) float32: what each projector px adds at each place within one; and reach."""
+    """(2 reach + 1, OVERSAMPLING, LEVELS) float32: what each projector px adds at each place within
+    one; and reach."""
     reach = int(np.ceil(4.5 * max(sigmas))) + 1
     around = np.arange(-reach, reach + 1)[:, None, None]
     within = (np.arange(OVERSAMPLING) / OVERSAMPLING)[:, None]
@@ -60,6 +69,7 @@ def _compute_weights(sigmas: tuple[float, ...]) -> tuple[np.ndarray, int]:
 
 
 def window(coordinate: np.ndarray, extent: int, blur_px: np.ndarray) -> np.ndarray:
-    """Share 0 ... 1 of the projector's light at `coordinate` px, across the edges of its `extent` px; 0 where NaN."""
+    """Share 0 ... 1 of the projector's light at `coordinate` px, across the edges of its `extent`
+    px; 0 where NaN."""
     low, high = (coordinate + 0.5) / blur_px, (extent - 0.5 - coordinate) / blur_px
     return np.nan_to_num(ndtr(low) * ndtr(high))

@@ -12,14 +12,17 @@ from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.scenes import Surface, directions_of
 
-_LIFT_MM = 0.02  # shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
+# shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
+_LIFT_MM = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class MeshScene:
-    """A diffuse mesh: vertices (n, 3) mm in a frame of its own, triangles (m, 3) int, placed by `pose`.
+    """A diffuse mesh: vertices (n, 3) mm in a frame of its own, triangles (m, 3) int, placed by
+    `pose`.
 
-    Depths are those of the flat triangles, in float64; shading follows normals interpolated between the vertices.
+    Depths are those of the flat triangles, in float64; shading follows normals interpolated between
+    the vertices.
     """
 
     vertices: np.ndarray
@@ -54,16 +57,27 @@ class MeshScene:
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         front = facing < 0
         hit[hit] = front
-        surface = Surface(np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan), np.zeros(shape, np.float32))
-        surface.points[hit], surface.normals[hit], surface.albedo[hit] = points[front], smooth[front], self.albedo
+        surface = Surface(
+            np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan), np.zeros(shape, np.float32)
+        )
+        surface.points[hit], surface.normals[hit], surface.albedo[hit] = (
+            points[front],
+            smooth[front],
+            self.albedo,
+        )
         return surface
 
     def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w, 2): where on it."""
+        """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w,
+        2): where on it."""
         directions = directions_of(rays)
-        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
+        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(
+            np.float32
+        )
         cast = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
-        distance, index, uv = (cast[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs"))
+        distance, index, uv = (
+            cast[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")
+        )
         return np.where(np.isfinite(distance), index.astype(np.int64), -1), uv.astype(float)
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
@@ -75,9 +89,12 @@ class MeshScene:
 
     @cached_property
     def vertex_normals(self) -> np.ndarray:
-        """Unit normals (n, 3) of the vertices in the camera frame, averaged over triangles by area."""
+        """Unit normals (n, 3) of the vertices in the camera frame, averaged over triangles by
+        area."""
         corners = self.placed[self.triangles]
-        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # twice the area: a fair weight
+        flat = np.cross(
+            corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        )  # twice the area: a fair weight
         normals = np.zeros_like(self.placed)
         for k in range(3):
             np.add.at(normals, self.triangles[:, k], flat)
@@ -88,13 +105,19 @@ class MeshScene:
         """Open3D ray-casting scene of the placed mesh."""
         core = open3d().core
         scene = open3d().t.geometry.RaycastingScene()
-        scene.add_triangles(core.Tensor(self.placed.astype(np.float32)), core.Tensor(self.triangles.astype(np.uint32)))
+        scene.add_triangles(
+            core.Tensor(self.placed.astype(np.float32)),
+            core.Tensor(self.triangles.astype(np.uint32)),
+        )
         return scene
 
 
 def demo_object(pose: Pose) -> MeshScene:
-    """The ammonite of ``assets/objects/ammonite.ply``: about 140 mm wide, its front towards -z of its own frame."""
+    """The ammonite of ``assets/objects/ammonite.ply``: about 140 mm wide, its front towards -z of
+    its own frame."""
     mesh = open3d().io.read_triangle_mesh(str(asset("objects/ammonite.ply")))
     if not mesh.has_triangles():
-        raise InputError("the shipped file assets/objects/ammonite.ply has no triangles: install slviewer again")
+        raise InputError(
+            "the shipped file assets/objects/ammonite.ply has no triangles: install slviewer again"
+        )
     return MeshScene(np.asarray(mesh.vertices), np.asarray(mesh.triangles), pose)

@@ -1,4 +1,5 @@
-"""What the 'letter' preset puts before its rig: target poses, planes, spheres and objects, the same every time."""
+"""What the 'letter' preset puts before its rig: target poses, planes, spheres and objects, the same
+every time."""
 
 import tomllib
 from dataclasses import replace
@@ -8,7 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.simulation.assets import asset
-from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, blank_board, printed_board
+from slviewer.simulation.boards import (
+    FLAT,
+    BoardScene,
+    BoardShape,
+    Pose,
+    blank_board,
+    printed_board,
+)
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene, Spheres, sphere
@@ -22,10 +30,11 @@ _PLANS = tomllib.loads(asset("simulation/plans.toml").read_text(encoding="utf-8"
 def letter_plan(
     rig: SimulatedRig, board: Board | None = None, poses: int = 25, shape: BoardShape = FLAT
 ) -> dict[str, Scene]:
-    """Every capture of the preset by name: pose_01 ..., plane_01 ... plane_10, sphere_1 ... sphere_6, object_r1 ... r3.
+    """Every capture of the preset by name: pose_01 ..., plane_01 ... plane_10, sphere_1 ...
+    sphere_6, object_r1 ... r3.
 
-    `board` defaults to the Letter's circles:21x16:9, and `shape` to a flat plate with its circles in place. The rig's
-    seed draws the target poses and the misplacement.
+    `board` defaults to the Letter's circles:21x16:9, and `shape` to a flat plate with its circles
+    in place. The rig's seed draws the target poses and the misplacement.
     """
     board = board or Board.parse("circles:21x16:9")
     scenes: dict[str, Scene] = {}
@@ -35,13 +44,18 @@ def letter_plan(
 
 
 def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
-    """`n` poses at 500 ... 700 mm, tilted by up to 28 degrees, that together reach the image's corners.
+    """`n` poses at 500 ... 700 mm, tilted by up to 28 degrees, that together reach the image's
+    corners.
 
-    Every feature stays in the camera's view and in the projector's light. The poses are drawn by the rig's seed and do
-    not depend on its scale. Raises `InputError` for a board too large for that.
+    Every feature stays in the camera's view and in the projector's light. The poses are drawn by
+    the rig's seed and do not depend on its scale. Raises `InputError` for a board too large for
+    that.
     """
     smooth = np.zeros((0, 6))  # what is in view is no matter of tenths of a pixel
-    camera, projector = replace(rig.camera, scale=1.0, waves=smooth), replace(rig.projector, waves=smooth)
+    camera, projector = (
+        replace(rig.camera, scale=1.0, waves=smooth),
+        replace(rig.projector, waves=smooth),
+    )
     rig = replace(rig, camera=camera, projector=projector)
     rng = np.random.default_rng([rig.seed, 0x705E])
     middle = (board.points.min(0) + board.points.max(0)) / 2
@@ -54,14 +68,18 @@ def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
     for i in range(n):
         axis = tilts[i] * np.array([np.cos(towards[i]), np.sin(towards[i]), 0])
         R = rotation(axis) @ rotation(np.array([0, 0, np.radians(rng.uniform(-8, 8))]))
-        poses.append(_place_board(rig, board, R, middle, depths[i], offsets[i], rng.uniform(0.95, 1)))
+        poses.append(
+            _place_board(rig, board, R, middle, depths[i], offsets[i], rng.uniform(0.95, 1))
+        )
     return poses
 
 
 def planes() -> dict[str, BoardScene]:
     """The blank plate at ten poses whose shares in R1/R2/R3 resemble the Letter's Table 1."""
     return {
-        f"plane_{i:02d}": blank_board(Pose(rotation(np.radians([tilt_x, tilt_y, 0])), np.array([x, y, z])))
+        f"plane_{i:02d}": blank_board(
+            Pose(rotation(np.radians([tilt_x, tilt_y, 0])), np.array([x, y, z]))
+        )
         for i, (z, x, y, tilt_x, tilt_y) in enumerate(_PLANS["planes"], 1)
     }
 
@@ -72,7 +90,8 @@ def spheres() -> dict[str, Spheres]:
 
 
 def objects(moved: bool = False) -> dict[str, MeshScene]:
-    """Return the demo object in R1, R2 and R3, each time turned a little: the Letter's experiment 3.
+    """Return the demo object in R1, R2 and R3, each time turned a little: the Letter's experiment
+    3.
 
     ``moved``: turned by up to 15 degrees from one to the next, and placed beside the axis.
     """
@@ -88,18 +107,39 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def _list_directions(n: int) -> np.ndarray:
-    """(n, 2) in -1 ... 1: position of each board in the field of view; corners most, then edges, then the middle."""
+    """(n, 2) in -1 ... 1: position of each board in the field of view; corners most, then edges,
+    then the middle."""
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
-    cycle = [*corners, (0, 0), *corners, (1, 0), *corners, (0, -1), *corners, (-1, 0), *corners, (0, 1)]
+    cycle = [
+        *corners,
+        (0, 0),
+        *corners,
+        (1, 0),
+        *corners,
+        (0, -1),
+        *corners,
+        (-1, 0),
+        *corners,
+        (0, 1),
+    ]
     return np.array([cycle[i % len(cycle)] for i in range(n)], float)
 
 
 def _place_board(
-    rig: SimulatedRig, board: Board, R: np.ndarray, middle: np.ndarray, depth: float, offset: np.ndarray, share: float
+    rig: SimulatedRig,
+    board: Board,
+    R: np.ndarray,
+    middle: np.ndarray,
+    depth: float,
+    offset: np.ndarray,
+    share: float,
 ) -> Pose:
-    """The pose with its middle at `depth`, as far towards `offset` as keeps the board in view, times `share`."""
+    """The pose with its middle at `depth`, as far towards `offset` as keeps the board in view,
+    times `share`."""
     place = np.array([0.0, 0.0, depth])
-    rim = ((board.points == board.points.min(0)) | (board.points == board.points.max(0)))[:, :2].any(1)
+    rim = ((board.points == board.points.min(0)) | (board.points == board.points.max(0)))[
+        :, :2
+    ].any(1)
     features = (board.points[rim] - middle) @ R.T
     if not _is_in_view(rig, board, features + place):
         raise InputError(
@@ -119,7 +159,8 @@ def _place_board(
 
 
 def _is_in_view(rig: SimulatedRig, board: Board, points: np.ndarray) -> np.ndarray:
-    """(...) bool: whether all features, (..., n, 3) mm in the camera frame, lie in both images, a margin inside."""
+    """(...) bool: whether all features, (..., n, 3) mm in the camera frame, lie in both images, a
+    margin inside."""
     radius = board.pitch_mm / 4  # circles are half a pitch wide
     fits = np.ones(points.shape[:-2], bool)
     for pixels, lens, depths in (

@@ -18,16 +18,19 @@ from slviewer.simulation.light import blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
-_EXPOSURE_QUANTILE = 0.995  # of the illuminated pixels; a few brighter ones do not decide an exposure
+_EXPOSURE_QUANTILE = (
+    0.995  # of the illuminated pixels; a few brighter ones do not decide an exposure
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """What a perfect instrument would measure.
 
-    points: (h, w, 3) float64 mm, camera frame, NaN where the camera's ray meets nothing. projector: (h, w, 2) float64
-    px (column, row) of those points, also beyond the projector's image. mask: (h, w) bool, where the projector's light
-    arrives: inside its image, on a surface that faces it, in no shadow.
+    points: (h, w, 3) float64 mm, camera frame, NaN where the camera's ray meets nothing. projector:
+    (h, w, 2) float64 px (column, row) of those points, also beyond the projector's image. mask: (h,
+    w) bool, where the projector's light arrives: inside its image, on a surface that faces it, in
+    no shadow.
     """
 
     points: np.ndarray
@@ -39,8 +42,8 @@ class Truth:
 class _Maps:
     """A scene at unit exposure, (h + 2 r, w + 2 r) float32 with r the PSF's radius.
 
-    gain: full white light; even: the room's light, if it were as strong; level: blur, as a place among the tabulated
-    `sigmas`; coordinates: projector px along each axis.
+    gain: full white light; even: the room's light, if it were as strong; level: blur, as a place
+    among the tabulated `sigmas`; coordinates: projector px along each axis.
     """
 
     gain: np.ndarray
@@ -52,11 +55,13 @@ class _Maps:
 
 
 class Renderer:
-    """Renders one scene with one rig: geometry once, then frame after frame of any pattern sequence.
+    """Renders one scene with one rig: geometry once, then frame after frame of any pattern
+    sequence.
 
-    The exposure is set as an operator would: the brightest half percent of the illuminated surface reaches the sensor's
-    `peak_level` in full white light. Defocus and pixel response blur the projected profile by the surface's depth;
-    the camera's PSF blurs each frame. Silhouettes are not anti-aliased, printed edges are.
+    The exposure is set as an operator would: the brightest half percent of the illuminated surface
+    reaches the sensor's `peak_level` in full white light. Defocus and pixel response blur the
+    projected profile by the surface's depth; the camera's PSF blurs each frame. Silhouettes are not
+    anti-aliased, printed edges are.
     """
 
     def __init__(self, rig: SimulatedRig, scene: Scene) -> None:
@@ -70,17 +75,22 @@ class Renderer:
         return self._maps.truth
 
     def capture(
-        self, sequence: PatternSequence, seed: int = 0, progress: Callable[[int, int], None] | None = None
+        self,
+        sequence: PatternSequence,
+        seed: int = 0,
+        progress: Callable[[int, int], None] | None = None,
     ) -> np.ndarray:
-        """(n, h, w) uint8: every frame of `sequence`; the same seed (and rig) gives the same frames.
+        """(n, h, w) uint8: every frame of `sequence`; the same seed (and rig) gives the same
+        frames.
 
         `progress(done, n)` is called after each frame, and may raise to stop.
         """
         rig = self.rig
         if tuple(sequence.projector) != rig.projector.size:
             raise InputError(
-                f"the patterns are {sequence.projector[0]}x{sequence.projector[1]} px and the simulated projector has "
-                f"{rig.projector.size[0]}x{rig.projector.size[1]}: make them for this projector"
+                f"the patterns are {sequence.projector[0]}x{sequence.projector[1]} px and the"
+                f" simulated projector has {rig.projector.size[0]}x{rig.projector.size[1]}: make"
+                " them for this projector"
             )
         rng = np.random.default_rng([rig.seed, seed, 0xF0])
         keys = rng.integers(0, 2**32, (len(sequence.frames), 2), dtype=np.uint32)
@@ -103,23 +113,37 @@ class Renderer:
         exposure: float | None = None,
         gain: float = 1.0,
     ) -> None:
-        """Fill `out` (h, w) uint8 with one frame of `pattern`, the axis and grey levels that `fringe.profile` gives.
+        """Fill `out` (h, w) uint8 with one frame of `pattern`, the axis and grey levels that
+        `fringe.profile` gives.
 
-        `keys` (2,) uint32 decide the noise, `lamp` is the relative light of this frame, `exposure` replaces the
-        renderer's own, and `gain` multiplies the signal and its noise before they become 8 bits.
+        `keys` (2,) uint32 decide the noise, `lamp` is the relative light of this frame, `exposure`
+        replaces the renderer's own, and `gain` multiplies the signal and its noise before they
+        become 8 bits.
         """
         width, height = self.rig.camera.size
         if out.shape != (height, width) or out.dtype != np.uint8:
-            raise InputError(f"a frame needs an array of shape {(height, width)} uint8, got {out.shape} {out.dtype}")
-        light = self.light(pattern, lamp=lamp, exposure=(self.exposure if exposure is None else exposure) * gain)
+            raise InputError(
+                f"a frame needs an array of shape {(height, width)} uint8, got {out.shape}"
+                f" {out.dtype}"
+            )
+        light = self.light(
+            pattern, lamp=lamp, exposure=(self.exposure if exposure is None else exposure) * gain
+        )
         sensor = self.rig.sensor
-        noise = np.array([sensor.dark_level, gain**2 * sensor.read_variance, gain * sensor.shot_variance])
+        noise = np.array(
+            [sensor.dark_level, gain**2 * sensor.read_variance, gain * sensor.shot_variance]
+        )
         digitise(light, noise, 255.0, NORMAL_QUANTILES, keys, out)
 
     def light(
-        self, pattern: tuple[Axis | None, np.ndarray], *, lamp: float = 1.0, exposure: float | None = None
+        self,
+        pattern: tuple[Axis | None, np.ndarray],
+        *,
+        lamp: float = 1.0,
+        exposure: float | None = None,
     ) -> np.ndarray:
-        """(h, w) float32: the light of one frame in grey levels above dark, before noise and clipping; as `frame`."""
+        """(h, w) float32: the light of one frame in grey levels above dark, before noise and
+        clipping; as `frame`."""
         rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
         exposure = self.exposure if exposure is None else exposure
         illuminated, stray = self._light(exposure)
@@ -139,7 +163,8 @@ class Renderer:
         return out
 
     def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> np.ndarray:
-        """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile (n,) in 0 ... 1.
+        """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile
+        (n,) in 0 ... 1.
 
         The camera's PSF is neglected: this light varies slowly.
         """
@@ -153,12 +178,14 @@ class Renderer:
 
     @cached_property
     def _pixel_weights(self) -> tuple[csr_matrix, np.ndarray]:
-        """Weights of vertices (h w, n) at each pixel, and the light reflected of what it receives, (h, w) float32."""
+        """Weights of vertices (h w, n) at each pixel, and the light reflected of what it receives,
+        (h, w) float32."""
         assert isinstance(self.scene, ConcaveScene)
         return self.scene.pixel_weights(self.rig.camera.rays(0)), self._maps.even[self._frame]
 
     def room_light(self) -> np.ndarray:
-        """(h, w) float32: grey levels of even room light as strong as full white light from the projector."""
+        """(h, w) float32: grey levels of even room light as strong as full white light from the
+        projector."""
         return self._blur(self._maps.even * np.float32(self.exposure))
 
     def _blur(self, light: np.ndarray) -> np.ndarray:
@@ -168,25 +195,35 @@ class Renderer:
         return np.ascontiguousarray(light[self._frame])
 
     def _light(self, exposure: float) -> tuple[np.ndarray, np.ndarray]:
-        """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes, blurred, (h, w)."""
+        """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes,
+        blurred, (h, w)."""
         if exposure not in self._lights:
             maps, black = self._maps, self.rig.light.black
             stray = self._blur(exposure * (black * maps.gain + self.rig.light.ambient * maps.even))
             self._lights.clear()  # an exposure is kept for many frames
-            self._lights[exposure] = (exposure * (1 - black) * maps.gain).astype(np.float32), stray.astype(np.float32)
+            self._lights[exposure] = (
+                (exposure * (1 - black) * maps.gain).astype(np.float32),
+                stray.astype(np.float32),
+            )
         return self._lights[exposure]
 
     @cached_property
     def exposure(self) -> float:
-        """Grey levels of full white light on an albedo of 1 that faces the projector at its focus."""
+        """Grey levels of full white light on an albedo of 1 that faces the projector at its
+        focus."""
         maps, sensor = self._maps, self.rig.sensor
         light = (maps.gain + self.rig.light.ambient * maps.even)[self._frame]
         if isinstance(self.scene, ConcaveScene):
             light = light + self._indirect_light("x", np.ones(self.rig.projector.size[0]))
         illuminated = light[maps.truth.mask]
         if not illuminated.size:
-            raise InputError("nothing in the scene is illuminated by the projector: move it to where both fields meet")
-        return (sensor.peak_level - sensor.dark_level) / float(np.quantile(illuminated, _EXPOSURE_QUANTILE))
+            raise InputError(
+                "nothing in the scene is illuminated by the projector: move it to where both fields"
+                " meet"
+            )
+        return (sensor.peak_level - sensor.dark_level) / float(
+            np.quantile(illuminated, _EXPOSURE_QUANTILE)
+        )
 
     @cached_property
     def _taps(self) -> np.ndarray:
@@ -217,7 +254,9 @@ class Renderer:
         with np.errstate(invalid="ignore"):
             facing = np.nan_to_num((surface.normals * to_source).sum(-1) / distance).clip(min=0)
             depth = surface.points @ rig.R[2] + rig.t[2]
-            blur = np.hypot(light.blur_px, light.defocus_px_mm * np.abs(1 / depth - 1 / light.focus_mm))
+            blur = np.hypot(
+                light.blur_px, light.defocus_px_mm * np.abs(1 / depth - 1 / light.focus_mm)
+            )
             shade = np.nan_to_num(facing * (light.focus_mm / distance) ** 2)
         reached = facing > 0
         reached[reached] = ~self.scene.occluded(surface.points[reached], rig.projector_centre)
@@ -229,7 +268,9 @@ class Renderer:
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)
-        surface_share = 1 - self.scene.indirect.scattered if isinstance(self.scene, ConcaveScene) else 1.0
+        surface_share = (
+            1 - self.scene.indirect.scattered if isinstance(self.scene, ConcaveScene) else 1.0
+        )
         return _Maps(
             gain=(surface_share * reflected * shade * reached * illuminated).astype(np.float32),
             even=(reflected * hit).astype(np.float32),
@@ -239,5 +280,9 @@ class Renderer:
                 axis: np.nan_to_num(place, posinf=0.0, neginf=0.0).astype(np.float32)
                 for axis, place in zip(AXES, (u, v), strict=True)
             },
-            truth=Truth(surface.points[self._frame], projector[self._frame], (hit & reached & inside)[self._frame]),
+            truth=Truth(
+                surface.points[self._frame],
+                projector[self._frame],
+                (hit & reached & inside)[self._frame],
+            ),
         )

@@ -17,8 +17,9 @@ from slviewer.simulation.waves import random_waves
 class Sensor:
     """How light becomes grey levels; the fields are explained in ``assets/simulation/letter.toml``.
 
-    Noise of one pixel of one frame: variance = read_variance + shot_variance (level - dark_level), in grey levels
-    squared, then rounding to 8 bits adds 1/12. It is the same at every scale, so that figures can be compared.
+    Noise of one pixel of one frame: variance = read_variance + shot_variance (level - dark_level),
+    in grey levels squared, then rounding to 8 bits adds 1/12. It is the same at every scale, so
+    that figures can be compared.
     """
 
     psf_px: float
@@ -30,7 +31,8 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Illumination:
-    """The projector's light and the room's, relative to full white on a board that faces the projector at its focus."""
+    """The projector's light and the room's, relative to full white on a board that faces the
+    projector at its focus."""
 
     ambient: float
     black: float
@@ -43,7 +45,8 @@ class Illumination:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRig:
-    """Both lenses, their arrangement X_p = R X_c + t (mm), the sensor and the light; `seed` also keys the noise."""
+    """Both lenses, their arrangement X_p = R X_c + t (mm), the sensor and the light; `seed` also
+    keys the noise."""
 
     camera: SimulatedLens
     projector: SimulatedLens
@@ -59,7 +62,8 @@ class SimulatedRig:
         return -self.R.T @ self.t
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Projector pixels (..., 2) of camera-frame `points` (..., 3) mm; NaN behind the projector."""
+        """Projector pixels (..., 2) of camera-frame `points` (..., 3) mm; NaN behind the
+        projector."""
         return self.projector.project(np.asarray(points, float) @ self.R.T + self.t)
 
 
@@ -74,15 +78,18 @@ def letter(
 ) -> SimulatedRig:
     """A rig like the Letter's: camera 1600x1200 times `scale`, projector 912x1140, baseline 180 mm.
 
-    `seed` draws principal points, focal lengths, distortions, the local distortion's waves and the noise.
-    `local_distortion_px` is the rms of each coordinate's displacement in px of each device at full resolution (None:
-    the preset's 0.15; 0 switches it off exactly); `texture` its wavelengths: 0.3 ... 0.8 of the width, or 0.15 ... 0.4.
-    `gamma` and `flicker` replace the preset's (1: a linearised projector; 0: a steady lamp).
+    `seed` draws principal points, focal lengths, distortions, the local distortion's waves and the
+    noise. `local_distortion_px` is the rms of each coordinate's displacement in px of each device
+    at full resolution (None: the preset's 0.15; 0 switches it off exactly); `texture` its
+    wavelengths: 0.3 ... 0.8 of the width, or 0.15 ... 0.4. `gamma` and `flicker` replace the
+    preset's (1: a linearised projector; 0: a steady lamp).
     """
     if not 0.05 <= scale <= 4:
         raise InputError(f"the scale {scale:g} is not between 0.05 and 4: 1 is the full 1600x1200")
     if local_distortion_px is not None and not 0 <= local_distortion_px <= 5:
-        raise InputError(f"a local distortion of {local_distortion_px:g} px is not between 0 and 5 px")
+        raise InputError(
+            f"a local distortion of {local_distortion_px:g} px is not between 0 and 5 px"
+        )
     if texture not in ("coarse", "fine"):
         raise InputError(f"the local distortion's texture is coarse or fine, not {texture!r}")
     preset = tomllib.loads(asset("simulation/letter.toml").read_text(encoding="utf-8"))
@@ -94,7 +101,9 @@ def letter(
         for name, stream in zip(("camera", "projector"), streams[:2], strict=True)
     )
     R, t = _compute_arrangement(np.random.default_rng(streams[2]), preset["arrangement"])
-    given = {name: value for name, value in (("gamma", gamma), ("flicker", flicker)) if value is not None}
+    given = {
+        name: value for name, value in (("gamma", gamma), ("flicker", flicker)) if value is not None
+    }
     light = Illumination(**preset["light"] | given)
     camera = dataclasses.replace(camera, scale=scale)
     return SimulatedRig(camera, projector, R, t, Sensor(**preset["sensor"]), light, seed)
@@ -107,13 +116,18 @@ def _sample_lens(
     wavelengths: tuple[float, float],
     rms: float,
 ) -> SimulatedLens:
-    """Sample a random lens of a device as its preset describes: with Brown distortion and local waves."""
+    """Sample a random lens of a device as its preset describes: with Brown distortion and local
+    waves."""
     width, height = device["size"]
     focal = np.array(device["focal_px"]) * (1 + device["focal_spread"] * rng.uniform(-1, 1))
     middle = np.array([(width - 1) / 2, (height - 1) / 2]) + device["centre_offset_px"]
     centre = middle + device["centre_spread_px"] * rng.uniform(-1, 1, 2)
-    brown = np.array(device["distortion"]) + np.array(device["distortion_spread"]) * rng.uniform(-1, 1, 5)
-    waves = random_waves(rng, (width, height), focal[1] / focal[0], local["waves"], wavelengths, rms)
+    brown = np.array(device["distortion"]) + np.array(device["distortion_spread"]) * rng.uniform(
+        -1, 1, 5
+    )
+    waves = random_waves(
+        rng, (width, height), focal[1] / focal[0], local["waves"], wavelengths, rms
+    )
     k1, k2, p1, p2, k3 = brown.tolist()
     return SimulatedLens(
         (width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])),
@@ -121,8 +135,11 @@ def _sample_lens(
     )  # fmt: skip
 
 
-def _compute_arrangement(rng: np.random.Generator, arrangement: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """R and t: the projector at the baseline's length, its axis through the camera's axis at the crossing depth."""
+def _compute_arrangement(
+    rng: np.random.Generator, arrangement: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """R and t: the projector at the baseline's length, its axis through the camera's axis at the
+    crossing depth."""
     direction = np.array(arrangement["direction"])
     centre = arrangement["baseline_mm"] * direction / np.linalg.norm(direction)
     roll, pan, nod = np.radians(arrangement["spread_deg"]) * rng.uniform(-1, 1, 3)

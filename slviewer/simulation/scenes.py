@@ -1,7 +1,8 @@
 """Scenes in front of the simulated rig, and the surfaces that its camera rays meet.
 
-Every scene answers two questions: `trace` (where do the rays meet the surface, with which normal and albedo) and
-`occluded` (does the scene itself stand between a surface point and the projector). All lengths in mm, camera frame.
+Every scene answers two questions: `trace` (where do the rays meet the surface, with which normal
+and albedo) and `occluded` (does the scene itself stand between a surface point and the projector).
+All lengths in mm, camera frame.
 """
 
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ from slviewer.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What the rays of (h, w) pixels meet: points and unit normals (h, w, 3) float64, NaN where nothing is met;
-    normals look towards the camera; albedo (h, w) float32, averaged over the pixel's area, 0 where nothing is met.
+    """What the rays of (h, w) pixels meet: points and unit normals (h, w, 3) float64, NaN where
+    nothing is met; normals look towards the camera; albedo (h, w) float32, averaged over the
+    pixel's area, 0 where nothing is met.
     """
 
     points: np.ndarray
@@ -56,7 +58,10 @@ class Spheres:
 
     def __post_init__(self) -> None:
         if self.centres.ndim != 2 or self.centres.shape[1] != 3 or self.radius_mm <= 0:
-            raise InputError(f"spheres need centres (n, 3) and a radius above 0, got the shape {self.centres.shape}")
+            raise InputError(
+                "spheres need centres (n, 3) and a radius above 0, got the shape"
+                f" {self.centres.shape}"
+            )
 
     def trace(self, rays: np.ndarray) -> Surface:
         """The nearer intersection with the nearest sphere."""
@@ -73,7 +78,9 @@ class Spheres:
             depth[nearer] = z[nearer]
             normals[nearer] = (directions[nearer] * z[nearer, None] - centre) / self.radius_mm
         points = directions * np.where(np.isfinite(depth), depth, np.nan)[..., None]
-        return Surface(points, normals, np.where(np.isfinite(depth), self.albedo, 0).astype(np.float32))
+        return Surface(
+            points, normals, np.where(np.isfinite(depth), self.albedo, 0).astype(np.float32)
+        )
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return whether another part of the spheres is between the points and `source`."""
@@ -83,7 +90,8 @@ class Spheres:
             to_centre = centre - points
             share = (to_centre * way).sum(-1) / (way**2).sum(-1)
             gap = np.linalg.norm(to_centre - share[:, None] * way, axis=-1)
-            # A point of this very sphere lies at its radius: blocked only if the way enters, which `share > 0` says.
+            # A point of this very sphere lies at its radius: blocked only if the way enters, which
+            # `share > 0` says.
             blocked |= (share > 0) & (gap < self.radius_mm * (1 - 1e-9))
         return blocked
 

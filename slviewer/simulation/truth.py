@@ -16,7 +16,8 @@ from slviewer.simulation.scenes import Scene, Spheres, directions_of
 
 
 def rig_record(rig: SimulatedRig) -> dict[str, Any]:
-    """JSON-able: both lenses (waves included), R and t with X_p = R X_c + t in mm, sensor, light and seed."""
+    """JSON-able: both lenses (waves included), R and t with X_p = R X_c + t in mm, sensor, light
+    and seed."""
     return {
         "camera": _lens_record(rig.camera),
         "projector": _lens_record(rig.projector),
@@ -29,7 +30,8 @@ def rig_record(rig: SimulatedRig) -> dict[str, Any]:
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:
-    """JSON-able: the shape and its pose; mm, camera frame; poses as T_camera_board or T_camera_object (4, 4)."""
+    """JSON-able: the shape and its pose; mm, camera frame; poses as T_camera_board or
+    T_camera_object (4, 4)."""
     if isinstance(scene, BoardScene):
         return {
             "shape": "plane",
@@ -43,15 +45,22 @@ def scene_record(scene: Scene) -> dict[str, Any]:
         return {"shape": "sphere", "centres": scene.centres.tolist(), "radius_mm": scene.radius_mm}
     if isinstance(scene, MeshScene):
         return {"shape": "mesh", "T_camera_object": scene.pose.matrix.tolist()}
-    raise InputError(f"a scene of type {type(scene).__name__} has no record: use a board, spheres or a mesh")
+    raise InputError(
+        f"a scene of type {type(scene).__name__} has no record: use a board, spheres or a mesh"
+    )
 
 
 def _lens_record(lens: SimulatedLens) -> dict[str, Any]:
-    """The lens at its own scale as K and D in OpenCV's order; the waves stay in px of the full resolution."""
+    """The lens at its own scale as K and D in OpenCV's order; the waves stay in px of the full
+    resolution."""
     (fx, fy), (cx, cy), s = lens.focal_px, lens.centre_px, lens.scale
     return {
         "size": list(lens.size),
-        "K": [[fx * s, 0.0, (cx + 0.5) * s - 0.5], [0.0, fy * s, (cy + 0.5) * s - 0.5], [0.0, 0.0, 1.0]],
+        "K": [
+            [fx * s, 0.0, (cx + 0.5) * s - 0.5],
+            [0.0, fy * s, (cy + 0.5) * s - 0.5],
+            [0.0, 0.0, 1.0],
+        ],
         "D": list(lens.brown),
         "scale": s,
         "waves": lens.waves.tolist(),
@@ -77,7 +86,8 @@ class PerfectModel:
         return ("x", "y")
 
     def points(self, phase: PhaseMap) -> np.ndarray:
-        """(h, w, 3) float32 mm: where the rig's own lenses put each phase; NaN where it is invalid."""
+        """(h, w, 3) float32 mm: where the rig's own lenses put each phase; NaN where it is
+        invalid."""
         row = self.axes.index(phase.axis)
         valid = phase.mask
         rays = directions_of(self.rig.camera.rays())[valid]
@@ -91,7 +101,9 @@ class PerfectModel:
             if not going.any():
                 break
             step = np.where(
-                going & (off != before), off * (inverse - nearer) / np.where(off == before, 1, off - before), 0
+                going & (off != before),
+                off * (inverse - nearer) / np.where(off == before, 1, off - before),
+                0,
             )
             nearer, before, inverse = inverse, off, inverse - step
         out = np.full((*phase.phase.shape, 3), np.nan, np.float32)
@@ -109,6 +121,7 @@ class PerfectModel:
         return (per_px * phase.period_px / (2 * np.pi) * phase.sigma_phase).astype(np.float32)
 
     def _project_depths(self, rays: np.ndarray, inverse: np.ndarray, row: int) -> np.ndarray:
-        """Projector coordinate (n,) px, of one row, of points on the rays (n, 3) at inverse depths (n,) 1/mm."""
+        """Projector coordinate (n,) px, of one row, of points on the rays (n, 3) at inverse depths
+        (n,) 1/mm."""
         with np.errstate(divide="ignore"):
             return np.asarray(self.rig.project(rays / inverse[:, None])[:, row])

@@ -14,7 +14,9 @@ STEP_DEG = 360.0 / STEPS
 AXIS_POINT = np.array([3.0, 6.0, 600.0])
 """On the table's axis, mm in the camera's frame."""
 LOOKING_DOWN_DEG = 30.0
-AXIS = np.array([0.02, -np.cos(np.radians(LOOKING_DOWN_DEG)), -np.sin(np.radians(LOOKING_DOWN_DEG))])
+AXIS = np.array(
+    [0.02, -np.cos(np.radians(LOOKING_DOWN_DEG)), -np.sin(np.radians(LOOKING_DOWN_DEG))]
+)
 AXIS /= np.linalg.norm(AXIS)
 """Up from the table, in the camera's frame; the table turns the right-handed way about it."""
 _AXIS_OFFSET_MM = np.array([6.0, -4.0, 0.0])  # the object does not stand in the table's middle
@@ -26,14 +28,16 @@ _SUBDIVISIONS = 7  # edges of about half a millimetre
 
 
 def turning(steps: int = STEPS) -> dict[str, MeshScene]:
-    """The worn stone in equal steps of the table, turn_01, turn_02 ...: the camera sees all of it but its flat foot."""
+    """The worn stone in equal steps of the table, turn_01, turn_02 ...: the camera sees all of it
+    but its flat foot."""
     vertices, triangles = stone()
     side = np.cross(AXIS, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     upright = np.stack([side, np.cross(AXIS, side), AXIS], axis=1)
     first = Pose(upright, AXIS_POINT + upright @ _AXIS_OFFSET_MM)
     return {
-        f"turn_{k + 1:02d}": MeshScene(vertices, triangles, turn_pose(first, 360.0 * k / steps)) for k in range(steps)
+        f"turn_{k + 1:02d}": MeshScene(vertices, triangles, turn_pose(first, 360.0 * k / steps))
+        for k in range(steps)
     }
 
 
@@ -44,20 +48,24 @@ def turn_pose(pose: Pose, deg: float) -> Pose:
 
 
 def stone_on_table() -> MeshScene:
-    """The stone as it is first on the turntable, and a square table below its foot that the camera sees around it."""
+    """The stone as it is first on the turntable, and a square table below its foot that the camera
+    sees around it."""
     scene = turning(1)["turn_01"]
     a, n = _TABLE_MM, len(scene.vertices)
     corners = np.array([(x, y, -_FOOT_MM) for x, y in ((-a, -a), (a, -a), (a, a), (-a, a))])
     table = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
     return MeshScene(
-        np.concatenate([scene.vertices, corners]), np.concatenate([scene.triangles, n + table]), scene.pose
+        np.concatenate([scene.vertices, corners]),
+        np.concatenate([scene.triangles, n + table]),
+        scene.pose,
     )
 
 
 @lru_cache(1)
 def stone() -> tuple[np.ndarray, np.ndarray]:
-    """A worn stone on a flat foot, watertight: vertices (n, 3) float64 mm with z up, triangles (m, 3) int32 that are
-    counter-clockwise seen from outside. About 120 mm wide, 90 mm high, without symmetry."""
+    """A worn stone on a flat foot, watertight: vertices (n, 3) float64 mm with z up, triangles (m,
+    3) int32 that are counter-clockwise seen from outside. About 120 mm wide, 90 mm high, without
+    symmetry."""
     ball = trimesh.creation.icosphere(_SUBDIVISIONS)
     directions, triangles = np.array(ball.vertices), np.array(ball.faces, np.int32)
     rng = np.random.default_rng(12)
@@ -68,7 +76,12 @@ def stone() -> tuple[np.ndarray, np.ndarray]:
     middles = rng.normal(size=(90, 3))
     middles /= np.linalg.norm(middles, axis=1, keepdims=True)
     widths = np.radians(rng.uniform(5.0, 12.0, len(middles)))
-    heights = rng.uniform(0.15, 0.35, len(middles)) * widths * _RADIUS_MM * rng.choice([-1.0, 1.0], len(middles))
+    heights = (
+        rng.uniform(0.15, 0.35, len(middles))
+        * widths
+        * _RADIUS_MM
+        * rng.choice([-1.0, 1.0], len(middles))
+    )
     for middle, width, height in zip(middles, widths, heights, strict=True):
         radius += height * np.exp((directions @ middle - 1.0) / width**2)
     down = np.maximum(-directions[:, 2], 1e-9)

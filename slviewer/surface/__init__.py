@@ -1,1 +1,2 @@
-"""What becomes of registered scans: points fused by their sigma, cleaned, meshed, thinned, smoothed."""
+"""What becomes of registered scans: points fused by their sigma, cleaned, meshed, thinned,
+smoothed."""

@@ -1,4 +1,5 @@
-"""Agreement of overlapping scans: their distances, the gate within which they are one surface, and brightness gains."""
+"""Agreement of overlapping scans: their distances, the gate within which they are one surface, and
+brightness gains."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,9 +23,10 @@ _GATE_SIGMAS = 6.0
 class SurfaceAgreement:
     """Comparison of two scans where they overlap.
 
-    ``places``: number of compared points; ``rms_mm`` and ``bias_mm`` (median): height of the second scan's surface
-    above the first's along the normal; ``gate_mm``: height within which both are one surface; ``log_gain``: median
-    logarithm of the second's brightness over the first's, None without colours.
+    ``places``: number of compared points; ``rms_mm`` and ``bias_mm`` (median): height of the second
+    scan's surface above the first's along the normal; ``gate_mm``: height within which both are one
+    surface; ``log_gain``: median logarithm of the second's brightness over the first's, None
+    without colours.
     """
 
     places: int
@@ -39,8 +41,11 @@ Agreements = Mapping[tuple[str, str], SurfaceAgreement]
 """Of overlapping scans, by their names."""
 
 
-def compare_views(views: Views, progress: Callable[[float], None]) -> dict[tuple[str, str], SurfaceAgreement]:
-    """Compare every ordered pair of scans; pairs that overlap in too few points are missing from the result."""
+def compare_views(
+    views: Views, progress: Callable[[float], None]
+) -> dict[tuple[str, str], SurfaceAgreement]:
+    """Compare every ordered pair of scans; pairs that overlap in too few points are missing from
+    the result."""
     agreements: dict[tuple[str, str], SurfaceAgreement] = {}
     pairs = list(permutations(views, 2))
     for i, (a, b) in enumerate(pairs):
@@ -52,12 +57,17 @@ def compare_views(views: Views, progress: Callable[[float], None]) -> dict[tuple
 
 
 def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
-    """Compare a subset of the first scan's points with the second scan's surface; None for too small an overlap."""
+    """Compare a subset of the first scan's points with the second scan's surface; None for too
+    small an overlap."""
     mask = first.mask
     subset = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
-    points, normals = first.move_into(second, choose_pixels(first.points, mask)[subset], first.normals[mask][subset])
+    points, normals = first.move_into(
+        second, choose_pixels(first.points, mask)[subset], first.normals[mask][subset]
+    )
     spacing = max(first.spacing, second.spacing)
-    noise = float(np.median(first.noise[mask][subset])) + float(np.median(second.noise[second.mask]))
+    noise = float(np.median(first.noise[mask][subset])) + float(
+        np.median(second.noise[second.mask])
+    )
     window = max(_WINDOW_SPACINGS * spacing, _WINDOW_SIGMAS * noise)
     heights = np.empty((len(points), 2))
     measure_heights(points, normals, spacing, window, second.grid, heights)
@@ -69,7 +79,9 @@ def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
     if first.colours is not None and second.colours is not None:
         there = second.colours.reshape(-1, 3)[heights[overlaps, 1].astype(int)]
         log_gain = _estimate_log_gain(first.colours[mask][subset][overlaps], there)
-    gate = min(max(_GATE_SIGMAS * robust_sigma(height, about=0.0), 3.0 * noise, 0.25 * spacing), window)
+    gate = min(
+        max(_GATE_SIGMAS * robust_sigma(height, about=0.0), 3.0 * noise, 0.25 * spacing), window
+    )
     return SurfaceAgreement(
         places=int(overlaps.sum()),
         rms_mm=float(np.sqrt(np.mean(height[np.abs(height) <= gate] ** 2))),
@@ -80,7 +92,8 @@ def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
 
 
 def _estimate_log_gain(first: np.ndarray, second: np.ndarray) -> float | None:
-    """Return the median logarithm of the second colours' brightness over the first's, (n, 3) uint8 each.
+    """Return the median logarithm of the second colours' brightness over the first's, (n, 3) uint8
+    each.
 
     None where too few are neither dark nor saturated.
     """
@@ -92,7 +105,8 @@ def _estimate_log_gain(first: np.ndarray, second: np.ndarray) -> float | None:
 
 
 def colour_gains(views: Views, pairs: Agreements) -> dict[str, float] | None:
-    """Estimate the factor of each scan's colours that makes overlapping scans agree, least squares of the logarithms.
+    """Estimate the factor of each scan's colours that makes overlapping scans agree, least squares
+    of the logarithms.
 
     The mean logarithm is 0. None where a scan has no colours.
     """

@@ -1,4 +1,5 @@
-"""Mesh editing: removal of small parts, hole filling, smoothing and decimation; each returns figures of its change."""
+"""Mesh editing: removal of small parts, hole filling, smoothing and decimation; each returns
+figures of its change."""
 
 from dataclasses import dataclass
 
@@ -23,7 +24,8 @@ class DroppedParts:
 
 @dataclass(frozen=True)
 class FilledHoles:
-    """Number of filled holes, extent of the largest one in mm, and number of openings that remain (``left``)."""
+    """Number of filled holes, extent of the largest one in mm, and number of openings that remain
+    (``left``)."""
 
     holes: int
     largest_mm: float
@@ -32,7 +34,8 @@ class FilledHoles:
 
 @dataclass(frozen=True)
 class SurfaceShift:
-    """Distances from the vertices before a change to the surface after it, and the numbers of triangles."""
+    """Distances from the vertices before a change to the surface after it, and the numbers of
+    triangles."""
 
     rms_mm: float
     max_mm: float
@@ -41,7 +44,8 @@ class SurfaceShift:
 
 
 def drop_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, DroppedParts]:
-    """Remove the connected parts of at most ``most_mm2`` that have less than 1 % of the largest part's area."""
+    """Remove the connected parts of at most ``most_mm2`` that have less than 1 % of the largest
+    part's area."""
     if not len(mesh.faces):
         return mesh, DroppedParts(0, 0.0)
     groups = face_groups(mesh.faces, len(mesh.vertices))
@@ -52,7 +56,8 @@ def drop_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, DroppedParts]:
 
 
 def fill_holes(mesh: Mesh, size_mm: float) -> tuple[Mesh, FilledHoles]:
-    """Fill the holes with an extent of at most ``size_mm``, each by a triangle fan around its centroid."""
+    """Fill the holes with an extent of at most ``size_mm``, each by a triangle fan around its
+    centroid."""
     if not size_mm >= 0:
         raise InputError(f"Holes of up to {size_mm} mm cannot be filled: give 0 or more.")
     vertices, faces, sizes, left = [mesh.vertices], [mesh.faces], [], 0
@@ -81,7 +86,9 @@ def smooth(mesh: Mesh, rounds: int) -> tuple[Mesh, SurfaceShift]:
         raise InputError(f"{rounds} rounds of smoothing were asked for: give 1 or more.")
     calm = to_open3d_mesh(mesh).filter_smooth_taubin(number_of_iterations=rounds)
     smoothed = transfer_attributes(mesh, np.asarray(calm.vertices), mesh.faces)
-    return smoothed, SurfaceShift(*surface_shift(mesh, smoothed), len(mesh.faces), len(smoothed.faces))
+    return smoothed, SurfaceShift(
+        *surface_shift(mesh, smoothed), len(mesh.faces), len(smoothed.faces)
+    )
 
 
 def decimate(mesh: Mesh, triangles: int) -> tuple[Mesh, SurfaceShift]:
@@ -90,11 +97,17 @@ def decimate(mesh: Mesh, triangles: int) -> tuple[Mesh, SurfaceShift]:
         raise InputError(f"{triangles} triangles make no mesh: ask for at least 4.")
     if len(mesh.faces) <= triangles:
         return mesh, SurfaceShift(0.0, 0.0, len(mesh.faces), len(mesh.faces))
-    # Open3D places vertices well only in meshes of a large absolute size: the error of small parts was doubled
-    middle, size = mesh.vertices.mean(axis=0, dtype=np.float64), float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
+    # Open3D places vertices well only in meshes of a large absolute size: the error of small parts
+    # was doubled
+    middle, size = (
+        mesh.vertices.mean(axis=0, dtype=np.float64),
+        float(np.ptp(mesh.vertices, axis=0).max()) or 1.0,
+    )
     enlarged = to_open3d_mesh(mesh).translate(-middle).scale(_THINNED_AT / size, np.zeros(3))
     fewer = enlarged.simplify_quadric_decimation(triangles)
     thinned = transfer_attributes(
-        mesh, np.asarray(fewer.vertices) * (size / _THINNED_AT) + middle, np.asarray(fewer.triangles)
+        mesh,
+        np.asarray(fewer.vertices) * (size / _THINNED_AT) + middle,
+        np.asarray(fewer.triangles),
     )
     return thinned, SurfaceShift(*surface_shift(mesh, thinned), len(mesh.faces), len(thinned.faces))

@@ -1,9 +1,10 @@
 """Fusion of registered scans to one set of points, with overlapping surfaces averaged.
 
-Every point of a scan is moved along its normal to the weighted mean of all scans' surfaces; of overlapping scans, only
-the points of the one with the highest quality are kept. Weights are 1 / sigma2 and decrease to 0 at each scan's border,
-so that no step shows where a scan ends. Another scan's surface is interpolated between pixels, with a lower weight
-where it is curved, so that nothing is smoothed beyond one scan's resolution.
+Every point of a scan is moved along its normal to the weighted mean of all scans' surfaces; of
+overlapping scans, only the points of the one with the highest quality are kept. Weights are 1 /
+sigma2 and decrease to 0 at each scan's border, so that no step shows where a scan ends. Another
+scan's surface is interpolated between pixels, with a lower weight where it is curved, so that
+nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +17,13 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.surface.agreement import Agreements, SurfaceAgreement, Views, colour_gains, compare_views
+from slviewer.surface.agreement import (
+    Agreements,
+    SurfaceAgreement,
+    Views,
+    colour_gains,
+    compare_views,
+)
 from slviewer.surface.clean import viewing_cosines
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes
 from slviewer.surface.shapes import PointSet
@@ -32,10 +39,10 @@ MIN_WITNESS_WEIGHT = 0.3
 class Fused:
     """The fused surface of several scans, in the frame of their poses.
 
-    ``surface``: points with normals towards the cameras, sigmas along the normals, and colours if every scan has them.
-    ``source`` (n,) uint8: index in ``names`` of the scan that a point is from; ``seen_by`` (n,) uint8: number of scans
-    averaged in it. ``excluded``: numbers of excluded pixels of each scan by reason; ``pairs``: agreement of overlapping
-    scans, by their names.
+    ``surface``: points with normals towards the cameras, sigmas along the normals, and colours if
+    every scan has them. ``source`` (n,) uint8: index in ``names`` of the scan that a point is from;
+    ``seen_by`` (n,) uint8: number of scans averaged in it. ``excluded``: numbers of excluded pixels
+    of each scan by reason; ``pairs``: agreement of overlapping scans, by their names.
     """
 
     surface: PointSet
@@ -52,8 +59,8 @@ class Fused:
 
 
 PoseCovariance = tuple[np.ndarray, np.ndarray]
-"""Covariance (6, 6) of a scan's pose in the reference's frame: of a small rotation (rad) about a centre (3,) mm, and of
-a translation (mm); and that centre."""
+"""Covariance (6, 6) of a scan's pose in the reference's frame: of a small rotation (rad) about a
+centre (3,) mm, and of a translation (mm); and that centre."""
 
 
 def fuse(
@@ -62,14 +69,15 @@ def fuse(
     progress: Progress | None = None,
     poses: Mapping[str, PoseCovariance] | None = None,
 ) -> Fused:
-    """Fuse organised clouds, each in its camera's frame, with the pose (4, 4) of each by the same name.
+    """Fuse organised clouds, each in its camera's frame, with the pose (4, 4) of each by the same
+    name.
 
-    ``poses``: how uncertain these poses are; it becomes part of the points' sigmas, as if a point were from its best
-    scan alone.
+    ``poses``: how uncertain these poses are; it becomes part of the points' sigmas, as if a point
+    were from its best scan alone.
 
-    ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel. A single scan is only
-    cleaned.
-    Raises InputError for a scan without a pose, without a surface, or whose points are not those of one camera.
+    ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel. A single
+    scan is only cleaned. Raises InputError for a scan without a pose, without a surface, or whose
+    points are not those of one camera.
     """
     if not 1 <= len(scans) <= 255:
         raise InputError(f"{len(scans)} scans were given: fusing takes 1 to 255.")
@@ -84,7 +92,9 @@ def fuse(
     names = tuple(views)
     pairs = compare_views(views, lambda share: report(0.3 + 0.1 * share))
     excluded = {name: asdict(view.cleaned) for name, view in views.items()}
-    for name, violations in _detect_violations(views, pairs, lambda share: report(0.4 + 0.1 * share)).items():
+    for name, violations in _detect_violations(
+        views, pairs, lambda share: report(0.4 + 0.1 * share)
+    ).items():
         excluded[name]["unconfirmed"] = int(violations.sum())
         views[name] = views[name].without(violations)
     gains = colour_gains(views, pairs)
@@ -106,8 +116,11 @@ def fuse(
     )
 
 
-def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> dict[str, np.ndarray]:
-    """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that confirm them."""
+def _detect_violations(
+    views: Views, pairs: Agreements, progress: Progress
+) -> dict[str, np.ndarray]:
+    """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that
+    confirm them."""
     witnesses = {name: _select_witnesses(view) for name, view in views.items()}
     violations = {}
     for i, (name, view) in enumerate(views.items()):
@@ -118,8 +131,11 @@ def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> d
         for other, there in views.items():
             if other != name:
                 T = np.linalg.inv(there.T) @ view.T
-                # along the viewing direction two surfaces may be farther apart than along their normal
-                gate = 2.0 * max(_gate_mm(pairs, name, other, view, there), view.spacing, there.spacing)
+                # along the viewing direction two surfaces may be farther apart than along their
+                # normal
+                gate = 2.0 * max(
+                    _gate_mm(pairs, name, other, view, there), view.spacing, there.spacing
+                )
                 add_votes(
                     move_points(T, points), gate, there.points, witnesses[other], there.to_pixel, confirming,
                     contradicting,
@@ -130,14 +146,16 @@ def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> d
 
 
 def _select_witnesses(view: View) -> np.ndarray:
-    """Select the pixels (h, w) bool whose free space is certain: inside the surface, and not at grazing angles."""
+    """Select the pixels (h, w) bool whose free space is certain: inside the surface, and not at
+    grazing angles."""
     inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     facing = viewing_cosines(view.points, view.normals) > 0.25
     return np.asarray(inside & (view.inner > MIN_WITNESS_WEIGHT) & facing)
 
 
 def _gate_mm(pairs: Agreements, a: str, b: str, first: View, second: View) -> float:
-    """Return the gate of two scans by their agreement, or the larger of their point spacings without one."""
+    """Return the gate of two scans by their agreement, or the larger of their point spacings
+    without one."""
     pair = pairs.get((a, b)) or pairs.get((b, a))
     return pair.gate_mm if pair else max(first.spacing, second.spacing)
 
@@ -150,8 +168,8 @@ def _fuse_scan(
 ) -> tuple[PointSet, np.ndarray]:
     """Average a scan's points with the other scans' surfaces.
 
-    Returns the points at which the scan has the highest quality, in the reference's frame, and the number of scans (n,)
-    uint8 averaged in each.
+    Returns the points at which the scan has the highest quality, in the reference's frame, and the
+    number of scans (n,) uint8 averaged in each.
     """
     view, order = views[name], list(views)
     mask = view.mask
@@ -190,11 +208,17 @@ def _fuse_scan(
         scans += (overlap[:, 7] > 0).astype(np.uint8)
         sums += overlap
     best = ~inferior
-    return _average(view, points[best], normals[best], sums[best], own_colours is not None), scans[best]
+    return (
+        _average(view, points[best], normals[best], sums[best], own_colours is not None),
+        scans[best],
+    )
 
 
-def _average(view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarray, coloured: bool) -> PointSet:
-    """Return the averages of a scan's points (n, 3) in the reference's frame from their ``sums`` (n, FIELDS)."""
+def _average(
+    view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarray, coloured: bool
+) -> PointSet:
+    """Return the averages of a scan's points (n, 3) in the reference's frame from their ``sums``
+    (n, FIELDS)."""
     total = sums[:, 0]
     height = sums[:, 1] / total
     moved = move_points(view.T, points + height[:, None] * normals)
@@ -202,12 +226,15 @@ def _average(view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarr
     sigma = np.hypot(np.sqrt(sums[:, 2]) / total, sums[:, 3] / total)
     colours = None
     if coloured:
-        colours = np.clip(sums[:, 9:] / np.maximum(sums[:, 8:9], 1e-12) + 0.5, 0, 255).astype(np.uint8)
+        colours = np.clip(sums[:, 9:] / np.maximum(sums[:, 8:9], 1e-12) + 0.5, 0, 255).astype(
+            np.uint8
+        )
     return PointSet(moved, mean_normals, colours, sigma)
 
 
 def _add_pose_error(points: PointSet, covariance: np.ndarray, centre: np.ndarray) -> PointSet:
-    """Return the points with the error that their scan's pose has along the normals added to their sigmas."""
+    """Return the points with the error that their scan's pose has along the normals added to their
+    sigmas."""
     assert points.normals is not None and points.sigma_mm is not None
     lever = np.hstack([np.cross(points.points - centre, points.normals), points.normals])
     pose = np.einsum("ij,jk,ik->i", lever, covariance, lever)
@@ -219,5 +246,7 @@ def _concatenate(parts: list[PointSet]) -> PointSet:
     joined: dict[str, Any] = {}
     for field in fields(PointSet):
         values = [getattr(part, field.name) for part in parts]
-        joined[field.name] = None if any(value is None for value in values) else np.concatenate(values)
+        joined[field.name] = (
+            None if any(value is None for value in values) else np.concatenate(values)
+        )
     return PointSet(**joined)

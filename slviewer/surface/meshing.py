@@ -1,4 +1,5 @@
-"""From scans or merged points to a mesh that a program or a printer takes: the whole chain, and what it did."""
+"""From scans or merged points to a mesh that a program or a printer takes: the whole chain, and
+what it did."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -35,19 +36,22 @@ Progress = Callable[[float, str], None]
 SMALL_HOLE = 5.0
 """Spacings of the points: holes of that size are filled where no size is given."""
 SMALL_PART = 1000.0
-"""Points, about: larger parts stay, for before a wall an object is a small share of what was scanned."""
+"""Points, about: larger parts stay, for before a wall an object is a small share of what was
+scanned."""
 MOST_IMAGINED = 1 / 3
-"""Share of a watertight surface that may be filled in where nothing was measured: the foot of what stood on a table."""
+"""Share of a watertight surface that may be filled in where nothing was measured: the foot of what
+stood on a table."""
 
 
 @dataclass(frozen=True)
 class MeshingPlan:
     """How to mesh. Nothing needs to be given.
 
-    ``method``: triangles between the pixels of one scan (grid), one closed surface fitted to all points (poisson), or
-    the mean surface in small cells (volume); by default grid for a scan, poisson for merged points. ``fill_holes_mm``:
-    holes up to that far across are filled; by default a few spacings of the points, and with poisson any if it is to be
-    watertight. ``triangles``: at most so many. ``smooth``: rounds of smoothing. ``watertight``: closed, or refused.
+    ``method``: triangles between the pixels of one scan (grid), one closed surface fitted to all
+    points (poisson), or the mean surface in small cells (volume); by default grid for a scan,
+    poisson for merged points. ``fill_holes_mm``: holes up to that far across are filled; by default
+    a few spacings of the points, and with poisson any if it is to be watertight. ``triangles``: at
+    most so many. ``smooth``: rounds of smoothing. ``watertight``: closed, or refused.
     """
 
     method: Method | None = None
@@ -58,7 +62,9 @@ class MeshingPlan:
 
     def __post_init__(self) -> None:
         if self.fill_holes_mm is not None and not self.fill_holes_mm >= 0:
-            raise InputError(f"Holes of up to {self.fill_holes_mm} mm cannot be filled: give 0 or more.")
+            raise InputError(
+                f"Holes of up to {self.fill_holes_mm} mm cannot be filled: give 0 or more."
+            )
         if self.triangles is not None and self.triangles < 4:
             raise InputError(f"{self.triangles} triangles make no mesh: ask for at least 4.")
         if self.smooth < 0:
@@ -74,7 +80,8 @@ class MeshingPlan:
 
 @dataclass(frozen=True, eq=False)
 class BuiltMesh:
-    """A mesh and how it was made; steps that were not done are None. ``cell_mm``: the spacing of the points."""
+    """A mesh and how it was made; steps that were not done are None. ``cell_mm``: the spacing of
+    the points."""
 
     mesh: Mesh
     method: Method
@@ -105,23 +112,33 @@ class BuiltMesh:
 
     def text(self) -> str:
         """Describe the mesh for the terminal."""
-        lines = [f"{len(self.mesh.faces)} triangles by {self.method}, points {self.cell_mm:.2f} mm apart"]
+        lines = [
+            f"{len(self.mesh.faces)} triangles by {self.method}, points {self.cell_mm:.2f} mm apart"
+        ]
         if self.dropped.parts:
-            lines.append(f"{self.dropped.parts} floating parts removed, up to {self.dropped.largest_mm2:.1f} mm2")
+            lines.append(
+                f"{self.dropped.parts} floating parts removed, up to"
+                f" {self.dropped.largest_mm2:.1f} mm2"
+            )
         for done, holes in ((self.trimmed, "filled"), (self.filled, "holes")):
             if done is not None and (n := getattr(done, holes)):
-                lines.append(f"{n} hole{'s' * (n > 1)} filled, up to {done.largest_mm:.1f} mm across")
+                lines.append(
+                    f"{n} hole{'s' * (n > 1)} filled, up to {done.largest_mm:.1f} mm across"
+                )
         if self.trimmed is not None:
             if self.trimmed.flattened:
-                lines.append(f"{self.trimmed.flattened} of them filled flat, because the surface bulged there")
+                lines.append(
+                    f"{self.trimmed.flattened} of them filled flat, because the surface bulged"
+                    " there"
+                )
             if self.trimmed.imagined:
                 share = f"{100 * self.trimmed.imagined:.1f} %"
                 lines.append(f"{share} of the surface was not measured: it closes those holes")
         for what, change in (("smoothing", self.smoothed), ("thinning", self.thinned)):
             if change is not None:
                 lines.append(
-                    f"{what} moved the surface by {change.rms_mm:.4f} mm RMS, {change.max_mm:.3f} mm at most "
-                    f"({change.before} -> {change.after} triangles)"
+                    f"{what} moved the surface by {change.rms_mm:.4f} mm RMS, {change.max_mm:.3f}"
+                    f" mm at most ({change.before} -> {change.after} triangles)"
                 )
         if self.topology.watertight:
             lines.append(f"watertight, {self.topology.volume_mm3 / 1000:.2f} cm3")
@@ -130,18 +147,25 @@ class BuiltMesh:
         return "\n".join(lines)
 
 
-def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None) -> BuiltMesh:
+def build_mesh(
+    shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None
+) -> BuiltMesh:
     """Mesh one scan's organised cloud, or the points of a merge (with normals), as planned.
 
-    ``progress`` receives the share of the work done, 0 to 1, and what is being done; it may raise to cancel.
+    ``progress`` receives the share of the work done, 0 to 1, and what is being done; it may raise
+    to cancel.
 
-    Raises InputError for a plan that does not go with the shape, and SlviewerError where there is no surface, or none
-    that can be closed as asked.
+    Raises InputError for a plan that does not go with the shape, and SlviewerError where there is
+    no surface, or none that can be closed as asked.
     """
     plan, report = plan or MeshingPlan(), progress or (lambda share, step: None)
-    method = plan.method or ("grid" if isinstance(shape, Cloud) and not plan.watertight else "poisson")
+    method = plan.method or (
+        "grid" if isinstance(shape, Cloud) and not plan.watertight else "poisson"
+    )
     report(0.0, "finding the surface")
-    points = shape if isinstance(shape, PointSet) else fuse({"scan": shape}, {"scan": np.eye(4)}).surface
+    points = (
+        shape if isinstance(shape, PointSet) else fuse({"scan": shape}, {"scan": np.eye(4)}).surface
+    )
     cell = measure_spacing(points)
     limit = plan.largest_hole_mm(method, cell)
     report(0.1, f"meshing by {method}")
@@ -155,7 +179,9 @@ def build_mesh(shape: Cloud | PointSet, plan: MeshingPlan | None = None, progres
         report(0.5, "cutting off what was not measured")
         mesh, trimmed = trim_far_patches(mesh, points, cell, limit)
     if not len(mesh.faces):
-        raise SlviewerError("No surface could be laid through the points: merge scans that overlap more.")
+        raise SlviewerError(
+            "No surface could be laid through the points: merge scans that overlap more."
+        )
     report(0.6, "excluding floating parts")
     mesh, dropped = drop_small_parts(mesh, SMALL_PART * cell**2)
     if method != "poisson" and limit > 0:
@@ -197,30 +223,43 @@ def _refuse_if_open(topology: Topology, trimmed: TrimmedPatches | None, method: 
         raise SlviewerError(f"The surface does not close: {topology.faults()}; {remedy}.")
     if trimmed is not None and trimmed.imagined > MOST_IMAGINED:
         raise SlviewerError(
-            f"{100 * trimmed.imagined:.0f} % of the closed surface would be imagined, not measured (the largest gap is "
-            f"{trimmed.largest_mm:.0f} mm across): scan the object from more sides, or do without watertight."
+            f"{100 * trimmed.imagined:.0f} % of the closed surface would be imagined, not measured"
+            f" (the largest gap is {trimmed.largest_mm:.0f} mm across): scan the object from more"
+            " sides, or do without watertight."
         )
 
 
 def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
-    """Triangles of an organised cloud in its camera's frame, cut at depth jumps, without flying and stray pixels.
+    """Triangles of an organised cloud in its camera's frame, cut at depth jumps, without flying and
+    stray pixels.
 
-    Vertices carry the pixels' normals, colours and sigmas (along the normal). Raises InputError for merged points, and
-    where no two neighbouring pixels lie on a surface.
+    Vertices carry the pixels' normals, colours and sigmas (along the normal). Raises InputError for
+    merged points, and where no two neighbouring pixels lie on a surface.
     """
     if not isinstance(cloud, Cloud):
-        raise InputError("Merged points have no pixels: the method grid takes a single scan; use poisson or volume.")
+        raise InputError(
+            "Merged points have no pixels: the method grid takes a single scan; use poisson or"
+            " volume."
+        )
     normals = grid_normals(cloud.points)
     cleaned, _ = clean(cloud, normals)
     points = np.where(cleaned[..., None], cloud.points, np.float32(np.nan))
     depth = float(np.median(points[..., 2][cleaned])) if cleaned.any() else np.inf
     faces = triangulate_grid(points, JUMP * depth)
     if not len(faces):
-        raise InputError("No two neighbouring pixels of this scan lie on a surface: reconstruct it again.")
+        raise InputError(
+            "No two neighbouring pixels of this scan lie on a surface: reconstruct it again."
+        )
     along = viewing_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
     sigma = (cloud.sigma * along)[cleaned]
     colours = None if cloud.texture is None else cloud.texture[cleaned]
     if colours is not None and colours.ndim == 1:
         colours = np.repeat(colours[:, None], 3, axis=1)
-    mesh = Mesh(points[cleaned], faces, normals[cleaned], colours, sigma if np.isfinite(sigma).all() else None)
+    mesh = Mesh(
+        points[cleaned],
+        faces,
+        normals[cleaned],
+        colours,
+        sigma if np.isfinite(sigma).all() else None,
+    )
     return select_faces(mesh, np.ones(len(faces), bool))

@@ -10,8 +10,8 @@ from slviewer.geometry.jit import kernel
 MIN_NORMAL_COSINE = 0.5
 """Least cosine between the normals of one surface."""
 FIELDS = 12
-"""Number of sums per point: weight, weight x height, (weight x noise)^2, weight x systematic, weight x normal (3),
-number of scans, weight of colour, weight x colour (3)."""
+"""Number of sums per point: weight, weight x height, (weight x noise)^2, weight x systematic,
+weight x normal (3), number of scans, weight of colour, weight x colour (3)."""
 
 
 class SurfaceGrid(NamedTuple):
@@ -28,7 +28,8 @@ class SurfaceGrid(NamedTuple):
 
 @kernel()
 def pixel_of(x, y, z, to_pixel):
-    """Return the (column, row) whose ray passes (x, y, z) mm in the camera's frame; NaN outside the scan.
+    """Return the (column, row) whose ray passes (x, y, z) mm in the camera's frame; NaN outside the
+    scan.
 
     ``to_pixel``: see ``view._fit_pixel_map``.
     """
@@ -54,12 +55,14 @@ def pixel_of(x, y, z, to_pixel):
 
 @kernel()
 def interpolate_surface(p, n, reach, gate, grid, mean):
-    """Interpolate a scan's surface at a point ``p`` (3,) mm with normal ``n`` in its frame; False where it has none.
+    """Interpolate a scan's surface at a point ``p`` (3,) mm with normal ``n`` in its frame; False
+    where it has none.
 
-    Fills ``mean`` (8,): height above p along n, its variance, systematic sigma, border weight, normal (3), and the
-    pixel (v * width + u). The height is a weighted mean over the tangent planes of pixels within ``reach`` mm across n
-    and ``gate`` mm along n. Where these planes differ by more than their noise, the surface is curved: the variance
-    increases by what exceeds twice that of the noise.
+    Fills ``mean`` (8,): height above p along n, its variance, systematic sigma, border weight,
+    normal (3), and the pixel (v * width + u). The height is a weighted mean over the tangent planes
+    of pixels within ``reach`` mm across n and ``gate`` mm along n. Where these planes differ by
+    more than their noise, the surface is curved: the variance increases by what exceeds twice that
+    of the noise.
     """
     points, normals, noise = grid.points, grid.normals, grid.noise
     height, width = noise.shape
@@ -97,7 +100,12 @@ def interpolate_surface(p, n, reach, gate, grid, mean):
         return False
     t /= total
     curvature = max(tt / total - t * t - 2.0 * noises / total, 0.0)
-    mean[0], mean[1], mean[2], mean[3] = t, squares / (total * total) + curvature, s / total, w / total
+    mean[0], mean[1], mean[2], mean[3] = (
+        t,
+        squares / (total * total) + curvature,
+        s / total,
+        w / total,
+    )
     length = np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
     mean[4], mean[5], mean[6] = m0 / length, m1 / length, m2 / length
     mean[7] = row * width + column
@@ -106,9 +114,11 @@ def interpolate_surface(p, n, reach, gate, grid, mean):
 
 @kernel(parallel=True)
 def measure_heights(p, n, reach, gate, grid, heights):
-    """Measure the heights of a scan's surface above points ``p`` (k, 3) mm with normals ``n`` (k, 3) in its frame.
+    """Measure the heights of a scan's surface above points ``p`` (k, 3) mm with normals ``n`` (k,
+    3) in its frame.
 
-    Fills ``heights`` (k, 2): the height in mm and the index of the pixel; (NaN, -1) without overlap.
+    Fills ``heights`` (k, 2): the height in mm and the index of the pixel; (NaN, -1) without
+    overlap.
     """
     for i in numba.prange(len(p)):
         mean = np.empty(8)
@@ -119,10 +129,12 @@ def measure_heights(p, n, reach, gate, grid, heights):
 
 @kernel(parallel=True)
 def add_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
-    """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h, w) bool vote.
+    """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h,
+    w) bool vote.
 
-    Adds 1 to ``confirming`` (k,) where its surface is within ``gate`` mm in depth, or to ``contradicting`` (k,) where
-    the surface is more than 1.5 gates behind the point, which is thus in the scan's free space.
+    Adds 1 to ``confirming`` (k,) where its surface is within ``gate`` mm in depth, or to
+    ``contradicting`` (k,) where the surface is more than 1.5 gates behind the point, which is thus
+    in the scan's free space.
     """
     height, width = witnesses.shape
     for i in numba.prange(len(p)):
@@ -141,10 +153,12 @@ def add_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
 
 @kernel(parallel=True)
 def add_surface(p, n, own, R, reach, gate, grid, colours, gain, earlier, sums, inferior):
-    """Add a scan's surface to the ``sums`` (k, FIELDS) of points ``p`` (k, 3) with normals ``n`` (k, 3) in its frame.
+    """Add a scan's surface to the ``sums`` (k, FIELDS) of points ``p`` (k, 3) with normals ``n``
+    (k, 3) in its frame.
 
-    ``R`` (3, 3): rotation from its frame to the reference's. ``inferior`` (k,) is set True where the scan's quality
-    exceeds the points' ``own`` (k,), or equals it if the scan is the ``earlier`` one.
+    ``R`` (3, 3): rotation from its frame to the reference's. ``inferior`` (k,) is set True where
+    the scan's quality exceeds the points' ``own`` (k,), or equals it if the scan is the ``earlier``
+    one.
     """
     height, width = grid.noise.shape
     for i in numba.prange(len(p)):

@@ -1,7 +1,7 @@
 """Edits of a scan's points that are stored as operations: nothing is removed from the scan itself.
 
-An operation names pixels of the camera, or a plane in its frame, not points: it applies in the same way to the cloud
-that another calibration makes of the same frames.
+An operation names pixels of the camera, or a plane in its frame, not points: it applies in the same
+way to the cloud that another calibration makes of the same frames.
 """
 
 import zlib
@@ -20,10 +20,12 @@ _MAX_PIXELS = 1 << 32
 
 @dataclass(frozen=True, eq=False)
 class Edit:
-    """Points that are deleted: those at ``pixels`` (h, w) bool, or those on ``plane`` and below, one of both.
+    """Points that are deleted: those at ``pixels`` (h, w) bool, or those on ``plane`` and below,
+    one of both.
 
-    ``what``: how they were selected, in words; ``points``: how many it deleted when it was made; ``made``: when, as
-    text that sorts by time, the same for edits of several scans that were made together; empty where unknown.
+    ``what``: how they were selected, in words; ``points``: how many it deleted when it was made;
+    ``made``: when, as text that sorts by time, the same for edits of several scans that were made
+    together; empty where unknown.
     """
 
     what: str
@@ -42,14 +44,16 @@ class Edit:
         return "plane" if self.pixels is None else "pixels"
 
     def select(self, points: np.ndarray) -> Mask:
-        """Mask (h, w) of the points (h, w, 3) mm that the edit deletes. InputError for pixels of another size."""
+        """Mask (h, w) of the points (h, w, 3) mm that the edit deletes. InputError for pixels of
+        another size."""
         if self.plane is not None:
             return self.plane.select_below(points)
         assert self.pixels is not None
         if self.pixels.shape != points.shape[:2]:
             (h, w), (rows, columns) = self.pixels.shape, points.shape[:2]
             raise InputError(
-                f"the edit {self.what!r} is of {w}x{h} pixels, the scan has {columns}x{rows}: undo the edit"
+                f"the edit {self.what!r} is of {w}x{h} pixels, the scan has {columns}x{rows}: undo"
+                " the edit"
             )
         return self.pixels
 
@@ -65,15 +69,17 @@ def describe_edit(what: str, points: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class EditHistory:
-    """The edits of a scan in the order in which they were made, of which the first ``applied`` are in effect; those
-    after them were undone. A new edit replaces those that were undone."""
+    """The edits of a scan in the order in which they were made, of which the first ``applied`` are
+    in effect; those after them were undone. A new edit replaces those that were undone."""
 
     edits: tuple[Edit, ...] = ()
     applied: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.applied <= len(self.edits):
-            raise InputError(f"{self.applied} of {len(self.edits)} edits are stated to be in effect")
+            raise InputError(
+                f"{self.applied} of {len(self.edits)} edits are stated to be in effect"
+            )
 
     @property
     def active(self) -> tuple[Edit, ...]:
@@ -90,15 +96,21 @@ class EditHistory:
         return EditHistory((*self.active, edit), self.applied + 1)
 
     def undo(self, count: int = 1) -> "EditHistory":
-        """Return the history without the effect of its last edits. InputError where there are fewer."""
+        """Return the history without the effect of its last edits. InputError where there are
+        fewer."""
         if not 1 <= count <= self.applied:
-            raise InputError(f"{self.applied} edits are in effect: {count} of them cannot be undone")
+            raise InputError(
+                f"{self.applied} edits are in effect: {count} of them cannot be undone"
+            )
         return replace(self, applied=self.applied - count)
 
     def redo(self, count: int = 1) -> "EditHistory":
-        """Return the history with undone edits in effect again. InputError where there are fewer."""
+        """Return the history with undone edits in effect again. InputError where there are
+        fewer."""
         if not 1 <= count <= len(self.undone):
-            raise InputError(f"{len(self.undone)} edits are undone: {count} of them cannot be redone")
+            raise InputError(
+                f"{len(self.undone)} edits are undone: {count} of them cannot be redone"
+            )
         return replace(self, applied=self.applied + count)
 
     def keep_mask(self, points: np.ndarray) -> Mask:
@@ -109,12 +121,14 @@ class EditHistory:
         return kept
 
 
-def make_edit(points: np.ndarray, selected: Mask, what: str, plane: SupportPlane | None = None, made: str = "") -> Edit:
-    """Return the edit that deletes the ``selected`` (h, w) ones of points (h, w, 3) mm: with every later calibration,
-    also those at selected pixels that are NaN now.
+def make_edit(
+    points: np.ndarray, selected: Mask, what: str, plane: SupportPlane | None = None, made: str = ""
+) -> Edit:
+    """Return the edit that deletes the ``selected`` (h, w) ones of points (h, w, 3) mm: with every
+    later calibration, also those at selected pixels that are NaN now.
 
-    ``plane``: what the selection is everything below of, where it is; the edit is then stored as this plane.
-    InputError where nothing is selected.
+    ``plane``: what the selection is everything below of, where it is; the edit is then stored as
+    this plane. InputError where nothing is selected.
     """
     count = int(np.count_nonzero(selected & np.isfinite(points).all(axis=-1)))
     if not count:
@@ -128,7 +142,8 @@ def pack_mask(mask: Mask) -> NDArray[np.uint8]:
 
 
 def unpack_mask(packed: np.ndarray, size: Sequence[int]) -> Mask:
-    """Return the mask (h, w) of bytes (n,) from `pack_mask`; ``size`` is (w, h). InputError where they do not fit."""
+    """Return the mask (h, w) of bytes (n,) from `pack_mask`; ``size`` is (w, h). InputError where
+    they do not fit."""
     w, h = size
     if not 0 < w * h <= _MAX_PIXELS:
         raise InputError(f"a mask of {w}x{h} pixels is stated")
@@ -139,5 +154,7 @@ def unpack_mask(packed: np.ndarray, size: Sequence[int]) -> Mask:
     except zlib.error as error:
         raise InputError(f"the mask of an edit cannot be read ({error})") from error
     if len(body) != needed:
-        raise InputError(f"the mask of an edit holds {len(body)} bytes, {needed} are needed for {w}x{h} pixels")
+        raise InputError(
+            f"the mask of an edit holds {len(body)} bytes, {needed} are needed for {w}x{h} pixels"
+        )
     return np.unpackbits(np.frombuffer(body, np.uint8), count=w * h).astype(bool).reshape(h, w)

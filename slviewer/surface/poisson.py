@@ -25,8 +25,9 @@ BULGE = 1.3
 class TrimmedPatches:
     """Figures of the extrapolated patches of a surface.
 
-    ``filled``: number of patches that remain, of which ``flattened`` were replaced by flat ones; ``largest_mm``: extent
-    of the largest; ``imagined``: their share of the whole area; ``cut``: number of removed patches.
+    ``filled``: number of patches that remain, of which ``flattened`` were replaced by flat ones;
+    ``largest_mm``: extent of the largest; ``imagined``: their share of the whole area; ``cut``:
+    number of removed patches.
     """
 
     filled: int
@@ -39,12 +40,18 @@ class TrimmedPatches:
 def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
     """Reconstruct a closed surface from points with normals, with cells of ``cell_mm`` or larger.
 
-    It is extrapolated where there are no points. Raises InputError for points without normals, or too few.
+    It is extrapolated where there are no points. Raises InputError for points without normals, or
+    too few.
     """
     if points.normals is None:
-        raise InputError("These points have no normals: a surface through them needs to know its outside; merge again.")
+        raise InputError(
+            "These points have no normals: a surface through them needs to know its outside; merge"
+            " again."
+        )
     if len(points) < LEAST_POINTS:
-        raise InputError(f"{len(points)} points make no surface: at least {LEAST_POINTS} are needed.")
+        raise InputError(
+            f"{len(points)} points make no surface: at least {LEAST_POINTS} are needed."
+        )
     o3d = open3d()
     known = np.isfinite(points.normals).all(axis=1)
     middle = points.points.mean(axis=0, dtype=np.float64)
@@ -52,19 +59,29 @@ def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
     cloud.normals = o3d.utility.Vector3dVector(points.normals[known].astype(np.float64))
     extent = float(np.ptp(points.points, axis=0).max())
     depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell_mm)), 4, DEEPEST))
-    # one thread: its own pool spins, and where other programs hold the cores it takes a hundred times as long
-    surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
-    mesh = transfer_attributes(points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles))
+    # one thread: its own pool spins, and where other programs hold the cores it takes a hundred
+    # times as long
+    surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+        cloud, depth=depth, n_threads=1
+    )
+    mesh = transfer_attributes(
+        points, np.asarray(surface.vertices) + middle, np.asarray(surface.triangles)
+    )
     closed, _ = fill_holes(mesh, np.inf)  # where the box around the points cut it
     return closed
 
 
-def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float) -> tuple[Mesh, TrimmedPatches]:
+def trim_far_patches(
+    mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: float
+) -> tuple[Mesh, TrimmedPatches]:
     """Remove the patches far from all points whose rim has an extent of more than ``fill_mm``.
 
-    Smaller patches remain as filled holes; one that bulges, as below an object on a table, is replaced by a flat fan.
+    Smaller patches remain as filled holes; one that bulges, as below an object on a table, is
+    replaced by a flat fan.
     """
-    distance, _ = cKDTree(points.points).query(mesh.vertices, distance_upper_bound=REACH * spacing_mm)
+    distance, _ = cKDTree(points.points).query(
+        mesh.vertices, distance_upper_bound=REACH * spacing_mm
+    )
     far = ~np.isfinite(distance)
     imagined = far[mesh.faces].any(axis=1)
     if not imagined.any():
@@ -96,7 +113,8 @@ def trim_far_patches(mesh: Mesh, points: PointSet, spacing_mm: float, fill_mm: f
 
 
 def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
-    """Return the area in mm2 of the fan within the rim of a ``patch`` of faces (k, 3); inf for several rims."""
+    """Return the area in mm2 of the fan within the rim of a ``patch`` of faces (k, 3); inf for
+    several rims."""
     loops = opening_loops(patch)
     longest = max(loops, key=len, default=np.empty(0, int))
     if len(longest) < 0.8 * sum(map(len, loops)):

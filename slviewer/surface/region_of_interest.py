@@ -19,8 +19,10 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RegionOfInterest:
-    """A box about ``centre_mm`` of ``size_mm`` (whole sides), turned by ``rotation_deg`` about the camera's x, then y,
-    then z axis. All are (3,), in the camera's frame; InputError unless they are finite, sizes above 0."""
+    """A box about ``centre_mm`` of ``size_mm`` (whole sides), turned by ``rotation_deg`` about the
+    camera's x, then y, then z axis. All are (3,), in the camera's frame; InputError unless they are
+    finite, sizes above 0.
+    """
 
     centre_mm: Triple
     size_mm: Triple
@@ -30,10 +32,14 @@ class RegionOfInterest:
         for name in ("centre_mm", "size_mm", "rotation_deg"):
             values = tuple(float(value) for value in getattr(self, name))
             if len(values) != 3 or not all(abs(value) < _MAX_MM for value in values):
-                raise InputError(f"the region's {name} is {values}: give three numbers below {_MAX_MM:g}")
+                raise InputError(
+                    f"the region's {name} is {values}: give three numbers below {_MAX_MM:g}"
+                )
             object.__setattr__(self, name, values)
         if min(self.size_mm) <= 0:
-            raise InputError(f"the region's sides are {_times(self.size_mm)} mm: each must be above 0")
+            raise InputError(
+                f"the region's sides are {_times(self.size_mm)} mm: each must be above 0"
+            )
 
     @classmethod
     def between(cls, low: ArrayLike, high: ArrayLike) -> "RegionOfInterest":
@@ -43,7 +49,8 @@ class RegionOfInterest:
 
     @classmethod
     def around(cls, points: np.ndarray) -> "RegionOfInterest":
-        """Return the box, along the axes, around all points (..., 3) mm but outliers; InputError without points."""
+        """Return the box, along the axes, around all points (..., 3) mm but outliers; InputError
+        without points."""
         flat = points[np.isfinite(points).all(axis=-1)].astype(np.float64)
         if not len(flat):
             raise InputError("there are no points to put a region around: reconstruct a scan first")
@@ -66,7 +73,8 @@ class RegionOfInterest:
         return T
 
     def contains(self, points: np.ndarray) -> NDArray[np.bool_]:
-        """Bool like points (..., 3) mm without their last axis: whether they lie in the box; False for NaN."""
+        """Bool like points (..., 3) mm without their last axis: whether they lie in the box; False
+        for NaN."""
         T = self.T_camera_box
         inside = np.abs((points - T[:3, 3]) @ T[:3, :3]) <= np.array(self.size_mm) / 2
         return np.asarray(inside.all(axis=-1))
@@ -80,21 +88,26 @@ class RegionOfInterest:
         """Describe the box: its size, centre, and where it is turned its angles."""
         turned = ""
         if any(self.rotation_deg):
-            turned = f", turned by {', '.join(f'{deg:.1f}' for deg in self.rotation_deg)} degrees about x, y, z"
+            turned = (
+                f", turned by {', '.join(f'{deg:.1f}' for deg in self.rotation_deg)} degrees about"
+                " x, y, z"
+            )
         centre = ", ".join(f"{mm:.1f}" for mm in self.centre_mm)
         return f"{_times(self.size_mm)} mm about ({centre}) mm{turned}"
 
 
 def crop_mask(name: str, points: np.ndarray, region: RegionOfInterest) -> NDArray[np.bool_]:
-    """Bool (...): the points (..., 3) mm of a scan in the region. InputError, with where they are, if none is."""
+    """Bool (...): the points (..., 3) mm of a scan in the region. InputError, with where they are,
+    if none is."""
     inside = region.contains(points)
     flat = points[np.isfinite(points).all(axis=-1)]
     if len(flat) and not inside.any():
         spans = (f"{axis} {low:.0f} to {high:.0f}" for axis, low, high in zip(
             "xyz", flat.min(axis=0), flat.max(axis=0), strict=True))  # fmt: skip
         raise InputError(
-            f"{name}: none of its {len(flat)} points lies in the region of interest of {region.text()}; they span "
-            f"{', '.join(spans)} mm: move or enlarge the region, or switch it off (--roi off)"
+            f"{name}: none of its {len(flat)} points lies in the region of interest of"
+            f" {region.text()}; they span {', '.join(spans)} mm: move or enlarge the region, or"
+            " switch it off (--roi off)"
         )
     return inside
 
@@ -111,7 +124,10 @@ def _times(values: Triple) -> str:
 
 
 def box_edges(centre: np.ndarray, size: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """(12, 2, 3) mm: the edges of a box of sides ``size`` (3,) along the rows of ``axes`` (3, 3)."""
+    """(12, 2, 3) mm: the edges of a box of sides ``size`` (3,) along the rows of ``axes`` (3,
+    3)."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3)))
-    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
+    pairs = [
+        (a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1
+    ]
     return np.asarray((corners[np.array(pairs)] * size) @ axes + centre)

@@ -1,7 +1,8 @@
-"""Selecting points of an organised cloud: by an outline in a view, by connection, and by their supporting plane.
+"""Selecting points of an organised cloud: by an outline in a view, by connection, and by their
+supporting plane.
 
-Every function returns a mask (h, w) of the camera's pixels, so that a selection made in any view of the cloud applies
-to the same pixels after another calibration.
+Every function returns a mask (h, w) of the camera's pixels, so that a selection made in any view of
+the cloud applies to the same pixels after another calibration.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,8 @@ from slviewer.surface.topology import label_connected
 PLANE_SHARE = 0.1
 """Of the points that must lie on a plane for it to be taken as what supports the object."""
 PLANE_TOLERANCE = 0.002
-"""Of the median depth: how far points of the supporting plane may be from it, unless noise moves them farther."""
+"""Of the median depth: how far points of the supporting plane may be from it, unless noise moves
+them farther."""
 _RASTER = 2048
 _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
 Mask = NDArray[np.bool_]
@@ -27,8 +29,9 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class ViewCamera:
-    """The pinhole of a 3D view: ``position`` (3,) mm, ``R_scene_view`` (3, 3) with z along the viewing direction, x to
-    the right and y down, ``fov_rad`` of its height, and ``aspect``, width over height."""
+    """The pinhole of a 3D view: ``position`` (3,) mm, ``R_scene_view`` (3, 3) with z along the
+    viewing direction, x to the right and y down, ``fov_rad`` of its height, and ``aspect``, width
+    over height."""
 
     position: np.ndarray
     R_scene_view: np.ndarray
@@ -36,12 +39,15 @@ class ViewCamera:
     aspect: float
 
     def project(self, points: np.ndarray) -> NDArray[np.float64]:
-        """Project points (..., 3) mm to (..., 2): 0 ... 1 from the left and from the top; NaN behind the view."""
+        """Project points (..., 3) mm to (..., 2): 0 ... 1 from the left and from the top; NaN
+        behind the view."""
         local = (points - self.position) @ self.R_scene_view
         with np.errstate(invalid="ignore", divide="ignore"):
             depth = np.where(local[..., 2] > 0, local[..., 2], np.nan)
         reach = np.tan(self.fov_rad / 2)
-        return np.asarray(0.5 + local[..., :2] / depth[..., None] / (2 * reach * np.array([self.aspect, 1.0])))
+        return np.asarray(
+            0.5 + local[..., :2] / depth[..., None] / (2 * reach * np.array([self.aspect, 1.0]))
+        )
 
     def is_near(self, other: "ViewCamera") -> bool:
         """Whether another view shows a scene at the same place of the picture, to about a pixel."""
@@ -54,7 +60,8 @@ class ViewCamera:
 def select_in_outline(
     points: np.ndarray, view: ViewCamera, outline: Sequence[tuple[float, float]] | np.ndarray
 ) -> Mask:
-    """Mask (h, w) of the points (h, w, 3) mm that a view shows inside a closed outline (n, 2), in its 0 ... 1.
+    """Mask (h, w) of the points (h, w, 3) mm that a view shows inside a closed outline (n, 2), in
+    its 0 ... 1.
 
     What is hidden behind other points is selected too. InputError for fewer than 3 corners.
     """
@@ -73,20 +80,26 @@ def select_in_outline(
 
 
 def select_polygon(shape: tuple[int, ...], corners: np.ndarray) -> Mask:
-    """Mask (h, w) of the camera's pixels within a polygon of pixels (n, 2), (u, v). InputError below 3 corners."""
+    """Mask (h, w) of the camera's pixels within a polygon of pixels (n, 2), (u, v). InputError
+    below 3 corners."""
     corners = np.asarray(corners, np.float64)
     if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2:
-        raise InputError(f"a polygon of {corners.size // 2} corners was given: give u v of at least 3")
+        raise InputError(
+            f"a polygon of {corners.size // 2} corners was given: give u v of at least 3"
+        )
     mask = np.zeros(shape[:2], np.uint8)
     cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1)
     return mask == 1
 
 
-def select_connected(points: np.ndarray, seed: tuple[int, int], candidates: Mask | None = None) -> Mask:
+def select_connected(
+    points: np.ndarray, seed: tuple[int, int], candidates: Mask | None = None
+) -> Mask:
     """Mask (h, w) of the part of the surface that the pixel ``seed`` (u, v) belongs to.
 
-    Neighbouring pixels of points (h, w, 3) mm are connected where their distance is below ``JUMP`` of their depth.
-    ``candidates`` (h, w): the points to consider, by default all. InputError for a seed that is none of them.
+    Neighbouring pixels of points (h, w, 3) mm are connected where their distance is below ``JUMP``
+    of their depth. ``candidates`` (h, w): the points to consider, by default all. InputError for a
+    seed that is none of them.
     """
     valid = np.isfinite(points).all(axis=-1)
     if candidates is not None:
@@ -111,8 +124,8 @@ def select_connected(points: np.ndarray, seed: tuple[int, int], candidates: Mask
 
 @dataclass(frozen=True)
 class SupportPlane:
-    """The plane that an object stands on: points p with ``normal`` p = ``offset_mm``, the normal (3,) pointing to the
-    camera's side. What is at most ``margin_mm`` above it belongs to it."""
+    """The plane that an object stands on: points p with ``normal`` p = ``offset_mm``, the normal
+    (3,) pointing to the camera's side. What is at most ``margin_mm`` above it belongs to it."""
 
     normal: tuple[float, float, float]
     offset_mm: float
@@ -124,11 +137,14 @@ class SupportPlane:
             return np.asarray(points @ np.array(self.normal) - self.offset_mm <= self.margin_mm)
 
 
-def detect_support(points: np.ndarray, sigma_mm: float, margin_mm: float | None = None) -> SupportPlane:
+def detect_support(
+    points: np.ndarray, sigma_mm: float, margin_mm: float | None = None
+) -> SupportPlane:
     """Detect the plane with most points of a cloud (h, w, 3) mm of a median noise ``sigma_mm``.
 
-    Its margin is by default three robust standard deviations of its points, at least ``PLANE_TOLERANCE`` of their
-    depth. InputError where less than ``PLANE_SHARE`` of the points lie on any plane.
+    Its margin is by default three robust standard deviations of its points, at least
+    ``PLANE_TOLERANCE`` of their depth. InputError where less than ``PLANE_SHARE`` of the points lie
+    on any plane.
     """
     flat = points[np.isfinite(points).all(axis=-1)].astype(np.float64)
     depth = float(np.median(flat[:, 2])) if len(flat) else 0.0
@@ -137,8 +153,9 @@ def detect_support(points: np.ndarray, sigma_mm: float, margin_mm: float | None 
     share = float(inliers.mean())
     if share < PLANE_SHARE:
         raise InputError(
-            f"no supporting plane: at most {100 * share:.0f} % of the {len(flat)} points lie on one plane to "
-            f"{tolerance:.2f} mm, {100 * PLANE_SHARE:.0f} % are needed: select the points with an outline"
+            f"no supporting plane: at most {100 * share:.0f} % of the {len(flat)} points lie on one"
+            f" plane to {tolerance:.2f} mm, {100 * PLANE_SHARE:.0f} % are needed: select the points"
+            " with an outline"
         )
     residuals = plane.distance(flat[inliers])
     normal, offset = plane.normal, plane.offset
@@ -152,7 +169,7 @@ def detect_support(points: np.ndarray, sigma_mm: float, margin_mm: float | None 
 def select_support(
     points: np.ndarray, sigma_z: np.ndarray, margin_mm: float | None = None
 ) -> tuple[SupportPlane, Mask]:
-    """Detect the support of a cloud (h, w, 3) mm of the noise ``sigma_z`` (h, w) mm, as `detect_support` does; returns
-    it with the mask (h, w) of the points on it and below."""
+    """Detect the support of a cloud (h, w, 3) mm of the noise ``sigma_z`` (h, w) mm, as
+    `detect_support` does; returns it with the mask (h, w) of the points on it and below."""
     plane = detect_support(points, float(np.nanmedian(sigma_z)), margin_mm)
     return plane, plane.select_below(points)

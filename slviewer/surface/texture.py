@@ -1,9 +1,10 @@
 """A mesh with a texture: an image of its surface, projected from the scans that saw it.
 
-Every texel takes the mean of the scans that see it, weighted by how squarely they look at it, by their noise and by the
-distance to their border; scans in whose way something stands are excluded. Exposures are equalised over what two scans
-saw. The image shows the surface's reflectance where the light's place is known: what a scan sees falls with the cosine
-of the projector's angle and the square of its distance, which is divided out.
+Every texel takes the mean of the scans that see it, weighted by how squarely they look at it, by
+their noise and by the distance to their border; scans in whose way something stands are excluded.
+Exposures are equalised over what two scans saw. The image shows the surface's reflectance where the
+light's place is known: what a scan sees falls with the cosine of the projector's angle and the
+square of its distance, which is divided out.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,17 +34,20 @@ _STRETCH = 1 / 6
 _DEGREE = 5  # of `View.to_pixel`
 _MIN_COSINE = 0.15
 _GATE = 3.0  # spacings of a scan within which its surface is the mesh's
-_NOMINAL_MM = 600.0  # distance from the light of unchanged brightness; the image is scaled in the end
+_NOMINAL_MM = (
+    600.0  # distance from the light of unchanged brightness; the image is scaled in the end
+)
 _CHUNK = 1 << 14  # OpenCV samples images of up to 32,767 rows
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """A mesh whose vertices repeat along seams, ``uv`` (n, 2) of each, from the image's lower left corner, and its
-    ``image`` (h, w, 3) uint8 RGB.
+    """A mesh whose vertices repeat along seams, ``uv`` (n, 2) of each, from the image's lower left
+    corner, and its ``image`` (h, w, 3) uint8 RGB.
 
-    ``seen``: share of the surface that a scan shows; the rest takes the nearest colour. ``mm_per_texel``: mean side of
-    a texel on the surface; ``charts``: pieces that it was unfolded into; ``seams``: share of edges along their borders.
+    ``seen``: share of the surface that a scan shows; the rest takes the nearest colour.
+    ``mm_per_texel``: mean side of a texel on the surface; ``charts``: pieces that it was unfolded
+    into; ``seams``: share of edges along their borders.
     """
 
     mesh: Mesh
@@ -58,8 +62,9 @@ class TexturedMesh:
         """Describe the texture in a sentence."""
         height, width = self.image.shape[:2]
         return (
-            f"texture of {width}x{height} px, {self.mm_per_texel:.3f} mm per pixel, in {self.charts} charts with seams "
-            f"along {100 * self.seams:.1f} % of the edges; no scan sees {100 * (1 - self.seen):.1f} % of the surface"
+            f"texture of {width}x{height} px, {self.mm_per_texel:.3f} mm per pixel, in"
+            f" {self.charts} charts with seams along {100 * self.seams:.1f} % of the edges; no scan"
+            f" sees {100 * (1 - self.seen):.1f} % of the surface"
         )
 
 
@@ -74,29 +79,39 @@ def texture_mesh(
 ) -> TexturedMesh:
     """Unfold a mesh, and project the scans' textures onto it.
 
-    ``scans``: organised clouds with textures, by name; ``T_mesh_scan``: their poses (4, 4) mm in the mesh's frame.
-    ``size``: side of the image, px. ``light`` (3,) mm: the projector's place in the cameras' frame, whose shading is
-    removed; kept where it is None. Raises InputError for a scan without a texture, a mesh that is too large, or sizes
-    out of range; SlviewerError where the mesh cannot be unfolded.
+    ``scans``: organised clouds with textures, by name; ``T_mesh_scan``: their poses (4, 4) mm in
+    the mesh's frame. ``size``: side of the image, px. ``light`` (3,) mm: the projector's place in
+    the cameras' frame, whose shading is removed; kept where it is None. Raises InputError for a
+    scan without a texture, a mesh that is too large, or sizes out of range; SlviewerError where the
+    mesh cannot be unfolded.
     """
     report = progress or (lambda share: None)
     if not SIZES_PX[0] <= size <= SIZES_PX[1]:
-        raise InputError(f"a texture of {size} px cannot be made: give {SIZES_PX[0]} to {SIZES_PX[1]}")
+        raise InputError(
+            f"a texture of {size} px cannot be made: give {SIZES_PX[0]} to {SIZES_PX[1]}"
+        )
     if len(mesh.faces) > MOST_TRIANGLES:
         raise InputError(
-            f"the mesh has {len(mesh.faces):,} triangles, too many to unfold: thin it to {MOST_TRIANGLES:,} or fewer"
+            f"the mesh has {len(mesh.faces):,} triangles, too many to unfold: thin it to"
+            f" {MOST_TRIANGLES:,} or fewer"
         )
     for name, scan in scans.items():
         if scan.texture is None:
-            raise InputError(f"{name} has no texture: capture it with a white image among its patterns")
+            raise InputError(
+                f"{name} has no texture: capture it with a white image among its patterns"
+            )
     views = {name: prepare_view(name, cloud, T_mesh_scan[name]) for name, cloud in scans.items()}
-    gains = colour_gains(views, compare_views(views, lambda share: None)) if len(views) > 1 else None
+    gains = (
+        colour_gains(views, compare_views(views, lambda share: None)) if len(views) > 1 else None
+    )
     report(0.2)
     unfolded, corners, charts = _unfold(mesh, size)
     report(0.5)
     places, normals = _bake_places(unfolded, size)
     chart = np.isfinite(places[..., 0])
-    colours, weight = _blend(places[chart], normals[chart], views, gains, light, lambda s: report(0.5 + 0.4 * s))
+    colours, weight = _blend(
+        places[chart], normals[chart], views, gains, light, lambda s: report(0.5 + 0.4 * s)
+    )
     image, seen = np.zeros((size, size, 3), np.float32), np.zeros((size, size), bool)
     image[chart], seen[chart] = colours, weight > 0
     if not seen.any():
@@ -121,7 +136,8 @@ def texture_mesh(
 
 
 def _unfold(mesh: Mesh, size: int) -> tuple[Any, np.ndarray, int]:
-    """Return Open3D's mesh with an atlas, the texture coordinates (m, 3, 2) of its triangles, and its charts."""
+    """Return Open3D's mesh with an atlas, the texture coordinates (m, 3, 2) of its triangles, and
+    its charts."""
     o3d = open3d()
     unfolded = o3d.t.geometry.TriangleMesh(
         np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int64)
@@ -130,13 +146,15 @@ def _unfold(mesh: Mesh, size: int) -> tuple[Any, np.ndarray, int]:
         _, charts, _ = unfolded.compute_uvatlas(size=size, gutter=_GUTTER_PX, max_stretch=_STRETCH)
     except RuntimeError as error:
         raise SlviewerError(
-            "the mesh cannot be unfolded, as edges of it join more than two triangles: mesh it with the method poisson"
+            "the mesh cannot be unfolded, as edges of it join more than two triangles: mesh it with"
+            " the method poisson"
         ) from error
     return unfolded, unfolded.triangle.texture_uvs.numpy().astype(np.float64), int(charts)
 
 
 def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the place (h, w, 3) mm of each texel and the unit normal there; NaN outside of the charts."""
+    """Return the place (h, w, 3) mm of each texel and the unit normal there; NaN outside of the
+    charts."""
     unfolded.compute_vertex_normals()
     baked = unfolded.bake_vertex_attr_textures(
         size, {"positions", "normals"}, margin=1, fill=float("nan"), update_material=False
@@ -153,7 +171,8 @@ def _blend(
     light: np.ndarray | None,
     report: Callable[[float], None],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean colours (n, 3) float32 of texels and their weights (n,), 0 where no view sees them."""
+    """Return the mean colours (n, 3) float32 of texels and their weights (n,), 0 where no view sees
+    them."""
     total, weight = np.zeros((len(places), 3), np.float64), np.zeros(len(places), np.float64)
     for k, (name, view) in enumerate(views.items()):
         gain = 1.0 if gains is None else gains[name]
@@ -169,7 +188,8 @@ def _blend(
 def _look(
     places: np.ndarray, normals: np.ndarray, view: View, light: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a view shows of places (n, 3) with normals: colours (n, 3), and weights (n,), 0 of what it misses."""
+    """Return what a view shows of places (n, 3) with normals: colours (n, 3), and weights (n,), 0
+    of what it misses."""
     points = move_points(np.linalg.inv(view.T), places.astype(np.float64))
     facing = normals @ view.T[:3, :3]
     cosine = -np.sum(facing * points, axis=1) / np.linalg.norm(points, axis=1)
@@ -180,7 +200,9 @@ def _look(
     def sample(image: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
         """Return an image at the pixels, NaN outside."""
         outside = (np.nan,) * 4
-        return np.asarray(cv2.remap(image, pixels[:, :1], pixels[:, 1:], how, borderValue=outside))[:, 0]
+        return np.asarray(cv2.remap(image, pixels[:, :1], pixels[:, 1:], how, borderValue=outside))[
+            :, 0
+        ]
 
     away = np.sum((points - sample(view.points, cv2.INTER_NEAREST)) * facing, axis=1)
     inside = (np.abs(rays) <= 1.05).all(axis=1)
@@ -188,7 +210,11 @@ def _look(
         sees = inside & (cosine > _MIN_COSINE) & (np.abs(away) < _GATE * view.spacing)
     assert view.colours is not None
     colours = sample(view.colours.astype(np.float32)).astype(np.float64)
-    weight = sample(view.inner).astype(np.float64) * cosine**2 / sample(view.noise, cv2.INTER_NEAREST) ** 2
+    weight = (
+        sample(view.inner).astype(np.float64)
+        * cosine**2
+        / sample(view.noise, cv2.INTER_NEAREST) ** 2
+    )
     if light is not None:
         to_light = light - points
         distance = np.linalg.norm(to_light, axis=1)
@@ -201,16 +227,27 @@ def _look(
     return np.where(sees[:, None], colours, 0.0), np.where(sees, weight, 0.0)
 
 
-def _split_vertices(mesh: Mesh, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, one for every uv of the mesh's, faces, uv (n, 2), and which of the mesh's vertices each is."""
-    every = np.column_stack([mesh.faces.ravel(), np.round(corners.reshape(-1, 2) * (1 << 20))]).astype(np.int64)
+def _split_vertices(
+    mesh: Mesh, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, one for every uv of the mesh's, faces, uv (n, 2), and which of the mesh's
+    vertices each is."""
+    every = np.column_stack(
+        [mesh.faces.ravel(), np.round(corners.reshape(-1, 2) * (1 << 20))]
+    ).astype(np.int64)
     unique, first, inverse = np.unique(every, axis=0, return_index=True, return_inverse=True)
     kept = unique[:, 0]
-    return mesh.vertices[kept], inverse.reshape(-1, 3), corners.reshape(-1, 2)[first].astype(np.float32), kept
+    return (
+        mesh.vertices[kept],
+        inverse.reshape(-1, 3),
+        corners.reshape(-1, 2)[first].astype(np.float32),
+        kept,
+    )
 
 
 def _seam_share(before: np.ndarray, after: np.ndarray) -> float:
-    """Return the share of a mesh's edges along which its unfolded triangles ``after`` (m, 3) come apart."""
+    """Return the share of a mesh's edges along which its unfolded triangles ``after`` (m, 3) come
+    apart."""
 
     def edges(faces: np.ndarray) -> int:
         """Return the number of different edges."""

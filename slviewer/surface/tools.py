@@ -1,4 +1,5 @@
-"""Mesh utilities: transfer of colours and sigmas, selection of faces, vertex normals, and distances."""
+"""Mesh utilities: transfer of colours and sigmas, selection of faces, vertex normals, and
+distances."""
 
 from dataclasses import replace
 from typing import Any
@@ -12,7 +13,8 @@ from slviewer.surface.topology import face_vectors
 
 
 def transfer_attributes(known: Mesh | PointSet, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Return a mesh of vertices (n, 3) mm and faces (m, 3) with colours and sigmas of the nearest known points.
+    """Return a mesh of vertices (n, 3) mm and faces (m, 3) with colours and sigmas of the nearest
+    known points.
 
     Normals are computed from the faces.
     """
@@ -35,21 +37,31 @@ def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Return the area-weighted mean normals (n, 3) float32 of the faces around each vertex; (0, 0, 1) without faces."""
+    """Return the area-weighted mean normals (n, 3) float32 of the faces around each vertex; (0, 0,
+    1) without faces."""
     corners, weights = mesh.faces.ravel(), np.repeat(face_vectors(mesh), 3, axis=0)
-    normals = np.stack([np.bincount(corners, along, len(mesh.vertices)) for along in weights.T], axis=1)
+    normals = np.stack(
+        [np.bincount(corners, along, len(mesh.vertices)) for along in weights.T], axis=1
+    )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0]).astype(np.float32)
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0]).astype(
+        np.float32
+    )
 
 
 def surface_shift(before: Mesh, after: Mesh) -> tuple[float, float]:
-    """Return (RMS, maximum) in mm of the distances from the vertices of one mesh to the surface of the other."""
+    """Return (RMS, maximum) in mm of the distances from the vertices of one mesh to the surface of
+    the other."""
     o3d = open3d()
     middle = before.vertices.mean(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
     core = o3d.core
-    scene.add_triangles(core.Tensor(after.vertices - middle), core.Tensor(after.faces.astype(np.uint32)))
-    distance = scene.compute_distance(core.Tensor(before.vertices - middle)).numpy().astype(np.float64)
+    scene.add_triangles(
+        core.Tensor(after.vertices - middle), core.Tensor(after.faces.astype(np.uint32))
+    )
+    distance = (
+        scene.compute_distance(core.Tensor(before.vertices - middle)).numpy().astype(np.float64)
+    )
     return float(np.sqrt(np.mean(distance**2))), float(distance.max())
 
 
@@ -57,5 +69,6 @@ def to_open3d_mesh(mesh: Mesh) -> Any:
     """Convert to Open3D's triangle mesh; only vertices and faces."""
     o3d = open3d()
     return o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), o3d.utility.Vector3iVector(mesh.faces)
+        o3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)),
+        o3d.utility.Vector3iVector(mesh.faces),
     )

@@ -1,4 +1,5 @@
-"""Surface reconstruction by a signed distance field: mean heights above the points' tangent planes, marching cubes."""
+"""Surface reconstruction by a signed distance field: mean heights above the points' tangent planes,
+marching cubes."""
 
 import numpy as np
 
@@ -15,27 +16,34 @@ _MOST_BLOCKS = 20_000_000
 
 
 def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
-    """Reconstruct the surface of points with normals on a grid of ``cell_mm``; it extends two cells beyond the points.
+    """Reconstruct the surface of points with normals on a grid of ``cell_mm``; it extends two cells
+    beyond the points.
 
-    Points are weighted by 1 / sigma2 where known. Memory grows with the surface's area, not with the bounding box.
-    Raises InputError for points without normals, for a bounding box of too many cells, and without a surface.
+    Points are weighted by 1 / sigma2 where known. Memory grows with the surface's area, not with
+    the bounding box. Raises InputError for points without normals, for a bounding box of too many
+    cells, and without a surface.
     """
     if points.normals is None:
-        raise InputError("These points have no normals: a volume needs to know its outside; merge the scans again.")
+        raise InputError(
+            "These points have no normals: a volume needs to know its outside; merge the scans"
+            " again."
+        )
     o3d = open3d()
     origin = points.points.min(axis=0).astype(np.float64) - 4 * cell_mm
     at = (points.points - origin) / cell_mm
     shape = np.ceil(at.max(axis=0) / BLOCK).astype(np.int64) + 2
     if np.prod(shape) > _MOST_BLOCKS:
         raise InputError(
-            f"The points fill {np.ptp(points.points, axis=0).max():.0f} mm, too much for cells of {cell_mm:.3g} mm: "
-            "exclude stray scans."
+            f"The points fill {np.ptp(points.points, axis=0).max():.0f} mm, too much for cells of"
+            f" {cell_mm:.3g} mm: exclude stray scans."
         )
     touched = np.zeros(tuple(shape), bool)
     _mark_blocks(at, BLOCK, REACH, touched)
     keys = np.argwhere(touched).astype(np.int32)
     core, kinds = o3d.core, (o3d.core.float32, o3d.core.float32)
-    grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, ((1,), (1,)), 1.0, BLOCK, len(keys))
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), kinds, ((1,), (1,)), 1.0, BLOCK, len(keys)
+    )
     buffers, _ = grid.hashmap().activate(core.Tensor(keys))
     lookup = np.full(tuple(shape), -1, np.int32)
     lookup[tuple(keys.T)] = buffers.numpy()
@@ -43,20 +51,34 @@ def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     weight = grid.attribute("weight").numpy().reshape(-1, BLOCK**3)
     height[:], weight[:] = 0, 0
     sigma = points.sigma_mm
-    share = np.ones(len(points)) if sigma is None else (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
-    _add_planes(at, points.normals.astype(np.float64), share.astype(np.float64), BLOCK, REACH, lookup, height, weight)
+    share = (
+        np.ones(len(points)) if sigma is None else (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
+    )
+    _add_planes(
+        at,
+        points.normals.astype(np.float64),
+        share.astype(np.float64),
+        BLOCK,
+        REACH,
+        lookup,
+        height,
+        weight,
+    )
     known = weight > 0
     height[known] /= weight[known]
     weight[known] = 1.0
     mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
     if not len(mesh.vertex.positions):
-        raise InputError("No surface was found between the points: the cells are too fine for them.")
+        raise InputError(
+            "No surface was found between the points: the cells are too fine for them."
+        )
     vertices, faces = _sort_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy())
     return transfer_attributes(points, vertices.astype(np.float64) * cell_mm + origin, faces)
 
 
 def _sort_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sort vertices (n, 3) by position and faces (m, 3) by vertex, so that the result does not depend on threads."""
+    """Sort vertices (n, 3) by position and faces (m, 3) by vertex, so that the result does not
+    depend on threads."""
     order = np.lexsort(vertices.T)
     faces = np.argsort(order)[faces]
     first = faces.argmin(axis=1)[:, None]
@@ -66,7 +88,8 @@ def _sort_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 @kernel()
 def _mark_blocks(at, block, reach, touched):
-    """Set ``touched`` (a, b, c) True for the blocks within ``reach`` cells of points ``at`` (n, 3), in cells."""
+    """Set ``touched`` (a, b, c) True for the blocks within ``reach`` cells of points ``at`` (n, 3),
+    in cells."""
     for i in range(len(at)):
         x0, x1 = int(at[i, 0] - reach) // block, int(at[i, 0] + reach + 1) // block
         y0, y1 = int(at[i, 1] - reach) // block, int(at[i, 1] + reach + 1) // block
@@ -79,10 +102,11 @@ def _mark_blocks(at, block, reach, touched):
 
 @kernel()
 def _add_planes(at, normals, share, block, reach, lookup, height, weight):
-    """Add the signed distances to each point's tangent plane to the grid nodes around it, and their weights.
+    """Add the signed distances to each point's tangent plane to the grid nodes around it, and their
+    weights.
 
-    ``at`` (n, 3) in cells; ``share`` (n,): the points' weights; ``lookup`` (a, b, c): index of each block; ``height``
-    and ``weight`` (blocks, block^3): sums.
+    ``at`` (n, 3) in cells; ``share`` (n,): the points' weights; ``lookup`` (a, b, c): index of each
+    block; ``height`` and ``weight`` (blocks, block^3): sums.
     """
     for i in range(len(at)):
         p0, p1, p2 = at[i, 0], at[i, 1], at[i, 2]
@@ -96,5 +120,7 @@ def _add_planes(at, normals, share, block, reach, lookup, height, weight):
                     w = share[i] * near * near
                     b = lookup[x // block, y // block, z // block]
                     k = x % block + block * (y % block + block * (z % block))
-                    height[b, k] += w * (d0 * normals[i, 0] + d1 * normals[i, 1] + d2 * normals[i, 2])
+                    height[b, k] += w * (
+                        d0 * normals[i, 0] + d1 * normals[i, 1] + d2 * normals[i, 2]
+                    )
                     weight[b, k] += w

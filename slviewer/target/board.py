@@ -5,8 +5,9 @@
 ``acircles:4x11:20``           OpenCV's asymmetric grid: circle j of row i at ((2 j + i % 2) pitch, i pitch)
 ``chessboard:9x7:75``          columns x rows of *inner corners* : side of a square in mm
 ``charuco:8x6:30``             columns x rows of *squares* : side of a square in mm; then, if they differ from the
-                               defaults, ``:marker mm`` (0.75 of the square) and ``:dictionary`` (DICT_5X5_1000).
-                               The layout is OpenCV's since 4.6: the top-left square is dark
+                               defaults, ``:marker mm`` (0.75 of the square) and ``:dictionary``
+                               (DICT_5X5_1000). The layout is OpenCV's since 4.6: the top-left
+                               square is dark
 =============================  ================================================================================
 
 Plugins add others (`BoardType`).
@@ -44,11 +45,13 @@ _DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
 class BoardType:
     """A kind of board, written ``NAME:COLUMNSxROWS:PITCH`` as in ``example``.
 
-    ``features(board)``: (columns, rows) of its features. ``points(board)``: their coordinates (n, 3) float64 mm, row by
-    row, z = 0, x along a row and y along a column, as in `Board`. ``detect(board, image)``: of an image (h, w) uint8
-    the detected features as ``pixels`` (m, 2) float64 px and ``ids`` (m,) int, their indices into the points; it raises
-    DetectionError rather than return a wrong number. ``margin_pitches``: what of the board surely lies beyond the
-    outermost features, in pitches. ``what``: its name in the wizard; ``counts``: what columns, rows and pitch mean.
+    ``features(board)``: (columns, rows) of its features. ``points(board)``: their coordinates (n,
+    3) float64 mm, row by row, z = 0, x along a row and y along a column, as in `Board`.
+    ``detect(board, image)``: of an image (h, w) uint8 the detected features as ``pixels`` (m, 2)
+    float64 px and ``ids`` (m,) int, their indices into the points; it raises DetectionError rather
+    than return a wrong number. ``margin_pitches``: what of the board surely lies beyond the
+    outermost features, in pitches. ``what``: its name in the wizard; ``counts``: what columns, rows
+    and pitch mean.
     """
 
     name: str
@@ -75,7 +78,8 @@ def board_examples() -> dict[str, str]:
 
 
 def _find_example(kind: str) -> str:
-    """Return a notation of a kind of board, empty for an unknown one; no plugin is imported for those built in."""
+    """Return a notation of a kind of board, empty for an unknown one; no plugin is imported for
+    those built in."""
     return EXAMPLES.get(kind) or board_examples().get(kind, "")
 
 
@@ -83,9 +87,10 @@ def _find_example(kind: str) -> str:
 class Board:
     """A flat calibration target.
 
-    ``points``: the features, row by row: x along a row, y along a column, so that the normal (x cross y) points
-    away from a camera that sees the printed side; the first feature is the origin. ``marker_mm`` and
-    ``dictionary`` belong to ChArUco boards only. ``kind``: a `Kind`, or the name of a plugin's `BoardType`.
+    ``points``: the features, row by row: x along a row, y along a column, so that the normal (x
+    cross y) points away from a camera that sees the printed side; the first feature is the origin.
+    ``marker_mm`` and ``dictionary`` belong to ChArUco boards only. ``kind``: a `Kind`, or the name
+    of a plugin's `BoardType`.
     """
 
     kind: str
@@ -105,12 +110,13 @@ class Board:
         fewest = {"acircles": (2, 3)}.get(self.kind, (3, 3) if self.kind in EXAMPLES else (1, 1))
         if not (fewest[0] <= self.columns <= 200 and fewest[1] <= self.rows <= 200):
             raise InputError(
-                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give {fewest[0]} to 200 columns "
-                f"and {fewest[1]} to 200 rows, as in '{example}'"
+                f"a {self.kind} board of {self.columns}x{self.rows} cannot be used: give"
+                f" {fewest[0]} to 200 columns and {fewest[1]} to 200 rows, as in '{example}'"
             )
         if not (math.isfinite(self.pitch_mm) and 0.01 <= self.pitch_mm <= 10_000):
             raise InputError(
-                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in '{example}'"
+                f"a pitch of {self.pitch_mm:g} mm cannot be used: give 0.01 to 10000 mm, as in"
+                f" '{example}'"
             )
         if self.kind == "charuco":
             self._check_markers()
@@ -118,7 +124,8 @@ class Board:
             raise InputError(f"a {self.kind} board has no markers: omit marker and dictionary")
 
     def _check_markers(self) -> None:
-        """Set the defaults of marker and dictionary, and raise InputError where they do not fit the board."""
+        """Set the defaults of marker and dictionary, and raise InputError where they do not fit the
+        board."""
         if not self.marker_mm:
             object.__setattr__(self, "marker_mm", DEFAULT_MARKER * self.pitch_mm)
         if not self.dictionary:
@@ -137,8 +144,8 @@ class Board:
         needed = self.columns * self.rows // 2
         if needed > int(known[2]):
             raise InputError(
-                f"a ChArUco board of {self.columns}x{self.rows} squares needs {needed} markers, and "
-                f"{self.dictionary} has {known[2]}: choose a larger dictionary"
+                f"a ChArUco board of {self.columns}x{self.rows} squares needs {needed} markers, and"
+                f" {self.dictionary} has {known[2]}: choose a larger dictionary"
             )
 
     @classmethod
@@ -149,18 +156,22 @@ class Board:
         example = _find_example(kind)
         if not example:
             raise InputError(
-                f"board '{notation}' is not understood: start it with one of {', '.join(board_examples())}, "
-                f"for example '{EXAMPLES['circles']}'" + BOARD_PLUGINS.explain_missing(kind)
+                f"board '{notation}' is not understood: start it with one of"
+                f" {', '.join(board_examples())}, for example '{EXAMPLES['circles']}'"
+                + BOARD_PLUGINS.explain_missing(kind)
             )
         most = 4 if kind == "charuco" else 2
         if not 2 <= len(fields) <= most:
             raise InputError(
-                f"board '{notation}' has {len(fields)} fields after the kind: give columns x rows and the "
-                f"{'side of a square' if kind in ('chessboard', 'charuco') else 'pitch'} in mm, as in '{example}'"
+                f"board '{notation}' has {len(fields)} fields after the kind: give columns x rows"
+                f" and the {'side of a square' if kind in ('chessboard', 'charuco') else 'pitch'}"
+                f" in mm, as in '{example}'"
             )
         size = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", fields[0])
         if not size:
-            raise InputError(f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'")
+            raise InputError(
+                f"board '{notation}': '{fields[0]}' is not columns x rows, as in '{example}'"
+            )
         pitch = _parse_millimetres(notation, fields[1], example)
         marker = _parse_millimetres(notation, fields[2], example) if len(fields) > 2 else 0.0
         dictionary = fields[3].strip().upper() if len(fields) > 3 else ""
@@ -178,10 +189,15 @@ class Board:
 
     @property
     def features(self) -> tuple[int, int]:
-        """(columns, rows) of features: a ChArUco board of c x r squares has (c - 1) x (r - 1) inner corners."""
+        """(columns, rows) of features: a ChArUco board of c x r squares has (c - 1) x (r - 1) inner
+        corners."""
         if added := self.plugin_type:
             return added.features(self)
-        return (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
+        return (
+            (self.columns - 1, self.rows - 1)
+            if self.kind == "charuco"
+            else (self.columns, self.rows)
+        )
 
     @property
     def plugin_type(self) -> BoardType | None:
@@ -197,19 +213,25 @@ class Board:
         points = np.stack([x, i, np.zeros(len(i))], axis=1) * self.pitch_mm
         if added := self.plugin_type:
             points = np.array(added.points(self), np.float64)
-            if points.shape != (columns * rows, 3) or not np.isfinite(points).all() or points[:, 2].any():
+            if (
+                points.shape != (columns * rows, 3)
+                or not np.isfinite(points).all()
+                or points[:, 2].any()
+            ):
                 raise InputError(
-                    f"the plugin of {self.kind} boards gives points of shape {points.shape} for {columns}x{rows} "
-                    "features: it must give (n, 3) mm with z = 0, row by row"
+                    f"the plugin of {self.kind} boards gives points of shape {points.shape} for"
+                    f" {columns}x{rows} features: it must give (n, 3) mm with z = 0, row by row"
                 )
         points.flags.writeable = False
         return points
 
     def outline(self, margin_mm: float | None = None) -> NDArray[np.float64]:
-        """Return a rectangle (4, 3) float64 mm around the features, from top left over top right to bottom left.
+        """Return a rectangle (4, 3) float64 mm around the features, from top left over top right to
+        bottom left.
 
-        ``margin_mm`` beyond the outermost features; by default what is part of the board for certain: half a pitch
-        for circles, 0.95 of a square for a chessboard's inner corners, the whole sheet of squares for ChArUco.
+        ``margin_mm`` beyond the outermost features; by default what is part of the board for
+        certain: half a pitch for circles, 0.95 of a square for a chessboard's inner corners, the
+        whole sheet of squares for ChArUco.
         """
         if margin_mm is None:
             added = self.plugin_type

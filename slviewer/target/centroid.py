@@ -1,4 +1,5 @@
-"""Sub-pixel centres of circles: centroids of their ink, relative to the brightness of the paper around them."""
+"""Sub-pixel centres of circles: centroids of their ink, relative to the brightness of the paper
+around them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,48 +14,66 @@ RING_PX = 5.0
 CORE_RADIUS = 0.6
 """Share of a circle's radius that its blurred edge does not reach."""
 INITIAL_GATE = 0.35
-"""Largest variation of the background around a circle, over its contrast: light that halves across one circle."""
+"""Largest variation of the background around a circle, over its contrast: light that halves across
+one circle."""
 GATE_SIGMAS = 4.0
 FLATNESS = 0.04
-"""Pixels of the ring are background within so many standard deviations of its plane, or this share of the contrast."""
+"""Pixels of the ring are background within so many standard deviations of its plane, or this share
+of the contrast."""
 MIN_RING_PIXELS = 8
 """Smallest number of pixels for a plane fit."""
 
 
 def refine_centres(image: NDArray[np.float32], blobs: Blobs) -> NDArray[np.float64]:
-    """Return the centroids (n, 2) float64 px of the circles' ink, relative to the brightness around each circle.
+    """Return the centroids (n, 2) float64 px of the circles' ink, relative to the brightness around
+    each circle.
 
-    ``image`` (h, w) float32; ``blobs`` describe the circles' ellipses to some tenths of a pixel. Ink is ``1 - I / W``
-    with W the plane through the paper's brightness next to the circle, so that uneven light does not move the centroid;
-    for bright circles, ink is the excess over the background, divided by the plane of their own brightness. NaN where
-    too little paper is visible around a circle, or where the result is too far from the initial centre.
+    ``image`` (h, w) float32; ``blobs`` describe the circles' ellipses to some tenths of a pixel.
+    Ink is ``1 - I / W`` with W the plane through the paper's brightness next to the circle, so that
+    uneven light does not move the centroid; for bright circles, ink is the excess over the
+    background, divided by the plane of their own brightness. NaN where too little paper is visible
+    around a circle, or where the result is too far from the initial centre.
     """
     centres, covariances, inverted = blobs.centres, blobs.covariances, blobs.inverted
     ring_px = _ring_widths(centres, covariances)
     refined = np.full(centres.shape, np.nan)
-    arrays = [read_only(np.ascontiguousarray(each, np.float64)) for each in (centres, covariances, ring_px)]
-    run_rows(_measure_centroids, len(centres), read_only(np.ascontiguousarray(image)), *arrays, inverted, refined)
+    arrays = [
+        read_only(np.ascontiguousarray(each, np.float64))
+        for each in (centres, covariances, ring_px)
+    ]
+    run_rows(
+        _measure_centroids,
+        len(centres),
+        read_only(np.ascontiguousarray(image)),
+        *arrays,
+        inverted,
+        refined,
+    )
     off = np.linalg.norm(refined - centres, axis=1)
     refined[~(off < np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))] = np.nan
     return refined
 
 
 def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-    """Return the width (n,) px of the paper between each circle's edge and its nearest neighbour's."""
+    """Return the width (n,) px of the paper between each circle's edge and its nearest
+    neighbour's."""
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     nearest = apart.argmin(1)
     towards = (centres[nearest] - centres) / apart.min(1)[:, None]
-    # half the width of an ellipse along a direction e: 2 sqrt(e C e), C being a quarter of the squared half axes
+    # half the width of an ellipse along a direction e: 2 sqrt(e C e), C being a quarter of the
+    # squared half axes
     own, other = (
-        2 * np.sqrt(np.einsum("ni,nij,nj->n", towards, c, towards)) for c in (covariances, covariances[nearest])
+        2 * np.sqrt(np.einsum("ni,nij,nj->n", towards, c, towards))
+        for c in (covariances, covariances[nearest])
     )
     return np.asarray(apart.min(1) - own - other)
 
 
 @kernel()
 def _measure_centroids(first, last, image, centres, covariances, gaps, inverted, out):
-    """Fill ``out`` (n, 2) with the centroids px of circles ``first`` to ``last``; others stay as they are.
+    """Fill ``out`` (n, 2) with the centroids px of circles ``first`` to ``last``; others stay as
+    they are.
 
     ``gaps`` (n,): width px of the paper around each circle.
     """
@@ -72,16 +91,26 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
         u1, v1 = min(int(np.ceil(u + far_u)) + 1, width), min(int(np.ceil(v + far_v)) + 1, height)
         size = max(u1 - u0, 0) * max(v1 - v0, 0)
         place, level = np.empty((2, size)), np.empty(size)
-        within, ring, core = np.zeros(size, np.bool_), np.zeros(size, np.bool_), np.zeros(size, np.bool_)
+        within, ring, core = (
+            np.zeros(size, np.bool_),
+            np.zeros(size, np.bool_),
+            np.zeros(size, np.bool_),
+        )
         i = 0
         for row in range(v0, v1):
             for column in range(u0, u1):
                 du, dv = column - u, row - v
                 square = (yy * du * du - 2 * xy * du * dv + xx * dv * dv) / (4 * determinant)
                 radius = np.sqrt(max(square, 0.0))  # 1 on the edge
-                beyond = np.sqrt(du * du + dv * dv) * (1 - 1 / max(radius, 1e-6))  # px from the edge, outwards
+                beyond = np.sqrt(du * du + dv * dv) * (
+                    1 - 1 / max(radius, 1e-6)
+                )  # px from the edge, outwards
                 place[0, i], place[1, i], level[i] = du, dv, image[row, column]
-                within[i], ring[i], core[i] = beyond < soft, soft < beyond < end, radius < CORE_RADIUS
+                within[i], ring[i], core[i] = (
+                    beyond < soft,
+                    soft < beyond < end,
+                    radius < CORE_RADIUS,
+                )
                 i += 1
         if np.count_nonzero(ring) < MIN_RING_PIXELS or not core.any():
             continue
@@ -101,10 +130,12 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
 
 @kernel()
 def _fit_paper_level(place, level, ring, ink):
-    """Fit a plane to the brightness ``level`` (n,) of the ``ring`` (n,) around a circle, without edges or other blobs.
+    """Fit a plane to the brightness ``level`` (n,) of the ``ring`` (n,) around a circle, without
+    edges or other blobs.
 
-    Where the ring does not fit one plane, the fit starts with the quarter that differs most from the circle's own level
-    ``ink`` and continues with the pixels within the noise of the plane. ``place`` (2, n) px from the circle's centre.
+    Where the ring does not fit one plane, the fit starts with the quarter that differs most from
+    the circle's own level ``ink`` and continues with the pixels within the noise of the plane.
+    ``place`` (2, n) px from the circle's centre.
     """
     plane = _fit_plane(place, level, ring)
     levels = level[ring]
@@ -119,7 +150,9 @@ def _fit_paper_level(place, level, ring, ink):
             return plane
         plane = _fit_plane(place, level, near)
         off = _distances(plane, place, level)
-        near = ring & (off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLATNESS * contrast))
+        near = ring & (
+            off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLATNESS * contrast)
+        )
     return _fit_plane(place, level, near) if np.count_nonzero(near) >= MIN_RING_PIXELS else plane
 
 
@@ -131,24 +164,42 @@ def _quantile(values, share):
 
 @kernel()
 def _fit_plane(place, level, where):
-    """Return the plane (mean level, slope along u, along v, mean u, mean v) of least squares through pixels ``where``.
+    """Return the plane (mean level, slope along u, along v, mean u, mean v) of least squares
+    through pixels ``where``.
 
     Its slopes are 0 where the pixels are on one line.
     """
     count, mean_u, mean_v, mean = 0, 0.0, 0.0, 0.0
     for i in range(len(level)):
         if where[i]:
-            count, mean_u, mean_v, mean = count + 1, mean_u + place[0, i], mean_v + place[1, i], mean + level[i]
+            count, mean_u, mean_v, mean = (
+                count + 1,
+                mean_u + place[0, i],
+                mean_v + place[1, i],
+                mean + level[i],
+            )
     mean_u, mean_v, mean = mean_u / count, mean_v / count, mean / count
     uu, uv, vv, ul, vl = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(level)):
         if where[i]:
             du, dv, dl = place[0, i] - mean_u, place[1, i] - mean_v, level[i] - mean
-            uu, uv, vv, ul, vl = uu + du * du, uv + du * dv, vv + dv * dv, ul + du * dl, vl + dv * dl
+            uu, uv, vv, ul, vl = (
+                uu + du * du,
+                uv + du * dv,
+                vv + dv * dv,
+                ul + du * dl,
+                vl + dv * dl,
+            )
     determinant = uu * vv - uv * uv
     if not determinant > 1e-9 * uu * vv:
         return mean, 0.0, 0.0, mean_u, mean_v
-    return mean, (vv * ul - uv * vl) / determinant, (uu * vl - uv * ul) / determinant, mean_u, mean_v
+    return (
+        mean,
+        (vv * ul - uv * vl) / determinant,
+        (uu * vl - uv * ul) / determinant,
+        mean_u,
+        mean_v,
+    )
 
 
 @kernel()

@@ -1,4 +1,5 @@
-"""Detect the inner corners of a ChArUco board; its markers identify them, so that a part of the board is enough."""
+"""Detect the inner corners of a ChArUco board; its markers identify them, so that a part of the
+board is enough."""
 
 import cv2
 import numpy as np
@@ -19,11 +20,14 @@ SUFFICIENT_SHARE = 0.8
 def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
     """Return the board as an OpenCV ``CharucoBoard``."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    return cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary)
+    return cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary
+    )
 
 
 def detect_charuco(board: Board, image: BoardImage) -> tuple[NDArray[np.float64], np.ndarray]:
-    """Detect corners; returns pixels (n, 2) float64 and ids (n,) int. Raises DetectionError for too few corners."""
+    """Detect corners; returns pixels (n, 2) float64 and ids (n,) int. Raises DetectionError for too
+    few corners."""
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     first = min(1.0, SEARCH_PX / max(image.grey.shape))
     best: tuple[np.ndarray, np.ndarray] | None = None
@@ -45,8 +49,8 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[NDArray[np.float64]
     if best is None or detected < MIN_CORNERS:
         total_markers = board.columns * board.rows // 2
         raise DetectionError(
-            f"{detected} of {len(board.points)} corners and {markers} of {total_markers} markers of {board} detected, "
-            f"and a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
+            f"{detected} of {len(board.points)} corners and {markers} of {total_markers} markers of"
+            f" {board} detected, and a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
         )
     check_grid(board, *best, "corners")
     return best

@@ -12,15 +12,28 @@ from slviewer.target.blobs import Blobs, detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
 from slviewer.target.images import SEARCH_PX, BoardImage, light_advice, resize_image
-from slviewer.target.lattice import AREA_RATIO, NODE_RADIUS, Lattice, complete_lattice, grow_lattices, match_pattern
+from slviewer.target.lattice import (
+    AREA_RATIO,
+    NODE_RADIUS,
+    Lattice,
+    complete_lattice,
+    grow_lattices,
+    match_pattern,
+)
 from slviewer.target.mark import select_numbering_by_mark
-from slviewer.target.numbering import MAX_GRID_OFFSET, MAX_GRID_OFFSET_SIGMAS, check_grid, select_upright
+from slviewer.target.numbering import (
+    MAX_GRID_OFFSET,
+    MAX_GRID_OFFSET_SIGMAS,
+    check_grid,
+    select_upright,
+)
 from slviewer.target.planar import GridMap, fit_grid_map, fit_homography, jacobians
 
 CLUTTER_FREE_SHARE = 1 / 3
 """Share of the board's circles in one lattice that clutter never reaches."""
 SQUARE_LIMIT_ROUNDNESS = 0.97
-"""Limit between the roundness of squares, 0.955, and of well-resolved circles, 0.985 and more on real photographs."""
+"""Limit between the roundness of squares, 0.955, and of well-resolved circles, 0.985 and more on
+real photographs."""
 WHOLE_CIRCLE_ROUNDNESS = 0.96
 """Roundness below which a circle is partly covered."""
 MIN_SHAPE_AREA_PX = 60.0
@@ -30,7 +43,8 @@ RESOLVED_AREA_PX = 80.0
 CONTINUATION_SHARE = 1 / 3
 """Share of a further row or column of circles above which the board is larger than stated."""
 DOMINANT_AREA_RATIO = 2.0
-"""Smallest ratio of the areas of two boards of the same kind at which the larger one is selected."""
+"""Smallest ratio of the areas of two boards of the same kind at which the larger one is
+selected."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +72,28 @@ class _Grid:
 def detect_circles(board: Board, image: BoardImage) -> tuple[NDArray[np.float64], float, bool]:
     """Detect every circle of a board.
 
-    Returns the centres (n, 2) float64 px in the order of ``board.points``, the circles' radius in mm, and whether the
-    board's mark was detected. Raises DetectionError, whose message gives the number of circles detected.
+    Returns the centres (n, 2) float64 px in the order of ``board.points``, the circles' radius in
+    mm, and whether the board's mark was detected. Raises DetectionError, whose message gives the
+    number of circles detected.
     """
     tried: list[_Binarisation] = []
     for attempt in _binarise_all(board, image.grey):
         tried.append(attempt)
-        grids = [grid for lattice in attempt.lattices if (grid := _match_board(board, lattice, attempt.blobs, image))]
+        grids = [
+            grid
+            for lattice in attempt.lattices
+            if (grid := _match_board(board, lattice, attempt.blobs, image))
+        ]
         if grids:
             return _measure(board, image, _select_board(board, grids))
     most = max(tried, key=_size_of_largest, default=None)
     if most is not None and _size_of_largest(most) > CLUTTER_FREE_SHARE * len(board.points):
-        # what one binarisation lacks, another may have: reflections and shadows cover parts of the board
+        # what one binarisation lacks, another may have: reflections and shadows cover parts of the
+        # board
         inverted = most.blobs.inverted
-        pool = _pool_blobs(most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted])
+        pool = _pool_blobs(
+            most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted]
+        )
         grid = _match_board(board, complete_lattice(max(most.lattices, key=len), pool), pool, image)
         if grid:
             return _measure(board, image, grid)
@@ -84,10 +106,11 @@ def _size_of_largest(attempt: _Binarisation) -> int:
 
 
 def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
-    """Yield binarisations at the search resolution, at half of it, at the full and at twice the full resolution.
+    """Yield binarisations at the search resolution, at half of it, at the full and at twice the
+    full resolution.
 
-    Once a third of the board is detected, the circles' polarity is fixed, and resolutions that cannot improve the
-    detection are skipped.
+    Once a third of the board is detected, the circles' polarity is fixed, and resolutions that
+    cannot improve the detection are skipped.
     """
     first = min(1.0, SEARCH_PX / max(grey.shape))
     colours = [False, True]
@@ -130,15 +153,16 @@ def _match_board(board: Board, lattice: Lattice, blobs: Blobs, image: BoardImage
             numberings, grid_map = fitting[0]
             if len(fitting) > 1 or _grid_continues(board, grid_map, blobs, numberings[0]):
                 raise DetectionError(
-                    f"{len(candidate)} circles in one grid detected where {board} has {len(board.points)}: "
-                    "check the board's columns and rows"
+                    f"{len(candidate)} circles in one grid detected where {board} has"
+                    f" {len(board.points)}: check the board's columns and rows"
                 )
             return _Grid(blobs, numberings)
     return None
 
 
 def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
-    """Fit the map from board to image; None unless the blobs, in the board's order, form a grid of equal circles."""
+    """Fit the map from board to image; None unless the blobs, in the board's order, form a grid of
+    equal circles."""
     points = board.points[:, :2] / board.pitch_mm
     try:
         grid_map = fit_grid_map(points, blobs.centres, robust=True)
@@ -147,38 +171,53 @@ def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
     pitch = grid_map.pitch_px(points)
     size = np.sqrt(blobs.areas) / np.maximum(pitch, 1e-9)
     alike = np.abs(np.log(size / np.median(size))) < np.log(AREA_RATIO) / 2
-    return grid_map if (alike & (np.linalg.norm(grid_map.residuals, axis=1) < NODE_RADIUS * pitch)).all() else None
+    return (
+        grid_map
+        if (alike & (np.linalg.norm(grid_map.residuals, axis=1) < NODE_RADIUS * pitch)).all()
+        else None
+    )
 
 
 def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
     """Return whether circles of the grid's size continue it by one more row or column.
 
-    A blob counts only if it is as close to its extrapolated position as the grid's own circles are; most clutter next
-    to a board is not.
+    A blob counts only if it is as close to its extrapolated position as the grid's own circles are;
+    most clutter next to a board is not.
     """
     points = board.points[:, :2] / board.pitch_mm
-    size = float(np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(grid_map.pitch_px(points), 1e-9)))
+    size = float(
+        np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(grid_map.pitch_px(points), 1e-9))
+    )
     others = np.delete(np.arange(len(blobs.centres)), numbering)
     if not len(others):
         return False
     for side in _neighbouring_rows(board):
         pitch = grid_map.pitch_px(side)
-        apart = np.linalg.norm(grid_map.to_image(side)[:, None] - blobs.centres[others][None], axis=2)
+        apart = np.linalg.norm(
+            grid_map.to_image(side)[:, None] - blobs.centres[others][None], axis=2
+        )
         nearest = apart.argmin(1)
         gate = np.maximum(MAX_GRID_OFFSET * pitch, 2 * MAX_GRID_OFFSET_SIGMAS * grid_map.sigma_px)
         ratio = np.sqrt(blobs.areas[others[nearest]]) / np.maximum(size * pitch, 1e-9)
-        on = (pitch > 0) & (apart.min(1) < gate) & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25))
+        on = (
+            (pitch > 0)
+            & (apart.min(1) < gate)
+            & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25))
+        )
         if np.count_nonzero(on) >= max(2.0, CONTINUATION_SHARE * len(side)):
             return True
     return False
 
 
 def _neighbouring_rows(board: Board) -> list[np.ndarray]:
-    """Return the positions (k, 2), in pitches, of one more row or column of circles at each of the four sides."""
+    """Return the positions (k, 2), in pitches, of one more row or column of circles at each of the
+    four sides."""
     columns, rows = board.features
     i, j = np.arange(rows), np.arange(columns)
     if board.kind == "acircles":
-        above, below = (np.stack([2 * j + row % 2, np.full(columns, row)], axis=1) for row in (-1, rows))
+        above, below = (
+            np.stack([2 * j + row % 2, np.full(columns, row)], axis=1) for row in (-1, rows)
+        )
         left, right = (np.stack([2 * column + i % 2, i], axis=1) for column in (-1, columns))
     else:
         above, below = (np.stack([j, np.full(columns, row)], axis=1) for row in (-1, rows))
@@ -187,19 +226,21 @@ def _neighbouring_rows(board: Board) -> list[np.ndarray]:
 
 
 def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
-    """Select the grid with the largest area in the image; raises DetectionError where two are of similar area."""
+    """Select the grid with the largest area in the image; raises DetectionError where two are of
+    similar area."""
     grids = sorted(grids, key=lambda grid: -grid.area_px)
     if len(grids) > 1 and grids[0].area_px < DOMINANT_AREA_RATIO * grids[1].area_px:
         (a, b), (c, d) = (grid.blobs.centres[grid.numberings[0]].mean(0) for grid in grids[:2])
         raise DetectionError(
-            f"{len(grids)} boards {board} detected, around pixels {a:.0f}, {b:.0f} and {c:.0f}, {d:.0f}: "
-            "take one out of view; a mirror image counts as well"
+            f"{len(grids)} boards {board} detected, around pixels {a:.0f}, {b:.0f} and {c:.0f},"
+            f" {d:.0f}: take one out of view; a mirror image counts as well"
         )
     return grids[0]
 
 
 def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
-    """Number the grid and refine its centres; returns (pixels (n, 2), radius in mm, whether the mark was detected)."""
+    """Number the grid and refine its centres; returns (pixels (n, 2), radius in mm, whether the
+    mark was detected)."""
     marked = select_numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
     blobs = grid.blobs.select(order)
@@ -211,7 +252,9 @@ def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
     """Raise DetectionError where blobs are squares or partly covered circles."""
     large = blobs.areas > MIN_SHAPE_AREA_PX
     if large.all() and np.median(blobs.roundness) < SQUARE_LIMIT_ROUNDNESS:
-        raise DetectionError(f"a grid of squares detected where {board} has circles: check the board's kind")
+        raise DetectionError(
+            f"a grid of squares detected where {board} has circles: check the board's kind"
+        )
     covered = np.count_nonzero(large & (blobs.roundness < WHOLE_CIRCLE_ROUNDNESS))
     if covered:
         raise DetectionError(
@@ -221,13 +264,14 @@ def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
 
 
 def _refine_centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
-    """Return the sub-pixel centres (n, 2) px; raises DetectionError where one cannot be measured or fits no grid."""
+    """Return the sub-pixel centres (n, 2) px; raises DetectionError where one cannot be measured or
+    fits no grid."""
     pixels = refine_centres(image.deep, blobs)
     unmeasured = np.isnan(pixels).any(1)
     if unmeasured.any():
         raise DetectionError(
-            f"{np.count_nonzero(unmeasured)} of {len(pixels)} circles are too close to their neighbours or too faint "
-            "to measure: move the board closer, or focus the camera"
+            f"{np.count_nonzero(unmeasured)} of {len(pixels)} circles are too close to their"
+            " neighbours or too faint to measure: move the board closer, or focus the camera"
         )
     check_grid(board, pixels, np.arange(len(pixels)), "circles")
     return pixels
@@ -241,7 +285,8 @@ def _measure_radius(board: Board, blobs: Blobs) -> float:
 
 
 def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
-    """Merge the blobs of several binarisations; of duplicates the one from the earlier binarisation remains."""
+    """Merge the blobs of several binarisations; of duplicates the one from the earlier binarisation
+    remains."""
     pool = first
     for blobs in others:
         apart = np.linalg.norm(blobs.centres[:, None] - pool.centres[None], axis=2).min(1)
@@ -266,18 +311,22 @@ def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None
     others = len(most.blobs.centres) - detected
     if detected >= total:
         return (
-            f"{detected} circles detected in a grid of {longer}x{shorter} that does not hold all of {board}: "
-            "check the board's columns and rows, and that nothing covers it"
+            f"{detected} circles detected in a grid of {longer}x{shorter} that does not hold all of"
+            f" {board}: check the board's columns and rows, and that nothing covers it"
         )
     facts = [f"{detected} of {total} circles of {board} detected"]
     if others:
         facts.append(f"among {others} other round blobs")
     centres = most.blobs.centres[lattice.blobs]
-    spacing = float(np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1))))
+    spacing = float(
+        np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1)))
+    )
     height, width = image.grey.shape
     gaps = {"left": centres[:, 0].min(), "right": width - 1 - centres[:, 0].max()}
     gaps |= {"upper": centres[:, 1].min(), "lower": height - 1 - centres[:, 1].max()}
-    sides = [side for side, gap in gaps.items() if gap < 1.5 * spacing]  # a circle that the border cuts is not detected
+    sides = [
+        side for side, gap in gaps.items() if gap < 1.5 * spacing
+    ]  # a circle that the border cuts is not detected
     if sides:
         facts.append(f"up to the {' and the '.join(sides)} border of the image")
     return f"{', '.join(facts)}: {light_advice(image.grey)}"

@@ -1,4 +1,5 @@
-"""Coded markers: squares that carry a number, detected in an image, and drawn on sheets to print."""
+"""Coded markers: squares that carry a number, detected in an image, and drawn on sheets to
+print."""
 
 import re
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ MOST_MARKERS = 587
 SMALLEST_PX = 16.0
 """Side of a marker below which its corners are too uncertain to be used."""
 _CONTRAST = 12.0
-"""Grey levels between a marker's border and the white around it, below which its sides are not measured."""
+"""Grey levels between a marker's border and the white around it, below which its sides are not
+measured."""
 _SEEN = 0.6
 """Share of a side's profiles that must cross it once."""
 _QUIET = 0.2
@@ -29,8 +31,9 @@ _PAGE_MM = (190.0, 277.0)
 
 @dataclass(frozen=True, eq=False)
 class CodedMarkers:
-    """Markers in an image: numbers ``ids`` (n,) int, each seen once, and ``corners`` (n, 4, 2) float64 px, in the order
-    of OpenCV. ``repeated``: numbers that were seen more than once, and are not among them."""
+    """Markers in an image: numbers ``ids`` (n,) int, each seen once, and ``corners`` (n, 4, 2)
+    float64 px, in the order of OpenCV. ``repeated``: numbers that were seen more than once, and are
+    not among them."""
 
     ids: NDArray[np.int_]
     corners: Floats
@@ -38,7 +41,8 @@ class CodedMarkers:
 
 
 def detect_markers(grey: NDArray[np.uint8]) -> CodedMarkers:
-    """Detect the markers of the first of `DICTIONARIES` that is seen in an image (h, w), with subpixel corners."""
+    """Detect the markers of the first of `DICTIONARIES` that is seen in an image (h, w), with
+    subpixel corners."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
     for name in DICTIONARIES:
@@ -46,33 +50,42 @@ def detect_markers(grey: NDArray[np.uint8]) -> CodedMarkers:
         found, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
         if ids is not None and len(ids):
             return _select(
-                grey, np.ravel(ids), np.reshape(found, (-1, 4, 2)).astype(np.float64), dictionary.markerSize + 2
+                grey,
+                np.ravel(ids),
+                np.reshape(found, (-1, 4, 2)).astype(np.float64),
+                dictionary.markerSize + 2,
             )
     return CodedMarkers(np.zeros(0, int), np.zeros((0, 4, 2)))
 
 
 def _select(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, modules: int) -> CodedMarkers:
-    """Keep markers that are large enough, were seen once and have sharp sides, ordered by number; refine corners."""
+    """Keep markers that are large enough, were seen once and have sharp sides, ordered by number;
+    refine corners."""
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
     ids, corners = ids[sides >= SMALLEST_PX], corners[sides >= SMALLEST_PX]
     numbers, counts = np.unique(ids, return_counts=True)
     refined = {
         int(number): quad
         for number, rough in zip(ids, corners, strict=True)
-        if number in numbers[counts == 1] and (quad := _refine_corners(grey, rough, modules)) is not None
+        if number in numbers[counts == 1]
+        and (quad := _refine_corners(grey, rough, modules)) is not None
     }
     order = sorted(refined)
     repeated = tuple(int(number) for number in numbers[counts > 1])
     return CodedMarkers(
-        np.array(order, int), np.reshape([refined[k] for k in order], (-1, 4, 2)).astype(float), repeated
+        np.array(order, int),
+        np.reshape([refined[k] for k in order], (-1, 4, 2)).astype(float),
+        repeated,
     )
 
 
 def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats | None:
-    """Return the corners (4, 2) px where the marker's four sides meet, each a parabola through the places where the
-    brightness is half way from the black border to the white around it; None where a side is not seen.
+    """Return the corners (4, 2) px where the marker's four sides meet, each a parabola through the
+    places where the brightness is half way from the black border to the white around it; None where
+    a side is not seen.
 
-    The border alone decides: the windows of general corner detectors would reach into the modules inside of it.
+    The border alone decides: the windows of general corner detectors would reach into the modules
+    inside of it.
     """
     for _ in range(2):
         sides = [_fit_side(grey, quad[k], quad[(k + 1) % 4], modules) for k in range(4)]
@@ -82,7 +95,10 @@ def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats 
         for k in range(4):
             before, after = sides[k - 1], sides[k]
             assert before is not None and after is not None
-            (p, d), (q, e) = before[1], after[0]  # places and directions of the sides at their common corner
+            (p, d), (q, e) = (
+                before[1],
+                after[0],
+            )  # places and directions of the sides at their common corner
             along = np.linalg.lstsq(np.stack([d, -e], axis=1), q - p, rcond=None)[0]
             meeting.append(p + along[0] * d)
         quad = np.array(meeting)
@@ -92,14 +108,17 @@ def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats 
 def _fit_side(
     grey: np.ndarray, start: np.ndarray, end: np.ndarray, modules: int
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None:
-    """Return place (2,) px and direction (2,) of a marker's side at its start and end; None if it is not seen."""
+    """Return place (2,) px and direction (2,) of a marker's side at its start and end; None if it
+    is not seen."""
     length = float(np.linalg.norm(end - start))
     way = (end - start) / length
     outward = np.array([way[1], -way[0]])  # corners run clockwise in the image
     reach = min(0.7 * length / modules, 6.0)
     t = np.linspace(0.06, 0.94, max(12, int(length)))
     offsets = np.linspace(-reach, reach, 4 * int(np.ceil(reach)) + 1)
-    places = (start + t[:, None, None] * (end - start) + offsets[:, None] * outward).astype(np.float32)
+    places = (start + t[:, None, None] * (end - start) + offsets[:, None] * outward).astype(
+        np.float32
+    )
     profile = np.asarray(cv2.remap(grey, places[..., 0], places[..., 1], cv2.INTER_CUBIC), float)
     dark, bright = np.median(profile[:, 0]), np.median(profile[:, -1])
     if not bright - dark > _CONTRAST:
@@ -119,41 +138,52 @@ def _fit_side(
     curve = np.polyfit(t[clear][good], place[good], 2)
     slope = np.polyder(curve)
     ends = [
-        (start + k * (end - start) + np.polyval(curve, k) * outward, way * length + np.polyval(slope, k) * outward)
+        (
+            start + k * (end - start) + np.polyval(curve, k) * outward,
+            way * length + np.polyval(slope, k) * outward,
+        )
         for k in (0.0, 1.0)
     ]
     return ends[0], ends[1]
 
 
 def marker_modules(number: int) -> NDArray[np.uint8]:
-    """The modules (m, m) of a marker of the first dictionary with its black border: 0 black, 255 white."""
+    """The modules (m, m) of a marker of the first dictionary with its black border: 0 black, 255
+    white."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARIES[0]))
     cells = dictionary.markerSize + 2
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, cells, borderBits=1))
 
 
 def draw_marker_sheet(notation: str) -> Drawing:
-    """Draw the sheet ``markers:FIRST-LAST:SIDE`` (numbers to cut out, mm) or ``mat:SIDE`` (a mat for a turntable: rings
-    of markers about a cross). Raises InputError for other notations, and for sheets that do not fit on A4."""
+    """Draw the sheet ``markers:FIRST-LAST:SIDE`` (numbers to cut out, mm) or ``mat:SIDE`` (a mat
+    for a turntable: rings of markers about a cross). Raises InputError for other notations, and for
+    sheets that do not fit on A4.
+    """
     if match := re.fullmatch(r"markers:(\d{1,3})-(\d{1,3}):(\d{1,3}(?:\.\d{1,2})?)", notation):
         return _draw_numbers(int(match[1]), int(match[2]), float(match[3]))
     if match := re.fullmatch(r"mat:(\d{1,3}(?:\.\d{1,2})?)", notation):
         return _draw_mat(float(match[1]))
-    raise InputError(f"{notation!r} is no sheet of markers: write markers:0-23:20 (numbers, mm) or mat:16 (mm)")
+    raise InputError(
+        f"{notation!r} is no sheet of markers: write markers:0-23:20 (numbers, mm) or mat:16 (mm)"
+    )
 
 
 def _draw_numbers(first: int, last: int, side: float) -> Drawing:
     """Draw a sheet of markers with cutting marks and numbers."""
     if not (5 <= side <= 150 and first <= last < MOST_MARKERS):
         raise InputError(
-            f"markers {first} to {last} of {side:g} mm are not possible: give numbers from 0 to {MOST_MARKERS - 1} in "
-            "ascending order, and a side of 5 to 150 mm"
+            f"markers {first} to {last} of {side:g} mm are not possible: give numbers from 0 to"
+            f" {MOST_MARKERS - 1} in ascending order, and a side of 5 to 150 mm"
         )
     pitch = side * (1 + 2 * _QUIET) + 4.0
     columns, rows = (int((length + 1e-9) // pitch) for length in _PAGE_MM)
     count = last - first + 1
     if count > columns * rows:
-        raise InputError(f"{count} markers of {side:g} mm do not fit on A4, {columns * rows} do: make several sheets")
+        raise InputError(
+            f"{count} markers of {side:g} mm do not fit on A4, {columns * rows} do: make several"
+            " sheets"
+        )
     drawing = Drawing(210.0, 297.0)
     for i in range(count):
         left, top = 10.0 + pitch * (i % columns), 10.0 + pitch * (i // columns)
@@ -179,12 +209,21 @@ def _draw_mat(side: float) -> Drawing:
             x, y = centre + radius * np.array([np.cos(angle), np.sin(angle)]) - side / 2
             _add_marker(drawing, number, float(x), float(y), side)
             number += 1
-    drawing.rectangles += [(centre[0] - 5, centre[1] - 0.1, 10, 0.2), (centre[0] - 0.1, centre[1] - 5, 0.2, 10)]
-    drawing.circles += [(centre[0] + 95 * np.cos(a), centre[1] + 95 * np.sin(a), 0.2) for a in np.arange(0, 6.28, 0.05)]
-    drawing.texts.append((10.0, 10.0, 3.0, f"slviewer mat, markers of {side:g} mm: put the cross on the axis"))
+    drawing.rectangles += [
+        (centre[0] - 5, centre[1] - 0.1, 10, 0.2),
+        (centre[0] - 0.1, centre[1] - 5, 0.2, 10),
+    ]
+    drawing.circles += [
+        (centre[0] + 95 * np.cos(a), centre[1] + 95 * np.sin(a), 0.2)
+        for a in np.arange(0, 6.28, 0.05)
+    ]
+    drawing.texts.append(
+        (10.0, 10.0, 3.0, f"slviewer mat, markers of {side:g} mm: put the cross on the axis")
+    )
     return drawing
 
 
 def _add_marker(drawing: Drawing, number: int, left: float, top: float, side: float) -> None:
-    """Add the black modules of a marker whose upper left corner is at (left, top) mm, neighbours in a row merged."""
+    """Add the black modules of a marker whose upper left corner is at (left, top) mm, neighbours in
+    a row merged."""
     drawing.add_cells(marker_modules(number) == 0, left, top, side)

@@ -20,12 +20,14 @@ _FEWEST = 6
 
 @dataclass(frozen=True)
 class Detection:
-    """Detected features: ``pixels`` (n, 2) float64 px, and ``ids`` (n,) int, their indices into ``board.points``.
+    """Detected features: ``pixels`` (n, 2) float64 px, and ``ids`` (n,) int, their indices into
+    ``board.points``.
 
-    All features in order for circles and chessboards, the detected ones for ChArUco. A circle's pixel is
-    the centroid of its image, which perspective and distortion move away from the image of its centre (some hundredths
-    of a pixel; it grows with the square of the radius): ``radius_mm``, 0 for corners, is there to correct that.
-    ``marked``: the mark beside the first circle was detected, so that the numbering is the board's own at any turn.
+    All features in order for circles and chessboards, the detected ones for ChArUco. A circle's
+    pixel is the centroid of its image, which perspective and distortion move away from the image of
+    its centre (some hundredths of a pixel; it grows with the square of the radius): ``radius_mm``,
+    0 for corners, is there to correct that. ``marked``: the mark beside the first circle was
+    detected, so that the numbering is the board's own at any turn.
     """
 
     pixels: NDArray[np.float64]
@@ -37,10 +39,11 @@ class Detection:
 def detect(board: Board, image: np.ndarray) -> Detection:
     """Detect a board's features in an image (h, w), or (h, w, 3) RGB, uint8 or uint16.
 
-    The numbering's x axis turns clockwise into its y axis in the image, always. A symmetric board is numbered from its
-    mark (``slviewer.target.mark``); where none is detected, the rule of ``slviewer.target.numbering`` selects the
-    numbering. Raises DetectionError, whose message states what was detected and what to do, rather than return a grid
-    with a feature missing, misplaced or shifted.
+    The numbering's x axis turns clockwise into its y axis in the image, always. A symmetric board
+    is numbered from its mark (``slviewer.target.mark``); where none is detected, the rule of
+    ``slviewer.target.numbering`` selects the numbering. Raises DetectionError, whose message states
+    what was detected and what to do, rather than return a grid with a feature missing, misplaced or
+    shifted.
     """
     board_image = BoardImage.from_image(image)
     if board.kind == "charuco":
@@ -57,27 +60,37 @@ def detect(board: Board, image: np.ndarray) -> Detection:
 
 
 def _check_detection(board: Board, pixels: np.ndarray, ids: np.ndarray) -> Detection:
-    """Return what a plugin's detector found. Raises DetectionError where its numbers cannot be those of the board."""
+    """Return what a plugin's detector found. Raises DetectionError where its numbers cannot be
+    those of the board."""
     pixels, ids = np.asarray(pixels, np.float64), np.asarray(ids)
     known = len(board.points)
-    distinct = pixels.shape == (len(ids), 2) and np.isfinite(pixels).all() and len(np.unique(ids)) == len(ids)
+    distinct = (
+        pixels.shape == (len(ids), 2)
+        and np.isfinite(pixels).all()
+        and len(np.unique(ids)) == len(ids)
+    )
     if not distinct or (len(ids) and (ids.min() < 0 or ids.max() >= known)):
         raise DetectionError(
-            f"the plugin of {board.kind} boards returned features that are not distinct, or not among the {known} of "
-            "the board: report it to its maker"
+            f"the plugin of {board.kind} boards returned features that are not distinct, or not"
+            f" among the {known} of the board: report it to its maker"
         )
     if len(ids) < _FEWEST:
-        raise DetectionError(f"{len(ids)} of {known} features were detected: show the whole board, evenly lit")
+        raise DetectionError(
+            f"{len(ids)} of {known} features were detected: show the whole board, evenly lit"
+        )
     return Detection(pixels, ids.astype(int))
 
 
 def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return the mask (h, w) bool of the pixels inside ``board.outline()``, by the homography of the detected features.
+    """Return the mask (h, w) bool of the pixels inside ``board.outline()``, by the homography of
+    the detected features.
 
     ``shape`` is the image's, (h, w) or (h, w, 3).
     """
     if len(detection.ids) < 4:
-        raise InputError(f"{len(detection.ids)} features do not give a board's outline: detect at least 4")
+        raise InputError(
+            f"{len(detection.ids)} features do not give a board's outline: detect at least 4"
+        )
     H = fit_homography(board.points[detection.ids][:, :2], np.asarray(detection.pixels, float))
     corners = to_image(H, board.outline()[:, :2])
     mask = np.zeros(shape[:2], np.uint8)

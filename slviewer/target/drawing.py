@@ -8,12 +8,14 @@ MM_PER_POINT = 25.4 / 72
 LARGEST_PDF_MM = 14_400 * MM_PER_POINT
 """Side of the largest page that PDF viewers accept."""
 ARC_CONTROL = 0.5522847498
-"""Handles of a quarter circle's Bezier curve over its radius; the curve leaves the circle by 0.03 % of it at most."""
+"""Handles of a quarter circle's Bezier curve over its radius; the curve leaves the circle by 0.03 %
+of it at most."""
 
 
 @dataclass
 class Drawing:
-    """Black shapes on a page of ``width`` x ``height`` mm; x to the right, y down from the top left corner, mm."""
+    """Black shapes on a page of ``width`` x ``height`` mm; x to the right, y down from the top left
+    corner, mm."""
 
     width: float
     height: float
@@ -25,26 +27,33 @@ class Drawing:
     """(x, y of the baseline, size of the letters, ASCII text)"""
 
     def add_cells(self, black: np.ndarray, left: float, top: float, side: float) -> None:
-        """Add the black cells (m, m) bool of a square of ``side`` mm at (left, top), neighbours in a row merged."""
+        """Add the black cells (m, m) bool of a square of ``side`` mm at (left, top), neighbours in
+        a row merged."""
         cell = side / len(black)
         for i, row in enumerate(np.pad(black, ((0, 0), (1, 1))).astype(int)):
             starts, ends = np.nonzero(np.diff(row) == 1)[0], np.nonzero(np.diff(row) == -1)[0]
             self.rectangles += [
-                (left + a * cell, top + i * cell, (b - a) * cell, cell) for a, b in zip(starts, ends, strict=True)
+                (left + a * cell, top + i * cell, (b - a) * cell, cell)
+                for a, b in zip(starts, ends, strict=True)
             ]
 
     def svg(self) -> bytes:
         """The drawing as an SVG file whose user unit is the millimetre."""
-        squares = "".join(f"M{_mm(x)} {_mm(y)}h{_mm(w)}v{_mm(h)}h{_mm(-w)}z" for x, y, w, h in self.rectangles)
+        squares = "".join(
+            f"M{_mm(x)} {_mm(y)}h{_mm(w)}v{_mm(h)}h{_mm(-w)}z" for x, y, w, h in self.rectangles
+        )
         lines = [
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{_mm(self.width)}mm" height="{_mm(self.height)}mm" '
-            f'viewBox="0 0 {_mm(self.width)} {_mm(self.height)}">',
+            (
+                f'<svg xmlns="http://www.w3.org/2000/svg" width="{_mm(self.width)}mm"'
+                f' height="{_mm(self.height)}mm" viewBox="0 0 {_mm(self.width)}'
+                f' {_mm(self.height)}">'
+            ),
             f'<rect width="{_mm(self.width)}" height="{_mm(self.height)}" fill="white"/>',
             *(f'<circle cx="{_mm(x)}" cy="{_mm(y)}" r="{_mm(r)}"/>' for x, y, r in self.circles),
             f'<path d="{squares}"/>',
             *(
-                f'<text x="{_mm(x)}" y="{_mm(y)}" font-size="{_mm(size)}" font-family="Helvetica, Arial, sans-serif">'
-                f"{text}</text>"
+                f'<text x="{_mm(x)}" y="{_mm(y)}" font-size="{_mm(size)}" font-family="Helvetica,'
+                f' Arial, sans-serif">{text}</text>'
                 for x, y, size, text in self.texts
             ),
             "</svg>",
@@ -52,7 +61,8 @@ class Drawing:
         return "\n".join(lines).encode("ascii")
 
     def pdf(self) -> bytes:
-        """The drawing as a PDF file of one page; its content is in mm, after one change of units."""
+        """The drawing as a PDF file of one page; its content is in mm, after one change of
+        units."""
         scale = 1 / MM_PER_POINT
         lines = [f"{scale:.10f} 0 0 {-scale:.10f} 0 {self.height * scale:.6f} cm"]
         for x, y, r in self.circles:
@@ -68,7 +78,8 @@ class Drawing:
         lines += [f"{_mm(x)} {_mm(y)} {_mm(w)} {_mm(h)} re" for x, y, w, h in self.rectangles]
         lines += ["f"] * bool(self.rectangles)  # one path, so that touching cells show no seams
         lines += [
-            f"BT /F1 {_mm(size)} Tf 1 0 0 -1 {_mm(x)} {_mm(y)} Tm ({text}) Tj ET" for x, y, size, text in self.texts
+            f"BT /F1 {_mm(size)} Tf 1 0 0 -1 {_mm(x)} {_mm(y)} Tm ({text}) Tj ET"
+            for x, y, size, text in self.texts
         ]
         content = "\n".join(lines)
         page = f"0 0 {self.width * scale:.6f} {self.height * scale:.6f}"
@@ -100,4 +111,8 @@ def _pdf_file(*objects: str) -> bytes:
         body += f"{number} 0 obj\n{text}\nendobj\n"
     table = "".join(f"{offset:010d} 00000 n \n" for offset in offsets)
     trailer = f"<< /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{len(body)}\n%%EOF\n"
-    return f"{body}xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}trailer\n{trailer}".encode("ascii")
+    return (
+        f"{body}xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}trailer\n{trailer}".encode(
+            "ascii"
+        )
+    )

@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 from slviewer.errors import InputError
 
 SEARCH_PX = 1600
-"""Longest side of the downscaled image for the first search; features are measured in the full image."""
+"""Longest side of the downscaled image for the first search; features are measured in the full
+image."""
 
 
 @dataclass(frozen=True)
 class BoardImage:
     """An image prepared for board detection.
 
-    ``grey`` (h, w) uint8: for the search, with stretched contrast if the image is dim; ``deep`` (h, w) float32: for
-    sub-pixel refinement, in the image's own grey levels.
+    ``grey`` (h, w) uint8: for the search, with stretched contrast if the image is dim; ``deep`` (h,
+    w) float32: for sub-pixel refinement, in the image's own grey levels.
     """
 
     grey: NDArray[np.uint8]
@@ -25,13 +26,15 @@ class BoardImage:
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> "BoardImage":
-        """Convert an image (h, w) or (h, w, 3) RGB, uint8 or uint16; raises InputError for others."""
+        """Convert an image (h, w) or (h, w, 3) RGB, uint8 or uint16; raises InputError for
+        others."""
         image = np.asarray(image)
         flat = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
         if image.dtype not in (np.uint8, np.uint16) or not flat or min(image.shape[:2]) < 32:
             raise InputError(
-                f"an image of shape {image.shape} and type {image.dtype} was given: boards are detected in (h, w) or "
-                "(h, w, 3) images of uint8 or uint16, 32 pixels and more on each side"
+                f"an image of shape {image.shape} and type {image.dtype} was given: boards are"
+                " detected in (h, w) or (h, w, 3) images of uint8 or uint16, 32 pixels and more on"
+                " each side"
             )
         if image.ndim == 3:
             image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -43,18 +46,28 @@ class BoardImage:
 
 
 def light_advice(grey: NDArray[np.uint8]) -> str:
-    """Return advice on exposure and board position for an error message, by the share of saturated pixels."""
+    """Return advice on exposure and board position for an error message, by the share of saturated
+    pixels."""
     saturated = float(np.mean(grey[::4, ::4] == 255))
-    exposure = f"lower the exposure ({saturated:.0%} of the image is saturated), or " if saturated > 0.02 else ""
+    exposure = (
+        f"lower the exposure ({saturated:.0%} of the image is saturated), or "
+        if saturated > 0.02
+        else ""
+    )
     return f"{exposure}move the board so that all of it is in view, evenly illuminated and in focus"
 
 
 def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
-    """Resize an image by ``factor``, with area averaging if smaller and cubic interpolation if larger."""
+    """Resize an image by ``factor``, with area averaging if smaller and cubic interpolation if
+    larger."""
     if factor == 1:
         return image
     return cv2.resize(
-        image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+        image,
+        None,
+        fx=factor,
+        fy=factor,
+        interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC,
     )
 
 
@@ -64,7 +77,8 @@ def to_full_image(pixels: np.ndarray, factor: float) -> np.ndarray:
 
 
 def flatten_light(grey: NDArray[np.uint8]) -> np.ndarray:
-    """Divide an image (h, w) uint8 by the local maximum brightness, so that paper becomes evenly white."""
+    """Divide an image (h, w) uint8 by the local maximum brightness, so that paper becomes evenly
+    white."""
     factor = 64 / max(grey.shape)
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     white = cv2.GaussianBlur(cv2.dilate(small, np.ones((9, 9), np.uint8)), (9, 9), 0)

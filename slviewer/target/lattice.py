@@ -1,7 +1,8 @@
-"""Grouping of scattered blobs into lattices, from neighbour to neighbour, and matching of a board's pattern to them.
+"""Grouping of scattered blobs into lattices, from neighbour to neighbour, and matching of a board's
+pattern to them.
 
-A board is accepted only if all of its circles match at exactly one position of the lattice: a grid that could be
-shifted by a row is refused.
+A board is accepted only if all of its circles match at exactly one position of the lattice: a grid
+that could be shifted by a row is refused.
 """
 
 from collections.abc import Iterator
@@ -20,7 +21,8 @@ PREDICTION_RADIUS = 0.27
 AREA_RATIO = 2.2
 """Largest ratio of the areas of neighbouring blobs."""
 NODE_RADIUS = 0.15
-"""Largest distance, in pitches, of a blob from the node predicted by the map of the whole lattice."""
+"""Largest distance, in pitches, of a blob from the node predicted by the map of the whole
+lattice."""
 COMPLETIONS = 4
 """Largest number of rows added at each side of a grown lattice."""
 MAX_SIDE_NODES = 200
@@ -29,19 +31,23 @@ SEEDS = 60
 """Largest number of lattices grown in one attempt."""
 NEIGHBOURS = 25
 """Number of nearest blobs among which neighbours of similar size are searched."""
-SHEARS = np.array([[[1, 0], [0, 1]], [[1, 0], [1, 1]], [[1, 1], [0, 1]], [[1, 0], [-1, 1]], [[1, -1], [0, 1]]])
-"""Changes of basis, for a strong slant where a diagonal of the grid looks shorter than its sides."""
+SHEARS = np.array(
+    [[[1, 0], [0, 1]], [[1, 0], [1, 1]], [[1, 1], [0, 1]], [[1, 0], [-1, 1]], [[1, -1], [0, 1]]]
+)
+"""Changes of basis, for a strong slant where a diagonal of the grid looks shorter than its
+sides."""
 TURNS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
 DIAGONAL = np.array([[1, 1], [-1, 1]])
-"""From nearest neighbours of an asymmetric grid, which lie on its diagonals, to its columns and rows."""
+"""From nearest neighbours of an asymmetric grid, which lie on its diagonals, to its columns and
+rows."""
 
 
 @dataclass(frozen=True)
 class Lattice:
     """Blobs at the nodes of a lattice.
 
-    ``nodes`` (m, 2) int: coordinates along two directions that are right-handed in the image (u right, v down);
-    ``blobs`` (m,) int: index of the blob at each node.
+    ``nodes`` (m, 2) int: coordinates along two directions that are right-handed in the image (u
+    right, v down); ``blobs`` (m,) int: index of the blob at each node.
     """
 
     nodes: np.ndarray
@@ -58,7 +64,8 @@ class Lattice:
 
 
 def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
-    """Yield lattices of similar blobs, grown from the most regular neighbourhoods; each blob is in one at most."""
+    """Yield lattices of similar blobs, grown from the most regular neighbourhoods; each blob is in
+    one at most."""
     if len(blobs.centres) < 6:
         return
     tree = cKDTree(blobs.centres)
@@ -76,23 +83,29 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
 
 
 def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
-    """Add the blobs at nodes that the lattice's map predicts, and remove those that are not at a node.
+    """Add the blobs at nodes that the lattice's map predicts, and remove those that are not at a
+    node.
 
-    Growing from neighbour to neighbour ends at a gap and may follow clutter next to a grid; the map of all nodes
-    does neither.
+    Growing from neighbour to neighbour ends at a gap and may follow clutter next to a grid; the map
+    of all nodes does neither.
     """
     for _ in range(COMPLETIONS):
         try:
-            grid_map = fit_grid_map(lattice.nodes.astype(float), blobs.centres[lattice.blobs], robust=True)
+            grid_map = fit_grid_map(
+                lattice.nodes.astype(float), blobs.centres[lattice.blobs], robust=True
+            )
         except DetectionError:
             return lattice
         low, high = lattice.nodes.min(0) - 1, lattice.nodes.max(0) + 1
         if (high - low).max() > MAX_SIDE_NODES:
             return lattice
-        nodes = np.stack(np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), -1).reshape(-1, 2)
+        nodes = np.stack(
+            np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), -1
+        ).reshape(-1, 2)
         pitch = grid_map.pitch_px(nodes.astype(float))
         typical = np.median(
-            np.sqrt(blobs.areas[lattice.blobs]) / np.maximum(grid_map.pitch_px(lattice.nodes * 1.0), 1e-9)
+            np.sqrt(blobs.areas[lattice.blobs])
+            / np.maximum(grid_map.pitch_px(lattice.nodes * 1.0), 1e-9)
         )
         apart, nearest = cKDTree(blobs.centres).query(grid_map.to_image(nodes.astype(float)))
         ratio = np.sqrt(blobs.areas[nearest]) / np.maximum(typical * pitch, 1e-9)
@@ -110,10 +123,11 @@ def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
 
 
 def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
-    """Return every numbering of the board's features, (n,) indices of blobs each; empty if blobs are missing.
+    """Return every numbering of the board's features, (n,) indices of blobs each; empty if blobs
+    are missing.
 
-    Numberings of the same blobs are the board's rotational symmetries; different sets of blobs mean that the lattice
-    is larger than the board.
+    Numberings of the same blobs are the board's rotational symmetries; different sets of blobs mean
+    that the lattice is larger than the board.
     """
     pattern = np.rint(board.points[:, :2] / board.pitch_mm).astype(int)
     spans = pattern.max(0) + 1
@@ -138,12 +152,15 @@ def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
 
 
 def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Return (blob, step, step) of blobs with similar neighbours opposite each other in two directions, best first."""
+    """Return (blob, step, step) of blobs with similar neighbours opposite each other in two
+    directions, best first."""
     centres, areas = blobs.centres, blobs.areas
     _, near = tree.query(centres, k=min(NEIGHBOURS, len(centres)))
     near = near[:, 1:]
     alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(AREA_RATIO)
-    first = np.argsort(~alike, axis=1, kind="stable")[:, :8]  # the nearest eight of its size, ignoring others between
+    first = np.argsort(~alike, axis=1, kind="stable")[
+        :, :8
+    ]  # the nearest eight of its size, ignoring others between
     near, alike = np.take_along_axis(near, first, axis=1), np.take_along_axis(alike, first, axis=1)
     step = centres[near] - centres[:, None]
     length = np.linalg.norm(step, axis=2)
@@ -163,13 +180,19 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.n
             k = across[0]
             score = regular[blob, a[0], b[0]] + regular[blob, a[k], b[k]]
             seeds.append((score, int(blob), axes[0], axes[k] * np.sign(cross[k])))
-    return [(blob, first, second) for _, blob, first, second in sorted(seeds, key=lambda seed: seed[0])]
+    return [
+        (blob, first, second) for _, blob, first, second in sorted(seeds, key=lambda seed: seed[0])
+    ]
 
 
-def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.ndarray, second: np.ndarray) -> Lattice:
-    """Grow the lattice around a ``seed`` blob with steps ``first`` and ``second`` (2,) px along its two directions.
+def _grow(
+    tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.ndarray, second: np.ndarray
+) -> Lattice:
+    """Grow the lattice around a ``seed`` blob with steps ``first`` and ``second`` (2,) px along its
+    two directions.
 
-    Each node's four neighbours are searched among the ``free`` (n,) bool blobs where the known nodes predict them.
+    Each node's four neighbours are searched among the ``free`` (n,) bool blobs where the known
+    nodes predict them.
     """
     centres, areas = blobs.centres, blobs.areas
     at = {(0, 0): seed}
@@ -195,7 +218,13 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
                     if lateral is not None and diagonal is not None:
                         step = centres[diagonal] - centres[lateral]
             neighbour = _nearest_similar_blob(
-                tree, here + step, PREDICTION_RADIUS * float(np.hypot(*step)), areas, areas[at[node]], free, used
+                tree,
+                here + step,
+                PREDICTION_RADIUS * float(np.hypot(*step)),
+                areas,
+                areas[at[node]],
+                free,
+                used,
             )
             if neighbour is None:
                 continue
@@ -208,9 +237,16 @@ def _grow(tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.nd
 
 
 def _nearest_similar_blob(
-    tree: cKDTree, place: np.ndarray, reach: float, areas: np.ndarray, area: float, free: np.ndarray, used: set[int]
+    tree: cKDTree,
+    place: np.ndarray,
+    reach: float,
+    areas: np.ndarray,
+    area: float,
+    free: np.ndarray,
+    used: set[int],
 ) -> int | None:
-    """Return the nearest unused blob of similar ``area`` within ``reach`` px of ``place`` (2,) px; None without one."""
+    """Return the nearest unused blob of similar ``area`` within ``reach`` px of ``place`` (2,) px;
+    None without one."""
     distances, indices = tree.query(place, k=3, distance_upper_bound=reach)
     for distance, index in zip(distances, indices, strict=True):
         if not np.isfinite(distance) or not free[index] or index in used:

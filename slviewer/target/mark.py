@@ -1,10 +1,12 @@
 """The mark that orients a board of circles: a dot next to its first circle.
 
-A symmetric grid looks the same turned by 180 degrees. The dot is outside the grid, on the first circle's diagonal, too
-far away to disturb the measurement of the circles; half as wide as a circle, it is never detected as one.
+A symmetric grid looks the same turned by 180 degrees. The dot is outside the grid, on the first
+circle's diagonal, too far away to disturb the measurement of the circles; half as wide as a circle,
+it is never detected as one.
 
-Other objects near a board (a screw, a label, a warm spot in a thermal image) are not accepted as the mark: a dot must
-have the position, size, polarity and contrast of the printed one, and be on the board's paper.
+Other objects near a board (a screw, a label, a warm spot in a thermal image) are not accepted as
+the mark: a dot must have the position, size, polarity and contrast of the printed one, and be on
+the board's paper.
 """
 
 from dataclasses import dataclass
@@ -18,21 +20,26 @@ from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_i
 OFFSET = 5 / 8
 RADIUS = 1 / 8
 PAPER_WIDTH = 1 / 8
-"""Offset of the dot to the left of and above the first circle, its radius, and the width of paper around it, in
-distances between neighbouring circles."""
+"""Offset of the dot to the left of and above the first circle, its radius, and the width of paper
+around it, in distances between neighbouring circles."""
 PREDICTING_CIRCLES = 16
-"""Number of circles that predict the dot's position; farther ones predict the local distortion less well."""
+"""Number of circles that predict the dot's position; farther ones predict the local distortion less
+well."""
 MAX_CUT_OFF = 0.3
 """Largest share of the paper around a dot that may be outside the image."""
 PRESENT = 0.4
 ABSENT = 0.2
-"""Contrast of a dot relative to a circle's: above PRESENT there is a dot, below ABSENT there is none."""
+"""Contrast of a dot relative to a circle's: above PRESENT there is a dot, below ABSENT there is
+none."""
 MAX_OFFSET = 0.4
-"""Largest distance of the dot's centroid from its predicted position, in its radii: lens distortion over one pitch."""
+"""Largest distance of the dot's centroid from its predicted position, in its radii: lens distortion
+over one pitch."""
 SIZES = (0.6, 1.5)
-"""Smallest and largest ratio of the radius at half contrast to the printed one, after blur and ink spread."""
+"""Smallest and largest ratio of the radius at half contrast to the printed one, after blur and ink
+spread."""
 MAX_PAPER_CHANGE = 0.5
-"""Largest brightness difference of the paper around the dot and around the first circle, over the circle's contrast."""
+"""Largest brightness difference of the paper around the dot and around the first circle, over the
+circle's contrast."""
 _RADII = np.linspace(0.0, 2.2, 12)
 _ANGLES = 20
 
@@ -47,7 +54,8 @@ class Mark:
 
 
 def mark_geometry(board: Board) -> Mark | None:
-    """Return the position and radius of a board's printed mark; None for chessboards and ChArUco."""
+    """Return the position and radius of a board's printed mark; None for chessboards and
+    ChArUco."""
     if board.kind not in ("circles", "acircles"):
         return None
     apart = neighbour_distance_mm(board)
@@ -64,8 +72,8 @@ def select_numbering_by_mark(
 ) -> np.ndarray | None:
     """Select the one of several valid numberings whose first circle has the mark next to it.
 
-    ``image`` (h, w) float32; ``centres`` (m, 2) px; ``numberings``: (n,) indices into them. None where no numbering,
-    or more than one, has a mark.
+    ``image`` (h, w) float32; ``centres`` (m, 2) px; ``numberings``: (n,) indices into them. None
+    where no numbering, or more than one, has a mark.
     """
     mark = mark_geometry(board)
     if mark is None:
@@ -74,11 +82,18 @@ def select_numbering_by_mark(
     contrasts = np.array([contrast for contrast, _ in dots])
     best = int(np.argmax(contrasts))
     others = np.delete(contrasts, best)
-    return numberings[best] if contrasts[best] > PRESENT and dots[best][1] and (others < ABSENT).all() else None
+    return (
+        numberings[best]
+        if contrasts[best] > PRESENT and dots[best][1] and (others < ABSENT).all()
+        else None
+    )
 
 
-def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray) -> tuple[float, bool]:
-    """Return the contrast at the mark's position over the first circle's, and whether a dot there may be the mark.
+def _detect_dot(
+    board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray
+) -> tuple[float, bool]:
+    """Return the contrast at the mark's position over the first circle's, and whether a dot there
+    may be the mark.
 
     ``pixels`` (n, 2): the circles' centres in the order of ``board.points``.
     """
@@ -96,7 +111,9 @@ def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray)
     if dot is None or circle is None or abs(circle.contrast) < 0.05:
         return 0.0, False
     same_paper = abs(dot.paper - circle.paper) < MAX_PAPER_CHANGE * abs(circle.paper - circle.ink)
-    is_mark = dot.off < MAX_OFFSET and SIZES[0] < dot.size < SIZES[1] and same_paper and dot.is_alone
+    is_mark = (
+        dot.off < MAX_OFFSET and SIZES[0] < dot.size < SIZES[1] and same_paper and dot.is_alone
+    )
     return dot.contrast / circle.contrast, is_mark
 
 
@@ -104,9 +121,10 @@ def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray)
 class _Profile:
     """Radial profile of a dot.
 
-    ``ink`` and ``paper``: grey levels of its middle and of the paper around it; ``contrast``: their difference over the
-    larger, negative for bright dots. ``off``: distance of its centroid from the predicted position, and ``size``: its
-    radius at half contrast, both over its nominal radius. ``is_alone``: whether there is paper on all sides.
+    ``ink`` and ``paper``: grey levels of its middle and of the paper around it; ``contrast``: their
+    difference over the larger, negative for bright dots. ``off``: distance of its centroid from the
+    predicted position, and ``size``: its radius at half contrast, both over its nominal radius.
+    ``is_alone``: whether there is paper on all sides.
     """
 
     ink: float
@@ -117,17 +135,26 @@ class _Profile:
     is_alone: bool
 
 
-def _measure_profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float) -> _Profile | None:
-    """Measure the profile around a point ``centre`` (2,) mm of the board, out to 2.2 radii; None where cut off.
+def _measure_profile(
+    image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float
+) -> _Profile | None:
+    """Measure the profile around a point ``centre`` (2,) mm of the board, out to 2.2 radii; None
+    where cut off.
 
-    The paper's level is the quantile of the outer rings that differs least from the dot, so that an edge is no dot.
+    The paper's level is the quantile of the outer rings that differs least from the dot, so that an
+    edge is no dot.
     """
     angles = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     offsets = _RADII[:, None, None] * radius * directions
     pixels = to_image(H, centre + offsets.reshape(-1, 2)).astype(np.float32)
     levels = cv2.remap(
-        image, pixels[:, 0], pixels[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+        image,
+        pixels[:, 0],
+        pixels[:, 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=np.nan,
     ).reshape(len(_RADII), _ANGLES)
     inner, outer = levels[_RADII <= 0.6], levels[_RADII >= 1.8]
     if np.isnan(inner).any() or np.isnan(outer).mean() > MAX_CUT_OFF:
@@ -142,7 +169,9 @@ def _measure_profile(image: np.ndarray, H: np.ndarray, centre: np.ndarray, radiu
     share = np.nan_to_num((paper - levels) / difference, nan=0.0)
     middle = float(np.median(ring))
     is_alone = bool(np.abs(ring - middle).max() < 0.5 * abs(difference))
-    ink = np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]  # weighted by the area of each sample
+    ink = (
+        np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]
+    )  # weighted by the area of each sample
     centroid = np.einsum("ra,r,ac->c", ink, _RADII, directions) / max(float(ink.sum()), 1e-9)
     means = share.mean(axis=1) / max(float(share[:2].mean()), 1e-9)
     below = np.nonzero(means < 0.5)[0]

@@ -1,8 +1,9 @@
 """Sub-pixel corners: where two blurred edges cross, fitted to the grey levels around each corner.
 
-The model is ``I = P (1 + kappa E_1 E_2)``: P the plane of the light, kappa the contrast, E_k the blurred step across
-edge k. A corner is the point that it is symmetric about, so that neither blur nor uneven light moves it; gradient-based
-refinement (OpenCV's ``cornerSubPix``) is off by 0.03 to 0.07 px on the same images.
+The model is ``I = P (1 + kappa E_1 E_2)``: P the plane of the light, kappa the contrast, E_k the
+blurred step across edge k. A corner is the point that it is symmetric about, so that neither blur
+nor uneven light moves it; gradient-based refinement (OpenCV's ``cornerSubPix``) is off by 0.03 to
+0.07 px on the same images.
 """
 
 import numpy as np
@@ -18,7 +19,8 @@ EDGE_SHARE = 0.4
 """Half length, in squares, of a corner's window along the edges."""
 MAX_MISFIT = 0.15
 MAX_RELATIVE_MISFIT = 3.0
-"""Largest RMS misfit of a corner's grey levels: over its contrast, and over the median misfit of all corners."""
+"""Largest RMS misfit of a corner's grey levels: over its contrast, and over the median misfit of
+all corners."""
 ITERATIONS = 15
 CONVERGENCE_PX = 1e-3
 
@@ -30,10 +32,12 @@ def refine_corners(
     pitch: float,
     marker: float = 0.0,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Refine corners; returns sub-pixel positions (n, 2) float64 px and whether each fits the model, (n,) bool.
+    """Refine corners; returns sub-pixel positions (n, 2) float64 px and whether each fits the
+    model, (n,) bool.
 
-    ``image`` (h, w) float32; ``pixels`` (n, 2) px: initial positions, good to a px or two; ``points`` (n, 2) mm: the
-    corners on the board; ``pitch`` and ``marker``: sides of the squares and of the markers in them, mm.
+    ``image`` (h, w) float32; ``pixels`` (n, 2) px: initial positions, good to a px or two;
+    ``points`` (n, 2) mm: the corners on the board; ``pitch`` and ``marker``: sides of the squares
+    and of the markers in them, mm.
     """
     H = fit_homography(points, pixels)
     to_px = jacobians(H, points) * pitch
@@ -58,17 +62,20 @@ def refine_corners(
 def _fit_corners(
     offset: np.ndarray, grey: np.ndarray, weight: np.ndarray, to_px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit all corners at once by damped Gauss-Newton; returns shifts (n, 2) px and RMS misfits over contrast (n,).
+    """Fit all corners at once by damped Gauss-Newton; returns shifts (n, 2) px and RMS misfits over
+    contrast (n,).
 
-    ``offset`` (n, m, 2) px: pixels of each window from the initial corner; ``grey`` and ``weight`` (n, m); ``to_px``
-    (n, 2, 2): px per square along the board's x and y.
+    ``offset`` (n, m, 2) px: pixels of each window from the initial corner; ``grey`` and ``weight``
+    (n, m); ``to_px`` (n, 2, 2): px per square along the board's x and y.
 
-    Unknowns of each corner: its position (2), the angles of the edges' normals (2), the blur's sigma, the plane of the
-    light (3), kappa.
+    Unknowns of each corner: its position (2), the angles of the edges' normals (2), the blur's
+    sigma, the plane of the light (3), kappa.
     """
     n = len(offset)
     q = np.zeros((n, 9))
-    q[:, 2:4] = np.arctan2(to_px[:, 0], -to_px[:, 1])  # an edge along (a, b) has its normal along (-b, a)
+    q[:, 2:4] = np.arctan2(
+        to_px[:, 0], -to_px[:, 1]
+    )  # an edge along (a, b) has its normal along (-b, a)
     q[:, 4] = 1.0
     q[:, 5] = (weight * grey).sum(1) / np.maximum(weight.sum(1), 1)
     q[:, 8] = 0.1
@@ -101,7 +108,8 @@ def _fit_corners(
 
 
 def _evaluate_model(q: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return grey levels (n, m) and derivatives (n, m, 9) of corners ``q`` (n, 9) at offsets (n, m, 2) px."""
+    """Return grey levels (n, m) and derivatives (n, m, 9) of corners ``q`` (n, 9) at offsets (n, m,
+    2) px."""
     x, y = offset[..., 0] - q[:, 0, None], offset[..., 1] - q[:, 1, None]
     sigma = q[:, 4, None]
     light = q[:, 5, None] + q[:, 6, None] * offset[..., 0] + q[:, 7, None] * offset[..., 1]

@@ -61,7 +61,8 @@ PERIOD_PX = 18.0
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Stages as rows: milliseconds, MB moved, the floor, the ratios and the target. ``missing``: peers not there."""
+    """Stages as rows: milliseconds, MB moved, the floor, the ratios and the target. ``missing``:
+    peers not there."""
 
     rows: list[Row]
     peak_memory_gb: float | None
@@ -70,7 +71,11 @@ class Benchmark:
 
     def to_json(self) -> dict[str, Any]:
         """Return the rows as plain values."""
-        figures = {"stages": self.rows, "peak_memory_gb": self.peak_memory_gb, "missing": list(self.missing)}
+        figures = {
+            "stages": self.rows,
+            "peak_memory_gb": self.peak_memory_gb,
+            "missing": list(self.missing),
+        }
         return figures if self.live is None else figures | {"live": to_plain(self.live)}
 
     def text(self) -> str:
@@ -96,10 +101,14 @@ def bench(
     """Time the main stages on this machine, beside what they cannot beat.
 
     Args:
-        calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full size).
-        live: Also scan live, at half the resolution, with one viewer that draws and one that stalls.
-        wizard: Time instead (ten minutes) what an operator waits for, at half the resolution, beside its targets.
-        scaling: Time instead (minutes) how the work grows with pixels, target poses, scans and captures.
+        calibration: Also simulate and calibrate 25 poses (minutes, and 3.5 GB of disk at full
+            size).
+        live: Also scan live, at half the resolution, with one viewer that draws and one that
+            stalls.
+        wizard: Time instead (ten minutes) what an operator waits for, at half the resolution,
+            beside its targets.
+        scaling: Time instead (minutes) how the work grows with pixels, target poses, scans and
+            captures.
         minutes: How long to scan live.
         scale: Resolution of the camera, as a share of 1600x1200.
     """
@@ -138,33 +147,49 @@ def bench(
 
 
 def _peak_memory() -> float | None:
-    """Return the most memory that this process ever used, GB; None where the system does not report it."""
+    """Return the most memory that this process ever used, GB; None where the system does not report
+    it."""
     if sys.platform == "win32":
         return None
     import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e9 if sys.platform == "darwin" else 1e6)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        1e9 if sys.platform == "darwin" else 1e6
+    )
 
 
 def _time_decoding(
-    stage: str, sequence: PatternSequence, frames: np.ndarray, note: str, definition: float | None = None
+    stage: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    note: str,
+    definition: float | None = None,
 ) -> tuple[list[Row], float]:
     """Rows of decoding with the kernel alone and as a whole, and the seconds of the kernel.
 
     ``definition``: seconds of the NumPy definition, where it is compared.
     """
     coded = frames[:-1]  # without the texture
-    kernel, moved, least = _time_with_floor(_time_kernel_alone(sequence, frames), coded, 0, (1, 4, 0))
+    kernel, moved, least = _time_with_floor(
+        _time_kernel_alone(sequence, frames), coded, 0, (1, 4, 0)
+    )
     whole = median(lambda: decode(sequence, frames, "x"), 5)
     target = None if definition is None else (1.7 * kernel, "1.7 kernels")
     return [
         row(f"{stage}, kernel", kernel, moved, least, note=note),
-        row(stage, whole, definition=definition, note="with the noise, spikes and new arrays", target=target),
+        row(
+            stage,
+            whole,
+            definition=definition,
+            note="with the noise, spikes and new arrays",
+            target=target,
+        ),
     ], kernel
 
 
 def _time_kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
-    """The decoding of axis x into arrays made before, with the noise known, and without a look at neighbours."""
+    """The decoding of axis x into arrays made before, with the noise known, and without a look at
+    neighbours."""
     layout = axis_layout(sequence, "x")
     scale = grey_scale(layout, measure_noise(layout, frames, 255.0), 255.0)
     maps = tuple(np.zeros(frames.shape[1:], dtype) for dtype in (*[np.float32] * 4, np.uint8))
@@ -177,7 +202,8 @@ def _time_kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callabl
 
 
 def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
-    """Rows of points from phases and of one fused pass, by both fast models, and of writing a file."""
+    """Rows of points from phases and of one fused pass, by both fast models, and of writing a
+    file."""
     rows = []
     phase = decode(sequence, frames, "x")
     pixelwise, compiled, rays = _make_calibrations(frames.shape[1:])
@@ -194,16 +220,31 @@ def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     rows.append(_time_one_pass(one, frames, 7))
     rows.append(_time_one_pass(OnePass(sequence, _make_splined(compiled, rays), "x"), frames, 5))
     rows += gpu_rows(sequence, pixelwise, frames)
-    rows.append(row("second pass, over spikes", median(lambda: one.repair_spikes(scan), 9), megabytes(scan.phase)))
-    rows.append(row("noise and fringe mean of a capture, sampled", median(lambda: one.light(frames), 5), target=1e-3))
+    rows.append(
+        row(
+            "second pass, over spikes",
+            median(lambda: one.repair_spikes(scan), 9),
+            megabytes(scan.phase),
+        )
+    )
+    rows.append(
+        row(
+            "noise and fringe mean of a capture, sampled",
+            median(lambda: one.light(frames), 5),
+            target=1e-3,
+        )
+    )
     return [*rows, *_time_files(scan.cloud(), sequence, frames)]
 
 
 def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
-    """The row of the fused kernel, which reads ``numbers`` float32 of calibration a pixel and allocates nothing."""
+    """The row of the fused kernel, which reads ``numbers`` float32 of calibration a pixel and
+    allocates nothing."""
     light = one.light(frames)
     scan = one.run(frames, light)
-    seconds, moved, least = _time_with_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
+    seconds, moved, least = _time_with_floor(
+        lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1)
+    )
     note = "frames to phase, points, depth noise, modulation and texture; spikes not repaired"
     stage = f"one pass over {len(frames)} frames, {one.model.name}"
     return row(stage, seconds, moved, least, note=note, target=(1.3 * least, "1.3 floors"))
@@ -212,17 +253,22 @@ def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
 def _time_with_floor(
     work: Callable[[], object], frames: np.ndarray, numbers: int, written: tuple[int, int, int]
 ) -> tuple[float, float, float]:
-    """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as `move_bytes` has them."""
+    """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as
+    `move_bytes` has them."""
     shape = frames.shape[1:]
     values = np.zeros((numbers, *shape), np.float32)
     grey = np.zeros((written[0], *shape), frames.dtype)
-    single, triple = np.zeros((written[1], *shape), np.float32), np.zeros((written[2], *shape, 3), np.float32)
+    single, triple = (
+        np.zeros((written[1], *shape), np.float32),
+        np.zeros((written[2], *shape, 3), np.float32),
+    )
     seconds, least = time_beside(work, lambda: move_bytes(frames, values, grey, single, triple), 25)
     return seconds, megabytes(frames, values, grey, single, triple), least
 
 
 def _time_live(rig: SimulatedRig, renderer: Renderer) -> Row:
-    """The row of a live scan: recorded frames of axis x to arrays in one fused pass of the pixel-wise model."""
+    """The row of a live scan: recorded frames of axis x to arrays in one fused pass of the
+    pixel-wise model."""
     sequence = one_axis(multifrequency(rig.projector.size, 4), "x")
     frames = renderer.capture(sequence)
     pixelwise, _, _ = _make_calibrations(frames.shape[1:])
@@ -230,29 +276,44 @@ def _time_live(rig: SimulatedRig, renderer: Renderer) -> Row:
     scan = one.run(frames)
     seconds = median(lambda: one.run(frames, scan.light, scan), 15)
     note = f"{1 / seconds:.0f} clouds/s"
-    return row(f"live: {len(frames) - 1} recorded frames to arrays", seconds, note=note, target=(1 / 60, "60 clouds/s"))
+    return row(
+        f"live: {len(frames) - 1} recorded frames to arrays",
+        seconds,
+        note=note,
+        target=(1 / 60, "60 clouds/s"),
+    )
 
 
-def _time_peers(rig: SimulatedRig, renderer: Renderer, coded: float) -> tuple[list[Row], tuple[str, ...]]:
-    """Rows of other programs, and of registration; ``coded`` seconds took our kernel for phase steps and Gray code."""
+def _time_peers(
+    rig: SimulatedRig, renderer: Renderer, coded: float
+) -> tuple[list[Row], tuple[str, ...]]:
+    """Rows of other programs, and of registration; ``coded`` seconds took our kernel for phase
+    steps and Gray code."""
     rows: list[Row] = []
     absent = tuple(filter(None, map(missing, ("fringes", "small-gicp"))))
     if not missing("fringes"):
         sequence = one_axis(multifrequency(rig.projector.size, 6), "x")
         frames = renderer.capture(sequence)
         count, size = len(frames) - 1, (frames.shape[2], frames.shape[1])
-        note = "absolute and wrapped phase, modulation, background and reason, in arrays made before"
-        rows, ours = _time_decoding(f"decode {count} frames of three periods", sequence, frames, note)
+        note = (
+            "absolute and wrapped phase, modulation, background and reason, in arrays made before"
+        )
+        rows, ours = _time_decoding(
+            f"decode {count} frames of three periods", sequence, frames, note
+        )
         rows += [fringes_row(25, size, coded), fringes_row(count, size, ours)]
     return rows + registration_rows(), absent
 
 
 def _time_calibration(scale: float, progress: Progress) -> list[Row]:
-    """Rows of the pixel-wise fit, one pass of the splined model, and calibrating a whole simulated session."""
+    """Rows of the pixel-wise fit, one pass of the splined model, and calibrating a whole simulated
+    session."""
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
         simulate(session, scale=scale, progress=part(progress, 0.0, 0.5))
-        whole = median(lambda: calibrate(session, TARGET, progress=part(progress, 0.5, 0.9)), 1, warm=False)
+        whole = median(
+            lambda: calibrate(session, TARGET, progress=part(progress, 0.5, 0.9)), 1, warm=False
+        )
         with opened(session) as store:
             stereo = load_stereo(store)
             observations = load_observations(store, list(stereo.poses))
@@ -260,7 +321,9 @@ def _time_calibration(scale: float, progress: Progress) -> list[Row]:
             splined = load_model(store, "splined")
             assert isinstance(splined, SplinedModel)
             only_x = one_axis(shot.sequence, "x")
-            passed = _time_one_pass(OnePass(only_x, splined, "x"), shot.stack()[: len(only_x.frames)], 5)
+            passed = _time_one_pass(
+                OnePass(only_x, splined, "x"), shot.stack()[: len(only_x.frames)], 5
+            )
         fit, held = _time_fit(observations, stereo)
     note = f"steps 2 to 5, both axes, phases in memory; at most {held:.2f} GB beside them"
     return [
@@ -271,10 +334,13 @@ def _time_calibration(scale: float, progress: Progress) -> list[Row]:
 
 
 def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[float, float]:
-    """Measure the seconds to smooth all poses' phases and fit the pixels to them, and the peak memory, GB."""
+    """Measure the seconds to smooth all poses' phases and fit the pixels to them, and the peak
+    memory, GB."""
     rng = np.random.default_rng(0)
     measured = {
-        (o.name, axis): (o.smoothed_phase(axis) + rng.normal(0, 0.02, o.region.shape)).astype(np.float32)
+        (o.name, axis): (
+            (o.smoothed_phase(axis) + rng.normal(0, 0.02, o.region.shape)).astype(np.float32)
+        )
         for o in observations
         for axis in o.surfaces
     }
@@ -299,28 +365,50 @@ def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[flo
 
 
 def _make_splined(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
-    """A splined model with made-up values, of which only the arrays that one pass reads are filled."""
+    """A splined model with made-up values, of which only the arrays that one pass reads are
+    filled."""
     model = object.__new__(SplinedModel)
     vars(model).update(rays=rays, _compiled={"x": compiled})
     return model
 
 
 def _time_files(cloud: Cloud, sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
-    """Rows of saving a capture, and of writing a cloud with texture and noise as PLY, against writing as many bytes."""
+    """Rows of saving a capture, and of writing a cloud with texture and noise as PLY, against
+    writing as many bytes."""
     mask = cloud.mask
     with tempfile.TemporaryDirectory() as folder:
         path, plain = Path(folder, "cloud.ply"), Path(folder, "plain")
         exported = median(
-            lambda: write_ply(path, cloud.measured, colours=cloud.colours(), scalars=cloud.sigmas(mask)), 3
+            lambda: write_ply(
+                path, cloud.measured, colours=cloud.colours(), scalars=cloud.sigmas(mask)
+            ),
+            3,
         )
         content = path.read_bytes()
         with Session.create(Path(folder, "session")) as session:
-            save = partial(session.save_capture, "scan_01", "scan", sequence, frames, source="simulated", force=True)
+            save = partial(
+                session.save_capture,
+                "scan_01",
+                "scan",
+                sequence,
+                frames,
+                source="simulated",
+                force=True,
+            )
             saved = median(save, 3)
-        copies = [median(partial(atomic.replace_file, plain, data), 3) for data in (content, frames.tobytes())]
+        copies = [
+            median(partial(atomic.replace_file, plain, data), 3)
+            for data in (content, frames.tobytes())
+        ]
     points = f"{np.count_nonzero(mask) / 1e6:.2f} M points"
     return [
-        row(f"write {points} as PLY", exported, len(content) / 1e6, copies[0], target=(1.5 * copies[0], "1.5 floors")),
+        row(
+            f"write {points} as PLY",
+            exported,
+            len(content) / 1e6,
+            copies[0],
+            target=(1.5 * copies[0], "1.5 floors"),
+        ),
         row(
             f"save a capture of {len(frames)} frames",
             saved,
@@ -337,7 +425,14 @@ def _make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, Compiled
     v, u = np.mgrid[:height, :width] / width
     ones = np.ones(shape, np.float32)
     c = np.stack([300 + 16 * u, 1.3 * ones, -2e-4 * ones, (u - 0.5) / 2, (v - 0.4) / 2])
-    fit = PixelFit(c, np.zeros((3, *shape), np.float32), np.full(shape, 25, np.uint16), 30 * ones, 250 * ones, ones)
+    fit = PixelFit(
+        c,
+        np.zeros((3, *shape), np.float32),
+        np.full(shape, 25, np.uint16),
+        30 * ones,
+        250 * ones,
+        ones,
+    )
     near, far = 200.0, 1000.0
     step = max(2, -(-width // GRID_CELLS_ACROSS))
     grid = np.zeros(((height - 1) // step + 2, (width - 1) // step + 2, DEPTHS), np.float32)

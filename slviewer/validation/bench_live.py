@@ -1,4 +1,5 @@
-"""How fast live clouds reach those who look, measured with the wizard itself and with viewers on real connections."""
+"""How fast live clouds reach those who look, measured with the wizard itself and with viewers on
+real connections."""
 
 import contextlib
 import socket
@@ -48,13 +49,14 @@ MAX_GROWTH_MB = 20.0
 
 @dataclass(frozen=True)
 class LiveFigures:
-    """A live scan of `seconds` by a camera of `size` px, with one viewer that draws and, after a third of the time or a
-    minute, one that has stalled.
+    """A live scan of `seconds` by a camera of `size` px, with one viewer that draws and, after a
+    third of the time or a minute, one that has stalled.
 
-    Captures a second before and after that; clouds a second decoded, reconstructed and sent to the viewer that draws;
-    `latency_ms`: the median from the first frame's light until a cloud is sent, NaN where none was. `growth_mb`,
-    `growth_files`, `growth_threads`: how much more memory, open files and threads the program had in the last tenth of
-    the time than in a tenth of it soon after the stalled viewer came, None where the system does not report it.
+    Captures a second before and after that; clouds a second decoded, reconstructed and sent to the
+    viewer that draws; `latency_ms`: the median from the first frame's light until a cloud is sent,
+    NaN where none was. `growth_mb`, `growth_files`, `growth_threads`: how much more memory, open
+    files and threads the program had in the last tenth of the time than in a tenth of it soon after
+    the stalled viewer came, None where the system does not report it.
     """
 
     size: tuple[int, int]
@@ -77,26 +79,35 @@ class LiveFigures:
             growth = f"memory {self.growth_mb:+.1f} MB (flat within {MAX_GROWTH_MB:g} MB: {flat})"
             growth += f", files {self.growth_files:+g}, threads {self.growth_threads:+g}"
         return (
-            f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s: {self.shown_per_s:.1f} clouds/s sent to "
-            f"a viewer, {self.latency_ms:.0f} ms behind the light ({self.clouds_per_s:.1f}/s made of {self.points:,} "
-            f"points); captures {self.captures_per_s:.1f}/s, beside a stalled viewer "
-            f"{self.captures_per_s_stalled:.1f}/s; {growth}"
+            f"live at {self.size[0]}x{self.size[1]} for {self.seconds:.0f} s:"
+            f" {self.shown_per_s:.1f} clouds/s sent to a viewer, {self.latency_ms:.0f} ms behind"
+            f" the light ({self.clouds_per_s:.1f}/s made of {self.points:,} points); captures"
+            f" {self.captures_per_s:.1f}/s, beside a stalled viewer"
+            f" {self.captures_per_s_stalled:.1f}/s; {growth}"
         )
 
 
 def live_rate(
-    scale: float = 0.5, seconds: float = 30.0, progress: Progress = ignore_progress, *, warm_s: float = _WARM_S
+    scale: float = 0.5,
+    seconds: float = 30.0,
+    progress: Progress = ignore_progress,
+    *,
+    warm_s: float = _WARM_S,
 ) -> LiveFigures:
-    """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled at once.
+    """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled
+    at once.
 
-    Clouds are reconstructed by the stereo model of the true lenses; the figures begin `warm_s` after the first one.
-    Raises SlviewerError where live scanning fails.
+    Clouds are reconstructed by the stereo model of the true lenses; the figures begin `warm_s`
+    after the first one. Raises SlviewerError where live scanning fails.
     """
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"
         true_calibration(session, letter(scale))
-        with Operator(session, {"driver": "simulated", "scale": scale}) as operator, _serve_wizard(operator) as server:
+        with (
+            Operator(session, {"driver": "simulated", "scale": scale}) as operator,
+            _serve_wizard(operator) as server,
+        ):
             _wait_until(lambda: operator.snapshot().rig.state == "open", operator)
             operator.place("object")
             with _Viewer(server, draws=True):
@@ -106,8 +117,11 @@ def live_rate(
                 return _measure(operator, server, seconds, progress, warm_s)
 
 
-def _measure(operator: Operator, server: SafeServer, seconds: float, progress: Progress, warm_s: float) -> LiveFigures:
-    """Figures of the running live scan over so many seconds, with a second viewer that stops reading."""
+def _measure(
+    operator: Operator, server: SafeServer, seconds: float, progress: Progress, warm_s: float
+) -> LiveFigures:
+    """Figures of the running live scan over so many seconds, with a second viewer that stops
+    reading."""
     time.sleep(warm_s)
     begun, first = time.monotonic(), operator.live_captures
     used: list[tuple[float, tuple[float, ...]]] = []
@@ -135,7 +149,8 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
     assert camera is not None
     growth: list[float | None] = [None] * 3
     first_uses, last_uses = (
-        [use for at, use in used if low < at <= low + seconds / 10] for low in (1.5 * alone, 0.9 * seconds)
+        [use for at, use in used if low < at <= low + seconds / 10]
+        for low in (1.5 * alone, 0.9 * seconds)
     )
     if first_uses and last_uses and not np.isnan(used[0][1]).any():
         growth = (np.median(last_uses, axis=0) - np.median(first_uses, axis=0)).tolist()
@@ -153,7 +168,8 @@ def _measure(operator: Operator, server: SafeServer, seconds: float, progress: P
 
 
 class _Viewer:
-    """A browser's connection: with `draws` it receives and acknowledges everything, otherwise it reads nothing."""
+    """A browser's connection: with `draws` it receives and acknowledges everything, otherwise it
+    reads nothing."""
 
     def __init__(self, server: SafeServer, draws: bool) -> None:
         self._server, self._draws = server, draws
@@ -172,7 +188,9 @@ class _Viewer:
         """Connect again and again until closed, and draw or stall according to ``draws``."""
         while not self._closing.is_set():
             with contextlib.suppress(WebSocketException, OSError), self._connect() as connection:
-                connection.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_VIEWPOINT}))
+                connection.send(
+                    msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_VIEWPOINT})
+                )
                 if self._draws:
                     self._answer_requests(connection)
                 else:  # until the server gives it up, and once more then
@@ -189,7 +207,9 @@ class _Viewer:
                 continue
             assert isinstance(raw, bytes)
             whole, packed = (int.from_bytes(raw[at : at + 8], "little") for at in (0, 8))
-            for message in msgspec.msgpack.decode(unpack.decompress(raw[16 : 16 + packed], whole))["messages"]:
+            for message in msgspec.msgpack.decode(unpack.decompress(raw[16 : 16 + packed], whole))[
+                "messages"
+            ]:
                 if message["type"] == "LocalStorageGetItemRequestMessage":
                     answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
                     kind = "LocalStorageGetItemResponseMessage"
@@ -202,7 +222,10 @@ class _Viewer:
         return connect(
             f"ws://{host}{grant.path}/",
             sock=socket.create_connection(("127.0.0.1", port), timeout=5),
-            additional_headers=[("Cookie", f"{grant.cookie_name}={grant.value}"), ("Origin", f"http://{host}")],
+            additional_headers=[
+                ("Cookie", f"{grant.cookie_name}={grant.value}"),
+                ("Origin", f"http://{host}"),
+            ],
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             max_size=2**26,
             ping_interval=None,  # who stalls does not give up by itself
@@ -221,7 +244,8 @@ def _serve_wizard(operator: Operator) -> Iterator[SafeServer]:
 
 
 def true_calibration(folder: Path, rig: SimulatedRig) -> None:
-    """Make a session whose stereo calibration is that of a simulated rig's true lenses, local distortion apart."""
+    """Make a session whose stereo calibration is that of a simulated rig's true lenses, local
+    distortion apart."""
     with Session.create(folder) as store:
         save_true_stereo(store, rig)
 
@@ -231,7 +255,10 @@ def _wait_until(condition: Callable[[], bool], operator: Operator) -> None:
     end = time.monotonic() + _PATIENCE_S
     while not condition():
         if time.monotonic() > end:
-            raise SlviewerError(f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_get_last_notice(operator)}")
+            raise SlviewerError(
+                f"the live scan did not begin within {_PATIENCE_S:.0f} s:"
+                f" {_get_last_notice(operator)}"
+            )
         time.sleep(0.02)
 
 
@@ -248,7 +275,8 @@ def _get_last_notice(operator: Operator) -> str:
 
 
 def _measure_use() -> tuple[float, float, float]:
-    """Memory, MB, open files and threads of this process; NaN where the system does not report them."""
+    """Memory, MB, open files and threads of this process; NaN where the system does not report
+    them."""
     if sys.platform == "win32":
         return (float("nan"),) * 3
     import resource

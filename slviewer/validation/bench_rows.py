@@ -35,7 +35,8 @@ def row(
 ) -> Row:
     """One row of the table; ``floor`` and ``definition`` in seconds, for the ratios.
 
-    ``target``: the most seconds on two cores at 1600x1200, and how the table states them where not in milliseconds.
+    ``target``: the most seconds on two cores at 1600x1200, and how the table states them where not
+    in milliseconds.
     """
     most_s, text = target if isinstance(target, tuple) else (target, "")
     if most_s is not None:
@@ -48,13 +49,18 @@ def row(
         "ratio to floor": None if floor is None else seconds / floor,
         "ratio NumPy / kernel": None if definition is None else definition / seconds,
         "target": text,
-        "holds": "" if most_s is None or seconds != seconds else "yes" if seconds <= most_s else "no",
+        "holds": (
+            "" if most_s is None or seconds != seconds else "yes" if seconds <= most_s else "no"
+        ),
         "note": note,
     }
 
 
-def time_beside(work: Callable[[], object], floor: Callable[[], object], times: int = 9) -> tuple[float, float]:
-    """Least seconds of some work and of its floor, run in turns, which lessens the share of other programs."""
+def time_beside(
+    work: Callable[[], object], floor: Callable[[], object], times: int = 9
+) -> tuple[float, float]:
+    """Least seconds of some work and of its floor, run in turns, which lessens the share of other
+    programs."""
     work(), floor()  # compiled, and in the caches
     seconds = [(timeit(work, number=1), timeit(floor, number=1)) for _ in range(times)]
     least, least_floor = map(min, zip(*seconds, strict=True))
@@ -75,7 +81,8 @@ def fastest(work: Callable[[], object], times: int) -> float:
 
 
 def run_python(*arguments: str, **environment: str) -> str:
-    """Run Python in a process of its own; returns its output, and raises CalledProcessError where it fails."""
+    """Run Python in a process of its own; returns its output, and raises CalledProcessError where
+    it fails."""
     command, changed = [sys.executable, *arguments], {**os.environ, **environment}
     return subprocess.run(command, check=True, capture_output=True, text=True, env=changed).stdout
 
@@ -89,8 +96,8 @@ def megabytes(*arrays: np.ndarray) -> float:
 def move_bytes(frames, numbers, grey, single, triple):
     """Move as many bytes as a decoder does, to measure the memory bandwidth.
 
-    Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w) of 8 or 16 bits,
-    ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32.
+    Reads ``frames`` (n, h, w) and float32 ``numbers`` (m, h, w) once, and writes ``grey`` (k, h, w)
+    of 8 or 16 bits, ``single`` (j, h, w) float32 and ``triple`` (i, h, w, 3) float32.
     """
     width = frames.shape[2]
     for y in prange(frames.shape[1]):
@@ -116,7 +123,8 @@ def move_bytes(frames, numbers, grey, single, triple):
 
 TIMES = 15
 AHEAD = 8
-"""Copies that keep the device busy while what is measured is queued: it then waits for no Python."""
+"""Copies that keep the device busy while what is measured is queued: it then waits for no
+Python."""
 
 
 def gpu_rows(
@@ -126,8 +134,8 @@ def gpu_rows(
     times: int = TIMES,
     ahead: int = AHEAD,
 ) -> list[Row]:
-    """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired, with copies there and
-    back; nothing without a device."""
+    """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired,
+    with copies there and back; nothing without a device."""
     name = cuda_device.find_device()
     if name is None:
         return []
@@ -144,15 +152,24 @@ def gpu_rows(
     note = f"{least / alone:.0%} of the {fast:.0f} GB/s of a copy on the device"
     return [
         row(f"{stage}: kernel", alone, moved / 1e6, least, note=note),
-        row(f"{stage}: with copies", whole, note=f"{1 / whole:.0f} clouds/s, frames in page-locked memory"),
-        row(f"{stage}: with copies", ordinary, note=f"{1 / ordinary:.0f} clouds/s, frames in ordinary memory"),
+        row(
+            f"{stage}: with copies",
+            whole,
+            note=f"{1 / whole:.0f} clouds/s, frames in page-locked memory",
+        ),
+        row(
+            f"{stage}: with copies",
+            ordinary,
+            note=f"{1 / ordinary:.0f} clouds/s, frames in ordinary memory",
+        ),
     ]
 
 
 def _time_kernel(
     one: CudaPass, frames: np.ndarray, light: LightLevels, times: int, ahead: int
 ) -> tuple[float, float, int]:
-    """(seconds of the first pass, seconds of a copy on the device that moves as much, bytes moved), by its clock."""
+    """(seconds of the first pass, seconds of a copy on the device that moves as much, bytes moved),
+    by its clock."""
     from numba import cuda
 
     card = one.card(frames.dtype)
@@ -189,8 +206,10 @@ def missing(package: str) -> str:
 
 
 def fringes_row(frames: int, size: tuple[int, int], ours: float) -> Row:
-    """Decoding by `fringes` of as many frames of (width, height), shared among three periods; ``ours`` seconds took our
-    kernel. It makes its arrays itself: brightness and modulation of each period, and coordinates."""
+    """Decoding by `fringes` of as many frames of (width, height), shared among three periods;
+    ``ours`` seconds took our kernel. It makes its arrays itself: brightness and modulation of each
+    period, and coordinates.
+    """
     from fringes import Fringes
 
     width, height = size
@@ -198,21 +217,33 @@ def fringes_row(frames: int, size: tuple[int, int], ours: float) -> Row:
     coder.X = coder.Y = 912
     coder.D, coder.K, coder.v = 1, 3, [1, 8, 57]
     coder.N = [frames // 3 + (i < frames % 3) for i in range(3)]
-    levels = np.random.default_rng(0).integers(0, 256, (int(coder.T), height, width)).astype(np.uint8)
+    levels = (
+        np.random.default_rng(0).integers(0, 256, (int(coder.T), height, width)).astype(np.uint8)
+    )
     seconds = fastest(lambda: coder.decode(levels), 3)
-    note = f"{seconds / ours:.0f} times our kernel; three periods, coordinates from them, in arrays of its own"
+    note = (
+        f"{seconds / ours:.0f} times our kernel; three periods, coordinates from them, in arrays of"
+        " its own"
+    )
     return row(f"decode {len(levels)} frames, fringes {version('fringes')}", seconds, note=note)
 
 
 def registration_rows() -> list[Row]:
-    """Aligning two noisy clouds of one relief, 1.4 M points each, 4 degrees and 5 mm apart: ours, then `small-gicp`."""
+    """Aligning two noisy clouds of one relief, 1.4 M points each, 4 degrees and 5 mm apart: ours,
+    then `small-gicp`."""
     (points, normals), (moved, moved_normals) = _make_relief(0, 0.0), _make_relief(1, 0.037)
-    truth = turn_about(np.radians(4.0) * np.array([1.0, 0.5, 2.0]) / 2.29, moved.mean(0), np.array([3.0, -3.0, 2.6]))
+    truth = turn_about(
+        np.radians(4.0) * np.array([1.0, 0.5, 2.0]) / 2.29,
+        moved.mean(0),
+        np.array([3.0, -3.0, 2.6]),
+    )
     start = np.linalg.inv(truth).astype(np.float64)
     moved, moved_normals = move_points(truth, moved), moved_normals @ truth[:3, :3].T
     count = f"{len(points) / 1e6:.2f} M points"
 
-    def time_alignment(stage: str, align: Callable[[], Floats], note: str, target: float | None = None) -> Row:
+    def time_alignment(
+        stage: str, align: Callable[[], Floats], note: str, target: float | None = None
+    ) -> Row:
         """The row of an alignment (4, 4), with its largest error over the scan, in um."""
         few = moved[::997]
         worst = np.linalg.norm(move_points(align(), few) - move_points(start, few), axis=1).max()
@@ -243,15 +274,22 @@ def registration_rows() -> list[Row]:
         )
 
     note = "generalised ICP, voxels of 0.5 mm, two threads, without checks of the result"
-    return [*rows, time_alignment(f"align {count}, small-gicp {version('small-gicp')}", theirs, note)]
+    return [
+        *rows,
+        time_alignment(f"align {count}, small-gicp {version('small-gicp')}", theirs, note),
+    ]
 
 
 def _make_relief(seed: int, shift_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) mm of a relief of 150 x 150 mm with noise of 0.03 mm, and its normals (n, 3) towards the camera;
-    the grid of the pixels is shifted by ``shift_mm``."""
+    """Points (n, 3) mm of a relief of 150 x 150 mm with noise of 0.03 mm, and its normals (n, 3)
+    towards the camera; the grid of the pixels is shifted by ``shift_mm``."""
     u = np.linspace(-75.0, 75.0, 1183) + shift_mm
     x, y = np.meshgrid(u, u)
-    z = 6 * np.sin(x / 9) * np.cos(y / 11) + 3 * np.sin((x + y) / 5) + 12 * np.exp(-((x - 20) ** 2 + y**2) / 200)
+    z = (
+        6 * np.sin(x / 9) * np.cos(y / 11)
+        + 3 * np.sin((x + y) / 5)
+        + 12 * np.exp(-((x - 20) ** 2 + y**2) / 200)
+    )
     slope_y, slope_x = np.gradient(z, u, u)
     normals = np.stack([slope_x, slope_y, -np.ones_like(z)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)

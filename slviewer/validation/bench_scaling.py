@@ -58,7 +58,8 @@ LINEAR = 1.1
 
 
 def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
-    """Rows of each size, with the largest memory of its arrays, and of each kind the exponent of its growth."""
+    """Rows of each size, with the largest memory of its arrays, and of each kind the exponent of
+    its growth."""
     rig = letter(SCALE)
     plan = letter_plan(rig, poses=max(POSES))
     scene = plan["pose_01"]
@@ -84,9 +85,11 @@ def _measure_growth(
     work: Callable[[float], Callable[[], object]],
     measure_s: Callable[[Callable[[], object], int, bool], float] = median,
 ) -> list[Row]:
-    """Time ``work(size)()`` for each size; the last row's note is what ``_describe_growth`` says of all of them.
+    """Time ``work(size)()`` for each size; the last row's note is what ``_describe_growth`` says of
+    all of them.
 
-    ``measure_s``: returns the seconds of a run, from how often it is run and whether it is run once before.
+    ``measure_s``: returns the seconds of a run, from how often it is run and whether it is run once
+    before.
     """
     seconds, rows = [], []
     for size in sizes:
@@ -109,7 +112,9 @@ def _describe_growth(sizes: tuple[float, ...], seconds: list[float]) -> str:
     return f"grows with the power {exponent:.2f}: {verdict}"
 
 
-def _time_pixels(rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = MEGAPIXELS) -> list[Row]:
+def _time_pixels(
+    rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = MEGAPIXELS
+) -> list[Row]:
     """Rows of decoding 25 frames of several sizes, which are resized from rendered ones."""
     sequence = one_axis(p18(rig.projector.size), "x")
     frames = Renderer(rig, scene).capture(sequence)
@@ -123,13 +128,17 @@ def _time_pixels(rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = 
     return _measure_growth("decode 25 frames, MP", megapixels, decode_size)
 
 
-def _time_captures(rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CAPTURES) -> list[Row]:
+def _time_captures(
+    rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CAPTURES
+) -> list[Row]:
     """Rows of the wizard's snapshot of a session with so many captures."""
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
         sequence = one_axis(p18(rig.projector.size), "x")
         frames = Renderer(rig, scene).capture(sequence)
         with Session.open_or_create(Path(folder, "session")) as session:
-            first = session.save_capture("pose_001", "calibration", sequence, frames, source="simulated", board=TARGET)
+            first = session.save_capture(
+                "pose_001", "calibration", sequence, frames, source="simulated", board=TARGET
+            )
             planner = Planner(lambda: None)
 
             def read_session(count: float) -> Callable[[], object]:
@@ -145,7 +154,8 @@ def _time_captures(rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CA
 
 
 def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]:
-    """Rows of registering scans of an object on a turntable that makes `STEPS` or more, with made-up noise."""
+    """Rows of registering scans of an object on a turntable that makes `STEPS` or more, with
+    made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
     steps = max(STEPS, *counts)
     for name, scene in turning(steps).items():
@@ -171,7 +181,8 @@ def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
         frames = Renderer(rig, plan[name]).capture(sequence)
         phases = decode_frames(name, sequence, frames)
         read = read_pose(
-            DecodedPose(name, sequence, frames, phases, texture_8bit(sequence, frames), board), Smoothing()
+            DecodedPose(name, sequence, frames, phases, texture_8bit(sequence, frames), board),
+            Smoothing(),
         )
         if read.observation is not None:
             observations.append(read.observation)
@@ -180,7 +191,9 @@ def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
         """Return the calibration from the first so many poses."""
         chosen = observations[: int(count)]
 
-        return lambda: calibrate_splined(chosen, calibrate_stereo(chosen, rig.projector.size, TARGET))
+        return lambda: calibrate_splined(
+            chosen, calibrate_stereo(chosen, rig.projector.size, TARGET)
+        )
 
     return _measure_growth("calibrate poses, stereo and splined", POSES, calibrate)
 
@@ -195,7 +208,8 @@ print(time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_m
 
 
 def _time_whole_captures(scene: Any) -> list[Row]:
-    """Rows of reconstructing captures of several sizes from disk to PLY, with the peak memory of the process."""
+    """Rows of reconstructing captures of several sizes from disk to PLY, with the peak memory of
+    the process."""
     seconds, rows = [], []
     for megapixels in WHOLE_MEGAPIXELS:
         scale = float(np.sqrt(megapixels / 1.92))
@@ -207,8 +221,13 @@ def _time_whole_captures(scene: Any) -> list[Row]:
         seconds.append(lasted)
         memory = peak / (1e6 if sys.platform == "darwin" else 1e3)
         rows.append(row(f"reconstruct a capture, MP: {megapixels:g}", lasted, memory))
-        rows[-1] |= {"target": f"{MOST_MB / 1e3:g} GB", "holds": "yes" if memory <= MOST_MB else "no"}
-    rows[-1]["note"] = f"{_describe_growth(WHOLE_MEGAPIXELS, seconds)}; MB: peak of the whole process"
+        rows[-1] |= {
+            "target": f"{MOST_MB / 1e3:g} GB",
+            "holds": "yes" if memory <= MOST_MB else "no",
+        }
+    rows[-1]["note"] = (
+        f"{_describe_growth(WHOLE_MEGAPIXELS, seconds)}; MB: peak of the whole process"
+    )
     return rows
 
 
@@ -224,7 +243,8 @@ def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
 
 
 def _time_batches(scene: Any) -> list[Row]:
-    """Rows of a batch of captures on one worker and on two; empty without the packages that batches need."""
+    """Rows of a batch of captures on one worker and on two; empty without the packages that batches
+    need."""
     try:
         from distributed import Client, LocalCluster
     except ImportError:
@@ -235,7 +255,9 @@ def _time_batches(scene: Any) -> list[Row]:
         _save_scans(session, 1.0, scene, BATCH)
         for workers in WORKERS:
             with (
-                LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
+                LocalCluster(
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None
+                ) as cluster,
                 Client(cluster, set_as_default=False),
             ):
                 work = partial(batch, [session], "reconstruct", scheduler=cluster.scheduler_address)

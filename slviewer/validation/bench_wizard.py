@@ -1,4 +1,5 @@
-"""What an operator waits for, measured by running the whole wizard on the simulated rig without a browser."""
+"""What an operator waits for, measured by running the whole wizard on the simulated rig without a
+browser."""
 
 import os
 import statistics
@@ -38,7 +39,8 @@ LIMITS = {
     "`slviewer reproduce --quick` after installation": 60.0,
     "`slviewer reproduce --quick` again": 30.0,
 }
-"""Seconds that a person may have to wait, at 800x600 on two cores. After installation no kernel is compiled yet."""
+"""Seconds that a person may have to wait, at 800x600 on two cores. After installation no kernel is
+compiled yet."""
 _SAMPLING_S = 0.02
 _FUNCTIONS = 8
 """Shown of the slowest act."""
@@ -48,7 +50,8 @@ _FUNCTIONS = 8
 class _Stopwatch:
     """Waiting times, s, by their names, from the snapshots of a wizard at work.
 
-    A listener of the operator's, which is called on one thread only. ``clock``: returns the present time in s.
+    A listener of the operator's, which is called on one thread only. ``clock``: returns the present
+    time in s.
     """
 
     clock: Callable[[], float] = time.perf_counter
@@ -71,12 +74,16 @@ class _Stopwatch:
         if planned and self._pose is not None and len(snapshot.session.poses) >= 3:
             self.seconds["suggestion of the next pose, from the third on"].append(now - self._pose)
             self._pose = None
-        if self._last_frame is not None and (stage := _get_new_result(before.session, snapshot.session)):
+        if self._last_frame is not None and (
+            stage := _get_new_result(before.session, snapshot.session)
+        ):
             self.seconds[stage].append(now - self._last_frame)
 
     def time_after_installation(self, folder: Path, scale: float) -> None:
         """Time the Autopilot and ``reproduce`` with folders for compiled kernels that are empty."""
-        code = f"from {__name__} import run_autopilot as run; run({str(folder / 'first')!r}, {scale})"
+        code = (
+            f"from {__name__} import run_autopilot as run; run({str(folder / 'first')!r}, {scale})"
+        )
         environment = {"NUMBA_CACHE_DIR": str(folder / "autopilot"), _STARTED: str(time.time())}
         first, whole = map(float, run_python("-c", code, **environment).split()[-2:])
         self.seconds["first judged pose after installation"].append(first)
@@ -89,7 +96,8 @@ class _Stopwatch:
 
 
 def _get_new_result(before: SessionView, after: SessionView) -> str:
-    """The stage whose result a session has and did not have before: a verification, or a scan's cloud; else empty."""
+    """The stage whose result a session has and did not have before: a verification, or a scan's
+    cloud; else empty."""
     if len(after.list_records(Verification)) > len(before.list_records(Verification)):
         return "verify a plane or a sphere with all models"
     clouds = [sum(scan.cloud == "fresh" for scan in session.scans) for session in (before, after)]
@@ -99,12 +107,14 @@ def _get_new_result(before: SessionView, after: SessionView) -> str:
 
 
 def _is_counted(module: str) -> bool:
-    """Whether samples are counted for a module's functions: the package's, but for the wrapper of every kernel."""
+    """Whether samples are counted for a module's functions: the package's, but for the wrapper of
+    every kernel."""
     return module.startswith("slviewer.") and module != "slviewer.geometry.jit"
 
 
 class _Sampler:
-    """Samples, on a thread of its own, which of the counted functions every other thread is in, act by act."""
+    """Samples, on a thread of its own, which of the counted functions every other thread is in, act
+    by act."""
 
     def __init__(self, is_counted: Callable[[str], bool] = _is_counted) -> None:
         self._is_counted = is_counted
@@ -128,10 +138,14 @@ class _Sampler:
                 if thread == self._thread.ident or frame.f_code.co_filename.endswith(_WAITING):
                     continue
                 inner: Any = frame
-                while inner is not None and not self._is_counted(inner.f_globals.get("__name__", "")):
+                while inner is not None and not self._is_counted(
+                    inner.f_globals.get("__name__", "")
+                ):
                     inner = inner.f_back
                 if inner is not None:
-                    name = f"{inner.f_globals['__name__']}.{inner.f_code.co_qualname}".replace(".<locals>", "")
+                    name = f"{inner.f_globals['__name__']}.{inner.f_code.co_qualname}".replace(
+                        ".<locals>", ""
+                    )
                     self.samples.setdefault(self.act, Counter())[name] += 1
 
 
@@ -140,10 +154,11 @@ _WAITING = ("threading.py", "selectors.py", "socket.py", "queue.py", "subprocess
 
 
 def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> list[Row]:
-    """Rows of what an operator waits for, with the seconds of the slowest acts of the Autopilot and of the functions
-    that the slowest one spent them in.
+    """Rows of what an operator waits for, with the seconds of the slowest acts of the Autopilot and
+    of the functions that the slowest one spent them in.
 
-    ``scale``: resolution of the camera, as a share of 1600x1200. Kernels are compiled before the wizard is measured.
+    ``scale``: resolution of the camera, as a share of 1600x1200. Kernels are compiled before the
+    wizard is measured.
     """
     acts: list[tuple[str, float]] = []
 
@@ -157,14 +172,18 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
         for name in ("warm", "session"):  # the first run compiles what is not compiled yet
             acts.clear()
             watch, session = _Stopwatch(), Path(folder, name)
-            with Operator(session, {**RIG, "scale": scale if name == "session" else min(scale, 0.25)}) as operator:
+            with Operator(
+                session, {**RIG, "scale": scale if name == "session" else min(scale, 0.25)}
+            ) as operator:
                 stop = operator.subscribe(watch.note)
                 Autopilot(operator, poses=POSES, before=begin).run()
                 begin("")
                 stop()
         lasted = [(act, after - at) for (act, at), (_, after) in pairwise(acts)]
         watch.seconds["Autopilot"].append(acts[-1][1] - acts[0][1])
-        watch.seconds[f"calibrate {POSES} poses"] += [seconds for act, seconds in lasted if act == "Calibrating"]
+        watch.seconds[f"calibrate {POSES} poses"] += [
+            seconds for act, seconds in lasted if act == "Calibrating"
+        ]
         progress(0.3, "reconstructing again")
         watch.seconds["reconstruct again in the same process"].append(
             median(lambda: reconstruct(session, "scan_01", out=Path(folder, "again.ply")), 5)
@@ -175,14 +194,20 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
             (f"`slviewer validate` on {POSES} poses", 1, "validate", str(session)),
             ("`slviewer --help`", 5, "--help"),
         ):
-            watch.seconds[name].append(median(partial(run_python, "-m", "slviewer.cli", *arguments), times, times > 1))
+            watch.seconds[name].append(
+                median(partial(run_python, "-m", "slviewer.cli", *arguments), times, times > 1)
+            )
         progress(0.5, "after installation")
         watch.time_after_installation(Path(folder), scale)
     progress(1.0, "measured")
     rows = []
     for stage, limit in LIMITS.items():
         measured = watch.seconds[stage] or [float("nan")]
-        note = f"median of {len(measured)}, the longest {1e3 * max(measured):.0f} ms" if len(measured) > 1 else ""
+        note = (
+            f"median of {len(measured)}, the longest {1e3 * max(measured):.0f} ms"
+            if len(measured) > 1
+            else ""
+        )
         rows.append(row(stage, statistics.median(measured), target=limit, note=note))
         if max(measured) > limit:  # of every time, not of their median
             rows[-1]["holds"] = "no"
@@ -190,13 +215,18 @@ def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> lis
     rows += [row(f"Autopilot: {act}", seconds) for act, seconds in slowest]
     inside = sampler.samples.get(slowest[0][0], Counter())
     return rows + [
-        row(f"  {name.removeprefix('slviewer.')}", slowest[0][1] * count / inside.total(), note=f"in {slowest[0][0]}")
+        row(
+            f"  {name.removeprefix('slviewer.')}",
+            slowest[0][1] * count / inside.total(),
+            note=f"in {slowest[0][0]}",
+        )
         for name, count in inside.most_common(_FUNCTIONS)
     ]
 
 
 def run_autopilot(session: str, scale: float) -> None:
-    """Run the Autopilot, and print the seconds since the process was started: at the first pose, and at the end."""
+    """Run the Autopilot, and print the seconds since the process was started: at the first pose,
+    and at the end."""
     started = time.time() - float(os.environ[_STARTED])
     first: list[float] = []
 

@@ -1,6 +1,7 @@
 """Simulated target poses, and the faults that are put into them one at a time.
 
-Target poses are rendered once, and disturbed afterwards where a fault allows it; all of it happens in memory.
+Target poses are rendered once, and disturbed afterwards where a fault allows it; all of it happens
+in memory.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -56,7 +57,11 @@ class FaultBench:
         frames = [
             frame
             for axis in AXES
-            for frame in (*phase_steps(axis, self.steps, PERIOD_PX), *gray_bits(axis, BITS), Frame("texture"))
+            for frame in (
+                *phase_steps(axis, self.steps, PERIOD_PX),
+                *gray_bits(axis, BITS),
+                Frame("texture"),
+            )
         ]
         return PatternSequence(self.rig.projector.size, tuple(frames))
 
@@ -71,9 +76,11 @@ class FaultBench:
             self._frames[i] = self.render(self.poses[i], i)
         return self._frames[i]
 
-    def render(self, pose: Pose, seed: int, exposure: float = 1.0, reverse: Axis | None = None) -> np.ndarray:
-        """(n, h, w) uint8: a capture of the board at a pose, in so many times the usual light, with the patterns of one
-        axis reversed.
+    def render(
+        self, pose: Pose, seed: int, exposure: float = 1.0, reverse: Axis | None = None
+    ) -> np.ndarray:
+        """(n, h, w) uint8: a capture of the board at a pose, in so many times the usual light, with
+        the patterns of one axis reversed.
         """
         renderer = Renderer(self.rig, printed_board(self.board, pose, self.shape, self.rig.seed))
         rng = np.random.default_rng([self.rig.seed, seed, 0xCA])
@@ -87,9 +94,14 @@ class FaultBench:
         return stack
 
     def examine(
-        self, i: int, frames: np.ndarray, sequence: PatternSequence | None = None, board: Board | None = None
+        self,
+        i: int,
+        frames: np.ndarray,
+        sequence: PatternSequence | None = None,
+        board: Board | None = None,
     ) -> Judged:
-        """Read a capture with its evidence; ``sequence`` and ``board`` as described to the program."""
+        """Read a capture with its evidence; ``sequence`` and ``board`` as described to the
+        program."""
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
         phases = decode_frames(name, sequence, frames)
         pose = DecodedPose(name, sequence, frames, phases, texture(sequence, frames), board)
@@ -101,14 +113,20 @@ class FaultBench:
         for i in wanted:
             if i not in self._examined:
                 frames = self._frames.get(i)
-                self._examined[i] = self.examine(i, self.render(self.poses[i], i) if frames is None else frames)
+                self._examined[i] = self.examine(
+                    i, self.render(self.poses[i], i) if frames is None else frames
+                )
         return [self._examined[i] for i in wanted]
 
-    def attempt(self, captures: Sequence[Judged], board: Board | None = None) -> DiagnosedCalibration:
+    def attempt(
+        self, captures: Sequence[Judged], board: Board | None = None
+    ) -> DiagnosedCalibration:
         """Calibrate from examined captures."""
         observations = [each.observation for each in captures if each.observation is not None]
         evidence = [each.evidence for each in captures if each.evidence is not None]
-        return calibrate_with_diagnosis(observations, evidence, self.rig.projector.size, board or self.board)
+        return calibrate_with_diagnosis(
+            observations, evidence, self.rig.projector.size, board or self.board
+        )
 
     def attempt_disturbed(
         self,
@@ -117,10 +135,15 @@ class FaultBench:
         board: Board | None = None,
         **rendering: Any,
     ) -> DiagnosedCalibration:
-        """The calibration from ``EVERY`` captures, all with their frames changed, another description, or rendered
-        otherwise."""
+        """The calibration from ``EVERY`` captures, all with their frames changed, another
+        description, or rendered otherwise."""
         captures = [
-            self.examine(i, change(self.render(pose, i, **rendering) if rendering else self.frames(i)), sequence, board)
+            self.examine(
+                i,
+                change(self.render(pose, i, **rendering) if rendering else self.frames(i)),
+                sequence,
+                board,
+            )
             for i, pose in enumerate(self.poses[:EVERY])
         ]
         return self.attempt(captures, board)
@@ -133,7 +156,8 @@ class FaultBench:
 
 
 def _describe_periods(bench: FaultBench, **period_px: float) -> DiagnosedCalibration:
-    """Diagnosed calibration with described fringe periods that are wrong, {axis: described period}."""
+    """Diagnosed calibration with described fringe periods that are wrong, {axis: described
+    period}."""
     frames = [
         replace(f, period_px=period_px[f.axis]) if f.kind == "phase" and f.axis in period_px else f
         for f in bench.sequence.frames
@@ -147,7 +171,8 @@ def _describe_board(bench: FaultBench, columns: int, rows: int) -> DiagnosedCali
 
 
 def _renumber_features(bench: FaultBench, order: FrameChange) -> DiagnosedCalibration:
-    """The diagnosed calibration with one pose's features reordered; ``order`` maps (rows, columns) indices."""
+    """The diagnosed calibration with one pose's features reordered; ``order`` maps (rows, columns)
+    indices."""
     captures = bench.examine_clean()
     observation = captures[2].observation
     assert observation is not None
@@ -155,7 +180,10 @@ def _renumber_features(bench: FaultBench, order: FrameChange) -> DiagnosedCalibr
     turned = order(np.arange(columns * rows).reshape(rows, columns)).ravel()
     slopes = None if observation.slopes is None else observation.slopes[turned]
     wrong = replace(
-        observation, camera=observation.camera[turned], projector=observation.projector[turned], slopes=slopes
+        observation,
+        camera=observation.camera[turned],
+        projector=observation.projector[turned],
+        slopes=slopes,
     )
     captures[2] = replace(captures[2], observation=wrong)
     return bench.attempt(captures)
@@ -175,7 +203,9 @@ def _apply_gamma(bench: FaultBench, gamma: float) -> DiagnosedCalibration:
     return replace(bench, rig=replace(bench.rig, light=light)).attempt_disturbed()
 
 
-def _tilt_boards_alike(bench: FaultBench, tilt_deg: float, spread_deg: float) -> DiagnosedCalibration:
+def _tilt_boards_alike(
+    bench: FaultBench, tilt_deg: float, spread_deg: float
+) -> DiagnosedCalibration:
     """The diagnosed calibration from boards that are all tilted alike, within ``spread_deg``."""
     rng = np.random.default_rng(5)
     middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
@@ -207,9 +237,18 @@ def _exchange_halves(frames: np.ndarray) -> np.ndarray:
 
 
 FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]] = {
-    "x and y frames exchanged": ("axes-swapped", lambda bench: bench.attempt_disturbed(_exchange_halves)),
-    "columns from right to left": ("axis-reversed", lambda bench: bench.attempt_disturbed(reverse="x")),
-    "rows from bottom to top": ("axis-reversed", lambda bench: bench.attempt_disturbed(reverse="y")),
+    "x and y frames exchanged": (
+        "axes-swapped",
+        lambda bench: bench.attempt_disturbed(_exchange_halves),
+    ),
+    "columns from right to left": (
+        "axis-reversed",
+        lambda bench: bench.attempt_disturbed(reverse="x"),
+    ),
+    "rows from bottom to top": (
+        "axis-reversed",
+        lambda bench: bench.attempt_disturbed(reverse="y"),
+    ),
     "period 18 described as 16": ("fringe-period", partial(_describe_periods, x=16.0, y=16.0)),
     "period 18 described as 20": ("fringe-period", partial(_describe_periods, x=20.0, y=20.0)),
     "period 18 described as 36": ("fringe-period", partial(_describe_periods, x=36.0, y=36.0)),
@@ -217,21 +256,36 @@ FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]]
     "board of 20x16 given": ("board-size", lambda bench: _describe_board(bench, 20, 16)),
     "board of 21x15 given": ("board-size", lambda bench: _describe_board(bench, 21, 15)),
     "board of 22x16 given": ("board-size", lambda bench: _describe_board(bench, 22, 16)),
-    "board transposed in one pose": ("board-numbering", lambda bench: _renumber_features(bench, np.transpose)),
+    "board transposed in one pose": (
+        "board-numbering",
+        lambda bench: _renumber_features(bench, np.transpose),
+    ),
     "board shifted by a row in one pose": (
         "board-numbering",
         lambda bench: _renumber_features(bench, lambda index: np.roll(index, 1, axis=0)),
     ),
-    "one pose moved between the axes": ("moved", lambda bench: _move_board(bench, (0.5, 0.2, 0.0), 0.5)),
-    "one pose moved among the frames of x": ("moved", lambda bench: _move_board(bench, (1.0, -0.5, 0.5), 0.18)),
+    "one pose moved between the axes": (
+        "moved",
+        lambda bench: _move_board(bench, (0.5, 0.2, 0.0), 0.5),
+    ),
+    "one pose moved among the frames of x": (
+        "moved",
+        lambda bench: _move_board(bench, (1.0, -0.5, 0.5), 0.18),
+    ),
     "one pose moved a little": ("moved", lambda bench: _move_board(bench, (0.15, 0.0, 0.15), 0.5)),
     "lag of one frame": ("frame-lag", lambda bench: bench.attempt_disturbed(delay_frames)),
-    "lag of one frame in one pose": ("frame-lag", lambda bench: bench.attempt_with(3, delay_frames(bench.frames(3)))),
+    "lag of one frame in one pose": (
+        "frame-lag",
+        lambda bench: bench.attempt_with(3, delay_frames(bench.frames(3))),
+    ),
     "fifth frame missing": (
         "missing-frame",
         lambda bench: bench.attempt_disturbed(lambda frames: drop_frame(frames, 4)),
     ),
-    "Gray bit missing": ("missing-frame", lambda bench: bench.attempt_disturbed(lambda frames: drop_frame(frames, -7))),
+    "Gray bit missing": (
+        "missing-frame",
+        lambda bench: bench.attempt_disturbed(lambda frames: drop_frame(frames, -7)),
+    ),
     "fifth frame missing in one pose": (
         "missing-frame",
         lambda bench: bench.attempt_with(3, drop_frame(bench.frames(3), 4)),
@@ -239,7 +293,10 @@ FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]]
     "overexposed": ("saturation", lambda bench: bench.attempt_disturbed(exposure=1.8)),
     "much overexposed": ("saturation", lambda bench: bench.attempt_disturbed(exposure=4.0)),
     "gamma 2.2": ("gamma", lambda bench: _apply_gamma(bench, 2.2)),
-    "boards facing the camera": ("parallel-poses", lambda bench: _tilt_boards_alike(bench, 0.0, 0.7)),
+    "boards facing the camera": (
+        "parallel-poses",
+        lambda bench: _tilt_boards_alike(bench, 0.0, 0.7),
+    ),
     "boards tilted alike": ("parallel-poses", lambda bench: _tilt_boards_alike(bench, 20.0, 3.0)),
     "no pose in one corner": ("empty-corner", _avoid_corner),
     "two poses": ("too-few-poses", lambda bench: bench.attempt(bench.examine_clean(2))),

@@ -1,4 +1,5 @@
-"""Captures of a hostile rig, put through the program's own path: files, import, calibration, clouds, fitted shapes."""
+"""Captures of a hostile rig, put through the program's own path: files, import, calibration,
+clouds, fitted shapes."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -45,9 +46,9 @@ _SAME_SURFACE_MM = 3.0
 class MeasuredScan:
     """A scan, point by point.
 
-    ``points`` (n, 3) mm as measured, ``truth`` (n, 3) mm of the same pixels, NaN where they see no surface directly,
-    ``sigma`` (n,) mm predicted for z; ``on_target`` (n,) bool: of the plane or sphere, which has ``expected`` pixels
-    that the projector lights.
+    ``points`` (n, 3) mm as measured, ``truth`` (n, 3) mm of the same pixels, NaN where they see no
+    surface directly, ``sigma`` (n,) mm predicted for z; ``on_target`` (n,) bool: of the plane or
+    sphere, which has ``expected`` pixels that the projector lights.
     """
 
     points: np.ndarray
@@ -59,7 +60,8 @@ class MeasuredScan:
 
 @dataclass(eq=False)
 class CaseReport:
-    """The program's messages on a case: its warnings, the causes that it named, and the error that ended it."""
+    """The program's messages on a case: its warnings, the causes that it named, and the error that
+    ended it."""
 
     warnings: list[str] = field(default_factory=list)
     named: list[frozenset[str]] = field(default_factory=list)
@@ -70,7 +72,8 @@ class CaseReport:
 class HostileBench:
     """A rig, its scenes, and their clean light, each rendered when it is first needed.
 
-    ``folder`` takes the sessions and images. ``models`` are fitted by every calibration, the last of them measures.
+    ``folder`` takes the sessions and images. ``models`` are fitted by every calibration, the last
+    of them measures.
     """
 
     rig: SimulatedRig
@@ -78,15 +81,22 @@ class HostileBench:
     poses: int = 7
     models: tuple[str, ...] = ("stereo",)
     seed: int = 0
-    _light: dict[str, tuple[np.ndarray, Renderer]] = field(default_factory=dict, init=False, repr=False)
+    _light: dict[str, tuple[np.ndarray, Renderer]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     @cached_property
     def sequence(self) -> PatternSequence:
-        """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at the end."""
+        """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at
+        the end."""
         frames = [
             frame
             for axis in AXES
-            for frame in (*phase_steps(axis, STEPS, PERIOD_PX), *gray_bits(axis, BITS), Frame("complementary", axis))
+            for frame in (
+                *phase_steps(axis, STEPS, PERIOD_PX),
+                *gray_bits(axis, BITS),
+                Frame("complementary", axis),
+            )
         ]
         return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
 
@@ -117,13 +127,18 @@ class HostileBench:
         if fault is not None and fault.is_optical:
             light, renderer = hostile_light(fault, severity, self.rig, scene, self.sequence, number)
         ambient = renderer.room_light()
-        frames = expose_frames(renderer.rig, light, self.sequence, ambient, number, fault, severity, self.seed)
+        frames = expose_frames(
+            renderer.rig, light, self.sequence, ambient, number, fault, severity, self.seed
+        )
         return frames, renderer, clean
 
     def store(self, session: Path, captures: dict[str, np.ndarray], report: CaseReport) -> None:
-        """Write frames as images with a TOML, and import them as anyone would; poses and scans by their names."""
+        """Write frames as images with a TOML, and import them as anyone would; poses and scans by
+        their names."""
         for role in ("calibration", "scan"):
-            names = [name for name in captures if name.startswith("pose_") == (role == "calibration")]
+            names = [
+                name for name in captures if name.startswith("pose_") == (role == "calibration")
+            ]
             if not names:
                 continue
             source = self.folder / "images"
@@ -133,9 +148,13 @@ class HostileBench:
             toml.write_text(describe_sequence(self.sequence, files[0]))
             try:
                 warn = report.warnings.append
-                import_captures(source, session, "frames", sequence=toml, role=role, force=True, warn=warn)  # type: ignore[arg-type]
+                import_captures(
+                    source, session, "frames", sequence=toml, role=role, force=True, warn=warn
+                )  # type: ignore[arg-type]
             except SlviewerError as error:
-                report.named += named_causes(self.sequence, captures, [*report.warnings, str(error)])
+                report.named += named_causes(
+                    self.sequence, captures, [*report.warnings, str(error)]
+                )
                 raise
         report.named += named_causes(self.sequence, captures, report.warnings)
 
@@ -148,8 +167,11 @@ class HostileBench:
                 verdict = load_last_verdict(store)
             report.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
 
-    def measure(self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport) -> MeasuredScan:
-        """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the renderers know."""
+    def measure(
+        self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport
+    ) -> MeasuredScan:
+        """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the
+        renderers know."""
         shape: Shape = "plane" if name.startswith("plane") else "sphere"
         with Session.open(session) as store:
             job, out = Job(store, warn=report.warnings.append), self.folder / "cloud.ply"
@@ -164,7 +186,8 @@ class HostileBench:
 
 
 def match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
-    """The cloud's points beside those that a perfect instrument would measure, of the scene as it was."""
+    """The cloud's points beside those that a perfect instrument would measure, of the scene as it
+    was."""
     truth = renderer.truth()
     points = truth.points
     if isinstance(renderer.scene, MirrorTable):
@@ -198,24 +221,33 @@ _SUSPECTED: dict[str, frozenset[str]] = {
     "dropped": frozenset({"missing-frame"}),
     "swapped": frozenset({"frame-order"}),
     "light": frozenset({"exposure-drift", "flicker", "room-light"}),
-    "strange": frozenset({"missing-frame", "duplicate-frame", "flicker", "exposure-drift", "motion"}),
+    "strange": frozenset(
+        {"missing-frame", "duplicate-frame", "flicker", "exposure-drift", "motion"}
+    ),
 }
-"""What a frame's suspected fault says, in the words of causes; several where it leaves that open."""
+"""What a frame's suspected fault says, in the words of causes; several where it leaves that
+open."""
 
 
 def named_causes(
     sequence: PatternSequence, captures: Mapping[str, np.ndarray], messages: Sequence[str]
 ) -> list[frozenset[str]]:
-    """The causes that messages about captures name: those of the program's own suspects and contradictions whose
-    sentence is part of a message.
+    """The causes that messages about captures name: those of the program's own suspects and
+    contradictions whose sentence is part of a message.
     """
     named: dict[frozenset[str], None] = {}
     for name, frames in captures.items():
         about = [message for message in messages if name in message]
         if not about:
             continue
-        suspects = [suspect for axis in capture_residuals(sequence, frames) for suspect in axis.suspects]
+        suspects = [
+            suspect for axis in capture_residuals(sequence, frames) for suspect in axis.suspects
+        ]
         known = [(s.sentence, _SUSPECTED.get(s.fault, frozenset({s.fault}))) for s in suspects]
         known += [(c.message, frozenset({c.cause})) for c in check_description(sequence, frames)]
-        named |= {causes: None for sentence, causes in known if any(sentence in message for message in about)}
+        named |= {
+            causes: None
+            for sentence, causes in known
+            if any(sentence in message for message in about)
+        }
     return list(named)

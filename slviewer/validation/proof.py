@@ -1,4 +1,5 @@
-"""The result of proving one claim: a table, the figures that must lie within bounds, and all of it as JSON."""
+"""The result of proving one claim: a table, the figures that must lie within bounds, and all of it
+as JSON."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,13 +32,16 @@ class BandCheck:
 
     def text(self) -> str:
         """The figure and its band in one line."""
-        band = f"at most {self.most:g}" if self.least <= 0 else f"{self.least:.3g} to {self.most:.3g}"
+        band = (
+            f"at most {self.most:g}" if self.least <= 0 else f"{self.least:.3g} to {self.most:.3g}"
+        )
         return f"{self.rig}: {self.what} is {self.value:.4g}, wanted {band}"
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """``rows``: the printed table, with lines ``above`` and ``below``. ``record``: the values for JSON."""
+    """``rows``: the printed table, with lines ``above`` and ``below``. ``record``: the values for
+    JSON."""
 
     holds: bool
     scale: float
@@ -52,8 +56,12 @@ class Proof:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values; NaN becomes None."""
-        text = json.dumps({"scale": self.scale, "holds": self.holds, **self.record}, default=to_plain)
-        plain: dict[str, Any] = json.loads(text, parse_constant={"NaN": None, "Infinity": float("inf")}.get)
+        text = json.dumps(
+            {"scale": self.scale, "holds": self.holds, **self.record}, default=to_plain
+        )
+        plain: dict[str, Any] = json.loads(
+            text, parse_constant={"NaN": None, "Infinity": float("inf")}.get
+        )
         return plain
 
 
@@ -69,13 +77,16 @@ def prove_checks(
     failed = [check.text() for check in checks if not check.holds]
     summary = f"{len(checks) - len(failed)} of {len(checks)} figures hold"
     figures = [{**vars(check), "holds": check.holds} for check in checks]
-    return Proof(not failed, scale, rows, {"checks": figures, **record}, above, [*below, summary, *failed])
+    return Proof(
+        not failed, scale, rows, {"checks": figures, **record}, above, [*below, summary, *failed]
+    )
 
 
 def track(
     progress: Progress, named: Mapping[str, T], start: float = 0.0, end: float = 1.0
 ) -> Iterator[tuple[str, T, Progress]]:
-    """Yield each item with its name, which is reported, and the progress of its share of ``start`` to ``end``."""
+    """Yield each item with its name, which is reported, and the progress of its share of ``start``
+    to ``end``."""
     for i, (name, item) in enumerate(named.items()):
         begin, after = (start + (end - start) * k / len(named) for k in (i, i + 1))
         progress(begin, name)

@@ -16,7 +16,17 @@ from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_surfaces import prove_surfaces
 from slviewer.validation.prove_uncertainty import prove_uncertainty
 
-Claim = Literal["accuracy", "causes", "edges", "guidance", "hostile", "plan", "registration", "surfaces", "uncertainty"]
+Claim = Literal[
+    "accuracy",
+    "causes",
+    "edges",
+    "guidance",
+    "hostile",
+    "plan",
+    "registration",
+    "surfaces",
+    "uncertainty",
+]
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
     "causes": ("faults called by their names", prove_causes),
@@ -45,12 +55,19 @@ class Proofs:
     def failure(self) -> str:
         """Which claims do not hold; empty where all do."""
         failed = [claim for claim, proof in self.proofs.items() if not proof.holds]
-        return f"not proven: {', '.join(failed)}: the tables show which figures miss their bounds" if failed else ""
+        return (
+            f"not proven: {', '.join(failed)}: the tables show which figures miss their bounds"
+            if failed
+            else ""
+        )
 
     def text(self) -> str:
         """Each table under its title, then whether each claim holds."""
         blocks = [f"{CLAIMS[claim][0]}\n\n{proof.text()}\n" for claim, proof in self.proofs.items()]
-        lines = [f"{'pass' if proof.holds else 'FAIL'}  {CLAIMS[claim][0]}" for claim, proof in self.proofs.items()]
+        lines = [
+            f"{'pass' if proof.holds else 'FAIL'}  {CLAIMS[claim][0]}"
+            for claim, proof in self.proofs.items()
+        ]
         return "\n".join([*blocks, *lines])
 
     def to_json(self) -> dict[str, Any]:
@@ -66,16 +83,20 @@ def prove(
     seed: int = 0,
     progress: Progress = ignore_progress,
 ) -> Proofs:
-    """Prove on simulated rigs that results reach the noise floor, faults are named, and predicted errors are honest.
+    """Prove on simulated rigs that results reach the noise floor, faults are named, and predicted
+    errors are honest.
 
-    Ends with status 1 where something does not hold. At full size it takes an hour or two on two cores.
+    Ends with status 1 where something does not hold. At full size it takes an hour or two on two
+    cores.
 
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
-        only: What to prove: accuracy on planes and spheres, causes of bad calibrations, printed edges, guidance of an
-            operator to good poses, captures of a hostile rig, tolerances of an inspection plan, registration of scans,
-            surfaces that light themselves, uncertainty against true errors; by default all.
-        cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or gamma:severe:scan.
+        only: What to prove: accuracy on planes and spheres, causes of bad calibrations, printed
+            edges, guidance of an operator to good poses, captures of a hostile rig, tolerances of
+            an inspection plan, registration of scans, surfaces that light themselves, uncertainty
+            against true errors; by default all.
+        cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or
+            gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
     """
     scale = QUICK_SCALE if quick else 1.0

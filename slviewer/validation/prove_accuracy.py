@@ -1,7 +1,8 @@
-"""Whether the splined calibration measures as well as the camera's noise allows, on simulated rigs with known truth.
+"""Whether the splined calibration measures as well as the camera's noise allows, on simulated rigs
+with known truth.
 
-Each rig is calibrated with every model, which then measures the Letter's planes and spheres. All of it happens in
-memory, one capture after another: a full-size session of so many would fill a disk.
+Each rig is calibrated with every model, which then measures the Letter's planes and spheres. All of
+it happens in memory, one capture after another: a full-size session of so many would fill a disk.
 """
 
 import math
@@ -46,7 +47,8 @@ COVERED = 6
 """Poses in which a pixel must have seen the board to be scored."""
 FLOOR = PerfectModel.name
 JUDGED = ("stereo", "splined", FLOOR)
-"""Scored over the pixels that all three measure; other models over those of them that they measure too."""
+"""Scored over the pixels that all three measure; other models over those of them that they measure
+too."""
 OVER_FLOOR = {"R1": 1.4, "R2": 1.1, "R3": 1.1}
 """Largest ratio of splined's RMS to the floor, in the mean over the planes of a region."""
 BELOW_FLOOR = 0.9
@@ -58,12 +60,14 @@ RADIUS_MM, SPACING_MM = 0.015, 0.04
 OVER_STEREO = 1.03
 """Of lenses without local distortion, where stereo lacks nothing."""
 MIN_MEASURED = 0.9
-"""Share of the pixels to be scored: a model that masks what it measures badly would look better than it is."""
+"""Share of the pixels to be scored: a model that masks what it measures badly would look better
+than it is."""
 
 
 @dataclass(frozen=True)
 class RigCase:
-    """A simulated rig of the Letter's kind, and the shape of the board that it is calibrated with."""
+    """A simulated rig of the Letter's kind, and the shape of the board that it is calibrated
+    with."""
 
     name: str
     seed: int = 0
@@ -73,7 +77,9 @@ class RigCase:
 
     def rig(self, scale: float) -> SimulatedRig:
         """The rig, its camera at ``scale`` times the Letter's resolution."""
-        return letter(scale, self.seed, local_distortion_px=self.local_distortion_px, texture=self.texture)
+        return letter(
+            scale, self.seed, local_distortion_px=self.local_distortion_px, texture=self.texture
+        )
 
 
 BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
@@ -93,9 +99,9 @@ def rig_cases(seed: int = 0) -> tuple[RigCase, ...]:
 
 @dataclass(frozen=True)
 class PlaneFigures:
-    """``region``: the depth range of most of the plane. ``rms_mm`` by model, the floor included; ``predicted_mm``: the
-    floor as the splined model predicts it. ``measured``: share of the pixels to be scored that the splined model
-    measures."""
+    """``region``: the depth range of most of the plane. ``rms_mm`` by model, the floor included;
+    ``predicted_mm``: the floor as the splined model predicts it. ``measured``: share of the pixels
+    to be scored that the splined model measures."""
 
     region: str
     rms_mm: Mapping[str, float]
@@ -106,8 +112,8 @@ class PlaneFigures:
 
 @dataclass(frozen=True)
 class RigFigures:
-    """The figures of one rig: planes by name, and errors in mm by model, of the spheres' radii and of the spacings of
-    their centres. ``seconds``: of rendering, calibrating and measuring."""
+    """The figures of one rig: planes by name, and errors in mm by model, of the spheres' radii and
+    of the spacings of their centres. ``seconds``: of rendering, calibrating and measuring."""
 
     rig: str
     seed: int
@@ -128,9 +134,12 @@ class RigFigures:
 
     @property
     def predicted_over_floor(self) -> float:
-        """Ratio of predicted noise to the floor of the plane where it is farthest from 1; NaN where one is unknown."""
+        """Ratio of predicted noise to the floor of the plane where it is farthest from 1; NaN where
+        one is unknown."""
         ratios = [plane.predicted_mm / plane.rms_mm[FLOOR] for plane in self.planes.values()]
-        return max(ratios, key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio)))
+        return max(
+            ratios, key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio))
+        )
 
     @property
     def measured(self) -> float:
@@ -160,7 +169,10 @@ def prove_accuracy(
     ``shapes``: those of the Letter's planes and spheres that are measured; by default all.
     """
     cases = {case.name: case for case in (rig_cases(seed) if rigs is None else rigs)}
-    figures = [measure_rig(case, scale, poses, report, shapes, settings) for _, case, report in track(progress, cases)]
+    figures = [
+        measure_rig(case, scale, poses, report, shapes, settings)
+        for _, case, report in track(progress, cases)
+    ]
     return judge_accuracy(figures, scale)
 
 
@@ -177,24 +189,37 @@ def check_figures(rig: RigFigures) -> tuple[BandCheck, ...]:
     regions = {plane.region for plane in rig.planes.values()}
     radius, spacing = rig.largest_errors_mm
     bounds: list[tuple[str, float, float, float]] = [
-        ("stereo over splined, of stereo over the floor,", floor / splined, OF_STEREO, 1 / BELOW_FLOOR),
+        (
+            "stereo over splined, of stereo over the floor,",
+            floor / splined,
+            OF_STEREO,
+            1 / BELOW_FLOOR,
+        ),
         *(
             (f"splined over the floor in {region}", rig.over_floor(region), BELOW_FLOOR, most)
             for region, most in OVER_FLOOR.items()
             if region in regions
         ),
-        ("predicted floor over the floor, of the worst plane,", rig.predicted_over_floor, 1 - PREDICTED, 1 + PREDICTED),
+        (
+            "predicted floor over the floor, of the worst plane,",
+            rig.predicted_over_floor,
+            1 - PREDICTED,
+            1 + PREDICTED,
+        ),
         ("share of the pixels that splined measures", rig.measured, MIN_MEASURED, 1.0),
         ("largest error of a sphere's radius in mm", radius, 0.0, RADIUS_MM),
         ("largest error of a spacing in mm", spacing, 0.0, SPACING_MM),
     ]
     if not rig.has_local_distortion:
-        bounds.append(("splined over stereo", splined / rig.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO))
+        bounds.append(
+            ("splined over stereo", splined / rig.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO)
+        )
     return tuple(BandCheck(rig.rig, *bound) for bound in bounds)
 
 
 def _make_row(rig: RigFigures) -> Row:
-    """The printed table row of one rig: mean RMS by model, ratios to the floor and the largest errors."""
+    """The printed table row of one rig: mean RMS by model, ratios to the floor and the largest
+    errors."""
     radius, spacing = rig.largest_errors_mm
     return {
         "rig": rig.rig,
@@ -230,7 +255,9 @@ def measure_rig(
         for name, scene in plan.items()
         if name.startswith(("plane_", "sphere_")) and (not shapes or name in shapes)
     }
-    stereo, splined, observations = calibrate_rendered(rig, plan, part(progress, 0.0, 0.6), settings)
+    stereo, splined, observations = calibrate_rendered(
+        rig, plan, part(progress, 0.0, 0.6), settings
+    )
     models: dict[str, Model] = {
         "stereo": stereo,
         "pixelwise": calibrate_pixelwise(observations, stereo),
@@ -256,11 +283,16 @@ def measure_rig(
         case.seed,
         case.local_distortion_px != 0,
         planes,
-        {m: {n: fit.radius_mm - spheres[n].radius_mm for n, fit in each.items()} for m, each in fits.items()},
+        {
+            m: {n: fit.radius_mm - spheres[n].radius_mm for n, fit in each.items()}
+            for m, each in fits.items()
+        },
         {
             model: {
-                f"{a} - {b}": math.dist(each[a].sphere.centre, each[b].sphere.centre)
-                - math.dist(spheres[a].centres[0], spheres[b].centres[0])
+                f"{a} - {b}": (
+                    math.dist(each[a].sphere.centre, each[b].sphere.centre)
+                    - math.dist(spheres[a].centres[0], spheres[b].centres[0])
+                )
                 for a, b in combinations(each, 2)
             }
             for model, each in fits.items()
@@ -282,12 +314,15 @@ def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:
 def compare_fits(
     models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, is_sphere: bool
 ) -> tuple[Comparison, float]:
-    """Every model's fit to one capture over the covered pixels, and the share of these that splined measures."""
+    """Every model's fit to one capture over the covered pixels, and the share of these that splined
+    measures."""
     clouds = {}
     for name, model in models.items():
         points = model.points(phase)
         sigma = model.sigma_z(phase, points)
-        clouds[name] = Cloud(np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma)
+        clouds[name] = Cloud(
+            np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma
+        )
     comparison = fit_clouds(
         "sphere" if is_sphere else "plane",
         {name: clouds[name] for name in JUDGED},
@@ -311,7 +346,8 @@ def compare_fits(
 
 
 def _make_plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:
-    """The figures of one plane from its comparison and the share of its pixels that were measured."""
+    """The figures of one plane from its comparison and the share of its pixels that were
+    measured."""
     shares = comparison.incidence or {}
     splined = comparison.results["splined"]
     return PlaneFigures(

@@ -1,4 +1,5 @@
-"""Whether every fault of a calibration is named as its cause, and sound calibrations raise no alarm."""
+"""Whether every fault of a calibration is named as its cause, and sound calibrations raise no
+alarm."""
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
@@ -15,7 +16,12 @@ from slviewer.target.board import Board
 from slviewer.validation.faulty_captures import BOARD, FAULTS, POSES, FaultBench
 from slviewer.validation.proof import Proof, track
 
-BOARDS = (BOARD, Board.parse("circles:14x11:13"), Board.parse("circles:17x13:11"), Board.parse("chessboard:10x7:18"))
+BOARDS = (
+    BOARD,
+    Board.parse("circles:14x11:13"),
+    Board.parse("circles:17x13:11"),
+    Board.parse("chessboard:10x7:18"),
+)
 """That calibrations without a fault are made from in turn."""
 
 
@@ -31,8 +37,9 @@ def prove_causes(
 ) -> Proof:
     """Every fault in turn, then ``clean`` calibrations of different rigs, poses and boards.
 
-    ``scale``: resolution of the camera, as a share of the Letter's. ``poses`` of each rig, captured in so many phase
-    ``steps``. A fault passes where the first finding is its cause, a clean calibration where there is none.
+    ``scale``: resolution of the camera, as a share of the Letter's. ``poses`` of each rig, captured
+    in so many phase ``steps``. A fault passes where the first finding is its cause, a clean
+    calibration where there is none.
     """
     bench = FaultBench(letter(scale, seed), count=poses, steps=steps)
     cases: dict[str, tuple[Cause | None, Callable[[], DiagnosedCalibration]]] = {
@@ -40,8 +47,13 @@ def prove_causes(
     }
     for k in range(clean):
         board, count, rig_seed = BOARDS[k % len(BOARDS)], poses + k % 5, seed + 1 + k
-        sound = FaultBench(letter(scale, rig_seed), board, count, BoardShape(misplaced_mm=0.01 * (k % 3)), steps)
-        cases[f"clean, seed {rig_seed}, {board}, {count} poses"] = None, partial(_attempt_clean, sound)
+        sound = FaultBench(
+            letter(scale, rig_seed), board, count, BoardShape(misplaced_mm=0.01 * (k % 3)), steps
+        )
+        cases[f"clean, seed {rig_seed}, {board}, {count} poses"] = (
+            None,
+            partial(_attempt_clean, sound),
+        )
     rows: list[Row] = []
     record = []
     confusion: dict[str, Counter[str]] = defaultdict(Counter)
@@ -64,7 +76,9 @@ def prove_causes(
         })  # fmt: skip
     right = sum(row["right"] == "yes" for row in rows)
     line = f"{right} of {len(rows)} named rightly, at scale {scale:g}"
-    return Proof(right == len(rows), scale, rows, {"confusion": confusion, "cases": record}, below=[line])
+    return Proof(
+        right == len(rows), scale, rows, {"confusion": confusion, "cases": record}, below=[line]
+    )
 
 
 def _attempt_clean(bench: FaultBench) -> DiagnosedCalibration:

@@ -1,5 +1,5 @@
-"""Proof that printed edges leave no ridges: a printed plane measured through lenses of different blur, and the edges of
-an object, which must not suffer."""
+"""Proof that printed edges leave no ridges: a printed plane measured through lenses of different
+blur, and the edges of an object, which must not suffer."""
 
 from dataclasses import replace
 
@@ -23,7 +23,8 @@ PRINT = "chessboard:7x5:32"
 BLURS_PX = (0.6, 1.2, 2.0)
 """Standard deviations of the camera's point spread."""
 MAX_BLUR_SHARE = 3.0
-"""px at full scale: fringes are narrower at a smaller one, and a wider blur mixes too many of their slopes."""
+"""px at full scale: fringes are narrower at a smaller one, and a wider blur mixes too many of their
+slopes."""
 LOWER = 3.0
 """By this factor, at least, a ridge is lower than without the correction."""
 TILT = np.array([0.25, 0.2, 0.1])
@@ -34,7 +35,8 @@ _NEAR_PX = 3
 
 
 def prove_edges(scale: float, seed: int, progress: Progress) -> Proof:
-    """Measure the ridges of a printed plane and the edges of the demo object, with and without the correction."""
+    """Measure the ridges of a printed plane and the edges of the demo object, with and without the
+    correction."""
     rows: list[Row] = []
     checks: list[BandCheck] = []
     blurs = {f"blur {blur:g} px": blur for blur in BLURS_PX if blur <= MAX_BLUR_SHARE * scale}
@@ -47,18 +49,29 @@ def prove_edges(scale: float, seed: int, progress: Progress) -> Proof:
         ):
             before, after = (1e3 * error for error in measure(rig, seed))
             ratio = before / after
-            rows.append({"scene": f"{scene}, {name}", "without, µm": before, "with, µm": after, "ratio": ratio})
+            rows.append(
+                {
+                    "scene": f"{scene}, {name}",
+                    "without, µm": before,
+                    "with, µm": after,
+                    "ratio": ratio,
+                }
+            )
             checks.append(BandCheck(name, what, ratio, least, 100.0))
     above = [
-        "Peak to valley of the mean depth error across the edges of a print, and RMS depth error within "
-        f"{_NEAR_PX} px of an object's creases and depth jumps, by the true lenses.",
+        (
+            "Peak to valley of the mean depth error across the edges of a print, and RMS depth"
+            f" error within {_NEAR_PX} px of an object's creases and depth jumps, by the true"
+            " lenses."
+        ),
         "",
     ]
     return prove_checks(checks, scale, rows, {"rows": rows}, above=above)
 
 
 def measure_ridges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
-    """Peak to valley, mm, of the mean depth error across the printed edges of a plane: as decoded, and corrected."""
+    """Peak to valley, mm, of the mean depth error across the printed edges of a plane: as decoded,
+    and corrected."""
     board = Board.parse(PRINT)
     R = rotation(TILT)
     middle = (board.points.min(axis=0) + board.points.max(axis=0)) / 2
@@ -71,26 +84,36 @@ def measure_ridges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
 
 
 def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
-    """RMS depth error, mm, near the creases and depth jumps of the demo object, of the points that are in both clouds:
-    as decoded, and corrected."""
+    """RMS depth error, mm, near the creases and depth jumps of the demo object, of the points that
+    are in both clouds: as decoded, and corrected."""
     scene = demo_object(Pose(np.eye(3), np.array([0.0, 0.0, DEPTH_MM])))
     renderer = Renderer(rig, scene)
     truth = renderer.truth().points
-    before, after = _measure_depth_errors(rig, render_phase(renderer, "object", seed), truth[..., 2])
+    before, after = _measure_depth_errors(
+        rig, render_phase(renderer, "object", seed), truth[..., 2]
+    )
     near = _find_creases(truth) & np.isfinite(before) & np.isfinite(after)
-    rms_before, rms_after = (root_mean_square(np.clip(each[near], -1.0, 1.0)) for each in (before, after))
+    rms_before, rms_after = (
+        root_mean_square(np.clip(each[near], -1.0, 1.0)) for each in (before, after)
+    )
     return rms_before, rms_after
 
 
-def _measure_depth_errors(rig: SimulatedRig, phase: PhaseMap, true_z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth errors (h, w) mm of the phase as decoded, and of the cloud that the program makes of it."""
+def _measure_depth_errors(
+    rig: SimulatedRig, phase: PhaseMap, true_z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth errors (h, w) mm of the phase as decoded, and of the cloud that the program makes of
+    it."""
     model = PerfectModel(rig)
-    return model.points(phase)[..., 2] - true_z, reconstruct_cloud(model, {"x": phase}).points[..., 2] - true_z
+    return (
+        model.points(phase)[..., 2] - true_z,
+        reconstruct_cloud(model, {"x": phase}).points[..., 2] - true_z,
+    )
 
 
 def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (h, w) px along the rows from the nearest printed edge, positive on its right, NaN where another edge is
-    near or the plate ends; and whether that edge is bright on its right."""
+    """Distance (h, w) px along the rows from the nearest printed edge, positive on its right, NaN
+    where another edge is near or the plate ends; and whether that edge is bright on its right."""
     width, height = rig.camera.size
     albedo = scene.trace(rig.camera.rays()).albedo
     over = albedo - (scene.white + scene.dark) / 2
@@ -99,7 +122,9 @@ def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, 
         crossings = np.flatnonzero((row[:-1] < 0) != (row[1:] < 0))
         places = crossings + row[crossings] / (row[crossings] - row[crossings + 1])
         gaps = np.diff(places, prepend=-np.inf, append=np.inf) > 2 * _REACH_PX
-        for crossing, place, is_isolated in zip(crossings, places, gaps[:-1] & gaps[1:], strict=True):
+        for crossing, place, is_isolated in zip(
+            crossings, places, gaps[:-1] & gaps[1:], strict=True
+        ):
             first, last = int(place) - _REACH_PX, int(place) + _REACH_PX + 2
             if is_isolated and first >= 0 and last <= width and (albedo[v, first:last] > 0).all():
                 distance[v, first:last] = np.arange(first, last) - place
@@ -108,7 +133,8 @@ def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, 
 
 
 def _measure_ridge(error: np.ndarray, distance: np.ndarray, side: np.ndarray) -> float:
-    """Peak to valley of the mean error by distance from the edges, those bright on the right and on the left apart."""
+    """Peak to valley of the mean error by distance from the edges, those bright on the right and on
+    the left apart."""
     known = np.isfinite(error) & np.isfinite(distance)
     profile = []
     for is_right in (True, False):
@@ -122,7 +148,8 @@ def _measure_ridge(error: np.ndarray, distance: np.ndarray, side: np.ndarray) ->
 
 
 def _find_creases(points: np.ndarray) -> np.ndarray:
-    """Return the pixels (h, w) bool within `_NEAR_PX` of a depth jump, a silhouette or a crease of the true surface."""
+    """Return the pixels (h, w) bool within `_NEAR_PX` of a depth jump, a silhouette or a crease of
+    the true surface."""
     import cv2
 
     normal = np.nan_to_num(normals(points.astype(np.float32), 1))

@@ -1,8 +1,9 @@
-"""Whether captures of a hostile rig are measured, or refused for the right reason: fault by fault, at each severity.
+"""Whether captures of a hostile rig are measured, or refused for the right reason: fault by fault,
+at each severity.
 
-A fault strikes either the scans, which a sound calibration then measures, or the target poses of a calibration, with
-which sound scans are measured. Errors are those of z against the truth, after the rigid motion that a calibration
-leaves open has been removed: it is fitted to the sound scans.
+A fault strikes either the scans, which a sound calibration then measures, or the target poses of a
+calibration, with which sound scans are measured. Errors are those of z against the truth, after the
+rigid motion that a calibration leaves open has been removed: it is fitted to the sound scans.
 """
 
 import re
@@ -29,7 +30,8 @@ MOST_OVER_FLOOR = 1.5
 """Times the undisturbed RMS, within which a case is measured."""
 SIGMAS = 3.0
 GROSS = 0.01
-"""Share of points beyond `SIGMAS`, more than of the undisturbed scans, that makes a result wrong."""
+"""Share of points beyond `SIGMAS`, more than of the undisturbed scans, that makes a result
+wrong."""
 LEAST_COVERAGE = 0.9
 """Share of the undisturbed coverage that a measured case has."""
 EXPLAINED_LOSS = 0.7
@@ -65,8 +67,9 @@ _OPEN: tuple[tuple[str, frozenset[str]], ...] = (
 
 @dataclass(frozen=True)
 class Figures:
-    """``rms_mm``: of z over the best 99 % of the target's points; ``predicted_mm`` of the same; ``gross``: share of all
-    measured points beyond 3 sigma; ``coverage``: share of the target's illuminated pixels that were measured.
+    """``rms_mm``: of z over the best 99 % of the target's points; ``predicted_mm`` of the same;
+    ``gross``: share of all measured points beyond 3 sigma; ``coverage``: share of the target's
+    illuminated pixels that were measured.
     """
 
     rms_mm: float
@@ -77,8 +80,8 @@ class Figures:
 
 @dataclass(frozen=True)
 class HostileCase:
-    """One fault at one severity, and the outcome; ``figures``: None where nothing was measured. ``named``: the causes
-    that the messages name."""
+    """One fault at one severity, and the outcome; ``figures``: None where nothing was measured.
+    ``named``: the causes that the messages name."""
 
     fault: str
     severity: Severity
@@ -117,10 +120,12 @@ def prove_hostile(
     seed: int = 0,
     progress: Progress = ignore_progress,
 ) -> Proof:
-    """Put every fault at every severity into scans, and into target poses, and judge the program's reaction.
+    """Put every fault at every severity into scans, and into target poses, and judge the program's
+    reaction.
 
-    ``cases``: some of them, as "flicker", "flicker:mild" or "flicker:mild:scan". ``splined``: measure with the splined
-    model on a rig with local distortion; otherwise with stereo on one without, which takes a fifth of the time.
+    ``cases``: some of them, as "flicker", "flicker:mild" or "flicker:mild:scan". ``splined``:
+    measure with the splined model on a rig with local distortion; otherwise with stereo on one
+    without, which takes a fifth of the time.
     """
     chosen = choose_cases(cases)
     rig = letter(scale, seed) if splined else letter(scale, seed, local_distortion_px=0.0)
@@ -128,7 +133,9 @@ def prove_hostile(
     with tempfile.TemporaryDirectory(prefix="slviewer-hostile-") as folder:
         models = ("stereo", "splined") if splined else ("stereo",)
         progress(0.0, "the undisturbed rig")
-        trial = _Trial(HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed))
+        trial = _Trial(
+            HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed)
+        )
         for i, (name, severity, direction) in enumerate(chosen):
             progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
             done.append(trial.run(name, severity, direction))
@@ -141,7 +148,8 @@ def prove_hostile(
 
 
 def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direction]]:
-    """All cases, or those that begin with one of the ``wanted``, colons between fault, severity and direction."""
+    """All cases, or those that begin with one of the ``wanted``, colons between fault, severity and
+    direction."""
     every = [
         (name, severity, direction)
         for direction in get_args(Direction)
@@ -152,10 +160,15 @@ def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direct
     chosen: list[tuple[str, Severity, Direction]] = []
     for pattern in wanted or ("",):
         parts = pattern.split(":")
-        matching = [case for case in every if all(part in ("", word) for part, word in zip(parts, case, strict=False))]
+        matching = [
+            case
+            for case in every
+            if all(part in ("", word) for part, word in zip(parts, case, strict=False))
+        ]
         if not matching or len(parts) > 3:
             raise UsageError(
-                f"no hostile case is called {pattern!r}: use {', '.join(FAULTS)}; :mild, :medium or :severe"
+                f"no hostile case is called {pattern!r}: use {', '.join(FAULTS)}; :mild, :medium or"
+                " :severe"
             )
         chosen += [case for case in matching if case not in chosen]
     return chosen
@@ -188,19 +201,38 @@ class _Trial:
         gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
         figures = score(measured, gauge) if measured else None
         outcome, named = judge_case(FAULTS[name], severity, report, figures, self._floor)
-        messages = [*report.warnings, *([f"{type(report.error).__name__}: {report.error}"] if report.error else [])]
+        messages = [
+            *report.warnings,
+            *([f"{type(report.error).__name__}: {report.error}"] if report.error else []),
+        ]
         seconds = perf_counter() - start
         return HostileCase(
-            name, severity, direction, outcome, outcome in PASSED, figures, self._floor, named, tuple(messages), seconds
+            name,
+            severity,
+            direction,
+            outcome,
+            outcome in PASSED,
+            figures,
+            self._floor,
+            named,
+            tuple(messages),
+            seconds,
         )
 
     def _measure_scans(
-        self, session: Path, report: CaseReport, fault: Fault | None = None, severity: Severity = "mild"
+        self,
+        session: Path,
+        report: CaseReport,
+        fault: Fault | None = None,
+        severity: Severity = "mild",
     ) -> list[MeasuredScan]:
-        """Measure all scans, captured with the fault if there is one, with the calibration of a session."""
+        """Measure all scans, captured with the fault if there is one, with the calibration of a
+        session."""
         shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
         self._bench.store(session, {name: shot[0] for name, shot in shots.items()}, report)
-        return [self._bench.measure(session, name, shot[1:], report) for name, shot in shots.items()]
+        return [
+            self._bench.measure(session, name, shot[1:], report) for name, shot in shots.items()
+        ]
 
     def _measure_after_faulty_calibration(
         self, fault: Fault, severity: Severity, report: CaseReport
@@ -209,7 +241,10 @@ class _Trial:
         bench, session = self._bench, self._bench.folder / "hostile"
         shutil.rmtree(session, ignore_errors=True)
         struck = bench.targets[: fault.struck[SEVERITIES.index(severity)]]
-        frames = {n: bench.capture(n, *((fault, severity) if n in struck else ()))[0] for n in bench.targets}
+        frames = {
+            n: bench.capture(n, *((fault, severity) if n in struck else ()))[0]
+            for n in bench.targets
+        }
         bench.store(session, frames, report)
         bench.calibrate(session, report)
         return self._measure_scans(session, report)
@@ -228,13 +263,17 @@ def judge_case(
     is_right = any(each & fault.causes for each in named)
     must_measure = fault.must_measure and severity == "mild"
     if figures is None or report.error is not None:
-        return ("WRONG REASON" if not is_right else "TURNED AWAY" if must_measure else "refused"), words
+        return (
+            "WRONG REASON" if not is_right else "TURNED AWAY" if must_measure else "refused"
+        ), words
     if named and not is_right:
         return "WRONG REASON", words
     return _judge_figures(figures, floor, is_right, must_measure), words
 
 
-def _match_causes(facts: Sequence[tuple[str, frozenset[str]]], texts: Sequence[str]) -> list[frozenset[str]]:
+def _match_causes(
+    facts: Sequence[tuple[str, frozenset[str]]], texts: Sequence[str]
+) -> list[frozenset[str]]:
     """The causes whose pattern is in one of the texts."""
     return [causes for pattern, causes in facts if any(re.search(pattern, text) for text in texts)]
 
@@ -252,7 +291,11 @@ def _judge_figures(figures: Figures, floor: Figures, is_right: bool, must_measur
         return "SILENTLY WRONG"
     if must_measure:
         return "TURNED AWAY"
-    return "noisier as predicted" if figures.coverage >= EXPLAINED_LOSS * floor.coverage else "UNEXPLAINED LOSS"
+    return (
+        "noisier as predicted"
+        if figures.coverage >= EXPLAINED_LOSS * floor.coverage
+        else "UNEXPLAINED LOSS"
+    )
 
 
 def fit_gauge(measured: Sequence[MeasuredScan]) -> np.ndarray:
@@ -281,7 +324,9 @@ def score(measured: Sequence[MeasuredScan], gauge: np.ndarray) -> Figures:
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
     most = max(1, int(_TRIMMED * target.sum()))
-    rms, predicted = (root_mean_square(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma))
+    rms, predicted = (
+        root_mean_square(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma)
+    )
     return Figures(
         rms,
         predicted,

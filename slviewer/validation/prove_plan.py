@@ -1,6 +1,8 @@
-"""Whether the uncertainty of each tolerance of a plan covers the truth, on synthesised clouds of known noise.
+"""Whether the uncertainty of each tolerance of a plan covers the truth, on synthesised clouds of
+known noise.
 
-Every repeat is another part: its form is drawn anew, of all wavelengths that a region resolves, as machining leaves it.
+Every repeat is another part: its form is drawn anew, of all wavelengths that a region resolves, as
+machining leaves it.
 """
 
 from collections.abc import Callable
@@ -18,12 +20,13 @@ from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 REPEATS = 200
 NOISE_MM = 0.02
 BAND = (93.0, 97.0)
-"""Percent of the repeats in which U (k = 2) must cover the truth, give or take the standard deviation that so many
-repeats have."""
+"""Percent of the repeats in which U (k = 2) must cover the truth, give or take the standard
+deviation that so many repeats have."""
 SIDE = 55
 """Points along either direction of a region, in a grid as a camera sees them."""
 FORM_MM, DECAY = 0.03, 0.7
-"""Of the drawn form: standard deviation of its coarsest components, and the ratio from one degree to the next."""
+"""Of the drawn form: standard deviation of its coarsest components, and the ratio from one degree
+to the next."""
 DEGREES = range(2, 7)
 TILT = 0.002
 RADIUS, HALF = 10.0, 15.0
@@ -31,21 +34,27 @@ Case = tuple[float, Quantity]
 
 
 def prove_plan(scale: float, seed: int, progress: Progress) -> Proof:
-    """Measure parts of known form repeatedly, with new noise along the surface's normals; compare U with the errors.
+    """Measure parts of known form repeatedly, with new noise along the surface's normals; compare U
+    with the errors.
 
-    ``scale``: as a share of the number of points along each direction, at least 0.7. Real scans have errors of the
-    calibration too, of which `prove --only uncertainty` judges the prediction.
+    ``scale``: as a share of the number of points along each direction, at least 0.7. Real scans
+    have errors of the calibration too, of which `prove --only uncertainty` judges the prediction.
     """
     side = int(SIDE * max(scale, 0.7))
     rows, checks = [], []
     for k, (kind, measure, _) in enumerate(track(progress, CASES)):
         cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(REPEATS)]
-        truths, U = np.array([truth for truth, _ in cases]), np.array([q.U or 0.0 for _, q in cases])
+        truths, U = (
+            np.array([truth for truth, _ in cases]),
+            np.array([q.U or 0.0 for _, q in cases]),
+        )
         errors = np.array([q.value for _, q in cases]) - truths
         covered = 100 * float(np.mean(np.abs(errors) <= U))
         chance = 100 * float(np.sqrt(0.95 * 0.05 / REPEATS))
         least, most = BAND[0] - chance, BAND[1] + chance
-        checks.append(BandCheck(kind, f"% of {REPEATS} repeats covered by U (k = 2)", covered, least, most))
+        checks.append(
+            BandCheck(kind, f"% of {REPEATS} repeats covered by U (k = 2)", covered, least, most)
+        )
         rows.append(
             {
                 "characteristic": kind,
@@ -61,7 +70,8 @@ def prove_plan(scale: float, seed: int, progress: Progress) -> Proof:
 
 
 def draw_form(rng: np.random.Generator) -> np.ndarray:
-    """Draw the coefficients (7, 7) of a form, mm: of degrees `DEGREES` in sum, decaying with the degree."""
+    """Draw the coefficients (7, 7) of a form, mm: of degrees `DEGREES` in sum, decaying with the
+    degree."""
     degree = np.add.outer(np.arange(7), np.arange(7))
     amplitude = FORM_MM * DECAY ** (degree - DEGREES[0]) * rng.normal(size=degree.shape)
     return np.where(np.isin(degree, DEGREES), amplitude, 0.0)
@@ -78,16 +88,19 @@ def remove_fit(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
-def make_plate(side: int, rng: np.random.Generator, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of a plate of 40 x 40 mm with drawn form, which rises by ``tilt`` along x, and its true heights."""
+def make_plate(
+    side: int, rng: np.random.Generator, tilt: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) of a plate of 40 x 40 mm with drawn form, which rises by ``tilt`` along x, and
+    its true heights."""
     uv = make_grid(side)
     heights = legendre.legval2d(uv[:, 0], uv[:, 1], draw_form(rng)) + 20 * tilt * uv[:, 0]
     return np.column_stack([20 * uv, heights + NOISE_MM * rng.normal(size=len(uv))]), heights
 
 
 def make_cylinder(side: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) of a cylinder with drawn form: waves about its axis that change along it; their angles and places
-    along it (n, 2), -1 to 1, and true deviations (n,)."""
+    """Points (n, 3) of a cylinder with drawn form: waves about its axis that change along it; their
+    angles and places along it (n, 2), -1 to 1, and true deviations (n,)."""
     uv = make_grid(side)
     angles = np.pi * uv[:, 0]
     along = legendre.legvander(uv[:, 1], 6)
@@ -114,7 +127,9 @@ def _roundness(side: int, rng: np.random.Generator) -> Case:
     for wave in (np.cos, np.sin):
         form += wave(np.outer(angles, harmonics)) @ (amplitudes * rng.normal(size=5))
     r = RADIUS + form + NOISE_MM * rng.normal(size=len(form))
-    points = np.stack([r * np.cos(angles), r * np.sin(angles), HALF * make_grid(side)[:, 1]], axis=1)
+    points = np.stack(
+        [r * np.cos(angles), r * np.sin(angles), HALF * make_grid(side)[:, 1]], axis=1
+    )
     return float(np.ptp(form)), form_error("roundness", fit_feature("cylinder", points), points)
 
 
@@ -127,13 +142,16 @@ def _cylindricity(side: int, rng: np.random.Generator) -> Case:
 
 
 def _orientation(side: int, rng: np.random.Generator, upright: bool) -> Case:
-    """The parallelism of a tilted plate, or the perpendicularity of a leaning wall, to a plate without form."""
+    """The parallelism of a tilted plate, or the perpendicularity of a leaning wall, to a plate
+    without form."""
     points, heights = make_plate(side, rng, TILT)
     datum = np.column_stack([20 * make_grid(side), -20 + NOISE_MM * rng.normal(size=len(points))])
     if upright:
         points = points[:, [2, 1, 0]]
     kind = "perpendicularity" if upright else "parallelism"
-    measured = orientation_error(kind, fit_feature("plane", points), points, fit_feature("plane", datum))  # type: ignore[arg-type]
+    measured = orientation_error(
+        kind, fit_feature("plane", points), points, fit_feature("plane", datum)
+    )  # type: ignore[arg-type]
     return float(np.ptp(heights)), measured
 
 
@@ -145,14 +163,18 @@ def _position(side: int, rng: np.random.Generator) -> Case:
     centre = 0.03 * rng.normal(size=3)
     points = (RADIUS + NOISE_MM * rng.normal(size=(len(c), 1))) * out + centre
     nominal = Feature("sphere", np.zeros(3), None, RADIUS)
-    return 2 * float(np.linalg.norm(centre)), position_error(fit_feature("sphere", points), points, nominal)
+    return 2 * float(np.linalg.norm(centre)), position_error(
+        fit_feature("sphere", points), points, nominal
+    )
 
 
 def _profile(side: int, rng: np.random.Generator) -> Case:
     """The profile of a plate against the plane z = 0."""
     points, heights = make_plate(side, rng)
     nominal = Feature("plane", np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    return 2 * float(np.abs(heights).max()), profile_error(points, nominal.distance(points), nominal.normals(points))
+    return 2 * float(np.abs(heights).max()), profile_error(
+        points, nominal.distance(points), nominal.normals(points)
+    )
 
 
 CASES: dict[str, Callable[[int, np.random.Generator], Case]] = {
@@ -164,4 +186,5 @@ CASES: dict[str, Callable[[int, np.random.Generator], Case]] = {
     "position": _position,
     "profile": _profile,
 }
-"""Of each characteristic: measure a part that is drawn; returns its true value, mm, and what was measured."""
+"""Of each characteristic: measure a part that is drawn; returns its true value, mm, and what was
+measured."""

@@ -1,7 +1,8 @@
-"""Proof of the claimed accuracy of registration and meshing, on a simulated rig with known ground truth.
+"""Proof of the claimed accuracy of registration and meshing, on a simulated rig with known ground
+truth.
 
-Three depths and a full turn of an object are measured with the splined calibration of rendered target poses, registered
-and fused; pairs that do not determine a pose must be refused.
+Three depths and a full turn of an object are measured with the splined calibration of rendered
+target poses, registered and fused; pairs that do not determine a pose must be refused.
 """
 
 from collections.abc import Mapping
@@ -30,7 +31,13 @@ from slviewer.registration.multiway import MultiwayAlignment, Starts, register_a
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose, blank_board
-from slviewer.simulation.decals import MarkedScene, cylinder_mesh, marked_cylinder, marked_plate, marked_sphere
+from slviewer.simulation.decals import (
+    MarkedScene,
+    cylinder_mesh,
+    marked_cylinder,
+    marked_plate,
+    marked_sphere,
+)
 from slviewer.simulation.mesh import MeshScene, demo_object
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
@@ -48,7 +55,8 @@ POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
 LOOP_MM = 0.05
 MARKERS_MM = 0.05
-"""At full resolution; in proportion to the size of the pixels, in which corners are found, at less."""
+"""At full resolution; in proportion to the size of the pixels, in which corners are found, at
+less."""
 SECONDS = 5.0
 HONEST = (0.7, 1.5)
 """Predicted over true error, pooled over all pairs."""
@@ -61,8 +69,8 @@ _EVERY = 37  # of the pixels, from which the calibrated camera's frame is estima
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScans:
-    """Scans of one object: their clouds, their registration, the true poses T_camera_object (4, 4) in the calibrated
-    camera's frame, and the seconds that registering took."""
+    """Scans of one object: their clouds, their registration, the true poses T_camera_object (4, 4)
+    in the calibrated camera's frame, and the seconds that registering took."""
 
     clouds: Mapping[str, Cloud]
     alignment: MultiwayAlignment
@@ -70,8 +78,9 @@ class RegisteredScans:
     seconds: float
 
     def loop_error(self) -> tuple[float, float]:
-        """Loop error of the pairs that follow one another, from the first scan to the last and back to the first, mm at
-        the object's middle and degrees; NaN where one of them did not register."""
+        """Loop error of the pairs that follow one another, from the first scan to the last and back
+        to the first, mm at the object's middle and degrees; NaN where one of them did not
+        register."""
         names, pairs = list(self.clouds), self.alignment.pairs
         steps = [(after, before) for before, after in pairwise(names)]
         if not {*steps, (names[-1], names[0])} <= set(pairs):
@@ -80,9 +89,13 @@ class RegisteredScans:
         D = T @ np.linalg.inv(pairs[names[-1], names[0]].T_reference_scan)
         return _measure_motion(D, self.poses[names[0]][:3, 3])
 
-    def error(self, scan: str, onto: str, T_onto_scan: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
+    def error(
+        self, scan: str, onto: str, T_onto_scan: np.ndarray, centre: np.ndarray
+    ) -> tuple[float, float]:
         """Error of a registration (4, 4): mm at ``centre`` (3,) mm, and degrees."""
-        return _measure_motion(T_onto_scan @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre)
+        return _measure_motion(
+            T_onto_scan @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre
+        )
 
     def rows(self) -> list[Row]:
         """A table row for each registered pair, true and predicted errors beside each other."""
@@ -110,7 +123,8 @@ def _make_row(scan: str, onto: str, pair: Registration, shift: float, turn: floa
 
 
 def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
-    """Calibrate a rendered rig, scan and register three depths and a turn, mesh them, and try what must be refused."""
+    """Calibrate a rendered rig, scan and register three depths and a turn, mesh them, and try what
+    must be refused."""
     rig = letter(scale, seed)
     plan = turn_plan(rig, Board.parse(TARGET), POSES)
     model: Model = calibrate_rendered(rig, plan, part(progress, 0.0, 0.5))[1]
@@ -119,23 +133,33 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     measured, true = [], []
     for name, scene, _ in track(progress, scans, 0.5, 0.75):
         renderer = Renderer(rig, scene)
-        clouds[name] = reconstruct_cloud(model, {"x": render_phase(renderer, name, POSES + len(clouds))})
+        clouds[name] = reconstruct_cloud(
+            model, {"x": render_phase(renderer, name, POSES + len(clouds))}
+        )
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])
-    # A calibration's camera frame is a gauge: turned by a part of a milliradian it measures every distance the same.
+    # A calibration's camera frame is a gauge: turned by a part of a milliradian it measures every
+    # distance the same.
     T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
     truth = {name: T_calibrated_camera @ scene.pose.matrix for name, scene in scans.items()}
 
-    def register(kind: str, reference: str, starts: Starts | None, done: Progress) -> RegisteredScans:
+    def register(
+        kind: str, reference: str, starts: Starts | None, done: Progress
+    ) -> RegisteredScans:
         """Register all scans of one kind onto the reference, and time it."""
         chosen = {name: cloud for name, cloud in clouds.items() if name.startswith(kind)}
         start = perf_counter()
-        alignment = register_all(chosen, reference, starts, lambda share: done(share, "registering"))
+        alignment = register_all(
+            chosen, reference, starts, lambda share: done(share, "registering")
+        )
         return RegisteredScans(chosen, alignment, truth, perf_counter() - start)
 
     depths = register("object_", "object_r3", None, part(progress, 0.75, 0.8))
-    angles = {name: STEP_DEG * k for k, name in enumerate(name for name in scans if name.startswith("turn_"))}
+    angles = {
+        name: STEP_DEG * k
+        for k, name in enumerate(name for name in scans if name.startswith("turn_"))
+    }
     turn = register("turn_", "turn_01", Starts(table_deg=angles), part(progress, 0.8, 0.88))
     checks = check_registration(depths, turn)
     progress(0.88, "fusing and meshing")
@@ -148,10 +172,14 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
         })  # fmt: skip
         refusals[what] = {"wanted": wanted, "got": reason}
         is_right = float(reason in wanted.split("/"))
-        surfaces.append(BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0))
+        surfaces.append(
+            BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0)
+        )
     for k, (what, marked) in enumerate(_make_marked_pairs().items()):
         progress(0.98, f"{what} by markers")
-        surfaces.append(_check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k, scale))
+        surfaces.append(
+            _check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k, scale)
+        )
     rows = depths.rows() + turn.rows()
     checks += surfaces
     r1, r2 = the_letter.EXPERIMENT_3_ICP_RMS_MM.values()
@@ -160,18 +188,24 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
         scale,
         rows,
         {"surface": surface_record, "refusals": refusals, "pairs": rows},
-        [f"errors of pairs at scale {scale:g}; the Letter's point-to-point RMS: {r1:.2f} and {r2:.2f} mm"],
+        [
+            f"errors of pairs at scale {scale:g}; the Letter's point-to-point RMS: {r1:.2f} and"
+            f" {r2:.2f} mm"
+        ],
         [*lines, *(check.text() for check in checks if check.holds)],
     )
 
 
 def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[BandCheck]:
-    """Errors of the poses against their bounds, loops, duration, and predicted against true errors."""
+    """Errors of the poses against their bounds, loops, duration, and predicted against true
+    errors."""
     checks = []
     onto = depths.alignment.reference
     for name in depths.clouds:
         if name != onto:
-            shift, angle = depths.error(name, onto, depths.alignment.T_reference_scan[name], depths.poses[onto][:3, 3])
+            shift, angle = depths.error(
+                name, onto, depths.alignment.T_reference_scan[name], depths.poses[onto][:3, 3]
+            )
             checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
             checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
     adjusted = max((loop.after.shift_mm for loop in turn.alignment.loops), default=float("nan"))
@@ -183,35 +217,57 @@ def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[B
         BandCheck("good pairs", "number accepted", float(len(rows)), GOOD_PAIRS, float("inf")),
     ]
     for what, unit in (("shift", "um"), ("turn", "mdeg")):
-        predicted, true = (np.linalg.norm([row[f"{kind} {unit}"] for row in rows]) for kind in ("predicted", "error"))
+        predicted, true = (
+            np.linalg.norm([row[f"{kind} {unit}"] for row in rows])
+            for kind in ("predicted", "error")
+        )
         ratio = float(predicted / true)
-        checks.append(BandCheck("all pairs", f"predicted over true error of the {what}", ratio, *HONEST))
+        checks.append(
+            BandCheck("all pairs", f"predicted over true error of the {what}", ratio, *HONEST)
+        )
     return checks
 
 
 def _check_surfaces(
     depths: RegisteredScans, turn: RegisteredScans, scenes: Mapping[str, MeshScene]
 ) -> tuple[list[BandCheck], list[str], dict[str, object]]:
-    """Fuse both groups of scans where they were registered and mesh the turn: checks of the deviations from the true
-    surface, lines of text, and figures for JSON."""
+    """Fuse both groups of scans where they were registered and mesh the turn: checks of the
+    deviations from the true surface, lines of text, and figures for JSON."""
 
     def rms(surface: PointSet, name: str) -> float:
         """RMS deviation in mm from the object, after a best fit that begins at the true pose."""
-        nominal, T = Mesh(scenes[name].vertices, scenes[name].triangles), np.linalg.inv(depths.poses[name])
-        return deviation(surface.points, nominal, normals=surface.normals, initial=T).statistics()["rms"]
+        nominal, T = (
+            Mesh(scenes[name].vertices, scenes[name].triangles),
+            np.linalg.inv(depths.poses[name]),
+        )
+        return deviation(surface.points, nominal, normals=surface.normals, initial=T).statistics()[
+            "rms"
+        ]
 
-    single = {name: rms(fuse({name: cloud}, {name: np.eye(4)}).surface, name) for name, cloud in depths.clouds.items()}
-    fused = rms(fuse(depths.clouds, depths.alignment.T_reference_scan).surface, depths.alignment.reference)
-    meshed = build_mesh(fuse(turn.clouds, turn.alignment.T_reference_scan).surface, MeshingPlan(watertight=True))
+    single = {
+        name: rms(fuse({name: cloud}, {name: np.eye(4)}).surface, name)
+        for name, cloud in depths.clouds.items()
+    }
+    fused = rms(
+        fuse(depths.clouds, depths.alignment.T_reference_scan).surface, depths.alignment.reference
+    )
+    meshed = build_mesh(
+        fuse(turn.clouds, turn.alignment.T_reference_scan).surface, MeshingPlan(watertight=True)
+    )
     turned = rms(PointSet(meshed.mesh.vertices), turn.alignment.reference)
     ratio = fused / min(single.values())
     checks = [
-        BandCheck("three depths, fused", "RMS deviation over the best single scan's", ratio, *OVER_SINGLE),
+        BandCheck(
+            "three depths, fused", "RMS deviation over the best single scan's", ratio, *OVER_SINGLE
+        ),
         BandCheck("turn, mesh", "RMS deviation from the true mesh in mm", turned, *MESH_MM),
         BandCheck("turn, mesh", "watertight", float(meshed.topology.watertight), 1.0, 1.0),
     ]
     scans = ", ".join(f"{name} {each:.4f}" for name, each in single.items())
-    line = f"RMS deviation from the true surface in mm: {scans}; fused {fused:.4f}; the turn's mesh {turned:.4f}"
+    line = (
+        f"RMS deviation from the true surface in mm: {scans}; fused {fused:.4f}; the turn's mesh"
+        f" {turned:.4f}"
+    )
     record = {"single_mm": single, "fused_mm": fused, "turned_mm": turned, "mesh": meshed.to_json()}
     return checks, [line, meshed.text()], record
 
@@ -235,7 +291,11 @@ def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     return {
         "two scans of a plane": ("plane", blank_board(first), blank_board(second)),
         "two scans of a sphere": ("sphere", sphere((4.0, -3.0, 640.0)), sphere((-8.0, 6.0, 690.0))),
-        "two scans of a cylinder": ("cylinder", MeshScene(*cylinder, first), MeshScene(*cylinder, second)),
+        "two scans of a cylinder": (
+            "cylinder",
+            MeshScene(*cylinder, first),
+            MeshScene(*cylinder, second),
+        ),
         "scans of unrelated objects": (
             "disagree/overlap",
             demo_object(first),
@@ -270,7 +330,8 @@ def _check_markers(
     number: int,
     scale: float,
 ) -> BandCheck:
-    """The largest error over the surface of the second scan, registered by markers onto the first."""
+    """The largest error over the surface of the second scan, registered by markers onto the
+    first."""
     clouds = {}
     for k, (name, scene) in enumerate(zip("ab", pair, strict=True)):
         sequence = one_axis(p18(rig.projector.size), "x")
@@ -283,7 +344,9 @@ def _check_markers(
     points = clouds["b"].measured[::_EVERY].astype(float)
     gap = move_points(T, points) - move_points(true[0] @ np.linalg.inv(true[1]), points)
     error = float(np.linalg.norm(gap, axis=1).max())
-    return BandCheck(f"two scans of a {what}, by markers", "largest error in mm", error, 1e-4, MARKERS_MM / scale)
+    return BandCheck(
+        f"two scans of a {what}, by markers", "largest error in mm", error, 1e-4, MARKERS_MM / scale
+    )
 
 
 def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:

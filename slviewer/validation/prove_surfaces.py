@@ -1,7 +1,8 @@
 """What surfaces that light themselves do to a measurement, by sequence, and what of it is masked.
 
-Grooves, a bowl and wax before the simulated rig, whose truth is known, measured with the rig's own geometry, so that
-the codes alone are compared; then surfaces without indirect light, of which nothing should be masked.
+Grooves, a bowl and wax before the simulated rig, whose truth is known, measured with the rig's own
+geometry, so that the codes alone are compared; then surfaces without indirect light, of which
+nothing should be masked.
 """
 
 from collections.abc import Callable
@@ -30,23 +31,25 @@ WRONG_SIGMAS = 5.0
 GROSS_PX = 5.0
 """Error in projector px beyond which a point has the order of another place."""
 LEAST_CAUGHT = 0.9
-"""Share of these points that is masked. Of the points more than `WRONG_SIGMAS` sigma wrong it is reported only: most of
-them are off by a tenth of a stripe, by light from beside them, which weakens fringes no more than defocus does."""
+"""Share of these points that is masked. Of the points more than `WRONG_SIGMAS` sigma wrong it is
+reported only: most of them are off by a tenth of a stripe, by light from beside them, which weakens
+fringes no more than defocus does."""
 DEFOCUS = 4.0
 """Times the preset's defocus, with which the mask must spare surfaces too."""
 MOST_LOST = 0.005
 """Share of the good points of surfaces without indirect light that is masked."""
 JUDGED = "groove 90 deg"
-"""The others are reported: where Gray code is not misled, micro gains less, and light of the nearest stripes stays."""
+"""The others are reported: where Gray code is not misled, micro gains less, and light of the
+nearest stripes stays."""
 
 
 @dataclass(frozen=True)
 class SequenceErrors:
     """Errors of one sequence on one surface.
 
-    ``rms_mm``: of the depth without the mask; ``masked_rms_mm`` with it. ``wrong``: share of the points more than
-    `WRONG_SIGMAS` sigma wrong, ``caught``: of these the share that is masked, ``gross_caught``: of
-    those more than `GROSS_PX` wrong, ``lost``: of the good ones.
+    ``rms_mm``: of the depth without the mask; ``masked_rms_mm`` with it. ``wrong``: share of the
+    points more than `WRONG_SIGMAS` sigma wrong, ``caught``: of these the share that is masked,
+    ``gross_caught``: of those more than `GROSS_PX` wrong, ``lost``: of the good ones.
     """
 
     rms_mm: float
@@ -59,7 +62,10 @@ class SequenceErrors:
 
 def surface_cases() -> dict[str, tuple[Scene, bool]]:
     """Return the surfaces by name, each with whether it lights itself."""
-    tilted = {turn: Pose(rotation(np.radians([0, turn, 0])), np.array([0, 0, 640.0])) for turn in (0, 10, 15, 20)}
+    tilted = {
+        turn: Pose(rotation(np.radians([0, turn, 0])), np.array([0, 0, 640.0]))
+        for turn in (0, 10, 15, 20)
+    }
     glossy = Indirect(2, gloss=0.6, exponent=12.0)
     lit: dict[str, Scene] = {
         JUDGED: groove(tilted[15]),
@@ -83,7 +89,8 @@ def surface_cases() -> dict[str, tuple[Scene, bool]]:
 
 
 def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
-    """Measure every surface with p18, complementary, multifrequency and micro; judge gain, mask and false alarms.
+    """Measure every surface with p18, complementary, multifrequency and micro; judge gain, mask and
+    false alarms.
 
     ``scale``: resolution of the camera, as a share of the Letter's.
     """
@@ -93,7 +100,9 @@ def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
     record: dict[str, dict[str, dict[str, float]]] = {}
     checks: list[BandCheck] = []
     for name, (scene, is_indirect), _ in track(progress, surface_cases()):
-        blurred = replace(rig, light=replace(rig.light, defocus_px_mm=DEFOCUS * rig.light.defocus_px_mm))
+        blurred = replace(
+            rig, light=replace(rig.light, defocus_px_mm=DEFOCUS * rig.light.defocus_px_mm)
+        )
         renderer = Renderer(blurred if name.startswith("unsharp") else rig, scene)
         errors = {
             preset: measure_errors(renderer, PRESETS[preset], model, seed)
@@ -103,14 +112,28 @@ def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
         rows += [_make_row(name, preset, each) for preset, each in errors.items()]
         if not is_indirect:
             worst = max(errors, key=lambda preset: errors[preset].lost)
-            checks.append(BandCheck(name, f"good points masked with {worst}", errors[worst].lost, 0.0, MOST_LOST))
+            checks.append(
+                BandCheck(
+                    name, f"good points masked with {worst}", errors[worst].lost, 0.0, MOST_LOST
+                )
+            )
         if name == JUDGED:
             gain = errors["p18"].rms_mm / errors["micro"].rms_mm
-            caught, what = errors["p18"].gross_caught, f"share of p18's points over {GROSS_PX:g} px wrong masked"
-            checks.append(BandCheck(name, "error of p18 over that of micro", gain, LEAST_GAIN, np.inf))
+            caught, what = (
+                errors["p18"].gross_caught,
+                f"share of p18's points over {GROSS_PX:g} px wrong masked",
+            )
+            checks.append(
+                BandCheck(name, "error of p18 over that of micro", gain, LEAST_GAIN, np.inf)
+            )
             checks.append(BandCheck(name, what, caught, LEAST_CAUGHT, 1.0))
-    gains = ", ".join(f"{name} {each['p18']['rms_mm'] / each['micro']['rms_mm']:.1f}" for name, each in record.items())
-    return prove_checks(checks, scale, rows, {"surfaces": record}, below=[f"p18's RMS over micro's: {gains}"])
+    gains = ", ".join(
+        f"{name} {each['p18']['rms_mm'] / each['micro']['rms_mm']:.1f}"
+        for name, each in record.items()
+    )
+    return prove_checks(
+        checks, scale, rows, {"surfaces": record}, below=[f"p18's RMS over micro's: {gains}"]
+    )
 
 
 def measure_errors(
@@ -132,7 +155,10 @@ def measure_errors(
         root_mean_square(error[valid]),
         root_mean_square(error[valid & ~masked]),
         float(np.mean(wrong[valid])),
-        *(float(np.mean(masked[points])) if points.any() else np.nan for points in (wrong, gross, valid & ~wrong)),
+        *(
+            float(np.mean(masked[points])) if points.any() else np.nan
+            for points in (wrong, gross, valid & ~wrong)
+        ),
     )
 
 

@@ -24,7 +24,8 @@ from slviewer.validation.proof import track
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """The board, the patterns as a function of the projector's size, and the cells across each displacement field.
+    """The board, the patterns as a function of the projector's size, and the cells across each
+    displacement field.
 
     ``cells_across``: None for as many as the splined calibration has by default.
     """
@@ -43,10 +44,11 @@ def calibrate_rendered(
     progress: Progress = ignore_progress,
     settings: CalibrationSettings = DEFAULT_SETTINGS,
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
-    """Render the target poses of a plan, numbered in their order, and calibrate the stereo and the splined model.
+    """Render the target poses of a plan, numbered in their order, and calibrate the stereo and the
+    splined model.
 
-    Returns both models, and the observations with circles at their centres. Raises CalibrationRejected where the
-    poses do not determine the rig.
+    Returns both models, and the observations with circles at their centres. Raises
+    CalibrationRejected where the poses do not determine the rig.
     """
     targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
     observations = [
@@ -58,7 +60,9 @@ def calibrate_rendered(
 
 
 def calibrate_observed(
-    rig: SimulatedRig, observations: list[Observation], settings: CalibrationSettings = DEFAULT_SETTINGS
+    rig: SimulatedRig,
+    observations: list[Observation],
+    settings: CalibrationSettings = DEFAULT_SETTINGS,
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
     """Calibrate the stereo and the splined model from observations of the target's poses.
 
@@ -70,14 +74,20 @@ def calibrate_observed(
 
 
 def observe_rendered(
-    rig: SimulatedRig, scene: Scene, name: str, number: int, settings: CalibrationSettings = DEFAULT_SETTINGS
+    rig: SimulatedRig,
+    scene: Scene,
+    name: str,
+    number: int,
+    settings: CalibrationSettings = DEFAULT_SETTINGS,
 ) -> Observation:
-    """The observation of a rendered target pose, whose noise ``number`` seeds. Raises InputError where no board is
-    detected."""
+    """The observation of a rendered target pose, whose noise ``number`` seeds. Raises InputError
+    where no board is detected."""
     sequence = settings.make_sequence(rig.projector.size)
     frames = Renderer(rig, scene).capture(sequence, number)
     board = Board.parse(settings.target)
-    return observe(name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames))
+    return observe(
+        name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames)
+    )
 
 
 def render_phase(

@@ -44,7 +44,8 @@ def reproduce(
 
     Args:
         quick: Half resolution; its figures are its own.
-        scale: Resolution of the camera, as a share of 1600x1200 px; by default 1, or 0.5 with --quick.
+        scale: Resolution of the camera, as a share of 1600x1200 px; by default 1, or 0.5 with
+            --quick.
         out: Folder for the session and the report; by default reproduction, or reproduction-quick.
         seed: Another seed is another rig of the same kind.
 
@@ -57,13 +58,20 @@ def reproduce(
     elif quick:
         raise UsageError(f"--quick is --scale {QUICK_SCALE:g}: give one of both")
     _simulate(session, scale, seed, part(progress, 0.0, 0.4))
-    calibration = calibrate(session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn)
+    calibration = calibrate(
+        session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn
+    )
     assert calibration.pixelwise is not None
     with Session.open(session) as store:
         names = store.capture_names("scan")
         observations = load_observations(store, list(calibration.stereo.poses))
-    planes, spheres = [n for n in names if n.startswith("plane_")], [n for n in names if n.startswith("sphere_")]
-    flat = _compare_models(session, VerifySettings(planes, "plane"), part(progress, 0.65, 0.75), warn)
+    planes, spheres = (
+        [n for n in names if n.startswith("plane_")],
+        [n for n in names if n.startswith("sphere_")],
+    )
+    flat = _compare_models(
+        session, VerifySettings(planes, "plane"), part(progress, 0.65, 0.75), warn
+    )
     round_ = VerifySettings(spheres, "sphere", radius=letter.SPHERE_RADIUS_MM)
     balls = _compare_models(session, round_, part(progress, 0.75, 0.82), warn)
     with Session.open(session) as store:
@@ -86,23 +94,31 @@ def reproduce(
     return result
 
 
-def _compare_models(session: Path, settings: VerifySettings, progress: Progress, warn: Warn) -> dict[str, Comparison]:
+def _compare_models(
+    session: Path, settings: VerifySettings, progress: Progress, warn: Warn
+) -> dict[str, Comparison]:
     """Return the comparison of the models on each capture, in the Letter's depth ranges."""
     settings = replace(settings, models=MODELS, depth_range=letter.DEPTH_RANGE_MM)
     with Session.open(session) as store:
-        compared = compare_captures(Job(store, progress, warn), settings, load_models(store, MODELS))
+        compared = compare_captures(
+            Job(store, progress, warn), settings, load_models(store, MODELS)
+        )
         return {each.capture.name: each.found for each in compared}
 
 
 def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:
-    """Simulate the session unless it has this scale and seed already; raises an error if it has other data."""
+    """Simulate the session unless it has this scale and seed already; raises an error if it has
+    other data."""
     if is_session(session):
         made = _load_truth(session)
         if (made.get("scale"), made.get("seed")) == (scale, seed):
             return
         with Session.open(session) as store:
             if made or store.capture_names():
-                raise InputError(f"{session} holds another simulation: choose another folder with --out, or delete it")
+                raise InputError(
+                    f"{session} holds another simulation: choose another folder with --out, or"
+                    " delete it"
+                )
         shutil.rmtree(session)  # an interrupted run's, with nothing in it
     simulate(session, scale=scale, seed=seed, progress=progress)
 
@@ -114,10 +130,18 @@ def _load_truth(session: Path) -> dict[str, Any]:
     return truth
 
 
-def _compare_spacings(session: Path, spheres: Mapping[str, Comparison]) -> dict[str, tuple[float, Mapping[str, float]]]:
-    """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the simulation's truth."""
-    centres = {name: np.array(record["centres"][0]) for name, record in _load_truth(session)["spheres"].items()}
+def _compare_spacings(
+    session: Path, spheres: Mapping[str, Comparison]
+) -> dict[str, tuple[float, Mapping[str, float]]]:
+    """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the
+    simulation's truth."""
+    centres = {
+        name: np.array(record["centres"][0])
+        for name, record in _load_truth(session)["spheres"].items()
+    }
     return {
         f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
-        for (a, b), measured in centre_distances_mm({name: found.record() for name, found in spheres.items()}).items()
+        for (a, b), measured in centre_distances_mm(
+            {name: found.record() for name, found in spheres.items()}
+        ).items()
     }

@@ -29,7 +29,11 @@ from slviewer.report.data import (
     SphereRow,
 )
 from slviewer.report.page import write_page
-from slviewer.report.reproduction import reproduction_headlines, reproduction_sections, reproduction_title
+from slviewer.report.reproduction import (
+    reproduction_headlines,
+    reproduction_sections,
+    reproduction_title,
+)
 
 MODELS = ("stereo", "pixelwise", "splined")
 
@@ -49,7 +53,8 @@ class Reproduction:
 
     @property
     def in_range_ratio(self) -> float:
-        """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their points in R2."""
+        """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their
+        points in R2."""
         inside = [c for c in self.planes.values() if c.incidence and c.incidence["R2"] >= 87.0]
         means = [float(np.mean([c.results[m].rms_mm for c in inside])) for m in MODELS]
         return means[0] / means[1]
@@ -58,7 +63,16 @@ class Reproduction:
     def spacing_rms_mm(self) -> dict[str, float]:
         """RMS error of the distances between all pairs of sphere centres, by model."""
         return {
-            m: float(np.sqrt(np.mean([(measured[m] - known) ** 2 for known, measured in self.spacings_mm.values()])))
+            m: float(
+                np.sqrt(
+                    np.mean(
+                        [
+                            (measured[m] - known) ** 2
+                            for known, measured in self.spacings_mm.values()
+                        ]
+                    )
+                )
+            )
             for m in MODELS
         }
 
@@ -91,8 +105,11 @@ class Reproduction:
         return "\n".join(
             [
                 f"Simulated rig, camera {size}, {len(self.stereo.poses)} target poses. RMS in mm.",
-                f"Reprojection RMS: camera {rms['camera']:.3f} px, projector {rms['projector']:.3f} px "
-                f"(the Letter: {theirs['camera']:.3f}, {theirs['projector']:.3f}).",
+                (
+                    f"Reprojection RMS: camera {rms['camera']:.3f} px, projector"
+                    f" {rms['projector']:.3f} px (the Letter: {theirs['camera']:.3f},"
+                    f" {theirs['projector']:.3f})."
+                ),
                 "",
                 "Flat board (Table 1)",
                 render(_select_columns(letter_rows(self.planes))),
@@ -108,14 +125,21 @@ class Reproduction:
                 *pairs,
                 "",
                 f"Report: {self.report}",
-                f"Session: {self.report.parent / 'session'} ({_folder_size_gb(self.report.parent / 'session'):.1f} GB)",
+                (
+                    f"Session: {self.report.parent / 'session'}"
+                    f" ({_folder_size_gb(self.report.parent / 'session'):.1f} GB)"
+                ),
             ]
         )
 
 
 def _select_columns(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The columns that fit a terminal, without coverage and excluded points, which the report has."""
-    return [{k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k} for row in table]
+    """The columns that fit a terminal, without coverage and excluded points, which the report
+    has."""
+    return [
+        {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
+        for row in table
+    ]
 
 
 def _folder_size_gb(folder: Path) -> float:
@@ -134,7 +158,9 @@ def write_reproduction(
     """Write ``result.report``; ``pixel`` (u, v) is the one whose curves are drawn."""
     data = _make_report_data(result, observations, pixel, seed)
     title, subtitle = reproduction_title(data)
-    write_page(result.report, title, subtitle, reproduction_headlines(data), reproduction_sections(data))
+    write_page(
+        result.report, title, subtitle, reproduction_headlines(data), reproduction_sections(data)
+    )
 
 
 def _make_report_data(
@@ -156,13 +182,17 @@ def _make_report_data(
         letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
         fit_rms_mm=pixelwise.median_rms_mm(pixelwise.depth_axis),
         planes=[
-            _make_plane_row(name, c, row) for (name, c), row in zip(result.planes.items(), letter.TABLE_1, strict=True)
+            _make_plane_row(name, c, row)
+            for (name, c), row in zip(result.planes.items(), letter.TABLE_1, strict=True)
         ],
         spheres=[
             _make_sphere_row(name, c, row)
             for (name, c), row in zip(result.spheres.items(), letter.TABLE_2, strict=True)
         ],
-        spacings=[SpacingRow(name, known, measured) for name, (known, measured) in result.spacings_mm.items()],
+        spacings=[
+            SpacingRow(name, known, measured)
+            for name, (known, measured) in result.spacings_mm.items()
+        ],
         pairs=[
             MergePair(
                 name,
@@ -175,11 +205,17 @@ def _make_report_data(
         ],
         pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
         rms_maps_mm=fit.rms_mm,
-        plane_maps=[error_maps(f"plane_{i:02d}", result.planes[f"plane_{i:02d}"]) for i in SHOWN_PLANES],
+        plane_maps=[
+            error_maps(f"plane_{i:02d}", result.planes[f"plane_{i:02d}"]) for i in SHOWN_PLANES
+        ],
         sphere_maps=[error_maps(name, c) for name, c in result.spheres.items()],
-        plane_outlines={name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()},
+        plane_outlines={
+            name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()
+        },
         clouds=clouds,
-        merged=CloudView("merged", whole.surface.points, whole.surface.normals, whole.source, whole.names),
+        merged=CloudView(
+            "merged", whole.surface.points, whole.surface.normals, whole.source, whole.names
+        ),
         poses_left_out=stereo.excluded,
         letter_points=letter.EXPERIMENT_3_POINTS,
     )
@@ -205,9 +241,14 @@ def _make_sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePos
         true_radius_mm=letter.SPHERE_RADIUS_MM,
         rms_mm=_get_rms(comparison),
         noise_floor_mm=_get_noise_floor(comparison),
-        radius_mm={m: r.radius_mm for m, r in comparison.results.items() if isinstance(r, SphereResult)},
+        radius_mm={
+            m: r.radius_mm for m, r in comparison.results.items() if isinstance(r, SphereResult)
+        },
         letter_rms_mm={"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-        letter_radius_mm={"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
+        letter_radius_mm={
+            "stereo": theirs.stereo_radius_mm,
+            "pixelwise": theirs.pixelwise_radius_mm,
+        },
     )
 
 

@@ -1,4 +1,5 @@
-"""The wizard's state machine without a browser: requests go in, a frozen snapshot comes out, threads do the work.
+"""The wizard's state machine without a browser: requests go in, a frozen snapshot comes out,
+threads do the work.
 
 `operator.Operator` takes every request. Its parts:
 
@@ -16,5 +17,6 @@
 `preparation`         compiles the kernels that all this needs, in a process of its own, at the first start
 ====================  ==================================================================================================
 
-Nothing is stored outside of the session's files: a session that is opened again continues where it was.
+Nothing is stored outside of the session's files: a session that is opened again continues where it
+was.
 """

@@ -1,10 +1,11 @@
 """The thread that owns camera and projector: it shows, grabs and saves, and computes nothing.
 
-Between captures it grabs previews and offers the latest one. A capture is saved by the request's own `save` before
-anything else happens, or it never existed. A fault ends the capture in which it happens, with a notice; the devices are
-then closed and opened again, every `retry_s` until they answer, and the preview goes on. Other work that needs the open
-devices, such as a check of the rig, is queued among the captures, and ends and fails as they do. A stream replaces the
-previews until anything else is requested.
+Between captures it grabs previews and offers the latest one. A capture is saved by the request's
+own `save` before anything else happens, or it never existed. A fault ends the capture in which it
+happens, with a notice; the devices are then closed and opened again, every `retry_s` until they
+answer, and the preview goes on. Other work that needs the open devices, such as a check of the rig,
+is queued among the captures, and ends and fails as they do. A stream replaces the previews until
+anything else is requested.
 """
 
 import threading
@@ -17,7 +18,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from slviewer.devices.capture import CapturedFrames, capture_with_texture
-from slviewer.devices.protocols import CameraSettings, Rig, list_changed_settings, list_notes, stated_full_scale
+from slviewer.devices.protocols import (
+    CameraSettings,
+    Rig,
+    list_changed_settings,
+    list_notes,
+    stated_full_scale,
+)
 from slviewer.errors import Cancelled, DeviceError, SlviewerError, TurntableError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
@@ -30,7 +37,8 @@ PREVIEWS_PER_S = 10.0
 STREAM_PREVIEWS_PER_S = 4.0  # the clouds matter more then
 _NOT_OPEN = "choose a rig first, and wait until its preview runs"
 LIGHTS = {"white": 255, "grey": 128, "dark": None}
-"""What the projector may show between captures, as grey levels; "pattern" is a sequence's first frame."""
+"""What the projector may show between captures, as grey levels; "pattern" is a sequence's first
+frame."""
 
 _STREAM = "stream"  # what it shows during a stream
 
@@ -39,7 +47,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """A request to capture: `save(captured)` writes it to disk, then `saved()` is called, on the acquisition thread.
+    """A request to capture: `save(captured)` writes it to disk, then `saved()` is called, on the
+    acquisition thread.
 
     The frames, of each of `exposures_ms` where there are any, are overwritten by the next capture.
     """
@@ -66,10 +75,11 @@ class _Task:
 
 
 class Acquisition:
-    """Owns the devices and the queue of requests. Every method may be called from any thread, and returns at once.
+    """Owns the devices and the queue of requests. Every method may be called from any thread, and
+    returns at once.
 
-    `offer(frame, full_scale)` gets every preview (h, w), a fresh array each, and what the camera states as its full
-    scale; it must return at once too. `clock()` returns the time in s.
+    `offer(frame, full_scale)` gets every preview (h, w), a fresh array each, and what the camera
+    states as its full scale; it must return at once too. `clock()` returns the time in s.
     """
 
     def __init__(
@@ -122,7 +132,9 @@ class Acquisition:
                     turntable=rig.turntable.name if rig.turntable is not None else "",
                 )  # fmt: skip
             if self._thread is None and rig is not None:
-                self._thread = threading.Thread(target=self._serve, name="slviewer acquisition", daemon=True)
+                self._thread = threading.Thread(
+                    target=self._serve, name="slviewer acquisition", daemon=True
+                )
                 self._thread.start()
             self._condition.notify_all()
         for name in dropped:
@@ -132,13 +144,15 @@ class Acquisition:
         self._changed()
 
     def set_camera(self, settings: CameraSettings) -> None:
-        """Set exposure and gain before the next frame; the view then has what the camera really uses."""
+        """Set exposure and gain before the next frame; the view then has what the camera really
+        uses."""
         with self._condition:
             self._settings = settings
             self._condition.notify_all()
 
     def set_delay(self, settle_ms: float) -> None:
-        """Set the delay between showing and grabbing, from the next capture on; the devices stay open."""
+        """Set the delay between showing and grabbing, from the next capture on; the devices stay
+        open."""
         with self._condition:
             if self._wanted is not None:
                 settled = replace(self._wanted, settle_ms=settle_ms)
@@ -157,20 +171,23 @@ class Acquisition:
         """Queue a capture. Raises DeviceError where no rig is open."""
         self._queue_request(request)
 
-    def run_task(self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]) -> None:
-        """Queue other work with the open rig; `done(result)` is called on this thread, and must return at once.
+    def run_task(
+        self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]
+    ) -> None:
+        """Queue other work with the open rig; `done(result)` is called on this thread, and must
+        return at once.
 
-        The task may show, grab and set anything: light and settings are restored after it. Its progress appears in
-        `view().capture`, and raises Cancelled. What the task raises is reported like a capture's fault. Raises
-        DeviceError where no rig is open.
+        The task may show, grab and set anything: light and settings are restored after it. Its
+        progress appears in `view().capture`, and raises Cancelled. What the task raises is reported
+        like a capture's fault. Raises DeviceError where no rig is open.
         """
         self._queue_request(_Task(name, task, done))
 
     def stream(self, stream: Stream) -> None:
         """Show and grab a stream repeatedly, in place of previews, until it is stopped.
 
-        `stop_stream`, a request, another rig or a fault stop it, each of which calls `stream.end()`. Raises DeviceError
-        where no rig is open or something else runs on it.
+        `stop_stream`, a request, another rig or a fault stop it, each of which calls
+        `stream.end()`. Raises DeviceError where no rig is open or something else runs on it.
         """
         with self._condition:
             if self._view.state != "open":
@@ -228,10 +245,13 @@ class Acquisition:
             self._thread.join(5.0)
 
     def _queue_request(self, request: CaptureRequest | _Task) -> None:
-        """Append a capture or task to the queue, and end the stream. Raises DeviceError where no rig is open."""
+        """Append a capture or task to the queue, and end the stream. Raises DeviceError where no
+        rig is open."""
         with self._condition:
             if self._view.state != "open":
-                raise DeviceError(f"{request.name} is not possible: {self._view.fault or _NOT_OPEN}")
+                raise DeviceError(
+                    f"{request.name} is not possible: {self._view.fault or _NOT_OPEN}"
+                )
             self._requests.append(request)
             self._condition.notify_all()
         self.stop_stream()
@@ -239,7 +259,8 @@ class Acquisition:
     # on the thread
 
     def _serve(self) -> None:
-        """Run the acquisition loop until closing: change rigs, open devices, serve requests, stream, grab previews."""
+        """Run the acquisition loop until closing: change rigs, open devices, serve requests,
+        stream, grab previews."""
         next_preview = 0.0
         while True:
             with self._condition:
@@ -276,7 +297,8 @@ class Acquisition:
         self._close_devices()
 
     def _wait_for_work(self, next_preview: float) -> None:
-        """Wait until the next preview or opening attempt is due, or a request arrives; do not wait while streaming."""
+        """Wait until the next preview or opening attempt is due, or a request arrives; do not wait
+        while streaming."""
         with self._condition:
             if self._closing or self._requests or self._rig is not self._wanted:
                 return
@@ -313,7 +335,8 @@ class Acquisition:
             self._shown = light
 
     def _apply_settings(self, rig: Rig) -> None:
-        """Apply changed camera settings; publish the applied exposure and gain, and the camera's notes."""
+        """Apply changed camera settings; publish the applied exposure and gain, and the camera's
+        notes."""
         with self._condition:
             settings = self._settings
         if self._applied is None or settings != self._applied:
@@ -322,8 +345,13 @@ class Acquisition:
             if settings is None:
                 self._applied = actual
                 with self._condition:
-                    self._settings = self._settings or actual  # another thread may have set it meanwhile
-            notes = (*list_notes(rig.camera), *list_changed_settings(rig.camera, settings or actual, actual))
+                    self._settings = (
+                        self._settings or actual
+                    )  # another thread may have set it meanwhile
+            notes = (
+                *list_notes(rig.camera),
+                *list_changed_settings(rig.camera, settings or actual, actual),
+            )
             self._update_view(exposure_ms=actual.exposure_ms, gain=actual.gain, notes=notes)
 
     def _grab_preview(self, rig: Rig) -> None:
@@ -343,7 +371,9 @@ class Acquisition:
                 self._shown = (_STREAM, stream.sequence)
             view = self.view()
             settings = CameraSettings(view.exposure_ms, view.gain)
-            white = stream.capture(rig, settings, lambda: bool(self._closing or self._stream is not stream))
+            white = stream.capture(
+                rig, settings, lambda: bool(self._closing or self._stream is not stream)
+            )
         except DeviceError:
             raise
         except SlviewerError as error:  # the patterns are wrong, not the devices
@@ -355,13 +385,18 @@ class Acquisition:
             self._offer(white, stated_full_scale(rig.camera))
 
     def _serve_request(self, rig: Rig, request: CaptureRequest | _Task) -> None:
-        """Execute a queued capture or task and report how it ended; a DeviceError is raised to the caller."""
+        """Execute a queued capture or task and report how it ended; a DeviceError is raised to the
+        caller."""
         try:
             self._prepare_devices(rig)
             self._shown = None  # the request shows and sets its own from here on
             if isinstance(request, CaptureRequest):
                 out = self._get_buffer(rig, request.frames)
-                request.save(capture_with_texture(rig, request.sequence, request.exposures_ms, out, self._report_frame))
+                request.save(
+                    capture_with_texture(
+                        rig, request.sequence, request.exposures_ms, out, self._report_frame
+                    )
+                )
                 request.saved()
             else:
                 self._applied = None
@@ -380,7 +415,8 @@ class Acquisition:
             self._changed()
 
     def _get_buffer(self, rig: Rig, count: int) -> np.ndarray:
-        """Return the frame buffer (count, h, w), reused between captures of one size to avoid page faults."""
+        """Return the frame buffer (count, h, w), reused between captures of one size to avoid page
+        faults."""
         width, height = rig.camera.size
         shape, dtype = (count, height, width), rig.camera.dtype
         if self._buffer is None or self._buffer.shape != shape or self._buffer.dtype != dtype:
@@ -400,7 +436,8 @@ class Acquisition:
         self._changed()
 
     def _report_stage(self, share: float, stage: str) -> None:
-        """Publish the progress of a task, `share` 0 ... 1, as percent. Raises Cancelled once it was cancelled."""
+        """Publish the progress of a task, `share` 0 ... 1, as percent. Raises Cancelled once it was
+        cancelled."""
         self._report_frame(round(100 * share), 100, stage)
 
     def _handle_fault(self, error: Exception) -> None:

@@ -1,4 +1,5 @@
-"""Runs the whole wizard on the simulated rig, by the same requests as an operator, to show it to a newcomer."""
+"""Runs the whole wizard on the simulated rig, by the same requests as an operator, to show it to a
+newcomer."""
 
 import threading
 import time
@@ -28,7 +29,8 @@ PATIENCE_S = 120.0
 
 
 class Autopilot:
-    """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at the start of each.
+    """Runs the whole wizard once. The snapshot names the current act; `before(act)` is called at
+    the start of each.
 
     ``patience_s``: the time limit of one act. ``pause_s``: the pause before each.
     """
@@ -45,7 +47,9 @@ class Autopilot:
         self._operator, self._before, self._patience_s = operator, before, patience_s
         self._poses, self._pause_s = poses, pause_s
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run_and_report, name="slviewer autopilot", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run_and_report, name="slviewer autopilot", daemon=True
+        )
 
     @property
     def running(self) -> bool:
@@ -71,7 +75,8 @@ class Autopilot:
             self._operator.notify("error", f"autopilot has failed: {error}")
 
     def run(self) -> None:
-        """Do all acts on this thread. Raises Cancelled when stopped, SlviewerError with the notice of a failed act."""
+        """Do all acts on this thread. Raises Cancelled when stopped, SlviewerError with the notice
+        of a failed act."""
         try:
             self._operator.set_autopilot_status("Getting ready")
             self._prepare()
@@ -94,10 +99,13 @@ class Autopilot:
         if session is None:
             raise SlviewerError("no session is open: open or create one first")
         if session.target != TARGET:
-            self._perform_act(f"Choosing the target {TARGET}", lambda: operator.choose_target(TARGET))
+            self._perform_act(
+                f"Choosing the target {TARGET}", lambda: operator.choose_target(TARGET)
+            )
 
     def _calibrate(self) -> None:
-        """Capture suggested poses until there are enough, then calibrate. Raises SlviewerError if too many fail."""
+        """Capture suggested poses until there are enough, then calibrate. Raises SlviewerError if
+        too many fail."""
         operator = self._operator
         tried = 0
         while (good := _count_good_poses(now := self._wait_until_settled())) < self._poses and not (
@@ -105,9 +113,15 @@ class Autopilot:
         ):
             tried += 1
             if tried > 2 * self._poses:
-                raise SlviewerError(f"only {good} of {tried} poses could be used: see why the others were refused")
+                raise SlviewerError(
+                    f"only {good} of {tried} poses could be used: see why the others were refused"
+                )
             session = operator.snapshot().session
-            act = session.suggestion.sentence if session and session.suggestion else "Placing the board"
+            act = (
+                session.suggestion.sentence
+                if session and session.suggestion
+                else "Placing the board"
+            )
             self._perform_act(act, operator.place_at_suggestion)
             self._perform_act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
         self._perform_act("Calibrating", operator.calibrate)
@@ -118,7 +132,9 @@ class Autopilot:
         self._place("plane", planes()[PLANE])
         self._perform_act("Capturing a plane", lambda: operator.capture_plane("A flat plate"))
         self._place("sphere", spheres()[SPHERE])
-        self._perform_act("Capturing a sphere", lambda: operator.capture_sphere("A sphere of 196 mm"))
+        self._perform_act(
+            "Capturing a sphere", lambda: operator.capture_sphere("A sphere of 196 mm")
+        )
 
     def _scan(self) -> None:
         """Scan the simulated object at three distances, and merge the scans."""
@@ -126,7 +142,10 @@ class Autopilot:
         before = {scan.name for scan in _list_scans(operator.snapshot())}
         for label, scene in zip(("near", "middle", "far"), objects().values(), strict=True):
             self._place("object", scene)
-            self._perform_act(f"Scanning the object, {label}", partial(operator.capture_scan, f"Ammonite, {label}"))
+            self._perform_act(
+                f"Scanning the object, {label}",
+                partial(operator.capture_scan, f"Ammonite, {label}"),
+            )
         names = [scan.name for scan in _list_scans(operator.snapshot()) if scan.name not in before]
         self._perform_act("Merging the three scans", lambda: operator.merge(names, names[-1]))
 
@@ -136,10 +155,15 @@ class Autopilot:
         scans = operator.snapshot().session.scans  # type: ignore[union-attr]
         sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
         region = _make_ball_region(operator.surface(sphere))
-        self._perform_act("Measuring the sphere", partial(operator.measure, sphere, add_fit, "sphere", region))
+        self._perform_act(
+            "Measuring the sphere", partial(operator.measure, sphere, add_fit, "sphere", region)
+        )
         latest = _list_scans(operator.snapshot())[-1].name
         a, b = _select_width_ends(operator.surface(latest))
-        self._perform_act("Measuring the width of the object", partial(operator.measure, latest, add_distance, a, b))
+        self._perform_act(
+            "Measuring the width of the object",
+            partial(operator.measure, latest, add_distance, a, b),
+        )
 
     def _place(self, thing: Thing, scene: Scene) -> None:
         """Request that an object be placed at its scene's pose in front of the simulated rig."""
@@ -152,7 +176,8 @@ class Autopilot:
         self._perform_act(f"Placing the {thing}", lambda: self._operator.place(thing, T))
 
     def _perform_act(self, act: str, request: Callable[[], bool]) -> None:
-        """Send one request and wait until all its work has ended. Raises SlviewerError with the notice of a failure."""
+        """Send one request and wait until all its work has ended. Raises SlviewerError with the
+        notice of a failure."""
         self._operator.set_autopilot_status(act)
         self._before(act)
         if self._stopped.wait(self._pause_s):
@@ -165,7 +190,8 @@ class Autopilot:
                 raise SlviewerError(f"{act}: {notice.text}")
 
     def _wait_until_settled(self) -> Snapshot:
-        """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped, SlviewerError on timeout."""
+        """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped,
+        SlviewerError on timeout."""
         end = time.monotonic() + self._patience_s
         while True:
             if self._stopped.is_set():
@@ -200,4 +226,8 @@ def _select_width_ends(on: MeasuredSurface) -> tuple[Place, Place]:
 
 def _list_scans(snapshot: Snapshot) -> list[ScanView]:
     """List the captures of objects, without planes and spheres."""
-    return [scan for scan in (snapshot.session.scans if snapshot.session else ()) if scan.purpose == "scan"]
+    return [
+        scan
+        for scan in (snapshot.session.scans if snapshot.session else ())
+        if scan.purpose == "scan"
+    ]

@@ -11,7 +11,8 @@ from slviewer.wizard.snapshot import SplinedView
 
 
 def load_fit_rms(session: Session) -> dict[str, Mapping[str, float]] | None:
-    """Load {axis: {coefficient: median mm}} of the pixel-wise model; None where another version saved it."""
+    """Load {axis: {coefficient: median mm}} of the pixel-wise model; None where another version
+    saved it."""
     try:
         model = load_model(session, "pixelwise")
     except SessionError:
@@ -27,5 +28,7 @@ def load_splined(session: Session) -> SplinedView | None:
     except SessionError:
         return None
     assert isinstance(model, SplinedModel)
-    weights = {name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()}
+    weights = {
+        name: (fit.camera_trust, fit.projector_trust) for name, fit in model.bundle.fits.items()
+    }
     return SplinedView(model.summary(), weights, model.bundle.half_turned_poses)

@@ -23,12 +23,14 @@ class CaptureRequests(ResultRequests):
     @request("Capturing the pose")
     def capture_pose(self) -> None:
         """Capture the board where it is; its features are evaluated in the background."""
-        self._engine.hands_free.note_capture()  # first: a capture that fails is not repeated with every preview
+        # first: a capture that fails is not repeated with every preview
+        self._engine.hands_free.note_capture()
         self._capture_pose(self._next_name("pose"), retake=False)
 
     @request("Retaking the pose")
     def retake_pose(self, name: str) -> None:
-        """Capture the board in place of a pose; the old one goes to the trash once the new one is saved."""
+        """Capture the board in place of a pose; the old one goes to the trash once the new one is
+        saved."""
         if self._engine.store.load_capture(name).role != "calibration":
             raise InputError(f"{name} is no target pose: capture another scan instead")
         self._engine.hands_free.note_capture()
@@ -70,7 +72,8 @@ class CaptureRequests(ResultRequests):
         self._queue_capture(name, sequence, save)
 
     def _capture_scan(self, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
-        """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is saved."""
+        """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is
+        saved."""
         engine, store = self._engine, self._engine.store
         sequence = scan_sequence(engine)
         name = self._next_name(purpose)
@@ -89,18 +92,23 @@ class CaptureRequests(ResultRequests):
         save: Callable[[CapturedFrames], None],
         follow: Callable[[], object] = lambda: None,
     ) -> None:
-        """Queue a capture; `follow()` is called once it is saved. Raises SessionError where the disk is too full."""
+        """Queue a capture; `follow()` is called once it is saved. Raises SessionError where the
+        disk is too full."""
         engine, bench = self._engine, self._engine.bench
         exposures = engine.reader.exposures_ms()
         self._check_space(name, len(sequence.frames) * max(1, len(exposures)))
 
         def saved() -> None:
-            """Queue the processing of the saved capture, call `follow`, and advance a replayed recording."""
+            """Queue the processing of the saved capture, call `follow`, and advance a replayed
+            recording."""
             engine.queue_processing()
             follow()
             engine.publisher.mark_changed(session=True)
             if bench is not None and bench.reel is not None:
-                if engine.acquisition.view().light in ("dark", "pattern"):  # the next recording may lack these
+                if engine.acquisition.view().light in (
+                    "dark",
+                    "pattern",
+                ):  # the next recording may lack these
                     engine.acquisition.set_light("white")
                 bench.reel.wind_on()
 
@@ -120,13 +128,16 @@ class CaptureRequests(ResultRequests):
     def _next_name(self, kind: str) -> str:
         """Return the next unused name, such as pose_07, counting saved and queued captures."""
         used_names = [*self._engine.store.taken_names(), *self._engine.acquisition.names()]
-        numbers = [name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")]
+        numbers = [
+            name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")
+        ]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
         return f"{kind}_{number:02d}"
 
 
 def pose_sequence(engine: Engine) -> PatternSequence:
-    """Return the sequence for target poses: the session's pattern sequence along both axes, or that of a recording."""
+    """Return the sequence for target poses: the session's pattern sequence along both axes, or that
+    of a recording."""
     if engine.bench is None:
         raise DeviceError("no rig is chosen: choose one in the step Rig")
     sequence = choose_sequence(engine.bench, engine.reader.patterns())
@@ -135,8 +146,8 @@ def pose_sequence(engine: Engine) -> PatternSequence:
 
 
 def scan_sequence(engine: Engine) -> PatternSequence:
-    """Return the sequence for scans: that of poses along the one axis that measures depth. InputError before a
-    calibration."""
+    """Return the sequence for scans: that of poses along the one axis that measures depth.
+    InputError before a calibration."""
     calibration = engine.publisher.refresh().calibration
     if calibration is None:
         raise InputError("calibrate first: a capture cannot be measured without a calibration")

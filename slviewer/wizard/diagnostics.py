@@ -27,7 +27,17 @@ from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.snapshot import PreviewView, Snapshot
 
 LINES = 4000
-PACKAGES = ("numpy", "opencv-python-headless", "numba", "scipy", "zarr", "open3d-cpu", "open3d", "viser", "trimesh")
+PACKAGES = (
+    "numpy",
+    "opencv-python-headless",
+    "numba",
+    "scipy",
+    "zarr",
+    "open3d-cpu",
+    "open3d",
+    "viser",
+    "trimesh",
+)
 
 
 class LogKeeper(logging.Handler):
@@ -36,7 +46,9 @@ class LogKeeper(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.INFO)
         self.lines: deque[str] = deque(maxlen=LINES)
-        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s %(threadName)s: %(message)s"))
+        self.setFormatter(
+            logging.Formatter("%(asctime)s %(levelname)s %(name)s %(threadName)s: %(message)s")
+        )
         self._logger = logging.getLogger("slviewer")
         if self._logger.level == logging.NOTSET:
             self._logger.setLevel(logging.INFO)
@@ -53,24 +65,35 @@ class LogKeeper(logging.Handler):
 
 
 def write_bundle(
-    session: Session, snapshot: Snapshot, preview: PreviewView | None, log: LogKeeper, report: Reporter
+    session: Session,
+    snapshot: Snapshot,
+    preview: PreviewView | None,
+    log: LogKeeper,
+    report: Reporter,
 ) -> str:
     """Write ``diagnostics_<time>.zip`` into the exports; returns its name."""
     name = f"diagnostics_{datetime.now():%Y%m%d_%H%M%S}.zip"
     guarded = session.guarded(report.saving)
-    with guarded.staged_export(name) as path, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle:
+    with (
+        guarded.staged_export(name) as path,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as bundle,
+    ):
         report(0.1, "versions and settings")
         bundle.writestr("versions.json", to_json(_collect_versions()))
         bundle.writestr("state.json", hide_passwords(to_json(_summarise_state(snapshot)).decode()))
         bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
         for file in ("session.json", "decisions.json"):
-            with suppress(OSError):  # whatever it holds: a damaged one may be the reason for the report
+            with suppress(
+                OSError
+            ):  # whatever it holds: a damaged one may be the reason for the report
                 content = read_file(session.folder / file, MAX_JSON_BYTES)
                 bundle.writestr(f"session/{file}", hide_passwords(content.decode(errors="replace")))
         report(0.4, "captures and results")
         for capture in session.captures():
             described = {key: value for key, value in capture.meta.items() if key != "sequence"}
-            bundle.writestr(f"session/captures/{capture.name}.json", hide_passwords(to_json(described).decode()))
+            bundle.writestr(
+                f"session/captures/{capture.name}.json", hide_passwords(to_json(described).decode())
+            )
         for result in session.result_names():
             try:
                 described = session.load_result(result, only=())[0]
@@ -111,5 +134,10 @@ def _summarise_state(snapshot: Snapshot) -> dict[str, Any]:
     rig = asdict(snapshot.rig)
     notices = [[notice.time.isoformat(), notice.level, notice.text] for notice in snapshot.notices]
     space = None if snapshot.space is None else asdict(snapshot.space)
-    state = {"rig": rig, "steps": [asdict(step) for step in snapshot.steps], "notices": notices, "space": space}
+    state = {
+        "rig": rig,
+        "steps": [asdict(step) for step in snapshot.steps],
+        "notices": notices,
+        "space": space,
+    }
     return json.loads(to_json(state))

@@ -1,4 +1,5 @@
-"""Requests to set the region of interest, and to delete points of scans so that they can be brought back."""
+"""Requests to set the region of interest, and to delete points of scans so that they can be brought
+back."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -37,16 +38,22 @@ class EditRequests(RequestHandler):
 
     @request("Deleting points")
     def delete_points(self, selections: Sequence[Selection], what: str) -> None:
-        """Delete what is selected of the points that are shown of one or several scans; `undo_edit` undoes it."""
+        """Delete what is selected of the points that are shown of one or several scans; `undo_edit`
+        undoes it."""
         counts = delete_points(self._engine.store, selections, what)
         self._engine.notices.add(
-            "info", f"{', '.join(counts)}: {sum(counts.values()):,} points deleted; Undo edit brings them back"
+            "info",
+            f"{', '.join(counts)}: {sum(counts.values()):,} points deleted; Undo edit brings them"
+            " back",
         )
 
     @request("Removing the support")
     def remove_support(self, *scans: str) -> None:
-        """Delete the plane that the object stands on, and all below it, from scans; `undo_edit` undoes it for each."""
-        remove = partial(tasks.remove_support, self._engine.store, list(scans), warn=self._warner("scans"))
+        """Delete the plane that the object stands on, and all below it, from scans; `undo_edit`
+        undoes it for each."""
+        remove = partial(
+            tasks.remove_support, self._engine.store, list(scans), warn=self._warner("scans")
+        )
         self._submit("Removing the support", remove, tasks.describe_removal)
 
     @request("Undoing the edit")

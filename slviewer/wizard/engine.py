@@ -1,6 +1,8 @@
-"""The wizard's state and its threads: the session, the rig, the jobs, and the snapshot made of them.
+"""The wizard's state and its threads: the session, the rig, the jobs, and the snapshot made of
+them.
 
-Requests (`operator` and the `*_requests`) call in here; panels do not. Each attribute is written by the engine alone.
+Requests (`operator` and the `*_requests`) call in here; panels do not. Each attribute is written by
+the engine alone.
 """
 
 import contextlib
@@ -57,7 +59,8 @@ READ_ATTEMPTS = 20
 
 
 class Engine:
-    """Everything behind the requests. `capture_now` is called, on the preview's thread, for a hands-free capture."""
+    """Everything behind the requests. `capture_now` is called, on the preview's thread, for a
+    hands-free capture."""
 
     def __init__(self, set_up: SetUp, capture_now: Callable[[], object], timing: Timing) -> None:
         self._set_up, self._capture_now = set_up, capture_now
@@ -78,12 +81,19 @@ class Engine:
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
         self._reader: SessionReader | None = None
-        self._queued: set[tuple[str, str, str]] = set()  # captures by name and content hash, and the target
+        self._queued: set[tuple[str, str, str]] = (
+            set()
+        )  # captures by name and content hash, and the target
         self._brightness: Brightness = ""
         # the publisher's thread alone writes these:
-        self._reached: tuple[Path | None, bool] = (None, False)  # a session, and whether its poses were enough
+        self._reached: tuple[Path | None, bool] = (
+            None,
+            False,
+        )  # a session, and whether its poses were enough
         self._failed_reads, self._reported_faults = 0, set[str]()
-        empty = Snapshot(0, None, RigView(), None, None, (), views(Facts(None, RigView(), None)), None, False, "")
+        empty = Snapshot(
+            0, None, RigView(), None, None, (), views(Facts(None, RigView(), None)), None, False, ""
+        )
         self.publisher = Publisher(self._build_snapshot, empty, timing.retry_s)
         self.notices = Notices(self.publisher.mark_changed)
         self.jobs = Jobs(self.notices, self.publisher.mark_changed)
@@ -126,18 +136,23 @@ class Engine:
         """The scene of the simulated rig. Raises InputError where the rig is a real one."""
         world = self.bench.world if self.bench else None
         if world is None:
-            raise InputError("objects can be placed only before the simulated rig: choose it in the step Rig")
+            raise InputError(
+                "objects can be placed only before the simulated rig: choose it in the step Rig"
+            )
         return world
 
     def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
         """Open another session, with `rig`, else the one that it remembers, else the one in use.
 
-        Jobs of the previous session are cancelled. If the remembered rig is not connected, the session opens without.
-        Where the session is open already, only the rig changes.
+        Jobs of the previous session are cancelled. If the remembered rig is not connected, the
+        session opens without. Where the session is open already, only the rig changes.
         """
         with self.lock:
             if not self.acquisition.idle:
-                raise InputError("a capture is running: wait for it, or cancel it, before you open another session")
+                raise InputError(
+                    "a capture is running: wait for it, or cancel it, before you open another"
+                    " session"
+                )
             before = self.session
             if before is not None and expand_user(path).resolve() == before.folder.resolve():
                 if rig:
@@ -151,14 +166,18 @@ class Engine:
             if before is not None:
                 before.close()
             for name in store.recovered:
-                self.notices.add("info", f"{name} was complete when the program ended, and is in the session again")
+                self.notices.add(
+                    "info",
+                    f"{name} was complete when the program ended, and is in the session again",
+                )
             try:
                 self._restore_rig(store, rig)
             finally:
                 self.update_board()
 
     def _restore_rig(self, store: Session, rig: Choice | None) -> None:
-        """Use `rig`, else the rig saved in the session, else save the current one there; report one that fails."""
+        """Use `rig`, else the rig saved in the session, else save the current one there; report one
+        that fails."""
         choice = rig or store.valid_decision("rig")
         if choice and choice != self._choice:
             try:
@@ -178,8 +197,8 @@ class Engine:
     def use_rig(self, choice: Choice) -> None:
         """Use other devices from now on, in the session too.
 
-        If it is the same rig again, the measured delay stays unless the choice has one, and so does the exposure that
-        the session remembers.
+        If it is the same rig again, the measured delay stays unless the choice has one, and so does
+        the exposure that the session remembers.
         """
         with self.lock:
             store = self.session
@@ -191,17 +210,24 @@ class Engine:
             if store is not None and known != dict(choice):
                 self._remember(store, "rig", dict(choice))
             if store is not None and not same:
-                for decision in ("exposure", "exposures", "levels"):  # those of another camera do not apply
+                for decision in (
+                    "exposure",
+                    "exposures",
+                    "levels",
+                ):  # those of another camera do not apply
                     self._remember(store, decision, None)
             exposure = store.valid_decision("exposure") if store is not None else None
-            exposure = exposure or {key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)}
+            exposure = exposure or {
+                key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)
+            }
             self._forget_rig(choice, bench)
             self._rig_fault = ""
             self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
 
     @staticmethod
     def _remember(store: Session, what: str, value: Any) -> None:
-        """Remember a decision of the rig's in the session, unless its decisions are damaged, which its faults name."""
+        """Remember a decision of the rig's in the session, unless its decisions are damaged, which
+        its faults name."""
         with contextlib.suppress(DamagedError):
             store.decide(what, value)
 
@@ -216,10 +242,13 @@ class Engine:
             raise InputError("no rig is in use: choose one in the step Rig")
         now = self.acquisition.view()
         exposure = {"exposure_ms": now.exposure_ms, "gain": now.gain}
-        save_rig(self.store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what)
+        save_rig(
+            self.store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what
+        )
 
     def set_preflight(self, bench: RigSetup | None, result: Preflight) -> bool:
-        """Store the result of a rig check, and use the delay that it measured; the session remembers it with the rig.
+        """Store the result of a rig check, and use the delay that it measured; the session
+        remembers it with the rig.
 
         Returns False, and changes nothing, where `bench` is no longer in use.
         """
@@ -235,7 +264,8 @@ class Engine:
             return True
 
     def update_board(self) -> None:
-        """Apply the current target: print it on the simulated board, and queue the evaluation of the poses by it."""
+        """Apply the current target: print it on the simulated board, and queue the evaluation of
+        the poses by it."""
         board, world = self._parse_board(), self.bench.world if self.bench else None
         if board is not None and world is not None and board != world.board:
             world.print_board(board)
@@ -252,12 +282,14 @@ class Engine:
         self.publisher.mark_changed()
 
     def set_preparing(self, share: float | None) -> None:
-        """Set the share of the kernels that are compiled in the background; None: none are being compiled."""
+        """Set the share of the kernels that are compiled in the background; None: none are being
+        compiled."""
         self._preparing = share
         self.publisher.mark_changed()
 
     def set_merge_failure(self, why: str, reason: Reason | None = None) -> None:
-        """Set why the last merge failed, empty: it did not; ``reason``: that of a refused registration."""
+        """Set why the last merge failed, empty: it did not; ``reason``: that of a refused
+        registration."""
         self._merge_failure, self._merge_refusal = why, reason
         self.publisher.mark_changed()
 
@@ -307,7 +339,8 @@ class Engine:
         self.queue_processing()
 
     def _process_capture(self, reader: SessionReader, capture: Capture, report: Reporter) -> None:
-        """Make the thumbnail of a capture, check its frames, and read its features if it is a target pose."""
+        """Make the thumbnail of a capture, check its frames, and read its features if it is a
+        target pose."""
         if capture.name not in reader.session.capture_names():
             return  # deleted since
         if not reader.has_thumbnail(capture):
@@ -325,7 +358,8 @@ class Engine:
                     self.notices.add("warning", f"{capture.name}: {sentence}", "frames")
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
-        """Read the features of a target pose, examine its frames, and save both; the next pose is planned meanwhile."""
+        """Read the features of a target pose, examine its frames, and save both; the next pose is
+        planned meanwhile."""
         target = reader.target()
 
         def plan_next(observation: Observation) -> None:
@@ -333,13 +367,19 @@ class Engine:
             reader.add_features(capture, target, observation)
             self.publisher.mark_changed(session=True)
 
-        poses = read_stored_poses(session, [capture.name], Board.parse(target), Smoothing(), True, plan_next)
+        poses = read_stored_poses(
+            session, [capture.name], Board.parse(target), Smoothing(), True, plan_next
+        )
         judged = next(poses)
         if judged.observation is None:
-            self.notices.add("warning", f"{capture.name} cannot be used: {judged.refused}", "target-poses")
+            self.notices.add(
+                "warning", f"{capture.name} cannot be used: {judged.refused}", "target-poses"
+            )
         self.publisher.mark_changed(session=True)
 
-    def _handle_processing_failure(self, reader: SessionReader, capture: Capture, error: BaseException) -> None:
+    def _handle_processing_failure(
+        self, reader: SessionReader, capture: Capture, error: BaseException
+    ) -> None:
         """Report that a capture could not be processed, and store why it is unreadable."""
         self.notices.add_failure(f"Processing {capture.name}", error)
         if isinstance(error, InputError | DamagedError):
@@ -349,8 +389,11 @@ class Engine:
     # previews
 
     def _handle_preview(self, view: PreviewView) -> None:
-        """Publish an analysed preview, trigger hands-free capture, and update the brightness (preview thread)."""
-        countdown = self.hands_free.countdown(view.board, not self.acquisition.idle, time.monotonic())
+        """Publish an analysed preview, trigger hands-free capture, and update the brightness
+        (preview thread)."""
+        countdown = self.hands_free.countdown(
+            view.board, not self.acquisition.idle, time.monotonic()
+        )
         now = countdown is not None and countdown <= 0
         self.preview = view = replace(view, countdown_s=None if now else countdown)
         if now:
@@ -366,7 +409,11 @@ class Engine:
     def _build_snapshot(self, version: int, session_changed: bool) -> Snapshot:
         """Build the current snapshot without changing any state (publisher's thread)."""
         reader, bench, choice, rig = self._reader, self.bench, self._choice, self.acquisition.view()
-        session, space, read_failure = self.publisher.latest.session, None, self.publisher.latest.read_failure
+        session, space, read_failure = (
+            self.publisher.latest.session,
+            None,
+            self.publisher.latest.read_failure,
+        )
         if reader is None:
             session = None
         else:
@@ -381,7 +428,10 @@ class Engine:
             rig = replace(rig, state="lost", fault=self._rig_fault)
         world = _view_world(bench.world) if bench is not None and bench.world is not None else None
         rig = replace(
-            rig, simulated=world is not None, choice=choice, pages=() if choice is None else list_needed_pages(choice)
+            rig,
+            simulated=world is not None,
+            choice=choice,
+            pages=() if choice is None else list_needed_pages(choice),
         )
         return Snapshot(
             version=version,
@@ -406,7 +456,8 @@ class Engine:
     def _read_session(
         self, reader: SessionReader, rig: RigView, before: SessionView | None
     ) -> tuple[SessionView | None, str]:
-        """Return (the session, ""); where it cannot be read, (`before` if it is of the same folder, why)."""
+        """Return (the session, ""); where it cannot be read, (`before` if it is of the same folder,
+        why)."""
         try:
             return reader.read(rig, self.bench.focal_px if self.bench else None), ""
         except Exception as error:  # most likely files were being changed
@@ -416,7 +467,9 @@ class Engine:
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
         session = snapshot.session
-        faults = (snapshot.read_failure,) if snapshot.read_failure else session.faults if session else ()
+        faults = (
+            (snapshot.read_failure,) if snapshot.read_failure else session.faults if session else ()
+        )
         new_faults = [fault for fault in faults if fault not in self._reported_faults]
         self._reported_faults &= set(faults)
         self._failed_reads = self._failed_reads + 1 if new_faults else 0
@@ -435,7 +488,9 @@ class Engine:
         reached, self._reached = self._reached, (session.folder, session.enough)
         if session.enough and reached != self._reached and self.hands_free.is_on:
             self.hands_free.switch(False)
-            self.notices.add("good", "the poses reach the wanted accuracy: hands-free capture has stopped")
+            self.notices.add(
+                "good", "the poses reach the wanted accuracy: hands-free capture has stopped"
+            )
 
 
 def _view_world(world: SimulatedWorld) -> WorldView:
@@ -446,7 +501,8 @@ def _view_world(world: SimulatedWorld) -> WorldView:
 
 
 def _choose_watch(session: SessionView | None) -> Watch:
-    """Return what to detect in the previews: the session's board, and the lens to estimate its pose with."""
+    """Return what to detect in the previews: the session's board, and the lens to estimate its pose
+    with."""
     if session is None or not session.target:
         return Watch()
     return Watch(Board.parse(session.target), session.plan.lens if session.plan else None)

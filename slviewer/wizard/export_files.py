@@ -22,15 +22,26 @@ def export_file(
     warn: Warn,
     white: str = "",
 ) -> str:
-    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the file's name.
+    """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the
+    file's name.
 
-    ``texture``: side of the image of a mesh, px, None for a mesh without one; ``white``: its white balance.
+    ``texture``: side of the image of a mesh, px, None for a mesh without one; ``white``: its white
+    balance.
     """
     accepts, progress = accepts_rejected(session), report.within(0, 0.98)
     if texture is None:
-        with session.guarded(report.saving).staged_export(default_file_name(what, name, file_format)) as path:
+        with session.guarded(report.saving).staged_export(
+            default_file_name(what, name, file_format)
+        ) as path:
             exported = export(
-                session, what, name, out=path, plan=plan, accept_rejected=accepts, progress=progress, warn=warn
+                session,
+                what,
+                name,
+                out=path,
+                plan=plan,
+                accept_rejected=accepts,
+                progress=progress,
+                warn=warn,
             )
         words = exported.words
     else:

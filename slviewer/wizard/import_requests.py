@@ -17,7 +17,8 @@ from slviewer.wizard.requests import RequestHandler, request
 
 IMPORTING = "Importing"
 UNPACKED = "import"
-"""Name in the session's folder beside which an upload is unpacked: the session clears what a crash leaves of it."""
+"""Name in the session's folder beside which an upload is unpacked: the session clears what a crash
+leaves of it."""
 
 
 class ImportRequests(RequestHandler):
@@ -27,10 +28,13 @@ class ImportRequests(RequestHandler):
     def import_folder(
         self, folder: Path | str, layout: str = "detect", role: Role = "calibration", **options: Any
     ) -> None:
-        """Import the captures in a folder of this computer; `options` as `import_captures` takes them."""
+        """Import the captures in a folder of this computer; `options` as `import_captures` takes
+        them."""
         path = str(folder).strip()
         if not path:
-            raise InputError("no folder is named: enter the path of a folder on the computer that runs slviewer")
+            raise InputError(
+                "no folder is named: enter the path of a folder on the computer that runs slviewer"
+            )
         store = self._engine.store
 
         def work(report: Reporter) -> list[str]:
@@ -38,20 +42,28 @@ class ImportRequests(RequestHandler):
             session = store.guarded(report.saving)
             source = expand_user(path)
             warn = self._warner("frames")
-            return import_captures(source, session, layout, role=role, progress=report, warn=warn, **options)
+            return import_captures(
+                source, session, layout, role=role, progress=report, warn=warn, **options
+            )
 
         self._submit_import(work, role)
 
     @request(IMPORTING)
     def import_zip(
-        self, name: str, content: bytes, layout: str = "detect", role: Role = "calibration", **options: Any
+        self,
+        name: str,
+        content: bytes,
+        layout: str = "detect",
+        role: Role = "calibration",
+        **options: Any,
     ) -> None:
-        """Import the captures in a zip that was uploaded as `name`; images outside of folders become one capture of
-        that name."""
+        """Import the captures in a zip that was uploaded as `name`; images outside of folders
+        become one capture of that name."""
         self._submit_import(partial(self._read_zip, name, content, layout, role, options), role)
 
     def _submit_import(self, work: Callable[[Reporter], list[str]], role: Role) -> None:
-        """Queue an import as `role`; `work(report)` returns the names of the captures, which are then processed."""
+        """Queue an import as `role`; `work(report)` returns the names of the captures, which are
+        then processed."""
 
         def import_and_process(report: Reporter) -> list[str]:
             """Import, and queue the processing of the new captures; returns their names."""
@@ -62,9 +74,16 @@ class ImportRequests(RequestHandler):
         self._submit(IMPORTING, import_and_process, lambda names: describe_import(names, role))
 
     def _read_zip(
-        self, name: str, content: bytes, layout: str, role: Role, options: dict[str, Any], report: Reporter
+        self,
+        name: str,
+        content: bytes,
+        layout: str,
+        role: Role,
+        options: dict[str, Any],
+        report: Reporter,
     ) -> list[str]:
-        """Unpack an uploaded zip into a temporary folder and import it; returns the names of the captures."""
+        """Unpack an uploaded zip into a temporary folder and import it; returns the names of the
+        captures."""
         store, archive = self._engine.store, io.BytesIO(content)
         report(0.0, f"unpacking {name}")
         with atomic.staged_folder(store.folder / UNPACKED, unpacked_size(archive)) as staged:
@@ -72,7 +91,9 @@ class ImportRequests(RequestHandler):
             folder.mkdir()
             try:
                 unpacking = report.within(0, 0.2)
-                source, warnings = unpack(archive, folder, lambda done: unpacking(done, f"unpacking {name}"))
+                source, warnings = unpack(
+                    archive, folder, lambda done: unpacking(done, f"unpacking {name}")
+                )
                 for warning in warnings:
                     self._warner("frames")(warning)
                 return import_captures(
@@ -84,6 +105,9 @@ class ImportRequests(RequestHandler):
 
 
 def _make_capture_name(name: str) -> str:
-    """Return a valid capture name, ASCII and at most 100 characters, made from the name of an upload."""
-    plain = "".join(c if (c.isalnum() and c.isascii()) or c in "_-." else "_" for c in name).strip("._-")
+    """Return a valid capture name, ASCII and at most 100 characters, made from the name of an
+    upload."""
+    plain = "".join(c if (c.isalnum() and c.isascii()) or c in "_-." else "_" for c in name).strip(
+        "._-"
+    )
     return new_name(plain[:100] or "capture")

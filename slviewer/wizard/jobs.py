@@ -1,13 +1,15 @@
 """One worker that computes, one job after the other, and never blocks the operator.
 
-A job's `work(reporter)` runs in a thread of its own. Cancelling is cooperative first: the next `reporter(share, stage)`
-raises Cancelled. Work that is inside a call that cannot be interrupted (OpenCV, Open3D) is abandoned after
-`PATIENCE_S`: the worker goes on with the next job, and the abandoned thread ends at its next report.
+A job's `work(reporter)` runs in a thread of its own. Cancelling is cooperative first: the next
+`reporter(share, stage)` raises Cancelled. Work that is inside a call that cannot be interrupted
+(OpenCV, Open3D) is abandoned after `PATIENCE_S`: the worker goes on with the next job, and the
+abandoned thread ends at its next report.
 
-Abandoned work never saves anything afterwards: jobs get the session as `session.guarded(reporter.saving)`, and write
-exports through its `staged_export`; both call `saving` right before a save takes effect. Conversely, work that
-has begun to save is no longer cancelled but awaited, so that a calibration of two models is never half saved.
-`done(result)` runs on the worker if the job was not cancelled.
+Abandoned work never saves anything afterwards: jobs get the session as
+`session.guarded(reporter.saving)`, and write exports through its `staged_export`; both call
+`saving` right before a save takes effect. Conversely, work that has begun to save is no longer
+cancelled but awaited, so that a calibration of two models is never half saved. `done(result)` runs
+on the worker if the job was not cancelled.
 """
 
 import contextlib
@@ -29,8 +31,8 @@ PATIENCE_S = 0.5
 
 
 def release_memory() -> None:
-    """Return freed memory to the system: glibc keeps what was freed between blocks in use, some MB a minute of live
-    scanning on a busy machine. Does nothing with other C libraries."""
+    """Return freed memory to the system: glibc keeps what was freed between blocks in use, some MB
+    a minute of live scanning on a busy machine. Does nothing with other C libraries."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).malloc_trim(0)
@@ -46,7 +48,8 @@ class Reporter:
         self.share, self.stage = 0.0, ""
 
     def __call__(self, share: float, stage: str) -> None:
-        """Report progress: `share` 0 ... 1 and the `stage` in words. Raises Cancelled once the job was cancelled."""
+        """Report progress: `share` 0 ... 1 and the `stage` in words. Raises Cancelled once the job
+        was cancelled."""
         if share < 1:  # with the last report everything is saved
             with self._lock:
                 self._saving = False
@@ -60,7 +63,8 @@ class Reporter:
             raise Cancelled("cancelled")
 
     def saving(self) -> None:
-        """Mark the start of a save: raises Cancelled, or defers cancelling until the next report."""
+        """Mark the start of a save: raises Cancelled, or defers cancelling until the next
+        report."""
         with self._lock:
             if self._cancelled and not self._saving:
                 raise Cancelled("cancelled")
@@ -72,8 +76,11 @@ class Reporter:
             self._cancelled = True
 
     def within(self, start: float, end: float) -> "Reporter":
-        """Return a reporter for one part of the work, which maps its shares 0 ... 1 to `start` ... `end`."""
-        return _PartReporter(self, start, min(end, 0.999))  # the last report is the whole work's own
+        """Return a reporter for one part of the work, which maps its shares 0 ... 1 to `start` ...
+        `end`."""
+        return _PartReporter(
+            self, start, min(end, 0.999)
+        )  # the last report is the whole work's own
 
     @property
     def cancelled(self) -> bool:
@@ -108,7 +115,8 @@ class _PartReporter(Reporter):
 
 @dataclass(eq=False)
 class _Job:
-    """A queued or running job: its callbacks, its reporter, and its result or error once `ended` is set."""
+    """A queued or running job: its callbacks, its reporter, and its result or error once `ended` is
+    set."""
 
     name: str
     work: Callable[[Reporter], Any]
@@ -123,7 +131,8 @@ class _Job:
 
 
 class Jobs:
-    """A worker thread with a foreground and a background queue. Every method may be called from any thread."""
+    """A worker thread with a foreground and a background queue. Every method may be called from any
+    thread."""
 
     def __init__(self, notices: Notices, changed: Callable[[], None]) -> None:
         self._notices, self._changed = notices, changed
@@ -146,8 +155,8 @@ class Jobs:
     ) -> None:
         """Queue `work`, named as the operator reads it ("Calibrating").
 
-        Background work waits until no other job does, and cannot be cancelled by the operator. `failed(error)` runs on
-        the worker in place of a notice.
+        Background work waits until no other job does, and cannot be cancelled by the operator.
+        `failed(error)` runs on the worker in place of a notice.
         """
         job = _Job(name, work, done, failed, background, Reporter(self._changed))
         with self._condition:
@@ -185,7 +194,13 @@ class Jobs:
         reporter = job.reporter
         can_cancel = not job.background and not reporter.cancelled
         return JobView(
-            job.name, reporter.share, reporter.stage, time.monotonic() - job.begun, can_cancel, job.background, waiting
+            job.name,
+            reporter.share,
+            reporter.stage,
+            time.monotonic() - job.begun,
+            can_cancel,
+            job.background,
+            waiting,
         )
 
     @property
@@ -207,14 +222,17 @@ class Jobs:
         self._worker.join(4 * PATIENCE_S)
 
     def _serve(self) -> None:
-        """Run the worker loop until closing: take the next job, foreground jobs first, and run it."""
+        """Run the worker loop until closing: take the next job, foreground jobs first, and run
+        it."""
         while True:
             with self._condition:
                 self._running = None
                 self._condition.notify_all()
             self._changed()
             with self._condition:
-                self._condition.wait_for(lambda: self._closing or self._waiting or self._waiting_behind)
+                self._condition.wait_for(
+                    lambda: self._closing or self._waiting or self._waiting_behind
+                )
                 if self._closing:
                     return
                 job = (self._waiting or self._waiting_behind).popleft()
@@ -228,8 +246,11 @@ class Jobs:
             release_memory()
 
     def _supervise_job(self, job: _Job) -> None:
-        """Run a job on its own thread until it ends or is cancelled, then call `done` or `failed`, or add a notice."""
-        thread = threading.Thread(target=self._execute_job, args=(job,), name=f"slviewer: {job.name}", daemon=True)
+        """Run a job on its own thread until it ends or is cancelled, then call `done` or `failed`,
+        or add a notice."""
+        thread = threading.Thread(
+            target=self._execute_job, args=(job,), name=f"slviewer: {job.name}", daemon=True
+        )
         thread.start()
         reporter = job.reporter
         with self._condition:
@@ -239,8 +260,12 @@ class Jobs:
             while reporter.has_saved and not job.ended.wait(0.05):
                 pass
             if not job.ended.is_set():
-                log.info("%s: abandoned in the middle of a call that cannot be interrupted", job.name)
-        if reporter.cancelled and not (job.ended.is_set() and job.error is None and reporter.has_saved):
+                log.info(
+                    "%s: abandoned in the middle of a call that cannot be interrupted", job.name
+                )
+        if reporter.cancelled and not (
+            job.ended.is_set() and job.error is None and reporter.has_saved
+        ):
             if not job.background:
                 self._notices.add("info", f"{job.name}: cancelled")
         elif job.error is not None and job.failed is not None:

@@ -1,4 +1,5 @@
-"""The frames of a live scan: short captures one after the other, in a few buffers; only the newest counts."""
+"""The frames of a live scan: short captures one after the other, in a few buffers; only the newest
+counts."""
 
 import threading
 import time
@@ -15,7 +16,8 @@ from slviewer.geometry.cuda_device import allocate_frames
 
 @dataclass(eq=False)
 class LiveCapture:
-    """One short capture: frames (n, h, w), the time of its first frame by `time.monotonic`, and the settings."""
+    """One short capture: frames (n, h, w), the time of its first frame by `time.monotonic`, and the
+    settings."""
 
     frames: np.ndarray
     begun: float
@@ -25,9 +27,9 @@ class LiveCapture:
 class Stream:
     """A pattern sequence that is captured repeatedly; a reader gets the newest complete capture.
 
-    `capture` is called by the thread that owns the devices, `wait_next` by one that reads, the others by any. At most
-    three buffers exist: one being filled, one waiting, and one being read. `on_end` is called once, on the thread that
-    ends it.
+    `capture` is called by the thread that owns the devices, `wait_next` by one that reads, the
+    others by any. At most three buffers exist: one being filled, one waiting, and one being read.
+    `on_end` is called once, on the thread that ends it.
     """
 
     def __init__(self, sequence: PatternSequence, on_end: Callable[[], None]) -> None:
@@ -40,10 +42,13 @@ class Stream:
         self.captured = 0
         """Number of complete captures, including those that were not read."""
 
-    def capture(self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]) -> np.ndarray | None:
+    def capture(
+        self, rig: Rig, settings: CameraSettings, stopped: Callable[[], bool]
+    ) -> np.ndarray | None:
         """Show and grab every frame of the sequence, which the rig's projector has loaded.
 
-        Returns a copy of the last frame (h, w), or None, and drops the capture, once `stopped()`. Raises DeviceError.
+        Returns a copy of the last frame (h, w), or None, and drops the capture, once `stopped()`.
+        Raises DeviceError.
         """
         count, (width, height) = len(self.sequence.frames), rig.camera.size
         frames = self._allocate((count, height, width), rig.camera.dtype)
@@ -55,7 +60,9 @@ class Stream:
             settle(rig)
             rig.camera.grab(frames[k])
         else:
-            rig.projector.show(count - 1)  # a change during this exposure is reported at the next call
+            rig.projector.show(
+                count - 1
+            )  # a change during this exposure is reported at the next call
             last = frames[-1].copy()
             self._store_newest(LiveCapture(frames, begun, settings))
             return last
@@ -64,7 +71,8 @@ class Stream:
         return None
 
     def wait_next(self) -> LiveCapture | None:
-        """Wait for the newest capture that was not read yet, and return it; None once the stream has ended.
+        """Wait for the newest capture that was not read yet, and return it; None once the stream
+        has ended.
 
         Its frames stay valid until the next call.
         """

@@ -1,8 +1,9 @@
 """Masks what moved during a short sequence: there, even a handful of frames contradict each other.
 
-The frames of every period have the same mean, the background, at a pixel without motion; and where the finest has an
-even number of steps, its frames added with alternating signs leave nothing but noise and what the projector adds
-evenly everywhere, its second harmonic, which is measured from all pixels and subtracted.
+The frames of every period have the same mean, the background, at a pixel without motion; and where
+the finest has an even number of steps, its frames added with alternating signs leave nothing but
+noise and what the projector adds evenly everywhere, its second harmonic, which is measured from all
+pixels and subtracted.
 """
 
 import numba
@@ -15,8 +16,8 @@ from slviewer.geometry.jit import kernel
 
 SIGMAS = 5.0
 PART = 0.1
-"""A contradiction of so many standard deviations of its noise, and this part of the modulation besides, is motion: some
-0.2 rad from one frame to the next."""
+"""A contradiction of so many standard deviations of its noise, and this part of the modulation
+besides, is motion: some 0.2 rad from one frame to the next."""
 _SPARSE = 8  # step of the rows and columns from which the projector's second harmonic is estimated
 
 
@@ -29,24 +30,34 @@ def mask_motion(
     noise: tuple[float, float],
     points: np.ndarray,
 ) -> None:
-    """Set `points` (h, w, 3) to NaN where the frames (n, h, w) that they were made of contradict each other.
+    """Set `points` (h, w, 3) to NaN where the frames (n, h, w) that they were made of contradict
+    each other.
 
-    `phase` (h, w) rad, NaN where there is none, `modulation` (h, w) grey levels and `noise` are those that decoding
-    the axis gave, as a `PhaseMap` has them. Raises InputError where the finest period has an odd number of steps.
+    `phase` (h, w) rad, NaN where there is none, `modulation` (h, w) grey levels and `noise` are
+    those that decoding the axis gave, as a `PhaseMap` has them. Raises InputError where the finest
+    period has an odd number of steps.
     """
     shifts = axis_layout(sequence, axis).shifts
     finest = np.array(shifts[-1].indices, np.int64)
     if len(finest) % 2:
-        raise InputError(f"{len(finest)} steps of the finest period do not reveal motion: use an even number")
+        raise InputError(
+            f"{len(finest)} steps of the finest period do not reveal motion: use an even number"
+        )
     begins = np.cumsum([0, *(len(shift.indices) for shift in shifts)])
     indices = np.concatenate([np.array(shift.indices, np.int64) for shift in shifts])
-    signs = np.where(np.arange(len(finest)) % 2, -1.0, 1.0).astype(np.float32) / np.float32(len(finest))
+    signs = np.where(np.arange(len(finest)) % 2, -1.0, 1.0).astype(np.float32) / np.float32(
+        len(finest)
+    )
     some = (slice(None, None, _SPARSE),) * 2
     alternation = np.tensordot(signs, frames[(slice(None), *some)][finest], 1)
     shape = modulation[some] * np.cos(2 * phase[some])
     valid = np.isfinite(shape)
     power = float((shape[valid] ** 2).sum())
-    harmonic = float((shape[valid] * alternation[valid]).sum()) / power if power > 0 and len(finest) == 4 else 0.0
+    harmonic = (
+        float((shape[valid] * alternation[valid]).sum()) / power
+        if power > 0 and len(finest) == 4
+        else 0.0
+    )
     few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
     _mask_moving_pixels(
         frames, indices, begins, signs, modulation, phase, np.float32(harmonic),
@@ -57,11 +68,25 @@ def mask_motion(
 
 @kernel(parallel=True)
 def _mask_moving_pixels(
-    frames, indices, begins, signs, modulation, phase, harmonic, a, b, mean, alternating, part, points
+    frames,
+    indices,
+    begins,
+    signs,
+    modulation,
+    phase,
+    harmonic,
+    a,
+    b,
+    mean,
+    alternating,
+    part,
+    points,
 ):
-    """Kernel of `mask_motion`: set `points` (h, w, 3) to NaN where frames of a pixel contradict each other.
+    """Kernel of `mask_motion`: set `points` (h, w, 3) to NaN where frames of a pixel contradict
+    each other.
 
-    ``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's noise.
+    ``mean``, ``alternating``: limits of the two contradictions, in standard deviations of a frame's
+    noise.
     """
     height, width = modulation.shape
     groups = len(begins) - 1

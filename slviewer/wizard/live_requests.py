@@ -17,7 +17,8 @@ class LiveRequests(CaptureRequests):
 
     @request("Scanning live")
     def start_live(self) -> None:
-        """Start a live scan, which ends at `stop_live`, a capture, another rig or session, or a fault."""
+        """Start a live scan, which ends at `stop_live`, a capture, another rig or session, or a
+        fault."""
         engine = self._engine
         calibration = engine.publisher.refresh().calibration
         if calibration is None:
@@ -26,7 +27,9 @@ class LiveRequests(CaptureRequests):
         if bench is None:
             raise InputError("no rig is chosen: choose one in the step Rig")
         if bench.reel is not None:
-            raise InputError("a recording holds only its own patterns: choose a real rig or the simulated one")
+            raise InputError(
+                "a recording holds only its own patterns: choose a real rig or the simulated one"
+            )
         axis = depth_axis(calibration.stereo.rig)
         sequence = replace(short(bench.rig.projector.size, axis), levels=engine.reader.levels())
         live = LiveScan(
@@ -43,7 +46,8 @@ class LiveRequests(CaptureRequests):
 
     @request("Saving the live scan")
     def save_live(self, label: str = "") -> None:
-        """Save the frames of the latest live cloud as a scan, and reconstruct it; the live scan goes on."""
+        """Save the frames of the latest live cloud as a scan, and reconstruct it; the live scan
+        goes on."""
         engine = self._engine
         live, store = engine.live, engine.store
         shot = live.stream.copy_latest() if live is not None and live.is_running else None
@@ -52,13 +56,19 @@ class LiveRequests(CaptureRequests):
         name = self._next_name("scan")
         self._check_space(name, len(shot.frames))
         source = engine.acquisition.view().name
-        save_frames(store, name, "scan", CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source))
+        save_frames(
+            store,
+            name,
+            "scan",
+            CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source),
+        )
         self._set_label(name, label)
         engine.queue_processing()
         self._finish_scan(name)
 
     def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
-        """Call back with every live cloud, on the live scan's thread; returns a function that unsubscribes.
+        """Call back with every live cloud, on the live scan's thread; returns a function that
+        unsubscribes.
 
         A listener must return at once.
         """

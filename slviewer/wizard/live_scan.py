@@ -1,7 +1,8 @@
-"""Live scanning: a short capture becomes a cloud while the next one is captured, and listeners get the newest.
+"""Live scanning: a short capture becomes a cloud while the next one is captured, and listeners get
+the newest.
 
-The devices' thread fills a `Stream`, and a thread of the live scan computes the clouds and calls the listeners, which
-must return at once. Nothing is saved unless the operator saves it.
+The devices' thread fills a `Stream`, and a thread of the live scan computes the clouds and calls
+the listeners, which must return at once. Nothing is saved unless the operator saves it.
 """
 
 import threading
@@ -17,7 +18,13 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.models import accepts_rejected, check_accepted, load_model, load_stereo, preferred_model
+from slviewer.pipeline.models import (
+    accepts_rejected,
+    check_accepted,
+    load_model,
+    load_stereo,
+    preferred_model,
+)
 from slviewer.pipeline.scale import scale_factor
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.reconstruction.onepass import OnePass, PassResult
@@ -32,15 +39,16 @@ from slviewer.wizard.notices import Notices
 from slviewer.wizard.snapshot import LiveView
 
 REPORTS_PER_S = 3.0
-_AVERAGED_S = 2.0  # rates are averages over this time, or over the last two clouds where these came more slowly
+# rates are averages over this time, or over the last two clouds where these came more slowly
+_AVERAGED_S = 2.0
 _RELOAD_S = 1.0  # between two checks whether the calibration has changed
 _RELEASE_S = 30.0  # between two releases of freed memory
 
 
 @dataclass(frozen=True, eq=False)
 class LiveCloud:
-    """One cloud on the camera's grid: points (h, w, 3) float32 mm, NaN where not measured, and texture (h, w)
-    uint8.
+    """One cloud on the camera's grid: points (h, w, 3) float32 mm, NaN where not measured, and
+    texture (h, w) uint8.
 
     `begun`: the time of its first frame, by `time.monotonic`. Its arrays are never written again.
     """
@@ -54,8 +62,8 @@ class LiveCloud:
 class LiveScan:
     """A live scan, from its start to its end.
 
-    `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures changed or it ended.
-    `figures` and `count_shown` may be called from any thread.
+    `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures
+    changed or it ended. `figures` and `count_shown` may be called from any thread.
     """
 
     def __init__(
@@ -79,7 +87,8 @@ class LiveScan:
         self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
     def start(self) -> None:
-        """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a usable calibration."""
+        """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
+        usable calibration."""
         self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
         self._acquisition.stream(self.stream)
         self._made.append(time.monotonic())  # the first cloud has a rate too
@@ -112,7 +121,8 @@ class LiveScan:
             )
 
     def _serve(self) -> None:
-        """Compute and publish a cloud of each new capture until the stream ends; a failure ends it with a notice."""
+        """Compute and publish a cloud of each new capture until the stream ends; a failure ends it
+        with a notice."""
         released = time.monotonic()
         while (shot := self.stream.wait_next()) is not None:
             try:
@@ -146,7 +156,8 @@ class LiveScan:
 
 @dataclass(eq=False)
 class LiveModel:
-    """Reconstructs short captures: a sequence, a calibration, and the scale applied to it. For one thread at a time.
+    """Reconstructs short captures: a sequence, a calibration, and the scale applied to it. For one
+    thread at a time.
 
     ``calibrated``: the rig whose sizes the frames must have.
     """
@@ -164,14 +175,17 @@ class LiveModel:
             self._fast = one_pass(self.sequence, self.model, self.axis)
 
     def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w) uint8), both new arrays.
+        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w) uint8), both
+        new arrays.
 
-        As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for frames of another
-        sequence or camera.
+        As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for
+        frames of another sequence or camera.
         """
         if self.calibrated is not None:
             height, width = frames.shape[1:]
-            check_sizes("the live scan", (width, height), self.sequence.projector_size, self.calibrated)
+            check_sizes(
+                "the live scan", (width, height), self.sequence.projector_size, self.calibrated
+            )
         if self._fast is not None:
             scan = self._fast.run(frames, out=self._reuse_workspace())
             self._before, points = scan, scan.points
@@ -201,36 +215,53 @@ class LiveCalibration:
         self._current = self._load()
 
     def current(self) -> LiveModel:
-        """Return the model, checked for changes at most a second ago. Raises SlviewerError where none is usable."""
+        """Return the model, checked for changes at most a second ago. Raises SlviewerError where
+        none is usable."""
         if time.monotonic() - self._loaded > _RELOAD_S:
             self._current = self._load()
         return self._current
 
     def _load(self) -> LiveModel:
-        """Load the session's preferred model and its scale, or return the current one where neither has changed."""
+        """Load the session's preferred model and its scale, or return the current one where neither
+        has changed."""
         store = self._store
         self._loaded = time.monotonic()
         name = preferred_model(store)
         factor = scale_factor(store, name)
-        key = (name, factor, accepts_rejected(store), *sorted(store.input_hashes(f"calibration/{name}").items()))
+        key = (
+            name,
+            factor,
+            accepts_rejected(store),
+            *sorted(store.input_hashes(f"calibration/{name}").items()),
+        )
         if key == self._key:
             return self._current
         check_accepted(store, accepts_rejected(store))
         model = load_model(store, name)
         if self._axis not in model.axes:
             raise InputError(
-                f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture a scan"
+                f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture"
+                " a scan"
             )
         self._key = key
         return LiveModel(self._sequence, self._axis, model, factor, load_stereo(store).rig)
 
 
 def _compute_rate(times: "deque[float] | list[float]", now: float) -> float:
-    """Return the rate per second of sorted times in s, less where none has come for long; 0 for fewer than two."""
-    return (len(times) - 1) / max(times[-1] - times[0], now - times[-1], 1e-6) if len(times) > 1 else 0.0
+    """Return the rate per second of sorted times in s, less where none has come for long; 0 for
+    fewer than two."""
+    return (
+        (len(times) - 1) / max(times[-1] - times[0], now - times[-1], 1e-6)
+        if len(times) > 1
+        else 0.0
+    )
 
 
 def _drop_old(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
-    """Remove entries whose time in s is older than the averaging window from the front of a deque, but the last two."""
-    while len(times) > 2 and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S:
+    """Remove entries whose time in s is older than the averaging window from the front of a deque,
+    but the last two."""
+    while (
+        len(times) > 2
+        and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S
+    ):
         times.popleft()

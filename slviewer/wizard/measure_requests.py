@@ -1,4 +1,5 @@
-"""Requests to measure on surfaces: points, distances, fits, sections, deviations from a nominal model."""
+"""Requests to measure on surfaces: points, distances, fits, sections, deviations from a nominal
+model."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -12,13 +13,23 @@ from slviewer.evaluation.render import format_count
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
 from slviewer.pipeline.compare import NominalComparison, compare_surface
-from slviewer.pipeline.inspect_parts import Inspection, inspect_surfaces, save_inspection, write_inspection
+from slviewer.pipeline.inspect_parts import (
+    Inspection,
+    inspect_surfaces,
+    save_inspection,
+    write_inspection,
+)
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
 from slviewer.session import atomic
 from slviewer.session.atomic import rename
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
-from slviewer.session.measurements import Measurement, rename_measurement, restore_measurement, trash_measurement
+from slviewer.session.measurements import (
+    Measurement,
+    rename_measurement,
+    restore_measurement,
+    trash_measurement,
+)
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
 from slviewer.session.store import Session
@@ -34,12 +45,14 @@ MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
 class MeasureRequests(RequestHandler):
-    """Requests that measure on a scan or a merge, on the worker, and edit the list of measurements."""
+    """Requests that measure on a scan or a merge, on the worker, and edit the list of
+    measurements."""
 
     _surfaces: Surfaces
 
     def surface(self, name: str) -> MeasuredSurface:
-        """Load a scan or merge to measure on, which is slow. Raises InputError where it cannot be measured on."""
+        """Load a scan or merge to measure on, which is slow. Raises InputError where it cannot be
+        measured on."""
         return self._surfaces.load(self._engine.store, name)
 
     @request(MEASURING)
@@ -50,7 +63,8 @@ class MeasureRequests(RequestHandler):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> None:
-        """Measure on a surface by a function of `pipeline.measurements`: `measure("scan_01", add_distance, a, b)`."""
+        """Measure on a surface by a function of `pipeline.measurements`: `measure("scan_01",
+        add_distance, a, b)`."""
         store = self._engine.store
 
         def work(report: Reporter) -> Measurement:
@@ -75,24 +89,38 @@ class MeasureRequests(RequestHandler):
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
         """Save an uploaded nominal model in the session, if it can be read."""
-        self._save_upload("Reading the nominal model", NOMINALS, name, content, lambda path: read_nominal(path).text())
+        self._save_upload(
+            "Reading the nominal model",
+            NOMINALS,
+            name,
+            content,
+            lambda path: read_nominal(path).text(),
+        )
 
     @request("Reading the plan")
     def upload_plan(self, name: str, content: bytes) -> None:
-        """Save an uploaded inspection plan in the session, if it can be read. Its nominal model is the session's one of
-        that file name."""
+        """Save an uploaded inspection plan in the session, if it can be read. Its nominal model is
+        the session's one of that file name."""
 
         def describe(path: Path) -> str:
             """Read the plan; returns a sentence about it."""
             plan = read_plan(path)
-            return f"{plan.name}: {format_count(len(plan.characteristic), 'characteristic')}; run it on a scan"
+            return (
+                f"{plan.name}: {format_count(len(plan.characteristic), 'characteristic')}; run it"
+                " on a scan"
+            )
 
         if not name.lower().endswith(".toml"):
-            raise InputError(f"{name} is no plan: choose the .toml file that Make plan or slviewer plan wrote")
+            raise InputError(
+                f"{name} is no plan: choose the .toml file that Make plan or slviewer plan wrote"
+            )
         self._save_upload("Reading the plan", PLANS, name, content, describe)
 
-    def _save_upload(self, title: str, place: str, name: str, content: bytes, read: Callable[[Path], str]) -> None:
-        """Save an uploaded file in a folder of the session, if ``read`` can read it, which describes it."""
+    def _save_upload(
+        self, title: str, place: str, name: str, content: bytes, read: Callable[[Path], str]
+    ) -> None:
+        """Save an uploaded file in a folder of the session, if ``read`` can read it, which
+        describes it."""
         store, plain = self._engine.store, plain_name(name)
 
         def work(report: Reporter) -> str:
@@ -112,7 +140,8 @@ class MeasureRequests(RequestHandler):
 
     @request("Running the plan")
     def run_plan(self, plan: str, *surfaces: str) -> None:
-        """Inspect surfaces, each a part, by a plan of `SessionView.plans`; also writes the report into the exports."""
+        """Inspect surfaces, each a part, by a plan of `SessionView.plans`; also writes the report
+        into the exports."""
         store = self._engine.store
         if plan not in list_plans(store.folder):
             raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
@@ -124,7 +153,11 @@ class MeasureRequests(RequestHandler):
             read = read_plan(store.folder / plan)
             if read.alignment.nominal is not None:
                 own = store.folder / NOMINALS / Path(read.alignment.nominal).name
-                read = replace(read, alignment=replace(read.alignment, nominal=str(own))) if own.is_file() else read
+                read = (
+                    replace(read, alignment=replace(read.alignment, nominal=str(own)))
+                    if own.is_file()
+                    else read
+                )
             inputs = dict[str, str]()
 
             def load(name: str) -> MeasuredSurface:
@@ -147,7 +180,9 @@ class MeasureRequests(RequestHandler):
 
         def done(inspection: Inspection) -> None:
             """Report how many parts pass, and mark the session as changed."""
-            self._engine.notices.add("warning" if inspection.failure else "good", describe_inspection(inspection))
+            self._engine.notices.add(
+                "warning" if inspection.failure else "good", describe_inspection(inspection)
+            )
             self._engine.publisher.mark_changed(session=True)
 
         self._engine.jobs.submit("Running the plan", work, done)
@@ -156,14 +191,18 @@ class MeasureRequests(RequestHandler):
     def compare_nominal(
         self, on: str, nominal: str, units: Units | None = None, tolerance_mm: float | None = None
     ) -> None:
-        """Measure a surface's deviation from one of the session's nominal models after best fit; also writes a PLY."""
+        """Measure a surface's deviation from one of the session's nominal models after best fit;
+        also writes a PLY."""
         store = self._engine.store
         path = store.folder / NOMINALS / safe_name(nominal)
         if not path.is_file():
-            raise InputError(f"there is no nominal model {nominal!r} in the session: upload it first")
+            raise InputError(
+                f"there is no nominal model {nominal!r} in the session: upload it first"
+            )
 
         def work(report: Reporter) -> NominalComparison:
-            """Compare the surface with the nominal model, and write the deviations as PLY into the exports."""
+            """Compare the surface with the nominal model, and write the deviations as PLY into the
+            exports."""
             report(0.0, f"reading {nominal}")
             ideal, surface = read_nominal(path, units), self._surfaces.load(store, on)
             name = f"{on.replace('/', '_')}_{path.stem}_deviation.ply"
@@ -205,7 +244,8 @@ class MeasureRequests(RequestHandler):
         store = self._engine.store
 
         def work(report: Reporter) -> str:
-            """Write the CSV into the exports; returns a sentence with the number of measurements."""
+            """Write the CSV into the exports; returns a sentence with the number of
+            measurements."""
             with store.guarded(report.saving).staged_export(TABLE) as path:
                 count = measurements.export_measurements(store, path)
             report(1.0, "written")
@@ -215,18 +255,22 @@ class MeasureRequests(RequestHandler):
 
     @request("Making the plan")
     def make_inspection_plan(self) -> None:
-        """Write an inspection plan of the fits and relations into the exports, to repeat them on other scans."""
+        """Write an inspection plan of the fits and relations into the exports, to repeat them on
+        other scans."""
         store = self._engine.store
 
         def work(report: Reporter) -> str:
             """Write the plan into the exports; returns a sentence with what to do with it."""
-            made = make_plan(store, TOLERANCE_MM, name=store.folder.name, warn=self._warner("measurements"))
+            made = make_plan(
+                store, TOLERANCE_MM, name=store.folder.name, warn=self._warner("measurements")
+            )
             with store.guarded(report.saving).staged_export(PLAN) as path:
                 write_plan(made, path)
             report(1.0, "written")
             return (
-                f"{PLAN} is ready to download: {format_count(len(made.characteristic), 'characteristic')}; set its "
-                f"limits, then upload it below, or run slviewer inspect-parts {PLAN} SESSION..."
+                f"{PLAN} is ready to download:"
+                f" {format_count(len(made.characteristic), 'characteristic')}; set its limits, then"
+                f" upload it below, or run slviewer inspect-parts {PLAN} SESSION..."
             )
 
         self._submit("Making the plan", work, str)
@@ -238,7 +282,9 @@ def _reword_errors() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(str(error).replace("give --units ", "choose its units, ").replace("--units ", "")) from error
+        raise InputError(
+            str(error).replace("give --units ", "choose its units, ").replace("--units ", "")
+        ) from error
 
 
 def describe_quantities(measured: Measurement) -> str:
@@ -254,14 +300,22 @@ def describe_inspection(inspection: Inspection) -> str:
 
 
 def describe_deviation(result: NominalComparison) -> str:
-    """Describe a comparison in one sentence: RMS deviation in mm, and the decision against the tolerance."""
-    text = f"{result.scan} against {result.nominal.name}: RMS {result.found.statistics()['rms']:.4f} mm"
+    """Describe a comparison in one sentence: RMS deviation in mm, and the decision against the
+    tolerance."""
+    text = (
+        f"{result.scan} against {result.nominal.name}: RMS"
+        f" {result.found.statistics()['rms']:.4f} mm"
+    )
     if result.verdict is None:
         return text
-    return f"{text}; tolerance ± {result.verdict.tolerance_mm:g} mm: {DECIDED[result.verdict.decision]}"
+    return (
+        f"{text}; tolerance ± {result.verdict.tolerance_mm:g} mm:"
+        f" {DECIDED[result.verdict.decision]}"
+    )
 
 
 def plain_name(name: str) -> str:
-    """Return a valid file name for the session: ASCII letters, digits, '_', '-' and '.', at most 100 characters."""
+    """Return a valid file name for the session: ASCII letters, digits, '_', '-' and '.', at most
+    100 characters."""
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", Path(name).name).lstrip(".-")
     return safe_name(plain[-100:].lstrip(".-") or "nominal")

@@ -21,7 +21,8 @@ _ALTERNATIVES = {
 
 
 class MergeRequests(RequestHandler):
-    """Requests that merge scans on the worker; the snapshot shows why a merge failed until the next one."""
+    """Requests that merge scans on the worker; the snapshot shows why a merge failed until the next
+    one."""
 
     @request(MERGING)
     def merge(
@@ -56,7 +57,8 @@ class MergeRequests(RequestHandler):
         engine.set_merge_failure("")
 
         def failed(error: BaseException) -> None:
-            """Store and report why the merge failed, and suggest another initial alignment where that may help."""
+            """Store and report why the merge failed, and suggest another initial alignment where
+            that may help."""
             text = describe_failure(MERGING, error)
             if isinstance(error, Refused) and error.reason in ("overlap", "disagree"):
                 text = f"{text} {_ALTERNATIVES[start]}"

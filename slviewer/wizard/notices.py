@@ -26,14 +26,21 @@ class Notices:
     def add(self, level: Level, text: str, section: str = "") -> None:
         """Add a notice and log it, without passwords; `section`: of the help's page of findings."""
         text = hide_passwords(text)
-        log.log({"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO), "%s", text)
+        log.log(
+            {"warning": logging.WARNING, "error": logging.ERROR}.get(level, logging.INFO),
+            "%s",
+            text,
+        )
         with self._lock:
             self._count += 1
-            self._latest.append(Notice(self._count, level, text, datetime.now().astimezone(), section))
+            self._latest.append(
+                Notice(self._count, level, text, datetime.now().astimezone(), section)
+            )
         self._changed()
 
     def add_failure(self, action: str, error: BaseException) -> None:
-        """Add what `describe_failure` returns for the error that ended an action ("Calibrating")."""
+        """Add what `describe_failure` returns for the error that ended an action
+        ("Calibrating")."""
         self.add("error", describe_failure(action, error))
 
     def all(self) -> tuple[Notice, ...]:
@@ -43,13 +50,19 @@ class Notices:
 
 
 def describe_failure(action: str, error: BaseException) -> str:
-    """Describe an error to the operator in one sentence; an unexpected one is logged with its traceback."""
+    """Describe an error to the operator in one sentence; an unexpected one is logged with its
+    traceback."""
     if isinstance(error, SlviewerError):
         return str(error)
     log.error("%s failed", action, exc_info=error)
     if isinstance(error, MemoryError):
-        return f"{action} failed: out of memory. Close other programs, or use a smaller camera image"
+        return (
+            f"{action} failed: out of memory. Close other programs, or use a smaller camera image"
+        )
     if isinstance(error, OSError):
         where = f" ({error.filename})" if error.filename else ""
         return f"{action} failed: {error.strerror or error}{where}"
-    return f"{action} failed because of an error in the program ({type(error).__name__}); see the log for details"
+    return (
+        f"{action} failed because of an error in the program ({type(error).__name__}); see the log"
+        " for details"
+    )

@@ -1,7 +1,8 @@
 """The wizard without a browser: every request returns at once, and never raises.
 
-A request that cannot be granted becomes a notice, and returns False. Devices are used on the acquisition thread and
-the worker computes, so that requests may come from any thread, a browser's callbacks too.
+A request that cannot be granted becomes a notice, and returns False. Devices are used on the
+acquisition thread and the worker computes, so that requests may come from any thread, a browser's
+callbacks too.
 """
 
 import time
@@ -39,7 +40,9 @@ class AutopilotLike(Protocol):
         """Stop sending requests."""
 
 
-class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditRequests, ImportRequests):
+class Operator(
+    RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditRequests, ImportRequests
+):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(
@@ -81,11 +84,15 @@ class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditReq
         return self._engine.preview
 
     def subscribe(
-        self, callback: Callable[[Snapshot], None], preview: Callable[[PreviewView], None] | None = None
+        self,
+        callback: Callable[[Snapshot], None],
+        preview: Callable[[PreviewView], None] | None = None,
     ) -> Callable[[], None]:
-        """Call back with every new snapshot, and with every preview, each always on the same thread.
+        """Call back with every new snapshot, and with every preview, each always on the same
+        thread.
 
-        Returns a function that unsubscribes. A callback must return soon, and must not wait for another snapshot.
+        Returns a function that unsubscribes. A callback must return soon, and must not wait for
+        another snapshot.
         """
         removals = [self._engine.publisher.listeners.add(callback)]
         if preview is not None:
@@ -103,11 +110,13 @@ class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditReq
         return self._engine.notices.all()
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """Wait for the first snapshot for which `condition` holds, and return it; None after `timeout_s`."""
+        """Wait for the first snapshot for which `condition` holds, and return it; None after
+        `timeout_s`."""
         return self._engine.publisher.wait_for(condition, timeout_s)
 
     def wait_until_idle(self, timeout_s: float = 60.0) -> Snapshot:
-        """Wait until all captures, jobs and the plan of the next pose are complete; returns the snapshot.
+        """Wait until all captures, jobs and the plan of the next pose are complete; returns the
+        snapshot.
 
         Raises SlviewerError after `timeout_s`.
         """
@@ -119,7 +128,9 @@ class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditReq
                 end - time.monotonic(),
             )
             if idle is None:
-                raise SlviewerError(f"work is still running after {timeout_s:g} s: cancel it, or wait longer")
+                raise SlviewerError(
+                    f"work is still running after {timeout_s:g} s: cancel it, or wait longer"
+                )
             now = engine.publisher.refresh()
             if not _is_planning(now) and engine.publisher.is_current:
                 return now
@@ -148,7 +159,8 @@ class Operator(RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditReq
         self._engine.set_autopilot(act)
 
     def set_preparing(self, share: float | None) -> None:
-        """Set the share of the kernels that are compiled in the background; None: none are being compiled."""
+        """Set the share of the kernels that are compiled in the background; None: none are being
+        compiled."""
         self._engine.set_preparing(share)
 
     def notify(self, level: Level, text: str) -> None:

@@ -13,9 +13,11 @@ MOST_PLANS = 8
 
 
 class Planner:
-    """Provides the best plan available; `changed()` is called, on the planner's thread, when a better one is ready.
+    """Provides the best plan available; `changed()` is called, on the planner's thread, when a
+    better one is ready.
 
-    Only the latest request is computed. `compute` and `quick` are `plan_next_pose` and `quick_plan`.
+    Only the latest request is computed. `compute` and `quick` are `plan_next_pose` and
+    `quick_plan`.
     """
 
     def __init__(
@@ -27,16 +29,19 @@ class Planner:
         self._changed, self._compute, self._quick = changed, compute, quick
         self._lock = threading.Lock()
         self._plans: dict[object, PosePlan] = {}
-        self._latest: tuple[PlanInput, PosePlan] | None = None  # the last one that was computed and looked up
+        self._latest: tuple[PlanInput, PosePlan] | None = (
+            None  # the last one that was computed and looked up
+        )
         self._interim: tuple[object, PosePlan] | None = None
         self._requested: object = None
         self._worker = LatestWorker("slviewer planner", self._compute_plan)
 
     def look_up(self, given: PlanInput) -> tuple[PosePlan, bool]:
-        """Return (the best plan available, whether it is final). One that is not final is improved by `request`.
+        """Return (the best plan available, whether it is final). One that is not final is improved
+        by `request`.
 
-        Until then its poses are those of the last final plan for the same board and devices, and its
-        suggestion and sigma are that plan's as long as poses were only added.
+        Until then its poses are those of the last final plan for the same board and devices, and
+        its suggestion and sigma are that plan's as long as poses were only added.
         """
         with self._lock:
             final = self._plans.get(given.key)
@@ -51,11 +56,17 @@ class Planner:
         before, grown = None, False
         if latest is not None and latest[0].rig_key == given.rig_key:
             same = {name for name, _ in {*latest[0].hashes} & {*given.hashes}}
-            before = replace(latest[1], poses={name: T for name, T in latest[1].poses.items() if name in same})
+            before = replace(
+                latest[1], poses={name: T for name, T in latest[1].poses.items() if name in same}
+            )
             grown = latest[0].features.keys() <= same
         interim = self._quick(given, before)
         if before is not None and grown:
-            interim = replace(interim, sigma_mm=before.sigma_mm, suggestion=before.suggestion or interim.suggestion)
+            interim = replace(
+                interim,
+                sigma_mm=before.sigma_mm,
+                suggestion=before.suggestion or interim.suggestion,
+            )
         with self._lock:
             self._interim = given.key, interim
         return interim, False
@@ -73,7 +84,8 @@ class Planner:
         self._worker.close()
 
     def _compute_plan(self, given: PlanInput) -> None:
-        """Compute the requested plan on the planner's thread and store it; an interim plan where computing fails."""
+        """Compute the requested plan on the planner's thread and store it; an interim plan where
+        computing fails."""
         if given.key != self._requested:
             return
         try:
@@ -85,7 +97,8 @@ class Planner:
         self._changed()
 
     def _cache_plan(self, given: PlanInput, computed: PosePlan) -> PosePlan:
-        """Cache a final plan under its input's key, dropping the oldest where the cache is full; returns it."""
+        """Cache a final plan under its input's key, dropping the oldest where the cache is full;
+        returns it."""
         with self._lock:
             while len(self._plans) >= MOST_PLANS:
                 self._plans.pop(next(iter(self._plans)))

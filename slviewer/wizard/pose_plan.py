@@ -1,7 +1,7 @@
 """Where the target has been and should be held next, from the poses of a session.
 
-The first poses are spread by what they cover; from the third on, the rig is known well enough for its information
-matrix to say which pose adds most.
+The first poses are spread by what they cover; from the third on, the rig is known well enough for
+its information matrix to say which pose adds most.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,8 @@ from slviewer.target.board import Board
 
 @dataclass(frozen=True, eq=False)
 class PoseFeatures:
-    """Features of one pose: `points` (n, 3) mm on the board, their `camera` and `projector` (n, 2) px.
+    """Features of one pose: `points` (n, 3) mm on the board, their `camera` and `projector` (n, 2)
+    px.
 
     `noise_px`: noise of the projector's coordinates on bright places, px (NaN: unknown).
     """
@@ -46,11 +47,13 @@ class PoseFeatures:
 
 @dataclass(frozen=True, eq=False)
 class PlanInput:
-    """Input of a plan: the board, the sizes (width, height) px of both devices, the features of each pose that counts.
+    """Input of a plan: the board, the sizes (width, height) px of both devices, the features of
+    each pose that counts.
 
-    `stereo`: calibration (None: none that can be used). `focal_px`: the lens's nominal focal length. `refused`: number
-    of refused poses (as many suggestions failed and are passed over). `hashes`: {pose: hash of its frames}, and that of
-    the calibration under an empty name; equal inputs have equal `key`.
+    `stereo`: calibration (None: none that can be used). `focal_px`: the lens's nominal focal
+    length. `refused`: number of refused poses (as many suggestions failed and are passed over).
+    `hashes`: {pose: hash of its frames}, and that of the calibration under an empty name; equal
+    inputs have equal `key`.
     """
 
     board: Board
@@ -69,17 +72,23 @@ class PlanInput:
 
     @cached_property
     def key(self) -> tuple[object, ...]:
-        """Hashable key of the input: equal where board, devices, poses, calibration and focal length are."""
+        """Hashable key of the input: equal where board, devices, poses, calibration and focal
+        length are."""
         return *self.rig_key, self.hashes, self.focal_px, self.refused
 
     @cached_property
     def calibrated(self) -> StereoModel | None:
         """The stereo calibration, if its camera has this size; else None."""
-        return self.stereo if self.stereo is not None and self.stereo.rig.camera.size == self.camera else None
+        return (
+            self.stereo
+            if self.stereo is not None and self.stereo.rig.camera.size == self.camera
+            else None
+        )
 
     @property
     def takes_time(self) -> bool:
-        """Whether `plan_next_pose` evaluates a rig's information matrix (slow), rather than coverage alone."""
+        """Whether `plan_next_pose` evaluates a rig's information matrix (slow), rather than
+        coverage alone."""
         return self.calibrated is not None or len(self.features) >= MIN_POSES_FOR_RIG
 
     def initial_lens(self) -> Lens:
@@ -91,8 +100,8 @@ class PlanInput:
 
 
 USUAL_SIGMA = 4e-5
-"""Default of the wanted sigma, as a share of the middle depth: below a single point's noise, so that more poses would
-hardly improve a scan."""
+"""Default of the wanted sigma, as a share of the middle depth: below a single point's noise, so
+that more poses would hardly improve a scan."""
 MIN_POSES = 8
 """Fewer are never enough: errors show only where poses can be compared."""
 
@@ -101,9 +110,9 @@ MIN_POSES = 8
 class PosePlan:
     """Known poses, what they cover, and the suggestion for the next one.
 
-    ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have over the working
-    volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with the suggested pose added.
-    ``usual_mm``: the default of the wanted sigma.
+    ``sigma_mm``: the 3D standard deviation that a calibration from these poses is predicted to have
+    over the working volume (RMS), None before the rig is known well enough; ``sigma_next_mm``: with
+    the suggested pose added. ``usual_mm``: the default of the wanted sigma.
     """
 
     lens: Lens
@@ -115,8 +124,13 @@ class PosePlan:
     sigma_next_mm: float | None = None
 
     def reaches(self, wanted_mm: float) -> bool:
-        """Whether the predicted sigma is at most `wanted_mm` and there are at least `MIN_POSES` poses."""
-        return self.sigma_mm is not None and self.sigma_mm <= wanted_mm and len(self.poses) >= MIN_POSES
+        """Whether the predicted sigma is at most `wanted_mm` and there are at least `MIN_POSES`
+        poses."""
+        return (
+            self.sigma_mm is not None
+            and self.sigma_mm <= wanted_mm
+            and len(self.poses) >= MIN_POSES
+        )
 
 
 def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
@@ -136,10 +150,17 @@ def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
             return _plan_by_coverage(given, given.initial_lens(), {})
         rig, known = rough[0], dict(zip(given.features, rough[1], strict=True))
     spread = _plan_by_coverage(given, rig.camera, known, suggests=False)
-    expected = ExpectedNoise().with_noise(np.array([f.noise_px for f in poses]) / given.projector[0])
+    expected = ExpectedNoise().with_noise(
+        np.array([f.noise_px for f in poses]) / given.projector[0]
+    )
     try:
-        guidance = suggest_poses(GuidanceModel(rig, given.board, expected), list(spread.poses.values()), trials)
-    except (InputError, np.linalg.LinAlgError):  # devices that share no view: better coverage may repair it
+        guidance = suggest_poses(
+            GuidanceModel(rig, given.board, expected), list(spread.poses.values()), trials
+        )
+    except (
+        InputError,
+        np.linalg.LinAlgError,
+    ):  # devices that share no view: better coverage may repair it
         guidance = None
     if guidance is None:
         return _plan_by_coverage(given, rig.camera, known)
@@ -155,7 +176,8 @@ def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
 def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
     """Plan the next pose by coverage alone, in a few milliseconds.
 
-    Poses come from the calibration, else from the lens of the plan `before`, else from the initial lens.
+    Poses come from the calibration, else from the lens of the plan `before`, else from the initial
+    lens.
     """
     if given.calibrated is not None:
         return _plan_by_coverage(given, given.calibrated.rig.camera, given.calibrated.poses)
@@ -164,9 +186,11 @@ def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
     return _plan_by_coverage(given, given.initial_lens(), {})
 
 
-def _plan_by_coverage(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray], suggests: bool = True) -> PosePlan:
-    """Plan the next pose by coverage, with a suggestion if ``suggests``; poses (4, 4) that are not ``known`` are
-    estimated with the lens."""
+def _plan_by_coverage(
+    given: PlanInput, lens: Lens, known: Mapping[str, np.ndarray], suggests: bool = True
+) -> PosePlan:
+    """Plan the next pose by coverage, with a suggestion if ``suggests``; poses (4, 4) that are not
+    ``known`` are estimated with the lens."""
     poses = {}
     for name, one in given.features.items():
         T = known[name] if name in known else approximate_pose(one.points, one.camera, lens)
@@ -179,7 +203,9 @@ def _plan_by_coverage(given: PlanInput, lens: Lens, known: Mapping[str, np.ndarr
         return by_coverage
     reached = None
     if poses:
-        points = np.concatenate([given.features[n].points @ T[:3, :3].T + T[:3, 3] for n, T in poses.items()])
+        points = np.concatenate(
+            [given.features[n].points @ T[:3, :3].T + T[:3, 3] for n, T in poses.items()]
+        )
         projected = np.concatenate([given.features[n].projector for n in poses])
         reached = projector_reach(points, projected, given.projector)
     try:

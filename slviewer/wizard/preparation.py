@@ -1,7 +1,8 @@
-"""Compiles the kernels that the wizard needs, in a process of its own, while the operator makes the first choices.
+"""Compiles the kernels that the wizard needs, in a process of its own, while the operator makes the
+first choices.
 
-The process runs the wizard once on a small simulated rig. It is started where this version of the program has not run
-it yet; kernels that are compiled there are not compiled here (`geometry.jit`).
+The process runs the wizard once on a small simulated rig. It is started where this version of the
+program has not run it yet; kernels that are compiled there are not compiled here (`geometry.jit`).
 """
 
 import hashlib
@@ -32,11 +33,13 @@ _ACTS = 32  # of an autopilot with eight poses
 class Preparation:
     """The process that compiles.
 
-    ``report`` is called, on a thread of its own, with the share of its work that is done, and with None at the end.
-    ``command``: the process, which prints these shares.
+    ``report`` is called, on a thread of its own, with the share of its work that is done, and with
+    None at the end. ``command``: the process, which prints these shares.
     """
 
-    def __init__(self, report: Callable[[float | None], None], command: Sequence[str] = COMMAND) -> None:
+    def __init__(
+        self, report: Callable[[float | None], None], command: Sequence[str] = COMMAND
+    ) -> None:
         self._report, self._command = report, command
         self._process: subprocess.Popen[str] | None = None
         self._thread = threading.Thread(target=self._run, name="slviewer preparation", daemon=True)
@@ -59,7 +62,12 @@ class Preparation:
         pipe = subprocess.PIPE
         try:
             self._process = subprocess.Popen(
-                self._command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, env=environment
+                self._command,
+                stdin=pipe,
+                stdout=pipe,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                env=environment,
             )
         except OSError as error:  # kernels are then compiled when they are first used
             log.warning("kernels cannot be compiled beforehand: %s", error)
@@ -73,16 +81,21 @@ class Preparation:
 
 
 def prepared_file() -> Path | None:
-    """The file that exists once the kernels of these sources are compiled for this machine; None without a cache."""
+    """The file that exists once the kernels of these sources are compiled for this machine; None
+    without a cache."""
     root = cache_root()
     if root is None:
         return None
     compiler = f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()}"
-    return root / f"prepared-{hash_sources(__name__)}-{hashlib.blake2b(compiler.encode(), digest_size=8).hexdigest()}"
+    return (
+        root
+        / f"prepared-{hash_sources(__name__)}-{hashlib.blake2b(compiler.encode(), digest_size=8).hexdigest()}"
+    )
 
 
 def prepare() -> None:
-    """Run the wizard once on a small rig, and print the share that is done; ends when standard input is closed."""
+    """Run the wizard once on a small rig, and print the share that is done; ends when standard
+    input is closed."""
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(10)
@@ -96,14 +109,17 @@ def prepare() -> None:
         acts += 1
 
     with (
-        tempfile.TemporaryDirectory(prefix="slviewer-preparation-", ignore_cleanup_errors=True) as folder,
+        tempfile.TemporaryDirectory(
+            prefix="slviewer-preparation-", ignore_cleanup_errors=True
+        ) as folder,
         Operator(Path(folder, "session"), {**RIG, "scale": SCALE}) as operator,
     ):
         Autopilot(operator, poses=8, before=report).run()
 
 
 def _exit_with_parent() -> None:
-    """End this process once its standard input is closed, as it is when the parent ends in any way."""
+    """End this process once its standard input is closed, as it is when the parent ends in any
+    way."""
     sys.stdin.read()
     os._exit(1)
 

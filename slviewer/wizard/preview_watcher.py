@@ -1,7 +1,8 @@
 """Analyses the latest preview frame: the board, how bright it is, and whether anything moves.
 
-One thread makes previews and another detects the board, which takes longer, above all where there is none. Frames that
-arrive while a thread is busy replace one another, so that the latest is always the one analysed next.
+One thread makes previews and another detects the board, which takes longer, above all where there
+is none. Frames that arrive while a thread is busy replace one another, so that the latest is always
+the one analysed next.
 """
 
 import threading
@@ -29,10 +30,11 @@ SEARCH_PX = 800
 """Longest side of the image in which the board is detected, and which panels show."""
 BINS = 64
 STILL_PX = 0.004
-"""A board whose features move less than this share of the image's width between two looks is held still."""
-_UNCHANGED = (
-    6.0  # 99 % of a thumbnail's grey levels differ by less where nothing moved: a board's edges, by a fifth of a px
-)
+"""A board whose features move less than this share of the image's width between two looks is held
+still."""
+# 99 % of a thumbnail's grey levels differ by less where nothing moved: a board's edges, by a fifth
+# of a px
+_UNCHANGED = 6.0
 _THUMBNAIL_PX = 160
 HOLD_S = 1.0  # for which a board is held still before a hands-free countdown starts
 COUNT_S = 1.0  # of the countdown
@@ -72,7 +74,8 @@ class LatestWorker(Generic[Item]):
         self._thread.join(2.0)
 
     def _serve(self) -> None:
-        """Process the latest item until closing, pausing `rest` times its duration; failures are logged."""
+        """Process the latest item until closing, pausing `rest` times its duration; failures are
+        logged."""
         while True:
             with self._condition:
                 self._condition.wait_for(lambda: self._closing or self._item is not None)
@@ -86,7 +89,9 @@ class LatestWorker(Generic[Item]):
             except Exception:  # one bad item must not end the thread
                 log.exception("%s failed", threading.current_thread().name)
             with self._condition:
-                self._condition.wait_for(lambda: self._closing, self._rest * (time.monotonic() - begun))
+                self._condition.wait_for(
+                    lambda: self._closing, self._rest * (time.monotonic() - begun)
+                )
 
 
 class Watcher:
@@ -97,14 +102,17 @@ class Watcher:
         self._watch = Watch()
         self._result: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
         self._stillness = Stillness()
-        self._searched: tuple[Board | None, np.ndarray] | None = None  # the board, and a thumbnail of the last image
+        self._searched: tuple[Board | None, np.ndarray] | None = (
+            None  # the board, and a thumbnail of the last image
+        )
         self._detected: tuple[Detection | None, str] = (None, "")
         self._number, self._rate, self._last = 0, 0.0, 0.0
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
         self._viewer = LatestWorker("slviewer preview", self._make_preview)
 
     def offer(self, frame: np.ndarray, full_scale: int | None = None) -> None:
-        """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what the camera states."""
+        """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what
+        the camera states."""
         self._viewer.offer((frame, full_scale))
 
     def watch(self, target: Watch) -> None:
@@ -117,7 +125,8 @@ class Watcher:
         self._detector.close()
 
     def _make_preview(self, item: tuple[np.ndarray, int | None]) -> None:
-        """Reduce a frame (h, w), offer it for board detection, and publish a preview with the latest detection.
+        """Reduce a frame (h, w), offer it for board detection, and publish a preview with the
+        latest detection.
 
         ``item``: the frame, and the full scale that the camera states.
         """
@@ -138,20 +147,30 @@ class Watcher:
         self._analysed(PreviewView(self._number, image, scale, *light, board, missing, None, rate))
 
     def _detect(self, item: tuple[np.ndarray, float, float]) -> None:
-        """Detect the board in (reduced image, its scale, time in s), and store it, or why there is none.
+        """Detect the board in (reduced image, its scale, time in s), and store it, or why there is
+        none.
 
         An image in which nothing has moved is not searched again.
         """
         image, scale, time_s = item
         watch, board = self._watch, None
         thumbnail = reduced(image, _THUMBNAIL_PX)[0]
-        if self._searched is None or self._searched[0] != watch.board or _differs(thumbnail, self._searched[1]):
-            self._searched, self._detected = (watch.board, thumbnail), detect_in_preview(watch.board, image)
+        if (
+            self._searched is None
+            or self._searched[0] != watch.board
+            or _differs(thumbnail, self._searched[1])
+        ):
+            self._searched, self._detected = (
+                (watch.board, thumbnail),
+                detect_in_preview(watch.board, image),
+            )
         detection, missing = self._detected
         if detection is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
             detection = replace(detection, pixels=(detection.pixels + 0.5) / scale - 0.5)
-            still = self._stillness.update(detection.pixels, STILL_PX * image.shape[1] / scale, time_s)
+            still = self._stillness.update(
+                detection.pixels, STILL_PX * image.shape[1] / scale, time_s
+            )
             board = observe_board(watch.board, detection, still, watch.lens, time_s)
         else:
             self._stillness.reset()
@@ -166,9 +185,14 @@ class Stillness:
         self._since = 0.0
 
     def update(self, pixels: np.ndarray, tolerance_px: float, now: float) -> float:
-        """Return the seconds since features (n, 2) px last moved more than `tolerance_px` from their rest position."""
+        """Return the seconds since features (n, 2) px last moved more than `tolerance_px` from
+        their rest position."""
         before = self._pixels
-        if before is None or before.shape != pixels.shape or np.abs(pixels - before).max() > tolerance_px:
+        if (
+            before is None
+            or before.shape != pixels.shape
+            or np.abs(pixels - before).max() > tolerance_px
+        ):
             self._pixels, self._since = pixels, now
         return now - self._since
 
@@ -177,30 +201,44 @@ class Stillness:
         self._pixels = None
 
 
-def reduced(frame: np.ndarray, longest_px: int = SEARCH_PX, full_scale: int | None = None) -> tuple[np.ndarray, float]:
-    """Reduce a frame (h, w) to uint8 with at most ``longest_px`` on its longer side; returns (image, scale)."""
+def reduced(
+    frame: np.ndarray, longest_px: int = SEARCH_PX, full_scale: int | None = None
+) -> tuple[np.ndarray, float]:
+    """Reduce a frame (h, w) to uint8 with at most ``longest_px`` on its longer side; returns
+    (image, scale)."""
     scale = min(1.0, longest_px / max(frame.shape))
-    small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
+    small = (
+        cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        if scale < 1
+        else frame
+    )
     return to_eight_bits(small, full_scale, int(frame.max(initial=0))), scale
 
 
 def _differs(image: np.ndarray, before: np.ndarray) -> bool:
     """Whether anything has moved between two thumbnails (h, w) uint8."""
-    return image.shape != before.shape or float(np.percentile(cv2.absdiff(image, before), 99)) >= _UNCHANGED
+    return (
+        image.shape != before.shape
+        or float(np.percentile(cv2.absdiff(image, before), 99)) >= _UNCHANGED
+    )
 
 
 def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float, float, np.ndarray]:
-    """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,) of shares)."""
+    """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,)
+    of shares)."""
     top = clip_level(frame.dtype, int(frame.max(initial=0)), full_scale)
     some = frame[:: max(1, frame.shape[0] // 400), :: max(1, frame.shape[1] // 400)]
     by_level = np.bincount(some.ravel(), minlength=int(top) + 1)
     brightest = int(np.searchsorted(by_level.cumsum(), 0.995 * some.size))
-    shares = np.histogram(np.arange(len(by_level)), BINS, (0, top + 1), weights=by_level / some.size)[0]
+    shares = np.histogram(
+        np.arange(len(by_level)), BINS, (0, top + 1), weights=by_level / some.size
+    )[0]
     return float(by_level[int(top) :].sum()) / some.size, brightest / top, shares
 
 
 def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection | None, str]:
-    """Detect the board in a reduced image; returns (detection, "") or (None, why it was not detected)."""
+    """Detect the board in a reduced image; returns (detection, "") or (None, why it was not
+    detected)."""
     if board is None:
         return None, ""
     try:
@@ -212,7 +250,8 @@ def detect_in_preview(board: Board | None, image: np.ndarray) -> tuple[Detection
 def observe_board(
     board: Board, detection: Detection, still_s: float, lens: Lens | None, time_s: float
 ) -> BoardSeen | None:
-    """Return the detected board for display: outline (4, 2) px, approximate pose; None with fewer than 4 features."""
+    """Return the detected board for display: outline (4, 2) px, approximate pose; None with fewer
+    than 4 features."""
     points = board.points[detection.ids]
     if len(points) < 4:
         return None
@@ -222,13 +261,16 @@ def observe_board(
 
 
 class HandsFree:
-    """Decides when to capture hands-free: ``count_s`` after the board was held still for ``hold_s`` in a new place."""
+    """Decides when to capture hands-free: ``count_s`` after the board was held still for ``hold_s``
+    in a new place."""
 
     def __init__(self, hold_s: float = HOLD_S, count_s: float = COUNT_S) -> None:
         self._hold_s, self._count_s = hold_s, count_s
         self.is_on = False
         self._captured: np.ndarray | None = None  # the board's outline at the last capture
-        self._requested: float | None = None  # when the last capture was, until the board is detected after it
+        self._requested: float | None = (
+            None  # when the last capture was, until the board is detected after it
+        )
         self._begun: float | None = None
 
     def switch(self, on: bool) -> None:
@@ -236,11 +278,22 @@ class HandsFree:
         self.is_on = on
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
-        """Return the seconds until the capture, 0 or less when it is due; None where none is coming."""
-        if self._requested is not None and not busy and board is not None and board.time_s > self._requested:
+        """Return the seconds until the capture, 0 or less when it is due; None where none is
+        coming."""
+        if (
+            self._requested is not None
+            and not busy
+            and board is not None
+            and board.time_s > self._requested
+        ):
             self._captured, self._requested = board.outline, None
         held = self.is_on and self._requested is None and board is not None and not busy
-        if not held or board is None or board.still_s < self._hold_s or self._is_captured(board.outline):
+        if (
+            not held
+            or board is None
+            or board.still_s < self._hold_s
+            or self._is_captured(board.outline)
+        ):
             self._begun = None
             return None
         if self._begun is None:
@@ -248,11 +301,13 @@ class HandsFree:
         return self._count_s - (now - self._begun)
 
     def note_capture(self) -> None:
-        """Note that a capture was requested; the board's outline in the next preview is then the captured place."""
+        """Note that a capture was requested; the board's outline in the next preview is then the
+        captured place."""
         self._requested, self._begun = time.monotonic(), None
 
     def _is_captured(self, outline: np.ndarray) -> bool:
-        """Whether the outline (4, 2) px is within 3 % of the board's size of the last captured one."""
+        """Whether the outline (4, 2) px is within 3 % of the board's size of the last captured
+        one."""
         if self._captured is None:
             return False
         size = np.linalg.norm(np.ptp(outline, axis=0))

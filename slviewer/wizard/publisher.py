@@ -1,4 +1,5 @@
-"""Snapshots for listeners: one thread builds and publishes them, one for many changes that come together."""
+"""Snapshots for listeners: one thread builds and publishes them, one for many changes that come
+together."""
 
 import threading
 import time
@@ -13,7 +14,8 @@ PAUSE_S = 0.05
 """Between two snapshots: a panel needs no more than twenty a second."""
 REFRESH_S = 30.0
 RETRY_S = 2.0
-"""After a snapshot that is not the current state, until the next is built although nothing is known to have changed."""
+"""After a snapshot that is not the current state, until the next is built although nothing is known
+to have changed."""
 
 Item = TypeVar("Item")
 
@@ -49,13 +51,15 @@ class Listeners(Generic[Item]):
 class Publisher:
     """Builds a snapshot when something has changed, and publishes it to every listener.
 
-    Where that fails, the last snapshot is published again with the reason as its `read_failure`, and another is built
-    every ``retry_s`` until one succeeds.
+    Where that fails, the last snapshot is published again with the reason as its `read_failure`,
+    and another is built every ``retry_s`` until one succeeds.
 
     `build(version, session_changed)` and the listeners are called on the publisher's thread alone.
     """
 
-    def __init__(self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float = RETRY_S) -> None:
+    def __init__(
+        self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float = RETRY_S
+    ) -> None:
         self._build, self._retry_s = build, retry_s
         self._condition = threading.Condition()
         self._requested = self._published = 0  # changes: counted, and those that listeners know
@@ -86,12 +90,14 @@ class Publisher:
 
     @property
     def is_current(self) -> bool:
-        """Whether the latest snapshot contains every change, and every listener has been called with it."""
+        """Whether the latest snapshot contains every change, and every listener has been called
+        with it."""
         with self._condition:
             return self._requested == self._published
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
-        """Wait for the first snapshot for which `condition` holds, and return it; None after `timeout_s`."""
+        """Wait for the first snapshot for which `condition` holds, and return it; None after
+        `timeout_s`."""
         end = time.monotonic() + timeout_s
         with self._condition:
             while not condition(self.latest):
@@ -109,7 +115,8 @@ class Publisher:
         self._thread.join(5.0)
 
     def _serve(self) -> None:
-        """Build and publish a snapshot after each batch of changes, or after a failure, until closing."""
+        """Build and publish a snapshot after each batch of changes, or after a failure, until
+        closing."""
         while True:
             with self._condition:
                 self._condition.wait_for(
@@ -118,7 +125,10 @@ class Publisher:
                 )
                 if self._closing:
                     return
-                requested, session = self._requested, self._session_changed or bool(self.latest.read_failure)
+                requested, session = (
+                    self._requested,
+                    self._session_changed or bool(self.latest.read_failure),
+                )
                 self._session_changed = self._urgent = False
             version = self.latest.version + 1
             try:

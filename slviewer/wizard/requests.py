@@ -29,11 +29,14 @@ class RequestHandler:
         describe: Callable[[T], str],
         failed: Callable[[BaseException], None] | None = None,
     ) -> None:
-        """Queue a job; `describe(result)` becomes a notice, and `failed(error)` replaces the notice of a failure."""
+        """Queue a job; `describe(result)` becomes a notice, and `failed(error)` replaces the notice
+        of a failure."""
 
         def done(result: T) -> None:
             """Add the description of the result to the notices, and mark the session as changed."""
-            is_good = not isinstance(result, Findings) or all(each.is_good for each in result.values())
+            is_good = not isinstance(result, Findings) or all(
+                each.is_good for each in result.values()
+            )
             if text := describe(result):
                 self._engine.notices.add("good" if is_good else "warning", text)
             self._engine.publisher.mark_changed(session=True)
@@ -50,7 +53,8 @@ class RequestHandler:
     ) -> None:
         """Queue an operation on the session; the summary of what it found becomes a notice.
 
-        A calibration that the operator uses although it was rejected is used. ``section``: of the help, of warnings.
+        A calibration that the operator uses although it was rejected is used. ``section``: of the
+        help, of warnings.
         """
         store, warn = self._engine.store, self._warner(section)
 
@@ -70,7 +74,8 @@ Request = Callable[Concatenate[Any, P], bool]
 
 
 def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], Request[P]]:
-    """Return a decorator: the method then returns whether its request was granted, and an error becomes a notice."""
+    """Return a decorator: the method then returns whether its request was granted, and an error
+    becomes a notice."""
 
     def decorate(function: Callable[Concatenate[Handler, P], None]) -> Request[P]:
         """Wrap a method as a request."""

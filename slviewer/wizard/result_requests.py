@@ -1,4 +1,5 @@
-"""Requests to calibrate, verify, reconstruct and export, and to choose what results are made from."""
+"""Requests to calibrate, verify, reconstruct and export, and to choose what results are made
+from."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -70,7 +71,9 @@ class ResultRequests(RequestHandler):
         engine, target = self._engine, self._engine.reader.target()
         if not target:
             raise InputError("choose the target first")
-        calibrate = partial(tasks.calibrate_session, engine.store, target, warn=self._warner("calibration"))
+        calibrate = partial(
+            tasks.calibrate_session, engine.store, target, warn=self._warner("calibration")
+        )
 
         def done(result: CalibrationResult) -> None:
             """Report the result of the calibration, and mark the session as changed."""
@@ -80,14 +83,19 @@ class ResultRequests(RequestHandler):
         def failed(error: BaseException) -> None:
             """Report why the calibration failed, and mark the session as changed."""
             engine.notices.add_failure("Calibrating", error)
-            engine.publisher.mark_changed(session=True)  # a rejected calibration is saved, to be inspected
+            engine.publisher.mark_changed(
+                session=True
+            )  # a rejected calibration is saved, to be inspected
 
         engine.jobs.submit("Calibrating", calibrate, done, failed=failed)
 
     @request("Comparing the models")
     def compare_models(self) -> None:
-        """Cross-validate the models on the target poses; the best one is then recommended, and used."""
-        compare = partial(tasks.compare_models, self._engine.store, warn=self._warner("calibration"))
+        """Cross-validate the models on the target poses; the best one is then recommended, and
+        used."""
+        compare = partial(
+            tasks.compare_models, self._engine.store, warn=self._warner("calibration")
+        )
         self._submit("Comparing the models", compare, tasks.describe_comparison)
 
     @request("Choosing the model")
@@ -95,7 +103,9 @@ class ResultRequests(RequestHandler):
         """Set the model that later steps use; empty: the recommended one."""
         store = self._engine.store
         if name and name not in (models := available_models(store)):
-            raise InputError(f"the session has no {name} calibration: choose one of {', '.join(models)}")
+            raise InputError(
+                f"the session has no {name} calibration: choose one of {', '.join(models)}"
+            )
         store.decide("model", name or None)
 
     @request("Using the rejected calibration")
@@ -105,28 +115,39 @@ class ResultRequests(RequestHandler):
 
     @request("Verifying")
     def verify(self, names: Sequence[str], shape: Shape, radius_mm: float | None = None) -> None:
-        """Compare the models on captures of a plane or a sphere; `radius_mm` helps to detect a sphere."""
+        """Compare the models on captures of a plane or a sphere; `radius_mm` helps to detect a
+        sphere."""
         store = self._engine.store
         chosen = [store.load_capture(name).name for name in names]
-        self._run("Verifying", verify, VerifySettings(chosen, shape, radius=radius_mm, check=False), "scans")
+        self._run(
+            "Verifying",
+            verify,
+            VerifySettings(chosen, shape, radius=radius_mm, check=False),
+            "scans",
+        )
 
     @request("Reconstructing")
     def reconstruct(self, name: str, model: ModelName | None = None) -> None:
         """Reconstruct a capture, with the best model unless one is named."""
         self._engine.store.load_capture(name)
-        self._run("Reconstructing", reconstruct, ReconstructSettings(name, model, check=False), "scans")
+        self._run(
+            "Reconstructing", reconstruct, ReconstructSettings(name, model, check=False), "scans"
+        )
 
     @request("Running the operation")
     def run(self, operation: str, **settings: Any) -> None:
         """Run any operation by the name of its command, with its settings."""
         if operation not in OPERATIONS:
-            raise InputError(f"there is no operation {operation!r}: choose one of {', '.join(OPERATIONS)}")
+            raise InputError(
+                f"there is no operation {operation!r}: choose one of {', '.join(OPERATIONS)}"
+            )
         chosen = OPERATIONS[operation]
         self._run(operation.capitalize(), chosen, chosen.settings(**settings))
 
     @request("Aligning")
     def align(self, *names: str) -> None:
-        """Align reconstructed scans to those in place; without names all that were not aligned yet."""
+        """Align reconstructed scans to those in place; without names all that were not aligned
+        yet."""
         chosen = [self._engine.store.load_capture(name).name for name in names]
         self._run("Aligning", align, AlignSettings(chosen, only_reconstructed=True), "merge")
 
@@ -137,7 +158,8 @@ class ResultRequests(RequestHandler):
 
     @request("Switching the alignment of scans")
     def set_align_scans(self, on: bool) -> None:
-        """Align each new scan to those before it as soon as it is reconstructed; those that are there at once."""
+        """Align each new scan to those before it as soon as it is reconstructed; those that are
+        there at once."""
         self._engine.store.decide("align_scans", on or None)
         if on:
             self.align()
@@ -159,8 +181,9 @@ class ResultRequests(RequestHandler):
         white: str = "",
     ) -> None:
         """Write a file into the session's exports. `export.formats` lists the formats, the first is
-        the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is the current
-        one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj; `white`: its white balance.
+        the default. `name`: the scan of a cloud or a mesh, the model of coefficients; a merge is
+        the current one. `plan`: how to mesh; `texture`: side of its image, px, of a .glb or .obj;
+        `white`: its white balance.
         """
         store, view = self._engine.store, self._engine.publisher.refresh().session
         chosen = file_format or formats(what)[0]
@@ -176,7 +199,15 @@ class ResultRequests(RequestHandler):
         self._submit(
             "Exporting",
             partial(
-                export_file, store, what, name, chosen, plan, texture, warn=self._warner("measurements"), white=white
+                export_file,
+                store,
+                what,
+                name,
+                chosen,
+                plan,
+                texture,
+                warn=self._warner("measurements"),
+                white=white,
             ),
             str,
         )
@@ -187,11 +218,14 @@ class ResultRequests(RequestHandler):
 
     @request("Collecting diagnostics")
     def diagnostic_bundle(self) -> None:
-        """Write a zip with versions, settings, logs and small previews, without frames, into the exports."""
+        """Write a zip with versions, settings, logs and small previews, without frames, into the
+        exports."""
         engine = self._engine
         store, snapshot = engine.store, engine.publisher.refresh()
         self._submit(
             "Collecting diagnostics",
-            lambda report: diagnostics.write_bundle(store, snapshot, engine.preview, engine.log, report),
+            lambda report: diagnostics.write_bundle(
+                store, snapshot, engine.preview, engine.log, report
+            ),
             lambda file_name: f"{file_name} is ready to download",
         )

@@ -1,4 +1,5 @@
-"""What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here changes the session."""
+"""What panels draw from a session beyond the snapshot: clouds, error maps, curves. Nothing here
+changes the session."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -27,10 +28,11 @@ THUMBNAIL_PX = 240
 
 @dataclass(frozen=True, eq=False)
 class ScanCloud:
-    """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`, `phase` (rad),
-    `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3) uint8; `errors` of `load_error_maps`.
-    `sigma_calibration` (h, w) float32 mm is what the calibration's own uncertainty adds, `sigma_edges` what blur at
-    edges does; None where it is not known.
+    """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`,
+    `phase` (rad), `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3)
+    uint8; `errors` of `load_error_maps`. `sigma_calibration` (h, w) float32 mm is what the
+    calibration's own uncertainty adds, `sigma_edges` what blur at edges does; None where it is not
+    known.
     """
 
     name: str
@@ -51,13 +53,17 @@ class ScanCloud:
         return int(np.count_nonzero(np.isfinite(self.points[..., 2])))
 
     def nearest(self, origin: np.ndarray, direction: np.ndarray) -> tuple[int, int] | None:
-        """Return (u, v) of the measured pixel closest to a ray (camera frame, mm); None if none is near."""
+        """Return (u, v) of the measured pixel closest to a ray (camera frame, mm); None if none is
+        near."""
         index = nearest(self.points, origin, direction)
         return None if index is None else (index[1], index[0])
 
 
-def nearest(points: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tuple[int, ...] | None:
-    """Return the index of the point (..., 3) closest to a ray, within 1 % of its depth, the front before the back.
+def nearest(
+    points: np.ndarray, origin: np.ndarray, direction: np.ndarray
+) -> tuple[int, ...] | None:
+    """Return the index of the point (..., 3) closest to a ray, within 1 % of its depth, the front
+    before the back.
 
     None where there is none; NaN points are ignored.
     """
@@ -78,22 +84,29 @@ def load_scan_cloud(session: Session, name: str) -> ScanCloud:
 
 
 def used_points(session: Session, cloud: ScanCloud) -> ScanCloud:
-    """Return a scan's cloud with NaN for what edits and region remove. InputError where nothing remains."""
+    """Return a scan's cloud with NaN for what edits and region remove. InputError where nothing
+    remains."""
     if session.load_capture(cloud.name).role != "scan":
         return cloud
     kept = restriction_mask(session, cloud.name, cloud.points, load_region(session))
-    return cloud if kept is None else replace(cloud, points=np.where(kept[..., None], cloud.points, np.float32(np.nan)))
+    return (
+        cloud
+        if kept is None
+        else replace(cloud, points=np.where(kept[..., None], cloud.points, np.float32(np.nan)))
+    )
 
 
 def whole_cloud(session: Session, name: str) -> ScanCloud:
-    """Load the reconstructed cloud of a capture with all of its points. Raises InputError where there is none."""
+    """Load the reconstructed cloud of a capture with all of its points. Raises InputError where
+    there is none."""
     meta, arrays = session.load_result(f"clouds/{name}")
     errors = load_error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
 
 
 def load_error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
-    """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where not measured."""
+    """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where
+    not measured."""
     arrays = session.load_result(f"verify/{name}")[1]
     return {key.removeprefix("error_"): array for key, array in arrays.items()}
 
@@ -116,23 +129,32 @@ def pixel_fits(session: Session) -> Mapping[Axis, PixelFit]:
 
 
 def pixel_curve(session: Session, pixel: tuple[int, int], axis: Axis) -> PixelCurve | None:
-    """Return the data and fit of z-phi, x-z, y-z at a pixel (u, v); None where it was not fitted."""
+    """Return the data and fit of z-phi, x-z, y-z at a pixel (u, v); None where it was not
+    fitted."""
     model = load_model(session, "pixelwise")
     stereo = load_stereo(session)
     assert isinstance(model, PixelwiseModel)
     if axis not in model.fits:
-        raise InputError(f"the pixel-wise model has no axis {axis}: choose one of {', '.join(model.fits)}")
+        raise InputError(
+            f"the pixel-wise model has no axis {axis}: choose one of {', '.join(model.fits)}"
+        )
     h, w = model.fits[axis].rms_mm.shape[1:]
     if not (0 <= pixel[0] < w and 0 <= pixel[1] < h):
-        raise InputError(f"pixel {pixel} lies outside the camera's {w}x{h}: give column and row, counted from 0")
+        raise InputError(
+            f"pixel {pixel} lies outside the camera's {w}x{h}: give column and row, counted from 0"
+        )
     return curve_at(pixel, model, stereo, load_observations(session, list(stereo.poses)), axis)
 
 
 def make_thumbnail(capture: Capture) -> bytes:
-    """Return a small JPEG of the capture's texture, or of its brightest kind of frame where it has none."""
+    """Return a small JPEG of the capture's texture, or of its brightest kind of frame where it has
+    none."""
     order = ("texture", "white", "phase", "gray")
     frames = capture.sequence.frames
-    index = min(range(len(frames)), key=lambda k: order.index(frames[k].kind) if frames[k].kind in order else 9)
+    index = min(
+        range(len(frames)),
+        key=lambda k: order.index(frames[k].kind) if frames[k].kind in order else 9,
+    )
     image = capture.stack([index])[0]
     choice = capture.exposure_choice
     if choice is not None:

@@ -1,4 +1,5 @@
-"""Reads what a session's files contain, for the panels. Nothing is cached but what would be read again the same."""
+"""Reads what a session's files contain, for the panels. Nothing is cached but what would be read
+again the same."""
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -67,8 +68,8 @@ T = TypeVar("T")
 class _Inputs:
     """Current inputs, to detect stale results.
 
-    Captures by name, the operator's labels, hashes of captures and of fresh calibrations, and {model: correction of
-    scale}.
+    Captures by name, the operator's labels, hashes of captures and of fresh calibrations, and
+    {model: correction of scale}.
     """
 
     captures: Mapping[str, Capture]
@@ -77,9 +78,11 @@ class _Inputs:
     factors: Mapping[str, float]
 
     def is_fresh(self, meta: Mapping[str, Any]) -> bool:
-        """Whether every input of a result still has the hash it was made from, and no scale has changed since."""
+        """Whether every input of a result still has the hash it was made from, and no scale has
+        changed since."""
         return not (
-            _has_changed(meta.get("inputs", {}), self.hashes) or _has_changed(meta.get("scales", {}), self.factors)
+            _has_changed(meta.get("inputs", {}), self.hashes)
+            or _has_changed(meta.get("scales", {}), self.factors)
         )
 
 
@@ -102,7 +105,8 @@ class SessionReader:
             self._thumbnails[capture.hash] = jpeg
 
     def add_features(self, capture: Capture, target: str, observation: Observation) -> None:
-        """Store the features of a pose whose frames are still being examined, for the plan of the next pose."""
+        """Store the features of a pose whose frames are still being examined, for the plan of the
+        next pose."""
         sigma = observation.samples.sigma if observation.samples else np.zeros(0)
         with self._lock:
             seen = observation.points, observation.camera, observation.projector
@@ -114,7 +118,8 @@ class SessionReader:
             self._unreadable[capture.name, capture.hash, self.target()] = why
 
     def target(self) -> str:
-        """Return the board's notation, empty where it is unknown or a board of a plugin that is not installed."""
+        """Return the board's notation, empty where it is unknown or a board of a plugin that is not
+        installed."""
         notation = find_target(self.session)
         return "" if explain_board(notation) else notation
 
@@ -128,20 +133,28 @@ class SessionReader:
 
     def needs_judging(self, capture: Capture, target: str) -> bool:
         """Whether this is a target pose whose features were not read with this target yet."""
-        if capture.role != "calibration" or not target or (capture.name, capture.hash, target) in self._unreadable:
+        if (
+            capture.role != "calibration"
+            or not target
+            or (capture.name, capture.hash, target) in self._unreadable
+        ):
             return False
         return self._load_judgement(capture, target) is None
 
     def count_frames(self, rig: RigView) -> int | None:
-        """Return the number of frames of the next pose; None where the projector's size is unknown."""
+        """Return the number of frames of the next pose; None where the projector's size is
+        unknown."""
         if rig.projector is None:
             return None
         patterns, projector = self.patterns(), rig.projector
-        shown = self._get_cached(("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames))
+        shown = self._get_cached(
+            ("frames", patterns, projector), lambda: len(PRESETS[patterns](projector).frames)
+        )
         return int(shown) * max(1, len(self.exposures_ms()))
 
     def levels(self) -> tuple[int, ...] | None:
-        """Return the table of grey levels that linearises the projector; None where it is not used."""
+        """Return the table of grey levels that linearises the projector; None where it is not
+        used."""
         return tuple(int(level) for level in self.session.valid_decision("levels") or ()) or None
 
     def exposures_ms(self) -> tuple[float, ...]:
@@ -149,23 +162,29 @@ class SessionReader:
         return tuple(float(exposure) for exposure in self.session.valid_decision("exposures") or ())
 
     def read(self, rig: RigView, focal_px: float | None) -> SessionView:
-        """Read the session's current state; what is damaged is missing from it, and named in its `faults`.
+        """Read the session's current state; what is damaged is missing from it, and named in its
+        `faults`.
 
-        `rig` has the devices' sizes until there are poses, `focal_px` is its lens's nominal focal length.
+        `rig` has the devices' sizes until there are poses, `focal_px` is its lens's nominal focal
+        length.
         """
         session, target = self.session, self.target()
         sound, faults = session.read_captures()
         unknown = explain_board(find_target(session))
         self._faults = [*faults.values(), *session.decision_faults(), *filter(None, [unknown])]
         captures = {capture.name: capture for capture in sound}
-        calibration = self._attempt("the calibration", lambda: self._read_calibration(captures), None)
+        calibration = self._attempt(
+            "the calibration", lambda: self._read_calibration(captures), None
+        )
         scans = [capture.name for capture in sound if capture.role == "scan"]
         inputs = self._read_inputs(captures, scans, calibration.models if calibration else ())
         poses, plan, pending = self._read_poses(captures, target, calibration, rig, focal_px)
         records = self._read_records(inputs)
         of_scan = {name: [each for each in records if each.name == name] for name in scans}
         verdict = self._attempt("the verdict", lambda: load_last_verdict(session), None)
-        of_calibration = calibration is not None and _is_verdict_of(verdict, self._load_meta("calibration/stereo"))
+        of_calibration = calibration is not None and _is_verdict_of(
+            verdict, self._load_meta("calibration/stereo")
+        )
         return SessionView(
             folder=session.folder,
             target=target,
@@ -173,14 +192,19 @@ class SessionReader:
             poses=poses,
             plan=plan,
             pending_plan=pending,
-            wanted_mm=float(session.valid_decision("sigma_wanted_mm") or 0.0) or (plan.usual_mm if plan else 0.0),
+            wanted_mm=float(session.valid_decision("sigma_wanted_mm") or 0.0)
+            or (plan.usual_mm if plan else 0.0),
             calibration=calibration,
             verdict=verdict,
             verdict_of_calibration=of_calibration,
             records=records,
             scans=tuple(self._read_scan(captures[name], of_scan[name], inputs) for name in scans),
-            measurements=self._attempt("the measurements", lambda: self._read_measurements(inputs), ()),
-            deleted_measurements=sum(name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()),
+            measurements=self._attempt(
+                "the measurements", lambda: self._read_measurements(inputs), ()
+            ),
+            deleted_measurements=sum(
+                name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()
+            ),
             nominals=list_nominals(session.folder),
             plans=list_plans(session.folder),
             inspection=self._attempt("the inspection", lambda: self._read_inspection(inputs), None),
@@ -188,17 +212,24 @@ class SessionReader:
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
             aligns_scans=bool(session.valid_decision("align_scans")),
-            region=self._attempt("the region", lambda: load_region(session, even_if_off=True), None),
+            region=self._attempt(
+                "the region", lambda: load_region(session, even_if_off=True), None
+            ),
             region_is_on=bool((session.valid_decision("region") or {}).get("on")),
             deleted_poses=tuple(session.deleted_captures("calibration")),
             deleted_scans=tuple(session.deleted_captures("scan")),
             faults=tuple(dict.fromkeys(self._faults)),
         )
 
-    def _read_inputs(self, captures: Mapping[str, Capture], scans: Sequence[str], models: Sequence[str]) -> _Inputs:
-        """Read the current inputs of results: captures, edits of scans, and calibrations of these models."""
+    def _read_inputs(
+        self, captures: Mapping[str, Capture], scans: Sequence[str], models: Sequence[str]
+    ) -> _Inputs:
+        """Read the current inputs of results: captures, edits of scans, and calibrations of these
+        models."""
         session = self.session
-        cuts = self._attempt("edits and region", lambda: restriction_inputs(session, scans), dict[str, str]())
+        cuts = self._attempt(
+            "edits and region", lambda: restriction_inputs(session, scans), dict[str, str]()
+        )
         hashes = cuts | {name: capture.hash for name, capture in captures.items()}
         for name in (f"calibration/{model}" for model in models):
             meta = self._load_meta(name)
@@ -208,7 +239,8 @@ class SessionReader:
         return _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
 
     def _attempt(self, what: str, read: Callable[[], T], otherwise: T) -> T:
-        """Return what `read()` returns, or `otherwise` where that fails, which is one of the session's faults then."""
+        """Return what `read()` returns, or `otherwise` where that fails, which is one of the
+        session's faults then."""
         try:
             return read()
         except Exception as error:  # damaged files may make their reader fail in any way
@@ -218,12 +250,19 @@ class SessionReader:
     # poses
 
     def _load_judgement(self, capture: Capture, target: str) -> dict[str, Any] | None:
-        """Return the `meta` of a pose's result; None unless it was made from these frames and this board."""
+        """Return the `meta` of a pose's result; None unless it was made from these frames and this
+        board."""
         try:
             meta = self._find_meta(f"poses/{capture.name}")
         except DamagedError:  # the pose is evaluated again
             return None
-        return meta if meta and meta["inputs"].get(capture.name) == capture.hash and meta["target"] == target else None
+        return (
+            meta
+            if meta
+            and meta["inputs"].get(capture.name) == capture.hash
+            and meta["target"] == target
+            else None
+        )
 
     def _read_poses(
         self,
@@ -233,11 +272,19 @@ class SessionReader:
         rig: RigView,
         focal_px: float | None,
     ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
-        """Return (the poses, the plan after them, the input of the final plan where this one is interim)."""
+        """Return (the poses, the plan after them, the input of the final plan where this one is
+        interim)."""
         poses = [capture for capture in captures.values() if capture.role == "calibration"]
         judged = {pose.name: self._load_judgement(pose, target) for pose in poses}
-        states = {pose.name: self._determine_pose_state(pose, target, judged[pose.name], calibration) for pose in poses}
-        camera, projector = (poses[0].size, poses[0].sequence.projector_size) if poses else (rig.camera, rig.projector)
+        states = {
+            pose.name: self._determine_pose_state(pose, target, judged[pose.name], calibration)
+            for pose in poses
+        }
+        camera, projector = (
+            (poses[0].size, poses[0].sequence.projector_size)
+            if poses
+            else (rig.camera, rig.projector)
+        )
         plan = given = None
         is_final = True
         if target and camera is not None and projector is not None:
@@ -249,10 +296,19 @@ class SessionReader:
                 hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
             refused = sum(state == "refused" for state, _ in states.values())
             given = PlanInput(
-                Board.parse(target), camera, projector, features, stereo, focal_px, refused, tuple(hashes)
+                Board.parse(target),
+                camera,
+                projector,
+                features,
+                stereo,
+                focal_px,
+                refused,
+                tuple(hashes),
             )
             plan, is_final = self._planner.look_up(given)
-        views = tuple(self._view_pose(pose, *states[pose.name], target, plan, calibration) for pose in poses)
+        views = tuple(
+            self._view_pose(pose, *states[pose.name], target, plan, calibration) for pose in poses
+        )
         return views, plan, None if is_final else given
 
     def _view_pose(
@@ -273,13 +329,23 @@ class SessionReader:
             created=str(pose.meta.get("created", "")),
             T_camera_board=T,
             calibrated=state == "used",
-            board_px=None if plan is None or T is None else outline_px(Board.parse(target), plan.lens, T),
-            rms_px=calibration.stereo.pose_rms_px.get(pose.name) if calibration and state == "used" else None,
+            board_px=(
+                None if plan is None or T is None else outline_px(Board.parse(target), plan.lens, T)
+            ),
+            rms_px=(
+                calibration.stereo.pose_rms_px.get(pose.name)
+                if calibration and state == "used"
+                else None
+            ),
             thumbnail=self._thumbnails.get(pose.hash, b""),
         )
 
     def _determine_pose_state(
-        self, pose: Capture, target: str, meta: Mapping[str, Any] | None, calibration: CalibrationView | None
+        self,
+        pose: Capture,
+        target: str,
+        meta: Mapping[str, Any] | None,
+        calibration: CalibrationView | None,
     ) -> tuple[PoseState, str]:
         """Return the state of a target pose and the reason, which is empty where there is none."""
         excluded = self.session.valid_decision("excluded") or {}
@@ -295,14 +361,17 @@ class SessionReader:
             if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
                 return "used", ""
             why = calibration.stereo.excluded.get(pose.name, "")
-            if why and not why.startswith("excluded by the operator"):  # such a pose was included again since
+            if why and not why.startswith(
+                "excluded by the operator"
+            ):  # such a pose was included again since
                 return "unused", why
         return "good", ""
 
     def _read_features(
         self, poses: Sequence[Capture], target: str, judged: Mapping[str, Mapping[str, Any] | None]
     ) -> dict[str, PoseFeatures]:
-        """Return the features of poses by name, those seen early until a pose is judged; poses without are missing."""
+        """Return the features of poses by name, those seen early until a pose is judged; poses
+        without are missing."""
         features = {}
         for pose in poses:
             seen, meta = self._features.get((pose.hash, target)), judged[pose.name]
@@ -314,17 +383,21 @@ class SessionReader:
         return features
 
     def _load_features(self, name: str, content_hash: str) -> PoseFeatures:
-        """Load the features of a pose and the median noise of its projector coordinates; cached by content hash."""
+        """Load the features of a pose and the median noise of its projector coordinates; cached by
+        content hash."""
 
         def load() -> PoseFeatures:
             """Load the features from the pose's saved result."""
             names = ("points", "camera", "projector")
             try:
-                arrays = self.session.load_result(f"poses/{name}", only=(*names, "samples_sigma"))[1]
+                arrays = self.session.load_result(f"poses/{name}", only=(*names, "samples_sigma"))[
+                    1
+                ]
             except InputError:  # saved before samples were
                 arrays = self.session.load_result(f"poses/{name}", only=names)[1]
             return _make_features(
-                **{each: arrays[each] for each in names}, sigma=arrays.get("samples_sigma", np.zeros(0))
+                **{each: arrays[each] for each in names},
+                sigma=arrays.get("samples_sigma", np.zeros(0)),
             )
 
         return self._get_cached(("features", content_hash), load)  # type: ignore[no-any-return]
@@ -332,22 +405,29 @@ class SessionReader:
     # calibration
 
     def _read_calibration(self, captures: Mapping[str, Capture]) -> CalibrationView | None:
-        """Read the session's calibration, and what makes it stale; None without a complete stereo model."""
+        """Read the session's calibration, and what makes it stale; None without a complete stereo
+        model."""
         session = self.session
         models = available_models(session)
         if "stereo" not in models:
             return None
         hashes = {model: self._load_meta(f"calibration/{model}")["hash"] for model in models}
         made_of = ("stereo", hashes["stereo"], tuple(captures)[:1])
-        stereo: StereoModel | None = self._get_cached(made_of, lambda: load_stereo_if_complete(session))
+        stereo: StereoModel | None = self._get_cached(
+            made_of, lambda: load_stereo_if_complete(session)
+        )
         if stereo is None:
             return None
         fit_rms: Mapping[str, Mapping[str, float]] | None = {}
         splined = None
         if "pixelwise" in models:
-            fit_rms = self._get_cached(("pixelwise", hashes["pixelwise"]), lambda: load_fit_rms(session))
+            fit_rms = self._get_cached(
+                ("pixelwise", hashes["pixelwise"]), lambda: load_fit_rms(session)
+            )
         if "splined" in models:
-            splined = self._get_cached(("splined", hashes["splined"]), lambda: load_splined(session))
+            splined = self._get_cached(
+                ("splined", hashes["splined"]), lambda: load_splined(session)
+            )
         foreign = ""
         if fit_rms is None or ("splined" in models and splined is None):
             foreign = "it was saved by another version of slviewer: calibrate again"
@@ -355,7 +435,8 @@ class SessionReader:
             stereo=stereo,
             models=models,
             best=preferred_model(session),
-            stale=foreign or self._describe_changes(self._load_meta("calibration/stereo")["inputs"], captures),
+            stale=foreign
+            or self._describe_changes(self._load_meta("calibration/stereo")["inputs"], captures),
             fit_rms_mm=fit_rms or {},
             recommended=recommended_model(session),
             chosen=str(decided) if (decided := session.valid_decision("model")) in models else "",
@@ -368,7 +449,8 @@ class SessionReader:
         )
 
     def _describe_changes(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
-        """Describe which poses of a calibration were retaken, deleted or excluded since; empty where none was."""
+        """Describe which poses of a calibration were retaken, deleted or excluded since; empty
+        where none was."""
         excluded = self.session.valid_decision("excluded") or {}
         gone = [n for n, used in inputs.items() if n not in captures or captures[n].hash != used]
         dropped = [n for n in inputs if n in excluded]
@@ -386,21 +468,30 @@ class SessionReader:
         def read(result: str) -> Stored[Any] | None:
             """Read one record by its result name; None where a capture of it is gone."""
             (kind, _, name), meta = result.partition("/"), self._load_meta(result)
-            record = self._get_cached(("record", meta["hash"]), lambda: read_record(RECORDS[kind], meta))
+            record = self._get_cached(
+                ("record", meta["hash"]), lambda: read_record(RECORDS[kind], meta)
+            )
             if not set(captures_of(name, record)) <= set(inputs.captures):
                 return None
-            return Stored(name, str(inputs.labels.get(name, name)), record, not inputs.is_fresh(meta))
+            return Stored(
+                name, str(inputs.labels.get(name, name)), record, not inputs.is_fresh(meta)
+            )
 
         names = [name for kind in RECORDS for name in self._list_results(f"{kind}/")]
         records = [self._attempt(name, partial(read, name), None) for name in names]
         return tuple(record for record in records if record is not None)
 
-    def _read_scan(self, capture: Capture, records: Sequence[Stored[Any]], inputs: _Inputs) -> ScanView:
-        """Return the view of a scan capture: its label, and the figures and staleness of its cloud."""
+    def _read_scan(
+        self, capture: Capture, records: Sequence[Stored[Any]], inputs: _Inputs
+    ) -> ScanView:
+        """Return the view of a scan capture: its label, and the figures and staleness of its
+        cloud."""
         found = next((each for each in records if isinstance(each.record, Reconstruction)), None)
         place = next((each for each in records if isinstance(each.record, Placement)), None)
         edits, undone = self._attempt(
-            f"the edits of {capture.name}", partial(list_edits, self.session, capture.name), (tuple[str, ...](), 0)
+            f"the edits of {capture.name}",
+            partial(list_edits, self.session, capture.name),
+            (tuple[str, ...](), 0),
         )
         return ScanView(
             name=capture.name,
@@ -417,18 +508,31 @@ class SessionReader:
         )
 
     def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
-        """Read all measurements, in the order they were made; stale as ``pipeline.measurements`` defines it."""
+        """Read all measurements, in the order they were made; stale as ``pipeline.measurements``
+        defines it."""
         known, read, names = dict(inputs.hashes), [], self.session.valid_decision(NAMES) or {}
         results = self.session.result_names()
-        for kind in ("scale/", "merge/", f"{MEASUREMENTS}/"):  # each is made from captures and from those before it
+        for kind in (
+            "scale/",
+            "merge/",
+            f"{MEASUREMENTS}/",
+        ):  # each is made from captures and from those before it
             for result in (name for name in results if name.startswith(kind)):
                 meta = self._load_meta(result)
                 scales = meta.get("scales", {})
                 if kind == f"{MEASUREMENTS}/":
-                    scales = {meta["model"]: used} if (used := meta["data"].get("scale")) is not None else {}
-                stale = _has_changed(meta.get("inputs", {}), known) or _has_changed(scales, inputs.factors)
+                    scales = (
+                        {meta["model"]: used}
+                        if (used := meta["data"].get("scale")) is not None
+                        else {}
+                    )
+                stale = _has_changed(meta.get("inputs", {}), known) or _has_changed(
+                    scales, inputs.factors
+                )
                 if kind == f"{MEASUREMENTS}/":
-                    read.append(measurement_from_meta(result.removeprefix(kind), meta, names, stale))
+                    read.append(
+                        measurement_from_meta(result.removeprefix(kind), meta, names, stale)
+                    )
                 if not stale:
                     known[result] = meta["hash"]
         return tuple(read)
@@ -440,13 +544,17 @@ class SessionReader:
         meta = self._load_meta(names[-1])
         characteristic = from_plain(meta["characteristic"], tuple[Characteristic, ...])
         parts = from_plain(meta["parts"], tuple[PartResult, ...])
-        return InspectionView(meta["plan"], characteristic, parts, _has_changed(meta["inputs"], inputs.hashes))
+        return InspectionView(
+            meta["plan"], characteristic, parts, _has_changed(meta["inputs"], inputs.hashes)
+        )
 
     # files
 
     def _list_results(self, prefix: str) -> list[str]:
         """List the names of the results with a prefix, in natural order."""
-        return sorted((n for n in self.session.result_names() if n.startswith(prefix)), key=natural_key)
+        return sorted(
+            (n for n in self.session.result_names() if n.startswith(prefix)), key=natural_key
+        )
 
     def _find_meta(self, name: str) -> dict[str, Any]:
         """Return the `meta` of a result, empty where there is none."""
@@ -457,7 +565,8 @@ class SessionReader:
         return self.session.load_result(result, only=())[0]
 
     def _get_cached(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached value of a key, computed by `make()` where missing; a full cache is cleared."""
+        """Return the cached value of a key, computed by `make()` where missing; a full cache is
+        cleared."""
         if key not in self._cache:
             if len(self._cache) > MOST_CACHED:
                 self._cache.clear()
@@ -465,10 +574,15 @@ class SessionReader:
         return self._cache[key]
 
 
-def _make_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray) -> PoseFeatures:
-    """Return features (n, 3) mm, (n, 2) and (n, 2) px, with the median of their samples' standard deviations, px."""
+def _make_features(
+    points: np.ndarray, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray
+) -> PoseFeatures:
+    """Return features (n, 3) mm, (n, 2) and (n, 2) px, with the median of their samples' standard
+    deviations, px."""
     known = sigma[np.isfinite(sigma)]
-    return PoseFeatures(points, camera, projector, float(np.median(known)) if known.size else np.nan)
+    return PoseFeatures(
+        points, camera, projector, float(np.median(known)) if known.size else np.nan
+    )
 
 
 def _has_changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:

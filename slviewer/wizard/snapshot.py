@@ -38,13 +38,15 @@ RigState = Literal["none", "opening", "open", "lost"]
 Brightness = Literal["", "saturated", "dim"]
 
 SATURATED, DIM = 0.005, 0.35
-"""Share of saturated pixels above which, and brightness of the brightest ones below which, an image is reported."""
+"""Share of saturated pixels above which, and brightness of the brightest ones below which, an image
+is reported."""
 
 
 @dataclass(frozen=True)
 class ExposureChange:
-    """Exposures that were suggested and set, and what they replaced: exposure and gain as the session remembers them,
-    None where it did not, and the exposures of each capture, none where it was a single one."""
+    """Exposures that were suggested and set, and what they replaced: exposure and gain as the
+    session remembers them, None where it did not, and the exposures of each capture, none where it
+    was a single one."""
 
     suggestion: ExposureSuggestion
     exposure_before: dict[str, float | None] | None
@@ -53,7 +55,8 @@ class ExposureChange:
 
 @dataclass(frozen=True)
 class Notice:
-    """A message for the operator; `number` increases with each. `section`: of the help's page of findings, or none."""
+    """A message for the operator; `number` increases with each. `section`: of the help's page of
+    findings, or none."""
 
     number: int
     level: Level
@@ -64,7 +67,8 @@ class Notice:
 
 @dataclass(frozen=True)
 class JobView:
-    """The running job: the `share` done, 0 ... 1, its current `stage`, for how many seconds, and how many jobs wait."""
+    """The running job: the `share` done, 0 ... 1, its current `stage`, for how many seconds, and
+    how many jobs wait."""
 
     name: str
     share: float
@@ -91,7 +95,8 @@ class CaptureProgress:
 
 @dataclass(frozen=True)
 class RigView:
-    """The devices: `camera` and `projector` sizes are (width, height) px; what a device does not report is None."""
+    """The devices: `camera` and `projector` sizes are (width, height) px; what a device does not
+    report is None."""
 
     state: RigState = "none"
     name: str = ""
@@ -121,9 +126,9 @@ class RigView:
 
 @dataclass(frozen=True, eq=False)
 class PoseView:
-    """One target pose. `T_camera_board` (4, 4) mm is exact where `calibrated`, else approximate, None if unknown;
-    `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until made; `board_px` (4, 2) the
-    board's outline in the camera's px.
+    """One target pose. `T_camera_board` (4, 4) mm is exact where `calibrated`, else approximate,
+    None if unknown; `rms_px` is (camera, projector) reprojection; `thumbnail` a JPEG, empty until
+    made; `board_px` (4, 2) the board's outline in the camera's px.
     """
 
     name: str
@@ -139,8 +144,8 @@ class PoseView:
 
 @dataclass(frozen=True)
 class SplinedView:
-    """Results of the joint adjustment: `SplinedModel.summary`, the weight 0 ... 1 of each pose in camera and projector,
-    and the `turned` poses, numbered from the board's other end.
+    """Results of the joint adjustment: `SplinedModel.summary`, the weight 0 ... 1 of each pose in
+    camera and projector, and the `turned` poses, numbered from the board's other end.
     """
 
     summary: Mapping[str, Any]
@@ -152,11 +157,12 @@ class SplinedView:
 class CalibrationView:
     """The session's calibration: the `stereo` model, and what is known of the others.
 
-    `stale` names what changed since, empty where nothing did. `fit_rms_mm`: {axis: {z, x, y: median mm}} of the
-    pixel-wise fit, empty where there is none. `best` is the model in use, `recommended` the one that would be if the
-    operator had not `chosen` one (empty: he has not). `rejected` is the reason why the calibration was, empty where it
-    was not; `is_pinned`: it is used all the same. `scales`: {model: the correction of scale applied, in words}.
-    `missing`: what the poses lack for the splined model, empty where they allow it.
+    `stale` names what changed since, empty where nothing did. `fit_rms_mm`: {axis: {z, x, y: median
+    mm}} of the pixel-wise fit, empty where there is none. `best` is the model in use, `recommended`
+    the one that would be if the operator had not `chosen` one (empty: he has not). `rejected` is
+    the reason why the calibration was, empty where it was not; `is_pinned`: it is used all the
+    same. `scales`: {model: the correction of scale applied, in words}. `missing`: what the poses
+    lack for the splined model, empty where they allow it.
     """
 
     stereo: StereoModel
@@ -181,8 +187,8 @@ class CalibrationView:
 
 @dataclass(frozen=True, eq=False)
 class ScanView:
-    """One capture that is no target pose. `cloud`: whether it is reconstructed: no, yes, or by an older
-    calibration; `label` is the operator's name for it.
+    """One capture that is no target pose. `cloud`: whether it is reconstructed: no, yes, or by an
+    older calibration; `label` is the operator's name for it.
     """
 
     name: str
@@ -192,7 +198,9 @@ class ScanView:
     cloud: Literal["absent", "fresh", "stale"]
     figures: Reconstruction  # of the cloud
     thumbnail: bytes = field(repr=False)
-    placement: Placement | None = None  # among the scans that are aligned as they come; None: it was not tried
+    placement: Placement | None = (
+        None  # among the scans that are aligned as they come; None: it was not tried
+    )
     turn_step: TurnStep | None = None  # of a turn on a turntable
     edits: tuple[str, ...] = ()  # that are in effect, in words
     undone_edits: int = 0  # which can be redone
@@ -214,8 +222,8 @@ class ExportView:
 
 @dataclass(frozen=True)
 class InspectionView:
-    """The latest run of an inspection plan: its characteristics, and the results of each part; stale where a scan has
-    changed since."""
+    """The latest run of an inspection plan: its characteristics, and the results of each part;
+    stale where a scan has changed since."""
 
     plan: str
     characteristic: tuple[Characteristic, ...]
@@ -225,7 +233,8 @@ class InspectionView:
 
 @dataclass(frozen=True)
 class StepView:
-    """One step: its `instruction`, its `problems` with their remedies, and `blocked_by`: why it cannot be done yet."""
+    """One step: its `instruction`, its `problems` with their remedies, and `blocked_by`: why it
+    cannot be done yet."""
 
     key: str
     title: str
@@ -237,7 +246,8 @@ class StepView:
 
 @dataclass(frozen=True, eq=False)
 class WorldView:
-    """The simulated scene: the object in it, its T_camera_object (4, 4) mm, and its turn about the vertical."""
+    """The simulated scene: the object in it, its T_camera_object (4, 4) mm, and its turn about the
+    vertical."""
 
     standing: Thing
     T_camera_object: np.ndarray
@@ -248,9 +258,9 @@ class WorldView:
 class SessionView:
     """The content of a session's files.
 
-    `plan`: what the poses cover and where the next should be, None before the devices' sizes are known; while it is
-    interim, `pending_plan` is the input of the final one. `wanted_mm`: the 3D standard deviation that a calibration is
-    to reach, the operator's or a default.
+    `plan`: what the poses cover and where the next should be, None before the devices' sizes are
+    known; while it is interim, `pending_plan` is the input of the final one. `wanted_mm`: the 3D
+    standard deviation that a calibration is to reach, the operator's or a default.
     """
 
     folder: Path
@@ -261,7 +271,9 @@ class SessionView:
     pending_plan: PlanInput | None = None
     wanted_mm: float = 0.0
     calibration: CalibrationView | None = None
-    verdict: Verdict | None = None  # on the last attempt to calibrate, even if it gave no calibration
+    verdict: Verdict | None = (
+        None  # on the last attempt to calibrate, even if it gave no calibration
+    )
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
     records: tuple[Stored[Any], ...] = ()  # in natural order of their names
     scans: tuple[ScanView, ...] = ()
@@ -278,7 +290,9 @@ class SessionView:
     aligns_scans: bool = False  # each new scan to those before it
     region: RegionOfInterest | None = None  # in effect where `region_is_on`
     region_is_on: bool = False
-    faults: tuple[str, ...] = ()  # what is damaged, or no capture, and missing here, with the remedy
+    faults: tuple[
+        str, ...
+    ] = ()  # what is damaged, or no capture, and missing here, with the remedy
 
     @property
     def enough(self) -> bool:
@@ -302,7 +316,8 @@ class SessionView:
         return None if self.plan is None else self.plan.coverage
 
     def restriction(self, scan: str) -> tuple[RegionOfInterest | None, tuple[str, ...]]:
-        """Return what the points of a scan are restricted by: the region in effect, and its edits."""
+        """Return what the points of a scan are restricted by: the region in effect, and its
+        edits."""
         edits = next((each.edits for each in self.scans if each.name == scan), ())
         return self.region if self.region_is_on else None, edits
 
@@ -314,8 +329,9 @@ class SessionView:
 
 @dataclass(frozen=True)
 class LiveView:
-    """A live scan: clouds computed per second, 0 before the first, and of those shown; `latency_ms`: the median from
-    the start of a cloud's capture until it is sent to the screens, None before one was; `points` of the latest cloud.
+    """A live scan: clouds computed per second, 0 before the first, and of those shown;
+    `latency_ms`: the median from the start of a cloud's capture until it is sent to the screens,
+    None before one was; `points` of the latest cloud.
     """
 
     clouds_per_s: float
@@ -326,7 +342,8 @@ class LiveView:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Everything at one moment; `version` grows with each change. `session` is None until one is open."""
+    """Everything at one moment; `version` grows with each change. `session` is None until one is
+    open."""
 
     version: int
     session: SessionView | None
@@ -339,12 +356,18 @@ class Snapshot:
     hands_free: bool
     autopilot: str  # what it does now; empty where it is off
     preflight: Preflight | None = None  # result of the last check of the rig in use
-    exposure_change: ExposureChange | None = None  # the last suggestion for the rig in use, unless it was undone
+    exposure_change: ExposureChange | None = (
+        None  # the last suggestion for the rig in use, unless it was undone
+    )
     live: LiveView | None = None  # None while no live scan runs
     merge_failure: str = ""  # why the last merge was refused, or failed
     merge_refusal: Reason | None = None  # that of its registration
-    read_failure: str = ""  # why this is not the current state: files that could not be read just now
-    preparing: float | None = None  # share of the kernels compiled in the background; None while none are
+    read_failure: str = (
+        ""  # why this is not the current state: files that could not be read just now
+    )
+    preparing: float | None = (
+        None  # share of the kernels compiled in the background; None while none are
+    )
 
     @property
     def is_busy(self) -> bool:
@@ -373,9 +396,11 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class BoardSeen:
-    """The board in the preview: features (n, 2) and outline (4, 2), camera px, and its approximate pose (4, 4) mm.
+    """The board in the preview: features (n, 2) and outline (4, 2), camera px, and its approximate
+    pose (4, 4) mm.
 
-    `still_s`: seconds since it last moved; `time_s`: when the image was captured, by the monotonic clock.
+    `still_s`: seconds since it last moved; `time_s`: when the image was captured, by the monotonic
+    clock.
     """
 
     pixels: np.ndarray
@@ -387,11 +412,12 @@ class BoardSeen:
 
 @dataclass(frozen=True, eq=False)
 class PreviewView:
-    """The latest frame as a panel shows it, apart from the snapshot since it changes many times a second.
+    """The latest frame as a panel shows it, apart from the snapshot since it changes many times a
+    second.
 
-    `image` (h, w) uint8 is `scale` times the camera's size. `histogram` (64,) are shares of the pixels by grey level.
-    `board` is None where none is detected, and `missing` is then the reason. `countdown_s`: seconds until a hands-free
-    capture, None where none is coming.
+    `image` (h, w) uint8 is `scale` times the camera's size. `histogram` (64,) are shares of the
+    pixels by grey level. `board` is None where none is detected, and `missing` is then the reason.
+    `countdown_s`: seconds until a hands-free capture, None where none is coming.
     """
 
     number: int

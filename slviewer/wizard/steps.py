@@ -1,4 +1,5 @@
-"""The nine steps, in order: what to do now, what each waits for, which problems there are. A step is one entry.
+"""The nine steps, in order: what to do now, what each waits for, which problems there are. A step
+is one entry.
 
 Everything here follows from the session's files and the rig.
 """
@@ -14,7 +15,14 @@ from slviewer.records.merge import MIN_OVERLAP
 from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
 from slviewer.session.names import join_names
-from slviewer.wizard.snapshot import Brightness, CalibrationView, RigView, SessionView, StepState, StepView
+from slviewer.wizard.snapshot import (
+    Brightness,
+    CalibrationView,
+    RigView,
+    SessionView,
+    StepState,
+    StepView,
+)
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""
@@ -51,8 +59,8 @@ class Facts:
 class Step:
     """Definition of one step: functions of the facts that give its state and texts.
 
-    `blocked(facts)`: why it cannot be done yet, or empty; `done(facts)`; `instruction(facts)`: what to do, in one
-    sentence; `problems(facts)`: what is wrong, and how to correct it.
+    `blocked(facts)`: why it cannot be done yet, or empty; `done(facts)`; `instruction(facts)`: what
+    to do, in one sentence; `problems(facts)`: what is wrong, and how to correct it.
     """
 
     key: str
@@ -87,11 +95,17 @@ def _no_problems(facts: Facts) -> Iterator[str]:
 def _device_problems(facts: Facts) -> Iterator[str]:
     """Yield problems of rig, disk space and image brightness that prevent or degrade a capture."""
     if facts.rig.state == "lost" and facts.rig.camera is None:
-        yield f"The rig cannot be used: {facts.rig.fault}. Try again in the step Rig, or choose another."
+        yield (
+            f"The rig cannot be used: {facts.rig.fault}. Try again in the step Rig, or choose"
+            " another."
+        )
     elif facts.rig.state == "lost":
         yield f"The connection to the rig is lost: {facts.rig.fault}. Retrying every two seconds."
     if facts.space is not None and not facts.space.enough:
-        needs, free = format_bytes(facts.space.capture_bytes or 0), format_bytes(facts.space.free_bytes)
+        needs, free = (
+            format_bytes(facts.space.capture_bytes or 0),
+            format_bytes(facts.space.free_bytes),
+        )
         yield f"{free} are free on the disk and a capture needs {needs}: free some space."
     if facts.brightness == "saturated":
         yield "Parts of the image are saturated: lower the exposure, or close the aperture."
@@ -132,12 +146,15 @@ def _poses_done(facts: Facts) -> bool:
     # cells that the projector never reaches cannot be covered: many poses are enough too
     enough = facts.good_poses >= MANY_POSES or facts.rig.state == "none"
     if session is not None:
-        enough |= session.enough or (session.coverage is not None and session.coverage.share > COVERED)
+        enough |= session.enough or (
+            session.coverage is not None and session.coverage.share > COVERED
+        )
     return facts.good_poses >= POSES_FOR_PIXELWISE and enough
 
 
 def _poses_instruction(facts: Facts) -> str:
-    """Return the instruction of the step Poses: the suggested next pose, or that there are enough."""
+    """Return the instruction of the step Poses: the suggested next pose, or that there are
+    enough."""
     session, n = facts.session, facts.good_poses
     if session is None:
         return "Hold the board in view of camera and projector."
@@ -167,7 +184,8 @@ def _poses_problems(facts: Facts) -> Iterator[str]:
 
 
 def _calibrate_blocked(facts: Facts) -> str:
-    """Return why calibrating is not possible yet: no session, target or too few poses; else empty."""
+    """Return why calibrating is not possible yet: no session, target or too few poses; else
+    empty."""
     if facts.session is None:
         return _no_session(facts)
     if facts.calibration is not None:
@@ -175,7 +193,10 @@ def _calibrate_blocked(facts: Facts) -> str:
     if not facts.session.target:
         return "Choose the target first."
     if facts.good_poses < MIN_POSES:
-        return f"{facts.good_poses} good poses so far, at least {MIN_POSES} are needed: capture the board first."
+        return (
+            f"{facts.good_poses} good poses so far, at least {MIN_POSES} are needed: capture the"
+            " board first."
+        )
     return ""
 
 
@@ -186,7 +207,8 @@ def _calibrate_done(facts: Facts) -> bool:
 
 
 def _calibrate_instruction(facts: Facts) -> str:
-    """Return the instruction of the step Calibrate, with the number of poses and the reprojection RMS."""
+    """Return the instruction of the step Calibrate, with the number of poses and the reprojection
+    RMS."""
     calibration, n = facts.calibration, facts.good_poses
     if calibration is None:
         return f"Calibrate from {n} poses."
@@ -198,20 +220,30 @@ def _calibrate_instruction(facts: Facts) -> str:
     if rms is None:
         return "This calibration was imported: verify it next."
     poses = len(calibration.stereo.poses)
-    return f"Calibrated from {poses} poses, reprojection RMS {rms:.3f} px: check outlying poses, then verify."
+    return (
+        f"Calibrated from {poses} poses, reprojection RMS {rms:.3f} px: check outlying poses, then"
+        " verify."
+    )
 
 
 def _calibrate_problems(facts: Facts) -> Iterator[str]:
-    """Yield why to calibrate again, and a warning where there are poses for the stereo model only."""
+    """Yield why to calibrate again, and a warning where there are poses for the stereo model
+    only."""
     if facts.session is None:
         return
     if facts.calibration is not None:
         if facts.calibration.stale:
             yield f"The calibration is out of date: {facts.calibration.stale}."
         elif added := sum(pose.state == "good" for pose in facts.session.poses):
-            yield f"{format_count(added, 'good pose')} captured after the calibration: calibrate again to use them."
+            yield (
+                f"{format_count(added, 'good pose')} captured after the calibration: calibrate"
+                " again to use them."
+            )
     if MIN_POSES <= facts.good_poses < POSES_FOR_PIXELWISE:
-        yield f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is reliable: capture more."
+        yield (
+            f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is reliable:"
+            " capture more."
+        )
 
 
 def _not_calibrated(facts: Facts) -> str:
@@ -224,7 +256,10 @@ def _no_usable_calibration(facts: Facts) -> str:
     if facts.calibration is None:
         return _not_calibrated(facts)
     if reason := facts.calibration.refused:
-        return f"The calibration was rejected: {reason}. Calibrate again, or accept it in the step Calibrate."
+        return (
+            f"The calibration was rejected: {reason}. Calibrate again, or accept it in the step"
+            " Calibrate."
+        )
     return ""
 
 
@@ -237,7 +272,9 @@ def _capture_problems(facts: Facts) -> Iterator[str]:
 
 def _verify_done(facts: Facts) -> bool:
     """Whether there is an up-to-date verification."""
-    return facts.session is not None and any(not each.stale for each in facts.session.list_records(Verification))
+    return facts.session is not None and any(
+        not each.stale for each in facts.session.list_records(Verification)
+    )
 
 
 def _verify_instruction(facts: Facts) -> str:
@@ -250,7 +287,11 @@ def _verify_instruction(facts: Facts) -> str:
 def _verify_problems(facts: Facts) -> Iterator[str]:
     """Yield capture problems, and verifications of an older calibration."""
     yield from _capture_problems(facts)
-    if stale := [each.name for each in facts.session.list_records(Verification) if each.stale] if facts.session else []:
+    if stale := (
+        [each.name for each in facts.session.list_records(Verification) if each.stale]
+        if facts.session
+        else []
+    ):
         yield f"{join_names(stale, 3)} measured with an older calibration: measure again."
 
 
@@ -258,7 +299,10 @@ def _scan_instruction(facts: Facts) -> str:
     """Return the instruction of the step Scan."""
     if facts.scans == 0:
         return "Put the object in view, and capture it."
-    return f"{format_count(facts.scans, 'scan')}: turn or move the object for another, or merge them next."
+    return (
+        f"{format_count(facts.scans, 'scan')}: turn or move the object for another, or merge them"
+        " next."
+    )
 
 
 def _scan_problems(facts: Facts) -> Iterator[str]:
@@ -270,7 +314,8 @@ def _scan_problems(facts: Facts) -> Iterator[str]:
 
 
 def _merge_blocked(facts: Facts) -> str:
-    """Return why merging is not possible yet: no usable calibration, or fewer than two scans; else empty."""
+    """Return why merging is not possible yet: no usable calibration, or fewer than two scans; else
+    empty."""
     if why := _no_usable_calibration(facts):
         return why
     if facts.scans < 2 and not (facts.session and facts.session.merge):
@@ -280,7 +325,11 @@ def _merge_blocked(facts: Facts) -> str:
 
 def _merge_done(facts: Facts) -> bool:
     """Whether there is an up-to-date merge."""
-    return facts.session is not None and facts.session.merge is not None and not facts.session.merge.stale
+    return (
+        facts.session is not None
+        and facts.session.merge is not None
+        and not facts.session.merge.stale
+    )
 
 
 def _merge_instruction(facts: Facts) -> str:
@@ -310,14 +359,21 @@ def _measure_blocked(facts: Facts) -> str:
     if why := _no_usable_calibration(facts):
         return why
     session = facts.session
-    if session is None or session.merge or session.measurements or any(s.cloud == "fresh" for s in session.scans):
+    if (
+        session is None
+        or session.merge
+        or session.measurements
+        or any(s.cloud == "fresh" for s in session.scans)
+    ):
         return ""
     return "Measuring needs a scan: capture one, or reconstruct a recorded one."
 
 
 def _measure_done(facts: Facts) -> bool:
     """Whether there is an up-to-date measurement."""
-    return facts.session is not None and any(not measured.stale for measured in facts.session.measurements)
+    return facts.session is not None and any(
+        not measured.stale for measured in facts.session.measurements
+    )
 
 
 def _measure_instruction(facts: Facts) -> str:
@@ -330,7 +386,11 @@ def _measure_instruction(facts: Facts) -> str:
 
 def _measure_problems(facts: Facts) -> Iterator[str]:
     """Yield the stale measurements, whose surface has changed."""
-    if stale := [measured.name for measured in facts.session.measurements if measured.stale] if facts.session else []:
+    if stale := (
+        [measured.name for measured in facts.session.measurements if measured.stale]
+        if facts.session
+        else []
+    ):
         yield f"{join_names(stale, 3)}: the measured surface has changed; measure again."
 
 

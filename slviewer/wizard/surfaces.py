@@ -1,4 +1,5 @@
-"""The surfaces that the wizard measures on: reconstructed scans and merges, read from the session."""
+"""The surfaces that the wizard measures on: reconstructed scans and merges, read from the
+session."""
 
 import threading
 from pathlib import Path
@@ -7,7 +8,13 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place, load_merged_surface, surface_from_cloud
+from slviewer.pipeline.measured_surface import (
+    MERGED,
+    MeasuredSurface,
+    Place,
+    load_merged_surface,
+    surface_from_cloud,
+)
 from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.scan_edits import restrict_cloud
@@ -20,7 +27,8 @@ from slviewer.wizard.result_views import nearest
 
 
 class Surfaces:
-    """Loads surfaces to measure on, and caches the last one. Every method may be called from any thread."""
+    """Loads surfaces to measure on, and caches the last one. Every method may be called from any
+    thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -37,30 +45,38 @@ class Surfaces:
             raise InputError(f"{name} is not reconstructed: reconstruct it in the step Scan first")
         meta = store.load_result(result, only=())[0]
         again = "merge again" if result == name else "reconstruct it again in the step Scan"
-        scaled = all(scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items())
+        scaled = all(
+            scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items()
+        )
         if store.state_of(result) == "stale" or not scaled:
             raise InputError(f"the inputs of {name} have changed: {again}, then measure")
         cut = "" if result == name else str(restriction_inputs(store, [name]))
         key = (str(store.folder), result, str(meta["hash"]), cut)
         with self._lock:
             if self._key != key or self._cached is None:
-                self._cached = load_merged_surface(store, name) if result == name else _load_scan(store, name)
+                self._cached = (
+                    load_merged_surface(store, name) if result == name else _load_scan(store, name)
+                )
                 self._key = key
             return self._cached
 
 
 def _load_scan(store: Session, name: str) -> MeasuredSurface:
-    """Load the cloud of a scan as a surface, with its uncertainties and the model that it was made by."""
+    """Load the cloud of a scan as a surface, with its uncertainties and the model that it was made
+    by."""
     meta, arrays = store.load_result(f"clouds/{name}")
     systematic = arrays.get("sigma_calibration")
     points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
-    cloud = Cloud(points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges"))
+    cloud = Cloud(
+        points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges")
+    )
     cloud = restrict_cloud(store, name, cloud, load_region(store))
     return surface_from_cloud(store, name, cloud, load_model(store, meta["model"]))
 
 
 def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
-    """Return the measured point closest to a ray from origin (3,) mm along direction (3,), in the surface's frame.
+    """Return the measured point closest to a ray from origin (3,) mm along direction (3,), in the
+    surface's frame.
 
     None where the ray passes the surface.
     """
@@ -77,8 +93,9 @@ def point_at(on: MeasuredSurface, place: Place) -> np.ndarray:
 
 
 def box_in_view(on: MeasuredSurface, view: ViewCamera, low: np.ndarray, high: np.ndarray) -> Region:
-    """Return the box, with sides along a view's, around what a rectangle shows of a surface: its connected part in the
-    middle. ``low``, ``high`` (2,): corners in the view, 0 ... 1. InputError where it shows no measured point.
+    """Return the box, with sides along a view's, around what a rectangle shows of a surface: its
+    connected part in the middle. ``low``, ``high`` (2,): corners in the view, 0 ... 1. InputError
+    where it shows no measured point.
     """
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     chosen = select_in_outline(on.points, view, corners) & on.measured

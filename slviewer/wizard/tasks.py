@@ -1,7 +1,7 @@
 """The worker's jobs that are no operations yet, one function each.
 
-What they save names its inputs, so that stale results are detected. The frames of a capture are compared with each
-other by a job of their own (`engine`), which no cloud waits for.
+What they save names its inputs, so that stale results are detected. The frames of a capture are
+compared with each other by a job of their own (`engine`), which no cloud waits for.
 """
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
@@ -24,8 +24,11 @@ from slviewer.wizard.result_views import used_points, whole_cloud
 from slviewer.wizard.snapshot import Level
 
 
-def calibrate_session(session: Session, target: str, report: Reporter, warn: Warn) -> CalibrationResult:
-    """Calibrate every model that the included poses allow; models that they no longer allow go to the trash."""
+def calibrate_session(
+    session: Session, target: str, report: Reporter, warn: Warn
+) -> CalibrationResult:
+    """Calibrate every model that the included poses allow; models that they no longer allow go to
+    the trash."""
     guarded = session.guarded(report.saving)
     models = ["stereo", "pixelwise"]
     if missing := missing_for_splined(session):
@@ -43,7 +46,11 @@ def describe_calibration(made: CalibrationResult) -> tuple[Level, str]:
     """Describe a calibration result in one sentence: (level, text)."""
     rms = made.stereo.reprojection_rms_px["stereo"]
     text = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
-    return ("good", text) if made.verdict.level == "good" else ("warning", f"{text}; doubtful: {made.verdict.reason}")
+    return (
+        ("good", text)
+        if made.verdict.level == "good"
+        else ("warning", f"{text}; doubtful: {made.verdict.reason}")
+    )
 
 
 def missing_for_splined(session: Session) -> str:
@@ -56,7 +63,10 @@ def missing_for_splined(session: Session) -> str:
     needed = f"it needs {POSES_FOR_PIXELWISE} target poses with patterns along both axes"
     if len(poses) < POSES_FOR_PIXELWISE:
         return f"{needed}, and there are {both}: capture more"
-    return f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and capture more"
+    return (
+        f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and"
+        " capture more"
+    )
 
 
 def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValidation:
@@ -65,16 +75,22 @@ def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValid
 
 
 def describe_comparison(compared: CrossValidation) -> str:
-    """Describe the comparison of the models in one sentence: held-out errors, and the recommended model."""
-    figures = ", ".join(f"{model} {compared.rms(model, 'board_mm'):.3f} mm" for model in compared.models)
+    """Describe the comparison of the models in one sentence: held-out errors, and the recommended
+    model."""
+    figures = ", ".join(
+        f"{model} {compared.rms(model, 'board_mm'):.3f} mm" for model in compared.models
+    )
     return f"held-out error of the models: {figures}; {compared.recommended} is recommended"
 
 
-def remove_support(session: Session, names: list[str], report: Reporter, warn: Warn) -> dict[str, int]:
-    """Delete the plane that the object stands on, and all below it, from scans: {scan: points deleted}.
+def remove_support(
+    session: Session, names: list[str], report: Reporter, warn: Warn
+) -> dict[str, int]:
+    """Delete the plane that the object stands on, and all below it, from scans: {scan: points
+    deleted}.
 
-    Scans without such a plane, and those that it was deleted from before, stay as they are, with a warning. InputError
-    where all of them do.
+    Scans without such a plane, and those that it was deleted from before, stay as they are, with a
+    warning. InputError where all of them do.
     """
     selections, refused = list[Selection](), list[str]()
     for i, name in enumerate(names):
@@ -103,8 +119,11 @@ def describe_removal(deleted: dict[str, int]) -> str:
     return f"support removed: {counts}; Undo edit brings it back"
 
 
-def merge_scanned_turn(session: Session, names: list[str], report: Reporter, warn: Warn) -> tuple[Findings[Merge], str]:
-    """Merge the scans of a turn by the angles of its turntable, and write a watertight mesh into the exports.
+def merge_scanned_turn(
+    session: Session, names: list[str], report: Reporter, warn: Warn
+) -> tuple[Findings[Merge], str]:
+    """Merge the scans of a turn by the angles of its turntable, and write a watertight mesh into
+    the exports.
 
     Returns the merge, and a sentence about the mesh; where it does not close, the merge stays.
     """
@@ -112,7 +131,9 @@ def merge_scanned_turn(session: Session, names: list[str], report: Reporter, war
     merged = merge_turn(session.guarded(report.saving), settings, report.within(0, 0.7), warn)
     (number,) = merged
     try:
-        words = export_file(session, "merged-mesh", number, "ply", WATERTIGHT, None, report.within(0.7, 1), warn)
+        words = export_file(
+            session, "merged-mesh", number, "ply", WATERTIGHT, None, report.within(0.7, 1), warn
+        )
     except Cancelled:
         raise
     except SlviewerError as error:
@@ -126,4 +147,6 @@ def describe_turn(result: tuple[Findings[Merge], str]) -> str:
     """Describe the merge and the mesh of a turn in one sentence."""
     (merged,), words = result[0].values(), result[1]
     worst = max(pair.rms_mm for pair in merged.pairs.values())
-    return f"{len(merged.scans)} scans merged on {merged.reference}, RMS up to {worst:.3f} mm; {words}"
+    return (
+        f"{len(merged.scans)} scans merged on {merged.reference}, RMS up to {worst:.3f} mm; {words}"
+    )

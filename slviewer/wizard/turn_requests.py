@@ -32,8 +32,11 @@ class TurnRequests(CaptureRequests, MergeRequests):
     """Captures of all steps of a turn, each reconstructed while the table turns on."""
 
     @request("Scanning all round")
-    def scan_all_round(self, steps: int = STEPS, range_deg: float = FULL_TURN_DEG, *, then_merge: bool = True) -> None:
-        """Capture and reconstruct the steps of a turn; `then_merge` merges them and makes a watertight mesh."""
+    def scan_all_round(
+        self, steps: int = STEPS, range_deg: float = FULL_TURN_DEG, *, then_merge: bool = True
+    ) -> None:
+        """Capture and reconstruct the steps of a turn; `then_merge` merges them and makes a
+        watertight mesh."""
         self._scan_turn(plan_turn(next_turn(self._engine.store), steps, range_deg), then_merge)
 
     @request("Resuming the turn")
@@ -61,7 +64,11 @@ class TurnRequests(CaptureRequests, MergeRequests):
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step, and queue its reconstruction."""
                 captured = capture_with_texture(
-                    rig, sequence, exposures, buffer, lambda done, n: progress(done / n, f"frame {done} of {n}")
+                    rig,
+                    sequence,
+                    exposures,
+                    buffer,
+                    lambda done, n: progress(done / n, f"frame {done} of {n}"),
                 )
                 save_frames(store, step.name, "scan", captured, turn_step=step)
                 engine.queue_processing()

@@ -1,4 +1,5 @@
-"""A rig and target poses known exactly, without images: projections by OpenCV, whose lens code is not ours."""
+"""A rig and target poses known exactly, without images: projections by OpenCV, whose lens code is
+not ours."""
 
 import cv2
 import numpy as np
@@ -16,9 +17,12 @@ BOARD = Board.parse("circles:11x9:16")
 
 
 def rig() -> StereoRig:
-    """A quarter of the Letter's resolution: baseline 180 mm, axes crossing at 600 mm, fy twice fx in the projector."""
+    """A quarter of the Letter's resolution: baseline 180 mm, axes crossing at 600 mm, fy twice fx
+    in the projector."""
     camera = Lens(
-        np.array([[890.0, 0, 203.0], [0, 892.0, 147.0], [0, 0, 1]]), np.array([-0.08, 0.03, 4e-4, -3e-4, 0.0]), SIZE
+        np.array([[890.0, 0, 203.0], [0, 892.0, 147.0], [0, 0, 1]]),
+        np.array([-0.08, 0.03, 4e-4, -3e-4, 0.0]),
+        SIZE,
     )
     projector = Lens(
         np.array([[700.0, 0, 230.0], [0, 1400.0, 280.0], [0, 0, 1]]),
@@ -44,16 +48,26 @@ def board_poses(count: int, seed: int = 0) -> list[np.ndarray]:
 
 
 def observation(
-    true: StereoRig, T: np.ndarray, name: str, noise_px: float = 0.02, seed: int = 0, axes: tuple[str, ...] = ("x", "y")
+    true: StereoRig,
+    T: np.ndarray,
+    name: str,
+    noise_px: float = 0.02,
+    seed: int = 0,
+    axes: tuple[str, ...] = ("x", "y"),
 ) -> Observation:
     """The board at pose T as camera and projector see it, with Gaussian noise on every feature."""
     rng = np.random.default_rng([seed, sum(map(ord, name))])
     X = BOARD.points @ T[:3, :3].T + T[:3, 3]
-    camera, projector = cv_project(true.camera, X), cv_project(true.projector, X @ true.R.T + true.t)
+    camera, projector = (
+        cv_project(true.camera, X),
+        cv_project(true.projector, X @ true.R.T + true.t),
+    )
     u0, v0 = np.maximum(np.floor(camera.min(0)).astype(int) - 8, 0)
     u1, v1 = np.minimum(np.ceil(camera.max(0)).astype(int) + 9, SIZE)
     u, v = (a.ravel() for a in np.meshgrid(np.arange(u0, u1, 4), np.arange(v0, v1, 4)))
-    rays = cv2.undistortPoints(np.stack([u, v], 1)[:, None].astype(float), true.camera.K, true.camera.D)[:, 0]
+    rays = cv2.undistortPoints(
+        np.stack([u, v], 1)[:, None].astype(float), true.camera.K, true.camera.D
+    )[:, 0]
     d = np.c_[rays, np.ones(len(rays))]
     seen = d * (T[:3, 2] @ T[:3, 3] / (d @ T[:3, 2]))[:, None]
     coordinate = cv_project(true.projector, seen @ true.R.T + true.t)

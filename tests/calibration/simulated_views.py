@@ -1,4 +1,5 @@
-"""Board poses as a simulated rig with local distortion sees them, without rendering: exact projections and noise."""
+"""Board poses as a simulated rig with local distortion sees them, without rendering: exact
+projections and noise."""
 
 from dataclasses import replace
 
@@ -17,7 +18,8 @@ PERIOD = 18.0
 
 
 def moved(rig: SimulatedRig, turn_mrad=(0.0, 0.0, 0.0), baseline_mm: float = 0.0) -> SimulatedRig:
-    """The rig with its projector turned about its own centre, and that centre farther from the camera."""
+    """The rig with its projector turned about its own centre, and that centre farther from the
+    camera."""
     centre = rig.projector_centre
     centre = centre * (1 + baseline_mm / np.linalg.norm(centre))
     R = rotation(1e-3 * np.array(turn_mrad)) @ rig.R
@@ -29,8 +31,11 @@ def poses(rig: SimulatedRig, count: int, seed: int) -> list[Pose]:
     return target_poses(replace(rig, seed=seed), BOARD, count)
 
 
-def seen(rig: SimulatedRig, pose: Pose, name: str, axes=("x", "y"), camera_px=0.01, sample_px=0.02) -> Observation:
-    """What the rig sees of the board, with noise of so many px in each feature and each sample of the phase."""
+def seen(
+    rig: SimulatedRig, pose: Pose, name: str, axes=("x", "y"), camera_px=0.01, sample_px=0.02
+) -> Observation:
+    """What the rig sees of the board, with noise of so many px in each feature and each sample of
+    the phase."""
     rng = np.random.default_rng([sum(map(ord, name)), 3])
     X = pose.to_camera(BOARD.points)
     camera, projector = rig.camera.project(X), rig.project(X)
@@ -38,7 +43,9 @@ def seen(rig: SimulatedRig, pose: Pose, name: str, axes=("x", "y"), camera_px=0.
     u0, v0 = np.maximum(np.floor(camera.min(0)).astype(int) - 3, 0)
     u1, v1 = np.minimum(np.ceil(camera.max(0)).astype(int) + 4, (width, height))
     u, v = (a.ravel() for a in np.meshgrid(np.arange(u0, u1, 6), np.arange(v0, v1, 6)))
-    rays = np.concatenate([rig.camera.undistort(np.stack([u, v], 1).astype(float)), np.ones((len(u), 1))], 1)
+    rays = np.concatenate(
+        [rig.camera.undistort(np.stack([u, v], 1).astype(float)), np.ones((len(u), 1))], 1
+    )
     normal = pose.R[:, 2]
     coordinate = rig.project(rays * ((normal @ pose.t) / (rays @ normal))[:, None])
     coordinate += rng.normal(0, sample_px, coordinate.shape)

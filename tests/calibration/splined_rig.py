@@ -1,4 +1,5 @@
-"""Observations of the simulated rig without images: its own lenses say where features and bright places are seen."""
+"""Observations of the simulated rig without images: its own lenses say where features and bright
+places are seen."""
 
 import numpy as np
 
@@ -15,7 +16,8 @@ BOARD = Board.parse("circles:15x12:12")
 PERIOD = 18.0
 FEATURE_PX, SAMPLE_PX = 0.01, 0.006
 CELLS = 13
-"""Half as many across an image as by default: the coarse waves of the rig need no more, and it takes a second."""
+"""Half as many across an image as by default: the coarse waves of the rig need no more, and it
+takes a second."""
 
 
 def rig(seed: int = 0, local_distortion_px: float | None = None) -> SimulatedRig:
@@ -35,22 +37,31 @@ def observation(
     moved_mm: float = 0.0,
     axes: tuple[str, ...] = ("x", "y"),
 ) -> Observation:
-    """A pose with normal noise; the board ``moved_mm`` away between its picture and its patterns."""
+    """A pose with normal noise; the board ``moved_mm`` away between its picture and its
+    patterns."""
     rng = np.random.default_rng([true.seed, sum(map(ord, name))])
     scene = printed_board(BOARD, pose, shape, true.seed)
     points = pose.to_camera(scene.features)
     camera = true.camera.project(points)
-    later = printed_board(BOARD, Pose(pose.R, pose.t + np.array([0, 0, moved_mm])), shape, true.seed)
+    later = printed_board(
+        BOARD, Pose(pose.R, pose.t + np.array([0, 0, moved_mm])), shape, true.seed
+    )
     low, high = camera.min(0) - 4, camera.max(0) + 4
     pixels = rng.uniform(low, high, (3 * samples, 2))
     seen = on_board(later, true.camera.undistort(pixels))
     projector = true.project(seen)
     illuminated = (
-        np.isfinite(projector).all(1) & (projector > 0).all(1) & (projector < np.array(true.projector.size) - 1).all(1)
+        np.isfinite(projector).all(1)
+        & (projector > 0).all(1)
+        & (projector < np.array(true.projector.size) - 1).all(1)
     )
     pixels, projector = pixels[illuminated][:samples], projector[illuminated][:samples]
     box = (low[0], low[1], high[0], high[1])
-    surfaces = {a: fit_polynomial(*pixels.T, projector[:, i], None, box, 3) for i, a in enumerate("xy") if a in axes}
+    surfaces = {
+        a: fit_polynomial(*pixels.T, projector[:, i], None, box, 3)
+        for i, a in enumerate("xy")
+        if a in axes
+    }
     absent = [a not in axes for a in "xy"]
     noisy = projector + rng.normal(0, SAMPLE_PX, projector.shape)
     noisy[:, absent] = np.nan
@@ -77,17 +88,32 @@ def on_board(scene: BoardScene, rays: np.ndarray) -> np.ndarray:
     bounds = np.array([*scene.corner, *scene.plate])
     bend = np.array([scene.shape.bow_x_mm, scene.shape.bow_y_mm, scene.shape.twist_mm])
     R, t = scene.pose.R, scene.pose.t
-    return np.asarray(intersect(rays[None].copy(), -R.T @ t, np.ascontiguousarray(R.T), R, bounds, bend)[1][0])
+    return np.asarray(
+        intersect(rays[None].copy(), -R.T @ t, np.ascontiguousarray(R.T), R, bounds, bend)[1][0]
+    )
 
 
-def phase_map(true: SimulatedRig, depth: np.ndarray, axis: str = "x", period: float = PERIOD) -> PhaseMap:
-    """What a capture without noise says of a surface at ``depth`` (h, w) mm; NaN beyond the projector's image."""
+def phase_map(
+    true: SimulatedRig, depth: np.ndarray, axis: str = "x", period: float = PERIOD
+) -> PhaseMap:
+    """What a capture without noise says of a surface at ``depth`` (h, w) mm; NaN beyond the
+    projector's image."""
     coordinate = true.project(surface(true, depth))
     inside = ((coordinate >= 0) & (coordinate <= np.array(true.projector.size) - 1)).all(-1)
     seen = np.where(inside, coordinate[..., "xy".index(axis)], np.nan)
     ones = np.ones(depth.shape, np.float32)
     phase = (2 * np.pi * seen / period).astype(np.float32)
-    return PhaseMap(axis, period, phase, phase, 60 * ones, 90 * ones, np.isnan(seen).astype(np.uint8), (2.0, 0.0), 18)  # type: ignore[arg-type]
+    return PhaseMap(
+        axis,
+        period,
+        phase,
+        phase,
+        60 * ones,
+        90 * ones,
+        np.isnan(seen).astype(np.uint8),
+        (2.0, 0.0),
+        18,
+    )  # type: ignore[arg-type]
 
 
 def surface(true: SimulatedRig, depth: np.ndarray) -> np.ndarray:

@@ -16,8 +16,11 @@ TURN = cv2.Rodrigues(np.radians([0.0, -14.0, 0.0]))[0]
 
 
 def board(tilt: float, nearer_mm: float = 0.0, margin: float = 0.0) -> np.ndarray:
-    """(n, 3) mm: 11 x 8 features of 25 mm pitch, or as many points that reach ``margin`` pitches beyond them."""
-    x, y = np.meshgrid(np.linspace(-5 - margin, 5 + margin, 11), np.linspace(-3.5 - margin, 3.5 + margin, 8))
+    """(n, 3) mm: 11 x 8 features of 25 mm pitch, or as many points that reach ``margin`` pitches
+    beyond them."""
+    x, y = np.meshgrid(
+        np.linspace(-5 - margin, 5 + margin, 11), np.linspace(-3.5 - margin, 3.5 + margin, 8)
+    )
     R = cv2.Rodrigues(np.radians([tilt, -0.6 * tilt, 0.0]))[0]
     return np.stack([x, y, 0 * x], 2).reshape(-1, 3) * 25 @ R.T + [0, 0, 340 - nearer_mm]
 
@@ -28,9 +31,9 @@ def in_camera(points: np.ndarray) -> np.ndarray:
 
 def in_projector(points: np.ndarray) -> np.ndarray:
     bent = np.array([-0.06, 0.02, 0, 0, 0])
-    return cv2.projectPoints((points - [100, 0, 0]) @ TURN.T, np.zeros(3), np.zeros(3), PROJECTOR, bent)[0].reshape(
-        -1, 2
-    )
+    return cv2.projectPoints(
+        (points - [100, 0, 0]) @ TURN.T, np.zeros(3), np.zeros(3), PROJECTOR, bent
+    )[0].reshape(-1, 2)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 20.0])
@@ -69,7 +72,9 @@ def test_a_map_is_judged_pixel_by_pixel() -> None:
 def modulated(modulation: np.ndarray) -> PhaseMap:
     flat = np.zeros(modulation.shape, np.float32)
     reason = flat.astype(np.uint8)
-    return PhaseMap("x", 18.0, flat, flat, modulation.astype(np.float32), flat + 100, reason, (1.0, 0.0), 18)
+    return PhaseMap(
+        "x", 18.0, flat, flat, modulation.astype(np.float32), flat + 100, reason, (1.0, 0.0), 18
+    )
 
 
 def test_strips_beside_markers_are_read_and_edges_of_plain_squares_stay_clear() -> None:
@@ -77,7 +82,9 @@ def test_strips_beside_markers_are_read_and_edges_of_plain_squares_stay_clear() 
     white = (u // 36 + v // 36) % 2 == 0
     marker = white & (np.abs(u % 36 - 17.5) < 13.5) & (np.abs(v % 36 - 17.5) < 13.5)
     inside = np.pad(np.ones((180, 252), bool), 18)
-    plain = bright_pixels(modulated(cv2.GaussianBlur(np.where(white, 80.0, 8.0), (0, 0), 0.8)), inside, 36.0)
+    plain = bright_pixels(
+        modulated(cv2.GaussianBlur(np.where(white, 80.0, 8.0), (0, 0), 0.8)), inside, 36.0
+    )
     assert not plain[~white].any()
     assert plain[36 * 2 + 3, 36 * 2 + 3] and not plain[36 * 2 + 1, 36 * 2 + 10]
     strips = bright_pixels(modulated(np.where(white & ~marker, 80.0, 8.0)), inside, 36.0)

@@ -1,4 +1,5 @@
-"""Circles at their centres: what perspective and distortion do to a centroid, and that the correction takes it away."""
+"""Circles at their centres: what perspective and distortion do to a centroid, and that the
+correction takes it away."""
 
 from dataclasses import replace
 
@@ -35,7 +36,8 @@ def tilted(degrees: float, towards: float) -> np.ndarray:
 def noise_free(psf_px: float) -> tuple[SimulatedRig, Lens]:
     simulated = letter(0.5, 3, local_distortion_px=0.0)
     simulated = replace(
-        simulated, sensor=replace(simulated.sensor, read_variance=0.0, shot_variance=0.0, psf_px=psf_px)
+        simulated,
+        sensor=replace(simulated.sensor, read_variance=0.0, shot_variance=0.0, psf_px=psf_px),
     )
     record = rig_record(simulated)["camera"]
     return simulated, Lens(np.array(record["K"]), np.array(record["D"]), simulated.camera.size)
@@ -45,7 +47,9 @@ def test_the_shift_is_that_of_the_image_s_area() -> None:
     """Against a sum over the disc's surface, each piece as large as it appears."""
     lens, T = rig().camera, tilted(35, 60)
     r, a = RADIUS * np.sqrt((np.arange(40) + 0.5) / 40), np.arange(48) / 48 * 2 * np.pi
-    disc = np.stack([np.outer(r, np.cos(a)).ravel(), np.outer(r, np.sin(a)).ravel(), np.zeros(1920)], axis=1)
+    disc = np.stack(
+        [np.outer(r, np.cos(a)).ravel(), np.outer(r, np.sin(a)).ravel(), np.zeros(1920)], axis=1
+    )
 
     def seen(points: np.ndarray) -> np.ndarray:
         return lens.project(points @ T[:3, :3].T + T[:3, 3])
@@ -94,7 +98,11 @@ def test_a_calibration_from_centroids_finds_the_centres() -> None:
         shift = centroid_shifts(true.camera, poses[name], BOARD.points, RADIUS)
         slopes = np.tile([[0.8, 0.02], [-0.01, 1.5]], (len(shift), 1, 1))
         projector = o.projector + np.einsum("nij,nj->ni", slopes, shift)
-        seen.append(replace(o, camera=o.camera + shift, projector=projector, slopes=slopes, radius_mm=RADIUS))
+        seen.append(
+            replace(
+                o, camera=o.camera + shift, projector=projector, slopes=slopes, radius_mm=RADIUS
+            )
+        )
     stereo, corrected = calibrate_centres(seen, PROJECTOR, str(BOARD))
     before = max(np.abs(o.camera - exact[o.name].camera).max() for o in seen)
     left = max(np.abs(o.camera - exact[o.name].camera).max() for o in corrected)
@@ -102,6 +110,6 @@ def test_a_calibration_from_centroids_finds_the_centres() -> None:
     assert max(np.abs(o.projector - exact[o.name].projector).max() for o in corrected) < before / 25
     raw = calibrate_stereo(seen, PROJECTOR, str(BOARD))
     assert stereo.reprojection_rms_px["camera"] < raw.reprojection_rms_px["camera"] / 10
-    assert all(new is old for new, old in zip(move_to_centres(corrected, stereo), corrected, strict=True)), (
-        "once is enough"
-    )
+    assert all(
+        new is old for new, old in zip(move_to_centres(corrected, stereo), corrected, strict=True)
+    ), "once is enough"

@@ -31,12 +31,16 @@ def axis(**change: float) -> AxisEvidence:
 
 
 def pose(number: int, **change: object) -> PoseEvidence:
-    sound = PoseEvidence(f"pose_{number:02d}", axes={"x": axis(), "y": axis()}, moved_px=0.01, turn=UPRIGHT)
+    sound = PoseEvidence(
+        f"pose_{number:02d}", axes={"x": axis(), "y": axis()}, moved_px=0.01, turn=UPRIGHT
+    )
     return dataclasses.replace(sound, **change)
 
 
 def causes(*poses: PoseEvidence, **more: object) -> tuple[str, ...]:
-    return judge_evidence(Evidence("circles:21x16:9", (912, 1140), poses, tilt_spread_deg=30.0, **more)).causes
+    return judge_evidence(
+        Evidence("circles:21x16:9", (912, 1140), poses, tilt_spread_deg=30.0, **more)
+    ).causes
 
 
 def observations(count: int = 20) -> list[Observation]:
@@ -60,7 +64,9 @@ def plane_rms_mm(found: DiagnosedCalibration, poses: list[Observation]) -> float
 @pytest.mark.computes
 def test_a_sound_calibration_is_good() -> None:
     found = attempt(observations(8))
-    assert found.verdict == Verdict() and found.verdict.level == "good" and found.verdict.reason == ""
+    assert (
+        found.verdict == Verdict() and found.verdict.level == "good" and found.verdict.reason == ""
+    )
     assert len(found.observations) == 8 and not found.excluded
 
 
@@ -87,7 +93,9 @@ def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None
     bad, poses = clean[4], observations()
     if order in turns:
         turned = turns[order]().ravel()
-        poses[4] = dataclasses.replace(bad, camera=bad.camera[turned], projector=bad.projector[turned])
+        poses[4] = dataclasses.replace(
+            bad, camera=bad.camera[turned], projector=bad.projector[turned]
+        )
     elif order == "noise":
         noise = np.random.default_rng(1).normal(0, 3, bad.camera.shape)
         poses[4] = dataclasses.replace(bad, camera=bad.camera + noise)
@@ -97,7 +105,9 @@ def test_one_bad_pose_of_twenty_is_named_and_changes_nothing(order: str) -> None
     else:
         behind = board_poses(20)[4]
         behind[2, 3] += 8.0
-        poses[4] = dataclasses.replace(bad, projector=observation(TRUE, behind, "pose_04").projector)
+        poses[4] = dataclasses.replace(
+            bad, projector=observation(TRUE, behind, "pose_04").projector
+        )
     found = attempt(poses)
     cause = {"noise": "outlier", "bent": "outlier", "moved": "moved"}.get(order, "board-numbering")
     assert found.verdict.causes == (cause,) and found.verdict.findings[0].poses == ("pose_04",)
@@ -134,7 +144,9 @@ def test_what_cannot_be_used_is_kept_to_look_into_if_it_is_a_rig_at_all() -> Non
     ],
 )
 def test_a_mirror_image_is_explained(turn: tuple, cause: str, axes: tuple[str, ...]) -> None:
-    verdict = judge_evidence(Evidence("circles:21x16:9", (912, 1140), tuple(pose(k, turn=turn) for k in range(6))))
+    verdict = judge_evidence(
+        Evidence("circles:21x16:9", (912, 1140), tuple(pose(k, turn=turn) for k in range(6)))
+    )
     assert verdict.causes == (cause,) and verdict.level == "rejected"
     assert missing_facts(verdict.reason, *axes) == []
 
@@ -147,19 +159,31 @@ def test_a_projector_upside_down_is_sound() -> None:
 def test_the_root_cause_hides_its_consequences() -> None:
     late = Suspect(0, "lag", "from frame 1 on the camera is one image behind the projector")
     spoilt = {"refused": "no board", "suspects": (late,), "axes": {"x": axis(period_seen_px=7.0)}}
-    assert causes(*(pose(k, **spoilt) for k in range(6)), refusal="0 usable poses") == ("frame-lag",)
+    assert causes(*(pose(k, **spoilt) for k in range(6)), refusal="0 usable poses") == (
+        "frame-lag",
+    )
     # codes beyond the projector: of another size, or of other fringes
-    beyond = (Contradiction("projector-size", "10 % of the x codes lie outside: give the size", "x", 1000.0),)
-    assert causes(*(pose(k, contradictions=beyond, refused="codes") for k in range(6))) == ("projector-size",)
+    beyond = (
+        Contradiction(
+            "projector-size", "10 % of the x codes lie outside: give the size", "x", 1000.0
+        ),
+    )
+    assert causes(*(pose(k, contradictions=beyond, refused="codes") for k in range(6))) == (
+        "projector-size",
+    )
     wrong = {"axes": {"x": axis(period_px=20.0)}, "refused": "codes", "contradictions": beyond}
     assert causes(*(pose(k, **wrong) for k in range(6))) == ("fringe-period",)
     # a board that is never found says why before it says that too few are left
-    assert causes(*(pose(k, refused="336 of 352", grid=(20, 16)) for k in range(6))) == ("board-size",)
+    assert causes(*(pose(k, refused="336 of 352", grid=(20, 16)) for k in range(6))) == (
+        "board-size",
+    )
 
 
 def test_a_frame_that_is_white_too_early_or_late_tells_which_way() -> None:
     strange = (Suspect(50, "strange", "frame 51 does not fit the other bits"),)
-    assert causes(*(pose(k, suspects=strange, displaced=-1) for k in range(6)))[0] == "missing-frame"
+    assert (
+        causes(*(pose(k, suspects=strange, displaced=-1) for k in range(6)))[0] == "missing-frame"
+    )
     assert causes(*(pose(k, suspects=strange, displaced=1) for k in range(6)))[0] == "frame-lag"
     assert causes(*(pose(k, suspects=strange) for k in range(6))) == ()
 
@@ -179,8 +203,15 @@ def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
     barrel = 200 + (seen.camera - 200) * (1 - 0.25 * r2)  # some 25 % at the rim
     assert describe_misnumbering(BOARD, seen.points, barrel) == ""
     index = np.arange(99).reshape(9, 11)
-    for order, word in ((index.T, "transposed"), (np.roll(index, -1, 0), "row"), (np.roll(index, 1, 1), "column")):
-        assert missing_facts(describe_misnumbering(BOARD, seen.points, barrel[order.ravel()]), word) == []
+    for order, word in (
+        (index.T, "transposed"),
+        (np.roll(index, -1, 0), "row"),
+        (np.roll(index, 1, 1), "column"),
+    ):
+        assert (
+            missing_facts(describe_misnumbering(BOARD, seen.points, barrel[order.ravel()]), word)
+            == []
+        )
     shuffled = np.random.default_rng(3).permutation(99)
     assert describe_misnumbering(BOARD, seen.points, seen.camera[shuffled]) == "mixed up"
 
@@ -192,7 +223,10 @@ def test_evidence_and_verdicts_survive_saving() -> None:
     assert np.isnan(again.moved_px)
     assert dataclasses.replace(again, moved_px=0.0) == dataclasses.replace(kept, moved_px=0.0)
     verdict = Verdict.of(
-        [Finding("gamma", "doubtful", "curved", "correct it"), Finding("moved", "rejected", "it", "hold it")]
+        [
+            Finding("gamma", "doubtful", "curved", "correct it"),
+            Finding("moved", "rejected", "it", "hold it"),
+        ]
     )
     assert verdict.causes == ("moved", "gamma") and verdict.level == "rejected"
     assert from_plain(json.loads(json.dumps(verdict.to_json())), Verdict) == verdict

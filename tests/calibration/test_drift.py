@@ -35,14 +35,18 @@ def later() -> list[Pose]:
 def reference():
     observations = [seen(RIG, pose, f"pose_{i}") for i, pose in enumerate(poses(RIG, 12, seed=3))]
     model = calibrate_stereo(observations, RIG.projector.size, str(BOARD))
-    found = build_reference(model.rig, [DriftView.from_observation(o) for o in observations if o.name in model.poses])
+    found = build_reference(
+        model.rig, [DriftView.from_observation(o) for o in observations if o.name in model.poses]
+    )
     kept = DriftReference.from_arrays(model.rig, found.to_arrays())  # as a session keeps it
     assert kept.sigmas == found.sigmas
     return kept
 
 
 def checked(reference, rig, i, name="later", **how) -> Drift:
-    return check_drift(reference, DriftView.from_observation(seen(rig, later()[i], f"{name}_{i}", **how)))
+    return check_drift(
+        reference, DriftView.from_observation(seen(rig, later()[i], f"{name}_{i}", **how))
+    )
 
 
 def test_an_unmoved_rig_raises_no_alarm(reference):
@@ -92,7 +96,9 @@ def test_one_axis_says_what_it_cannot_see(reference):
 def test_a_refocused_lens_is_no_movement(reference):
     fx, fy = RIG.projector.focal_px
     k1, *others = RIG.projector.brown
-    other = replace(RIG, projector=replace(RIG.projector, focal_px=(fx, fy * 1.002), brown=(k1 + 0.05, *others)))
+    other = replace(
+        RIG, projector=replace(RIG.projector, focal_px=(fx, fy * 1.002), brown=(k1 + 0.05, *others))
+    )
     found = checked(reference, other, 3)
     assert found.verdict == "recalibrate"
     assert missing_facts(found.reasons[0], "lens", f"{found.misfit_px:.3f}") == []
@@ -102,10 +108,17 @@ def test_an_answer_survives_json(reference):
     found = checked(reference, moved(RIG, (0.05, 0.05, 0)), 4)
     assert from_plain(json.loads(json.dumps(to_plain(found))), Drift) == found
     assert found.verdict == "recalibrate" and found.reasons
-    assert missing_facts("\n".join(map(render_text, Drift.tables({"1": found}))), found.verdict, *found.reasons) == []
+    assert (
+        missing_facts(
+            "\n".join(map(render_text, Drift.tables({"1": found}))), found.verdict, *found.reasons
+        )
+        == []
+    )
 
 
 def test_too_few_poses_set_no_floor(reference):
-    views = [DriftView.from_observation(seen(RIG, pose, "few")) for pose in later()[: MIN_POSES - 1]]
+    views = [
+        DriftView.from_observation(seen(RIG, pose, "few")) for pose in later()[: MIN_POSES - 1]
+    ]
     with raises(InputError, MIN_POSES - 1, MIN_POSES):
         build_reference(reference.rig, views)

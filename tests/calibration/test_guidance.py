@@ -1,11 +1,16 @@
-"""Guidance from information: it foretells what a pose brings, asks for what can be seen, and knows when to stop."""
+"""Guidance from information: it foretells what a pose brings, asks for what can be seen, and knows
+when to stop."""
 
 import numpy as np
 import pytest
 from splined_rig import BOARD, poses, rig
 
 from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
-from slviewer.calibration.guidance.information import RigInformation, VolumeSensitivity, information_rows
+from slviewer.calibration.guidance.information import (
+    RigInformation,
+    VolumeSensitivity,
+    information_rows,
+)
 from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
@@ -24,7 +29,10 @@ def seen(true) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     found = []
     for pose in poses(true, 12):
         points = pose.to_camera(BOARD.points)
-        devices = [d + rng.normal(0, 0.01, d.shape) for d in (true.camera.project(points), true.project(points))]
+        devices = [
+            d + rng.normal(0, 0.01, d.shape)
+            for d in (true.camera.project(points), true.project(points))
+        ]
         found.append((BOARD.points, *devices))
     return found
 
@@ -50,7 +58,9 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
     sizes = true.camera.size, true.projector.size
     assert estimate_rig(*zip(*seen[:2], strict=True), sizes) is None
     points, camera, projector = (list(a) for a in zip(*seen[:4], strict=True))
-    assert estimate_rig(points, camera, projector[1:] + projector[:1], sizes) is None  # of other poses
+    assert (
+        estimate_rig(points, camera, projector[1:] + projector[:1], sizes) is None
+    )  # of other poses
 
 
 @pytest.mark.computes
@@ -59,7 +69,10 @@ def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
     rows = information_rows(bench, np.array(known[1]))
     before, after = (RigInformation.from_rows(bench, rows[:n], sensitivity) for n in (5, 6))
     gain = before.gain(rows[5])
-    assert gain == pytest.approx(before.variances.mean() - after.variances.mean(), rel=1e-3) and gain > 0
+    assert (
+        gain == pytest.approx(before.variances.mean() - after.variances.mean(), rel=1e-3)
+        and gain > 0
+    )
     assert (after.variances <= before.variances * (1 + 1e-6)).all()
 
 
@@ -74,11 +87,16 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
         sigmas.append(found.sigma_mm)
         had = [*had, found.poses[0]]
         X = BOARD.points @ had[-1][:3, :3].T + had[-1][:3, 3]
-        for pixels, device in ((true.camera.project(X), true.camera), (true.project(X), true.projector)):
+        for pixels, device in (
+            (true.camera.project(X), true.camera),
+            (true.project(X), true.projector),
+        ):
             assert ((pixels > -1) & (pixels < np.array(device.size))).all()
     sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
     reached, by_design = (
-        RigInformation.from_rows(bench, information_rows(bench, np.array(poses)), sensitivity).sigma_mm
+        RigInformation.from_rows(
+            bench, information_rows(bench, np.array(poses)), sensitivity
+        ).sigma_mm
         for poses in (had, known[1])
     )
     assert sigmas[0] > sigmas[1] > sigmas[2] > reached
@@ -90,7 +108,9 @@ def test_noise_that_was_seen_is_expected() -> None:
     usual = ExpectedNoise()
     assert usual.with_noise(np.array([np.nan, np.nan])) == usual
     noisy = usual.with_noise(3 * usual.sample * np.array([1.0, np.nan, 1.0]))
-    assert noisy.sample == pytest.approx(3 * usual.sample) and noisy.feature == pytest.approx(3 * usual.feature)
+    assert noisy.sample == pytest.approx(3 * usual.sample) and noisy.feature == pytest.approx(
+        3 * usual.feature
+    )
 
 
 @pytest.mark.slow
@@ -99,14 +119,21 @@ def test_a_plan_asks_until_the_wanted_sigma_is_reached(true, seen) -> None:
     sizes = true.camera.size, true.projector.size
     features = {f"pose_{i:02d}": PoseFeatures(*each) for i, each in enumerate(seen)}
     nothing, few, many = (
-        plan_next_pose(PlanInput(BOARD, *sizes, dict(list(features.items())[:n])), trials=16) for n in (0, 4, MIN_POSES)
+        plan_next_pose(PlanInput(BOARD, *sizes, dict(list(features.items())[:n])), trials=16)
+        for n in (0, 4, MIN_POSES)
     )
     assert nothing.sigma_mm is None and nothing.suggestion is not None and not nothing.reaches(1.0)
-    assert few.sigma_mm is not None and many.sigma_mm is not None and few.sigma_mm > many.sigma_mm > 0.001
+    assert (
+        few.sigma_mm is not None
+        and many.sigma_mm is not None
+        and few.sigma_mm > many.sigma_mm > 0.001
+    )
     assert few.sigma_next_mm is not None and few.sigma_next_mm < few.sigma_mm
     assert not few.reaches(2 * few.sigma_mm)  # too few to tell whether all is as it should be
     assert many.reaches(1.01 * many.sigma_mm) and not many.reaches(0.99 * many.sigma_mm)
     assert 0.01 < many.usual_mm < 0.04
-    refused = plan_next_pose(PlanInput(BOARD, *sizes, dict(list(features.items())[:4]), refused=1), trials=16)
+    refused = plan_next_pose(
+        PlanInput(BOARD, *sizes, dict(list(features.items())[:4]), refused=1), trials=16
+    )
     assert refused.suggestion is not None and few.suggestion is not None
     assert not np.allclose(refused.suggestion.T_camera_board, few.suggestion.T_camera_board)

@@ -1,4 +1,5 @@
-"""A board of circles that was turned by 180 degrees between poses is numbered as in the others, where it shows."""
+"""A board of circles that was turned by 180 degrees between poses is numbered as in the others,
+where it shows."""
 
 from dataclasses import replace
 
@@ -28,7 +29,9 @@ def true():
 @pytest.fixture(scope="module")
 def seen(true) -> list[Observation]:
     shape = BoardShape(bow_x_mm=0.1, twist_mm=0.05, misplaced_mm=0.03)
-    return [observation(true, pose, f"pose_{i:02d}", shape) for i, pose in enumerate(poses(true, 10))]
+    return [
+        observation(true, pose, f"pose_{i:02d}", shape) for i, pose in enumerate(poses(true, 10))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +45,9 @@ def turned(seen: Observation) -> Observation:
 
 
 def calibrated(seen: list[Observation], true) -> SplinedModel:
-    return calibrate_splined(seen, calibrate_stereo(seen, true.projector.size, str(BOARD)), cells_across=CELLS)
+    return calibrate_splined(
+        seen, calibrate_stereo(seen, true.projector.size, str(BOARD)), cells_across=CELLS
+    )
 
 
 @pytest.mark.slow
@@ -61,7 +66,9 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
         clouds = [model.points(phase).astype(float) for model in (found, as_held)]
         known = np.isfinite(clouds[0][..., 2]) & np.isfinite(clouds[1][..., 2])
         assert known.sum() > 20_000
-        assert np.sqrt(np.mean(aligned_error(*(cloud[known][::11] for cloud in clouds)) ** 2)) < 0.002
+        assert (
+            np.sqrt(np.mean(aligned_error(*(cloud[known][::11] for cloud in clouds)) ** 2)) < 0.002
+        )
     again = type(found.bundle).from_arrays(found.bundle.to_dict(), found.bundle.to_arrays())
     assert again.half_turned_poses == found.bundle.half_turned_poses
 
@@ -69,8 +76,12 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
 @pytest.mark.slow
 def test_marked_poses_are_never_turned(mixed, true) -> None:
     marked = [replace(each, marked=i in TURNED) for i, each in enumerate(mixed)]
-    found = adjust_bundle(marked, calibrate_stereo(marked, true.projector.size, str(BOARD)), cells_across=CELLS)
-    assert set(found.half_turned_poses) == {each.name for i, each in enumerate(mixed) if i not in TURNED}
+    found = adjust_bundle(
+        marked, calibrate_stereo(marked, true.projector.size, str(BOARD)), cells_across=CELLS
+    )
+    assert set(found.half_turned_poses) == {
+        each.name for i, each in enumerate(mixed) if i not in TURNED
+    }
 
 
 def test_boards_that_may_be_turned() -> None:
@@ -82,5 +93,7 @@ def test_boards_that_may_be_turned() -> None:
     )
     partner = opposite_features(BOARD.points)
     assert partner is not None and np.array_equal(partner, np.arange(len(BOARD.points))[::-1])
-    assert opposite_features(Board.parse("acircles:4x11:20").points) is None, "its last row would start elsewhere"
+    assert opposite_features(Board.parse("acircles:4x11:20").points) is None, (
+        "its last row would start elsewhere"
+    )
     assert opposite_features(Board.parse("acircles:4x10:20").points) is not None

@@ -17,7 +17,16 @@ def pose(name: str, marked: bool, turned: bool = False) -> Observation:
     camera = PLACES[::-1] if turned else PLACES
     projector = camera * 0.5
     return Observation(
-        name, BOARD.points, camera, projector, {}, {}, (640, 480), (0, 0, 8, 8), np.zeros(8, np.uint8), marked=marked
+        name,
+        BOARD.points,
+        camera,
+        projector,
+        {},
+        {},
+        (640, 480),
+        (0, 0, 8, 8),
+        np.zeros(8, np.uint8),
+        marked=marked,
     )
 
 
@@ -25,7 +34,9 @@ def pose(name: str, marked: bool, turned: bool = False) -> Observation:
 def test_what_a_minority_takes_for_a_mark_is_none(turned: bool) -> None:
     poses = [pose(f"pose_{k}", marked=k < 3, turned=turned and k < 3) for k in range(8)]
     numbered, warning = reconcile_marks(BOARD, poses)
-    assert [o.name for o in numbered] == [o.name for o in poses] and not any(o.marked for o in numbered)
+    assert [o.name for o in numbered] == [o.name for o in poses] and not any(
+        o.marked for o in numbered
+    )
     for each in numbered:
         np.testing.assert_array_equal(each.camera, PLACES)
         np.testing.assert_array_equal(each.projector, PLACES * 0.5)

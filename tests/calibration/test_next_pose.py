@@ -1,4 +1,5 @@
-"""Suggested poses keep the board in view, close the gaps of coverage, and say in words what they are."""
+"""Suggested poses keep the board in view, close the gaps of coverage, and say in words what they
+are."""
 
 import numpy as np
 import pytest
@@ -66,7 +67,9 @@ def test_words_say_what_the_pose_is():
     assert seen == set(TILTS)
     # the top of a board tilted "top away" is farther than its bottom
     top_away = next(T for T in poses if count_coverage(BOARD, LENS, [T]).tilts[1])
-    top, bottom = (top_away[:3, :3] @ corner + top_away[:3, 3] for corner in BOARD.outline()[[0, 3]])
+    top, bottom = (
+        top_away[:3, :3] @ corner + top_away[:3, 3] for corner in BOARD.outline()[[0, 3]]
+    )
     assert top[2] > bottom[2] + 10
 
 
@@ -82,7 +85,9 @@ def test_a_pose_and_a_lens_are_recovered_from_features():
 
 
 def test_the_projectors_reach_is_learnt_from_two_planes():
-    P = np.array([[700.0, 0, 456, 300 - 456 * 0.3], [0, 1400, 570, 0], [0, 0, 1, 0]]) @ np.diag([1, 1, 1, 300.0])
+    P = np.array([[700.0, 0, 456, 300 - 456 * 0.3], [0, 1400, 570, 0], [0, 0, 1, 0]]) @ np.diag(
+        [1, 1, 1, 300.0]
+    )
 
     def project(points):
         h = np.column_stack([points, np.ones(len(points))]) @ P.T
@@ -102,7 +107,9 @@ def test_the_projectors_reach_is_learnt_from_two_planes():
 
 
 def test_refused_suggestions_are_passed_over_and_large_boards_refused():
-    first, second = (suggest(BOARD, LENS, [], illuminated=everywhere, skip=k).T_camera_board for k in (0, 1))
+    first, second = (
+        suggest(BOARD, LENS, [], illuminated=everywhere, skip=k).T_camera_board for k in (0, 1)
+    )
     assert not np.allclose(first, second)
     with raises(InputError, BOARD):
         suggest(BOARD, LENS, [], illuminated=lambda points: np.zeros(len(points), bool))

@@ -1,4 +1,5 @@
-"""The lenses that other programs get of a splined calibration: they reproduce its clouds' pixels."""
+"""The lenses that other programs get of a splined calibration: they reproduce its clouds'
+pixels."""
 
 from pathlib import Path
 
@@ -35,7 +36,9 @@ def cloud_offsets(splined: SplinedModel, true, lens: Lens) -> np.ndarray:
     """(n,) px: from the pixels of a measured cloud to where a lens sees its points."""
     points = splined.points(phase_map(true, np.full(true.camera.size[::-1], 600.0)))
     v, u = np.nonzero(np.isfinite(points[..., 2]))
-    return np.asarray(np.linalg.norm(lens.project(points[v, u].astype(float)) - np.column_stack([u, v]), axis=1))
+    return np.asarray(
+        np.linalg.norm(lens.project(points[v, u].astype(float)) - np.column_stack([u, v]), axis=1)
+    )
 
 
 @pytest.mark.slow
@@ -69,7 +72,9 @@ def _bent() -> tuple[StereoModel, SplinedModel]:
 
 @pytest.mark.slow
 @pytest.mark.computes
-def test_the_exported_file_is_the_models_own_and_names_its_frame(models, true, tmp_path: Path) -> None:
+def test_the_exported_file_is_the_models_own_and_names_its_frame(
+    models, true, tmp_path: Path
+) -> None:
     stereo, splined = models
     warned: list[str] = []
     with Session.create(tmp_path / "session") as store:
@@ -79,7 +84,9 @@ def test_the_exported_file_is_the_models_own_and_names_its_frame(models, true, t
         save_fitted(store, splined, {f"pose_{i:02d}": "" for i in range(9)}, {})
         warn_if_frame_changed(store, "stereo", warned.append)
         assert len(warned) == 1 and frame_of(store, "splined") in warned[0]
-        assert frame_of(store, "pixelwise") == frame_of(store, "stereo") != frame_of(store, "splined")
+        assert (
+            frame_of(store, "pixelwise") == frame_of(store, "stereo") != frame_of(store, "splined")
+        )
         frame = frame_of(store, "splined")
     found = export(tmp_path / "session", "calibration", model="splined", out=tmp_path / "c.yml")
     assert frame in found.words

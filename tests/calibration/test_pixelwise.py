@@ -27,7 +27,9 @@ def phase_of_plane(z: float) -> tuple[PhaseMap, np.ndarray]:
     """Exact phase of the plane at depth z, and its points."""
     rays = TRUE.camera.rays()
     points = np.dstack([rays * z, np.full(rays.shape[:2], z)])
-    coordinate = cv_project(TRUE.projector, points.reshape(-1, 3) @ TRUE.R.T + TRUE.t)[:, 0].reshape(rays.shape[:2])
+    coordinate = cv_project(TRUE.projector, points.reshape(-1, 3) @ TRUE.R.T + TRUE.t)[
+        :, 0
+    ].reshape(rays.shape[:2])
     shape = coordinate.shape
     phase = PhaseMap(
         axis="x",
@@ -43,15 +45,21 @@ def phase_of_plane(z: float) -> tuple[PhaseMap, np.ndarray]:
     return phase, points
 
 
-@pytest.mark.parametrize(("z", "limit"), [(560.0, 0.06), (640.0, 0.06), (460.0, 0.25), (760.0, 0.25)])
-def test_depth_inside_and_outside_the_calibrated_range(model: PixelwiseModel, z: float, limit: float) -> None:
+@pytest.mark.parametrize(
+    ("z", "limit"), [(560.0, 0.06), (640.0, 0.06), (460.0, 0.25), (760.0, 0.25)]
+)
+def test_depth_inside_and_outside_the_calibrated_range(
+    model: PixelwiseModel, z: float, limit: float
+) -> None:
     phase, truth = phase_of_plane(z)
     measured = model.points(phase)
     seen = model.fits["x"].poses >= 10
     error = (measured - truth)[seen]
     rms = np.sqrt(np.nanmean(error[:, 2] ** 2))
     assert 1e-4 < rms < limit
-    assert np.sqrt(np.nanmean(error[:, :2] ** 2)) < 0.15  # the gauge: a principal point some tenths of a pixel off
+    assert (
+        np.sqrt(np.nanmean(error[:, :2] ** 2)) < 0.15
+    )  # the gauge: a principal point some tenths of a pixel off
 
 
 def test_fit_rms_is_kept_in_z_x_and_y(model: PixelwiseModel) -> None:
@@ -62,7 +70,11 @@ def test_fit_rms_is_kept_in_z_x_and_y(model: PixelwiseModel) -> None:
 def test_a_pixel_of_fewer_than_four_poses_is_nan(model: PixelwiseModel) -> None:
     fit = model.fits["x"]
     few = fit.poses < 4
-    assert few.any() and np.isnan(fit.coefficients[:, few]).all() and np.isnan(fit.rms_mm[:, few]).all()
+    assert (
+        few.any()
+        and np.isnan(fit.coefficients[:, few]).all()
+        and np.isnan(fit.rms_mm[:, few]).all()
+    )
     assert np.isfinite(fit.coefficients[:, fit.poses >= 8]).all()
     assert fit.poses.max() == 16
 
@@ -84,11 +96,15 @@ def test_predicted_noise_is_the_measured_one(model: PixelwiseModel) -> None:
 
 def test_a_capture_of_another_fringe_period_measures_the_same(model: PixelwiseModel) -> None:
     phase, _ = phase_of_plane(600.0)
-    finer = PhaseMap(**{**vars(phase), "period_px": 12.0, "phase": (phase.phase * 1.5).astype(np.float32)})
+    finer = PhaseMap(
+        **{**vars(phase), "period_px": 12.0, "phase": (phase.phase * 1.5).astype(np.float32)}
+    )
     clean = model.points(phase)
     assert np.nanmax(np.abs(model.points(finer) - clean)) < 1e-3
     # the same error in phase is two thirds of the error in projector px
-    assert np.nanmedian(model.sigma_z(finer, clean) / model.sigma_z(phase, clean)) == pytest.approx(2 / 3, rel=1e-3)
+    assert np.nanmedian(model.sigma_z(finer, clean) / model.sigma_z(phase, clean)) == pytest.approx(
+        2 / 3, rel=1e-3
+    )
 
 
 def test_it_survives_saving(model: PixelwiseModel) -> None:
@@ -104,7 +120,9 @@ def test_the_samples_of_a_pixel_lie_on_its_curve(model: PixelwiseModel) -> None:
     c = model.fits["x"].coefficients[:, 150, 200]
     assert len(phase) == model.fits["x"].poses[150, 200]
     residual = points[:, 2] - (c[0] + c[1] * phase) / (1 + c[2] * phase)
-    assert np.sqrt(np.mean(residual**2)) == pytest.approx(float(model.fits["x"].rms_mm[0, 150, 200]), rel=0.05)
+    assert np.sqrt(np.mean(residual**2)) == pytest.approx(
+        float(model.fits["x"].rms_mm[0, 150, 200]), rel=0.05
+    )
 
 
 def test_too_few_poses_are_rejected() -> None:
@@ -119,9 +137,25 @@ def test_moments_find_an_exact_rational_function() -> None:
     c0, c1, c2 = 900.0, -1.5, 3e-3
     z = (c0 + c1 * phi) / (1 + c2 * phi)
     a, rms, condition = np.empty((3, 1, 1)), np.empty((1, 1)), np.empty((1, 1), np.float32)
-    poses, low, high = np.empty((1, 1), np.uint16), np.empty((1, 1), np.float32), np.empty((1, 1), np.float32)
+    poses, low, high = (
+        np.empty((1, 1), np.uint16),
+        np.empty((1, 1), np.float32),
+        np.empty((1, 1), np.float32),
+    )
     reference = np.full((1, 1), 118.0)
-    fit_rational(phi.reshape(9, 1, 1), z.reshape(9, 1, 1), reference, 600.0, 4, a, rms, poses, low, high, condition)
+    fit_rational(
+        phi.reshape(9, 1, 1),
+        z.reshape(9, 1, 1),
+        reference,
+        600.0,
+        4,
+        a,
+        rms,
+        poses,
+        low,
+        high,
+        condition,
+    )
     assert rms[0, 0] < 1e-6 and poses[0, 0] == 9 and (low[0, 0], high[0, 0]) == (100, 130)
     a0, a1, a2 = a[:, 0, 0]
     s = phi - 118.0

@@ -1,4 +1,5 @@
-"""Residuals that repeat with the fringe, and residuals beyond noise: measured, named, and part of the verdict."""
+"""Residuals that repeat with the fringe, and residuals beyond noise: measured, named, and part of
+the verdict."""
 
 from dataclasses import replace
 
@@ -8,7 +9,12 @@ from facts import missing_facts
 from splined_rig import BOARD, PERIOD, SAMPLE_PX, observation, poses, rig
 
 from slviewer.calibration.diagnosis.capture_rules import diagnose_period, diagnose_ripple
-from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, PoseEvidence, SolutionEvidence
+from slviewer.calibration.diagnosis.evidence import (
+    AxisEvidence,
+    Evidence,
+    PoseEvidence,
+    SolutionEvidence,
+)
 from slviewer.calibration.diagnosis.ripple import Ripple, measure_ripple
 from slviewer.calibration.diagnosis.solution import measure_solution
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict, judge_splined
@@ -45,7 +51,9 @@ def with_ripple(o: Observation, px: float, waves: int) -> Observation:
     """Samples whose coordinates are off by ``px`` RMS, ``waves`` times a period."""
     assert o.samples is not None
     error = px * np.sqrt(2) * np.sin(2 * np.pi * waves * o.samples.projector / PERIOD)
-    return replace(o, samples=Samples(o.samples.camera, o.samples.projector + error, o.samples.sigma))
+    return replace(
+        o, samples=Samples(o.samples.camera, o.samples.projector + error, o.samples.sigma)
+    )
 
 
 @pytest.mark.parametrize("waves", [1, 3, 4])
@@ -53,7 +61,9 @@ def test_a_ripple_is_measured_beside_what_lenses_leave(seen, stereo, waves: int)
     clean = measure_ripple(seen, stereo)
     assert set(clean) == {"x", "y"} and max(r.rms_px for r in clean.values()) < 0.5 * SAMPLE_PX
     depth = clean["x"].depth_mm
-    pinhole = depth**2 / (stereo.rig.projector.K[0, 0] * np.linalg.norm(rig(seed=2).t))  # dz / du = z^2 / (f b)
+    pinhole = depth**2 / (
+        stereo.rig.projector.K[0, 0] * np.linalg.norm(rig(seed=2).t)
+    )  # dz / du = z^2 / (f b)
     assert 500 < depth < 700 and clean["x"].mm_per_px == pytest.approx(pinhole, rel=0.25)
     for found in measure_ripple([with_ripple(o, 0.05, waves) for o in seen], stereo).values():
         assert found.waves == waves and found.noise_px == pytest.approx(SAMPLE_PX)
@@ -65,7 +75,9 @@ def solution(seen, stereo) -> SolutionEvidence:
     return measure_solution(seen, stereo)
 
 
-def evidence(solution: SolutionEvidence, ripple: dict, steps: int, period_seen: float = PERIOD) -> Evidence:
+def evidence(
+    solution: SolutionEvidence, ripple: dict, steps: int, period_seen: float = PERIOD
+) -> Evidence:
     axes = {axis: AxisEvidence(PERIOD, steps, 1.0, 0.0, np.nan, period_seen) for axis in "xy"}
     turn = ((1.0, 0.0), (0.0, 1.0))
     return Evidence(
@@ -89,13 +101,17 @@ def test_as_many_waves_as_steps_are_gamma_and_few_are_changing_light(solution) -
 
 
 @pytest.mark.parametrize(("rms_px", "noise_px"), [(0.02, 0.1), (0.01, 0.02), (0.01, 0.0)])
-def test_a_ripple_below_the_noise_or_of_no_size_is_no_finding(solution, rms_px: float, noise_px: float) -> None:
+def test_a_ripple_below_the_noise_or_of_no_size_is_no_finding(
+    solution, rms_px: float, noise_px: float
+) -> None:
     """0.01 px are 16 um in depth here: an undisturbed rig at its noise floor shows as much."""
     assert not list(diagnose_ripple(evidence(solution, {"x": ripple(rms_px, 3, noise_px)}, 3)))
 
 
 def test_a_ripple_without_predicted_noise_is_named(solution) -> None:
-    found = diagnose_ripple(evidence(solution, {"x": ripple(0.1, 1, 0.0), "y": ripple(0.4, 3, 0.0)}, 3))
+    found = diagnose_ripple(
+        evidence(solution, {"x": ripple(0.1, 1, 0.0), "y": ripple(0.4, 3, 0.0)}, 3)
+    )
     assert [(f.cause, f.severity) for f in found] == [("gamma", "doubtful")]
 
 
@@ -115,12 +131,18 @@ def test_noise_is_predicted_where_every_pixel_is_black_in_a_step() -> None:
 def test_a_gamma_of_two_in_a_dark_room_is_named(tmp_path) -> None:
     """Every pixel of the boards is black in one of the 18 steps."""
     true = letter(0.2, 1, gamma=2.2)
-    true = replace(true, light=replace(true.light, ambient=0.0, black=0.0), sensor=replace(true.sensor, dark_level=0.0))
+    true = replace(
+        true,
+        light=replace(true.light, ambient=0.0, black=0.0),
+        sensor=replace(true.sensor, dark_level=0.0),
+    )
     sequence, board = p18(true.projector.size), Board.parse("circles:21x16:9")
     with Session.create(tmp_path / "session") as session:
         for i, pose in enumerate(target_poses(true, board, 8)):
             frames = Renderer(true, printed_board(board, pose)).capture(sequence, i)
-            session.save_capture(f"pose_{i}", "calibration", sequence, frames, source="simulated", board=board)
+            session.save_capture(
+                f"pose_{i}", "calibration", sequence, frames, source="simulated", board=board
+            )
     verdict = calibrate(tmp_path / "session", str(board), models=("stereo",)).verdict
     assert verdict.level == "doubtful" and "gamma" in verdict.causes
 
@@ -139,7 +161,11 @@ def test_residuals_beyond_noise_are_doubtful_and_never_good() -> None:
     scattered = estimate_noise(rng.normal(0, 0.01, (500, 2)), rng.normal(0, sigma * (1, 10)), sigma)
     assert scattered.ratio[0] < 1.1 and scattered.ratio[1] == pytest.approx(10, rel=0.06)
     verdict = judge_splined(Verdict(), scattered)
-    assert verdict.level == "doubtful" and verdict.causes == ("residuals",) and "in y, 0.3" in verdict.reason
+    assert (
+        verdict.level == "doubtful"
+        and verdict.causes == ("residuals",)
+        and "in y, 0.3" in verdict.reason
+    )
     gamma = Verdict((Finding("gamma", "doubtful", "bent", "straighten"),))
     assert "probable cause: gamma" in judge_splined(gamma, scattered).findings[1].sentence
     assert judge_splined(Verdict(), Noise(0.01, (2.4, 2.4), (2.401, 2.401))).level == "rejected"

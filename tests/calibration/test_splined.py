@@ -1,11 +1,22 @@
-"""The joint adjustment on a simulated rig seen without images: right in space, honest about what it does not know."""
+"""The joint adjustment on a simulated rig seen without images: right in space, honest about what it
+does not know."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from facts import raises
-from splined_rig import BOARD, CELLS, PERIOD, aligned_error, observation, phase_map, poses, rig, surface
+from splined_rig import (
+    BOARD,
+    CELLS,
+    PERIOD,
+    aligned_error,
+    observation,
+    phase_map,
+    poses,
+    rig,
+    surface,
+)
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.adjust import adjust_bundle
@@ -28,7 +39,9 @@ def true():
 
 @pytest.fixture(scope="module")
 def seen(true) -> list[Observation]:
-    return [observation(true, pose, f"pose_{i:02d}", SHAPE) for i, pose in enumerate(poses(true, 12))]
+    return [
+        observation(true, pose, f"pose_{i:02d}", SHAPE) for i, pose in enumerate(poses(true, 12))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +55,8 @@ def model(seen, stereo) -> SplinedModel:
 
 
 def measured(model, true, depths=DEPTHS) -> tuple[np.ndarray, np.ndarray]:
-    """Found and true points (n, 3) of fronto-parallel surfaces, through pixels that the model measures."""
+    """Found and true points (n, 3) of fronto-parallel surfaces, through pixels that the model
+    measures."""
     found, truth = [], []
     for depth in depths:
         z = np.full(true.camera.size[::-1], depth)
@@ -54,7 +68,9 @@ def measured(model, true, depths=DEPTHS) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_space_is_right_in_front_of_inside_and_behind_the_calibrated_depths(model, stereo, true) -> None:
+def test_space_is_right_in_front_of_inside_and_behind_the_calibrated_depths(
+    model, stereo, true
+) -> None:
     found, truth = measured(model, true)
     assert len(truth) > 30_000
     error = aligned_error(found, truth)
@@ -80,14 +96,20 @@ def test_weights_come_from_the_residuals(model) -> None:
     noise = model.bundle.noise
     assert 0.006 < noise.camera_px < 0.012
     assert max(noise.excess_px) < 0.003 and all(0.004 < s < 0.008 for s in noise.sample_px)
-    assert all(fit.camera_trust > 0.7 and fit.projector_trust > 0.7 for fit in model.bundle.fits.values())
+    assert all(
+        fit.camera_trust > 0.7 and fit.projector_trust > 0.7 for fit in model.bundle.fits.values()
+    )
     assert "splined" in model.text() and not model.bundle.excluded
 
 
 @pytest.mark.slow
-def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model, seen, stereo, true) -> None:
+def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(
+    model, seen, stereo, true
+) -> None:
     moved = observation(true, poses(true, 12)[5], "pose_05", SHAPE, moved_mm=0.5)
-    bundle = adjust_bundle([moved if o.name == "pose_05" else o for o in seen], stereo, cells_across=CELLS)
+    bundle = adjust_bundle(
+        [moved if o.name == "pose_05" else o for o in seen], stereo, cells_across=CELLS
+    )
     assert list(bundle.excluded) == ["pose_05"] and "moved" in bundle.excluded["pose_05"]
     z = np.full(true.camera.size[::-1], 600.0)
     phase = phase_map(true, z)
@@ -99,7 +121,10 @@ def test_a_pose_that_moved_during_its_capture_is_named_and_changes_nothing(model
 def test_poses_read_with_more_noise_count_less_and_do_not_pass_for_moved(seen, stereo) -> None:
     rng = np.random.default_rng(1)
     noisy = ("pose_02", "pose_07")
-    read = [replace(o, camera=o.camera + rng.normal(0, 0.02, o.camera.shape)) if o.name in noisy else o for o in seen]
+    read = [
+        replace(o, camera=o.camera + rng.normal(0, 0.02, o.camera.shape)) if o.name in noisy else o
+        for o in seen
+    ]
     bundle = adjust_bundle(read, stereo, cells_across=CELLS)
     assert not bundle.excluded
     assert all(bundle.fits[name].camera_trust > 0.65 for name in noisy)
@@ -122,7 +147,9 @@ def test_where_no_pose_looked_points_are_masked_unless_asked_for(seen, stereo, t
 def _left_of(o: Observation, limit: float):
     assert o.samples is not None
     kept = o.samples.camera[:, 0] < limit
-    return type(o.samples)(*(a[kept] for a in (o.samples.camera, o.samples.projector, o.samples.sigma)))
+    return type(o.samples)(
+        *(a[kept] for a in (o.samples.camera, o.samples.projector, o.samples.sigma))
+    )
 
 
 def test_what_is_saved_comes_back_the_same(model, true) -> None:
@@ -136,7 +163,9 @@ def test_what_is_saved_comes_back_the_same(model, true) -> None:
 
 
 def test_poses_of_one_axis_are_refused_with_what_is_missing(seen, stereo, true) -> None:
-    single = [observation(true, p, f"pose_{i:02d}", axes=("x",)) for i, p in enumerate(poses(true, 4))]
+    single = [
+        observation(true, p, f"pose_{i:02d}", axes=("x",)) for i, p in enumerate(poses(true, 4))
+    ]
     with raises(InputError, 0, "axis x"):
         adjust_bundle(single, stereo)
     with pytest.raises(InputError):
@@ -149,7 +178,11 @@ def test_a_scan_of_another_period_or_of_the_wrong_size(model, true) -> None:
     assert np.nanmax(np.abs(one - other)) < 2e-3
     small = phase_map(true, z)
     small = replace(
-        small, **{k: getattr(small, k)[:-2] for k in ("phase", "wrapped", "modulation", "background", "reason")}
+        small,
+        **{
+            k: getattr(small, k)[:-2]
+            for k in ("phase", "wrapped", "modulation", "background", "reason")
+        },
     )
     with pytest.raises(InputError):
         model.points(small)

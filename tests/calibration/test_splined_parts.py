@@ -1,4 +1,5 @@
-"""Derivatives against differences, the compiled form against the exact one, the covariance against true errors."""
+"""Derivatives against differences, the compiled form against the exact one, the covariance against
+true errors."""
 
 import numpy as np
 import pytest
@@ -70,20 +71,25 @@ def test_every_derivative_agrees_with_differences(seen, stereo) -> None:
     size[at.rig + 4 : at.rig + 9] = size[at.rig + 13 : at.rig + 18] = 1e-5
     size[at.rig + 18 : at.rig + 21] = 1e-6
     fields = rng.choice(np.arange(at.camera_field, at.size), 60, replace=False)
-    chosen = np.concatenate([np.arange(at.offsets + 6), np.arange(at.rig, at.camera_field), np.sort(fields)])
+    chosen = np.concatenate(
+        [np.arange(at.offsets + 6), np.arange(at.rig, at.camera_field), np.sort(fields)]
+    )
 
     def change(k: int) -> np.ndarray:
         step = np.zeros(at.size)
         step[k] = size[k]
         ahead, behind = (
-            np.concatenate([p.ravel() for p in predict_observations(state.step(s), data)]) for s in (step, -step)
+            np.concatenate([p.ravel() for p in predict_observations(state.step(s), data)])
+            for s in (step, -step)
         )
         return (ahead - behind) / (2 * size[k])
 
     J = np.array([change(k) for k in chosen])
     scale = np.sqrt(np.sum(W * J**2, axis=1)) + 1e-3
     assert np.abs(J @ (W * r) - b[chosen]).max() < 1e-5 * scale.max()
-    assert np.abs(((J * W) @ J.T - A[np.ix_(chosen, chosen)]) / (scale[:, None] * scale)).max() < 1e-5
+    assert (
+        np.abs(((J * W) @ J.T - A[np.ix_(chosen, chosen)]) / (scale[:, None] * scale)).max() < 1e-5
+    )
 
 
 @pytest.mark.computes
@@ -105,11 +111,15 @@ def test_a_factor_by_blocks_solves_the_normal_equations(seen, stereo, damping: f
     solution = np.column_stack([factor.solve(b), factor.solve(others)])
     scale = np.sqrt(np.diag(A))[:, None]
     residual = A @ solution - np.column_stack([b, others])
-    assert (np.abs(residual / scale).max(axis=0) < 1e-9 * np.abs(scale * solution).max(axis=0)).all()
+    assert (
+        np.abs(residual / scale).max(axis=0) < 1e-9 * np.abs(scale * solution).max(axis=0)
+    ).all()
 
 
 def _every(samples, n):
-    return type(samples)(*(np.ascontiguousarray(a[::n]) for a in (samples.camera, samples.projector, samples.sigma)))
+    return type(samples)(
+        *(np.ascontiguousarray(a[::n]) for a in (samples.camera, samples.projector, samples.sigma))
+    )
 
 
 def test_a_displacement_and_its_inverse(true) -> None:
@@ -123,7 +133,9 @@ def test_a_displacement_and_its_inverse(true) -> None:
     assert np.isclose(basis[0].sum(), 1) and np.isclose(basis[1].sum(), 0)
     form = roughness(device.coefficients)
     constant = np.ones(len(form))
-    assert np.isclose(constant @ form @ constant, 0.05 * len(form)) and np.linalg.eigvalsh(form)[0] > 0
+    assert (
+        np.isclose(constant @ form @ constant, 0.05 * len(form)) and np.linalg.eigvalsh(form)[0] > 0
+    )
 
 
 @pytest.mark.slow
@@ -137,7 +149,9 @@ def test_the_compiled_form_is_the_exact_one(model, true) -> None:
     z = rng.uniform(430, 810, (height, width))
     points = np.dstack([model.rays[0] * z, model.rays[1] * z, z])
     pixels = projector.project(points @ state.R.T + state.t)
-    coordinate = np.array([displacement(state.projector, u, v, basis)[0] for u, v in pixels.reshape(-1, 2)])
+    coordinate = np.array(
+        [displacement(state.projector, u, v, basis)[0] for u, v in pixels.reshape(-1, 2)]
+    )
     coordinate = coordinate.reshape(height, width) + pixels[..., 0]
     inside = ((pixels > 0) & (pixels < np.array(projector.size) - 1)).all(-1)
     phase = phase_map(true, z)
@@ -170,7 +184,8 @@ def column(state: State, pixel: np.ndarray, depth: float) -> float:
 
 
 def exact_point(state: State, pixel: np.ndarray, coordinate: float, guess: float) -> np.ndarray:
-    """(3,) mm: what a pixel sees that the projector lights with a column; by secants through the forward model."""
+    """(3,) mm: what a pixel sees that the projector lights with a column; by secants through the
+    forward model."""
     depth = guess
     for _ in range(20):
         slope = (column(state, pixel, depth + 0.1) - column(state, pixel, depth - 0.1)) / 0.2
@@ -187,12 +202,24 @@ def test_points_answer_to_the_unknowns_as_differences_say(model) -> None:
     J = bundle.point_jacobian("x", pixels, z).toarray()
     rng = np.random.default_rng(1)
     rig_step = rng.normal(size=at.size - at.rig) * np.concatenate(
-        [np.tile([1e-3] * 4 + [1e-6] * 5, 2), [1e-7] * 3, [1e-5] * 3, np.full(at.size - at.camera_field, 1e-4)]
+        [
+            np.tile([1e-3] * 4 + [1e-6] * 5, 2),
+            [1e-7] * 3,
+            [1e-5] * 3,
+            np.full(at.size - at.camera_field, 1e-4),
+        ]
     )
     step = np.concatenate([np.zeros(at.rig), rig_step])
-    coordinate = [column(bundle.state, pixel, depth) for pixel, depth in zip(pixels, z, strict=True)]
+    coordinate = [
+        column(bundle.state, pixel, depth) for pixel, depth in zip(pixels, z, strict=True)
+    ]
     ahead, behind = (
-        np.array([exact_point(bundle.state.step(s), *given) for given in zip(pixels, coordinate, z, strict=True)])
+        np.array(
+            [
+                exact_point(bundle.state.step(s), *given)
+                for given in zip(pixels, coordinate, z, strict=True)
+            ]
+        )
         for s in (step, -step)
     )
     assert np.allclose((ahead - behind).ravel() / 2, J @ rig_step, rtol=1e-4, atol=1e-9)

@@ -9,7 +9,9 @@ from slviewer.calibration.splined.correction_grid import add_corrections
 
 
 @numba.njit
-def _corrected(z: np.ndarray, cell: np.ndarray, rest: np.ndarray, grid: np.ndarray, step: int, row: int) -> None:
+def _corrected(
+    z: np.ndarray, cell: np.ndarray, rest: np.ndarray, grid: np.ndarray, step: int, row: int
+) -> None:
     add_corrections(z, cell, rest, grid, step, row)
 
 
@@ -25,7 +27,10 @@ def test_the_grid_is_added_between_its_eight_nodes(layers: int, step: int) -> No
     z = np.full(width, 500.0, np.float32)
     outside = rng.random(width) < 0.2
     cell[outside], z[outside] = -1, np.nan
-    cell[2 * step : 3 * step], z[2 * step : 3 * step] = -1, np.nan  # a grid cell that measures nothing
+    cell[2 * step : 3 * step], z[2 * step : 3 * step] = (
+        -1,
+        np.nan,
+    )  # a grid cell that measures nothing
     given = z.copy()
     _corrected(z, cell, rest, grid, step, row)
     seen = cell >= 0

@@ -18,7 +18,10 @@ TRUE = rig()
 
 
 def observations(count=12, noise_px=0.02, seed=0):
-    return [observation(TRUE, T, f"pose_{k:02d}", noise_px, seed) for k, T in enumerate(board_poses(count, seed))]
+    return [
+        observation(TRUE, T, f"pose_{k:02d}", noise_px, seed)
+        for k, T in enumerate(board_poses(count, seed))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +100,10 @@ def test_parallel_poses_are_rejected() -> None:
 def test_a_mirrored_projector_is_rejected_and_one_upside_down_is_not(turned: list[float]) -> None:
     def projected(signs: np.ndarray) -> list:
         middle = np.array(PROJECTOR) / 2 - 0.5
-        return [dataclasses.replace(o, projector=(o.projector - middle) * signs + middle) for o in observations(6)]
+        return [
+            dataclasses.replace(o, projector=(o.projector - middle) * signs + middle)
+            for o in observations(6)
+        ]
 
     with raises(CalibrationRejected, "mirror", 6):
         calibrate_stereo(projected(np.array(turned)), PROJECTOR)
@@ -109,7 +115,10 @@ def test_a_mirrored_projector_is_rejected_and_one_upside_down_is_not(turned: lis
 
 
 def test_exchanged_axes_are_rejected() -> None:
-    poses = [dataclasses.replace(o, projector=o.projector[:, ::-1] * np.array([1.0, 0.3])) for o in observations()]
+    poses = [
+        dataclasses.replace(o, projector=o.projector[:, ::-1] * np.array([1.0, 0.3]))
+        for o in observations()
+    ]
     for o in poses:
         o.projector[:, 0] += 40 * np.sin(np.arange(len(o.projector)))
     with pytest.raises(CalibrationRejected):

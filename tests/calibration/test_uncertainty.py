@@ -1,4 +1,5 @@
-"""How sure the splined calibration is of its space: against the truth, over the working volume, and pixel by pixel."""
+"""How sure the splined calibration is of its space: against the truth, over the working volume, and
+pixel by pixel."""
 
 import numpy as np
 import pytest
@@ -28,7 +29,12 @@ from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.validation.prove_uncertainty import BAND, PredictedErrors, compare_with_truth, judge_uncertainty
+from slviewer.validation.prove_uncertainty import (
+    BAND,
+    PredictedErrors,
+    compare_with_truth,
+    judge_uncertainty,
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +44,10 @@ def true() -> SimulatedRig:
 
 @pytest.fixture(scope="module")
 def stereo_and_model(true) -> tuple[StereoModel, SplinedModel]:
-    seen = [observation(true, pose, f"pose_{i:02d}", samples=1000) for i, pose in enumerate(poses(true, 10))]
+    seen = [
+        observation(true, pose, f"pose_{i:02d}", samples=1000)
+        for i, pose in enumerate(poses(true, 10))
+    ]
     stereo = calibrate_stereo(seen, true.projector.size, str(BOARD))
     return stereo, calibrate_splined(seen, stereo, cells_across=CELLS)
 
@@ -54,12 +63,16 @@ def illuminated(model: SplinedModel) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.computes
-def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_calibrated_depths(model) -> None:
+def test_the_working_volume_is_what_both_see_in_front_of_inside_and_behind_the_calibrated_depths(
+    model,
+) -> None:
     near, far = model.bundle.depth_range_mm
     volume = working_volume(model.rig, (near, far), columns=5, rows=4, depths=3)
     width, height = model.rig.camera.size
     assert volume.z.min() < 0.9 * near and volume.z.max() > 1.1 * far
-    assert {0.0, width - 1} <= set(volume.pixels[:, 0]) and {0.0, height - 1} <= set(volume.pixels[:, 1])
+    assert {0.0, width - 1} <= set(volume.pixels[:, 0]) and {0.0, height - 1} <= set(
+        volume.pixels[:, 1]
+    )
     assert (volume.projector > -0.51).all() and (volume.projector < model.rig.projector.size).all()
     assert select_depth_axis(model.rig, volume) == "x"
     supported = volume.supported(model.rig, *illuminated(model))
@@ -105,7 +118,11 @@ def test_it_is_as_wrong_as_it_says(model, true) -> None:
 def test_the_frame_would_overstate_it(model) -> None:
     volume = working_volume(model.rig, model.bundle.depth_range_mm)
     whitened = model.bundle.whiten(model.bundle.point_jacobian("x", volume.pixels, volume.z))
-    shape = sigma_3d(remove_rigid_motion(whitened, volume.points, volume.supported(model.rig, *illuminated(model))))
+    shape = sigma_3d(
+        remove_rigid_motion(
+            whitened, volume.points, volume.supported(model.rig, *illuminated(model))
+        )
+    )
     assert np.median(sigma_3d(whitened)) > 10 * np.median(shape)
 
 
@@ -138,22 +155,30 @@ def test_the_map_says_at_each_pixel_what_the_covariance_says_there(model) -> Non
     nodes = compute_sigma_map(bundle, "x", near, far)
     width, height = (int(n) for n in model.rig.camera.size)
     rng = np.random.default_rng(1)
-    pixels = np.column_stack([rng.integers(0, width, 200), rng.integers(0, height, 200)]).astype(float)
+    pixels = np.column_stack([rng.integers(0, width, 200), rng.integers(0, height, 200)]).astype(
+        float
+    )
     volume = select_visible(model.rig, pixels, rng.uniform(0.9, 1.1, 200) * 600)
     reference = working_volume(model.rig, bundle.depth_range_mm, columns=7, rows=5, depths=4)
     motion = BestMotion.fit(reference.points, reference.supported(model.rig, *illuminated(model)))
-    fitted = bundle.whiten(bundle.point_jacobian("x", reference.pixels, reference.z)) @ motion.weights
-    exact = bundle.whiten(bundle.point_jacobian("x", volume.pixels, volume.z)[2::3])
-    exact = np.linalg.norm(exact - fitted @ motion.displace(volume.points)[2::3].T, axis=0) * extrapolation_factor(
-        bundle, volume
+    fitted = (
+        bundle.whiten(bundle.point_jacobian("x", reference.pixels, reference.z)) @ motion.weights
     )
+    exact = bundle.whiten(bundle.point_jacobian("x", volume.pixels, volume.z)[2::3])
+    exact = np.linalg.norm(
+        exact - fitted @ motion.displace(volume.points)[2::3].T, axis=0
+    ) * extrapolation_factor(bundle, volume)
     points = np.full((height, width, 3), np.nan, np.float32)
     u, v = volume.pixels.astype(int).T
     points[v, u] = volume.points
     found = nodes.interpolate(points)
     assert np.array_equal(np.isfinite(found), np.isfinite(points[..., 2]))
     ratio = found[v, u] / exact
-    assert 0.9 < np.median(ratio) < 1.2 and np.percentile(ratio, 5) > 0.7 and np.percentile(ratio, 95) < 1.6
+    assert (
+        0.9 < np.median(ratio) < 1.2
+        and np.percentile(ratio, 5) > 0.7
+        and np.percentile(ratio, 95) < 1.6
+    )
 
 
 @pytest.mark.slow
@@ -173,9 +198,14 @@ def test_a_cloud_knows_its_noise_and_its_calibration_apart_and_its_file_holds_th
     write_ply(tmp_path / "cloud.ply", cloud.measured, scalars=cloud.sigmas(mask))
     scalars = read_ply(tmp_path / "cloud.ply").scalars
     assert set(scalars) == {"sigma_noise", "sigma_calibration", "sigma"}
-    assert np.array_equal(scalars["sigma_calibration"], left[mask]) and (scalars["sigma"] >= noise[mask]).all()
+    assert (
+        np.array_equal(scalars["sigma_calibration"], left[mask])
+        and (scalars["sigma"] >= noise[mask]).all()
+    )
     plain = reconstruct_cloud(stereo, phases)
-    assert plain.sigma_calibration is None and np.array_equal(plain.sigma, plain.sigma_z, equal_nan=True)
+    assert plain.sigma_calibration is None and np.array_equal(
+        plain.sigma, plain.sigma_z, equal_nan=True
+    )
     assert set(plain.sigmas(plain.mask)) == {"sigma_noise"}
 
 
@@ -199,20 +229,30 @@ def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) ->
     volume = working_volume(model.rig, bundle.depth_range_mm, columns=5, rows=4, depths=3)
     supported = volume.supported(model.rig, *illuminated(model))
     inside = np.argsort(np.linalg.norm(volume.points - volume.points.mean(axis=0), axis=1))
-    two = inside[supported[inside]][:2]  # well inside: at the rim, rounding decides on which side a place lies
+    two = inside[supported[inside]][
+        :2
+    ]  # well inside: at the rim, rounding decides on which side a place lies
     pixels, z, points = (each[two] for each in (volume.pixels, volume.z, volume.points))
     shared = splined_shared(bundle, "x")
-    ends = [Spread(np.zeros((3, 3)), shared(point[None], np.eye(3)[:, None]), "one") for point in points]
+    ends = [
+        Spread(np.zeros((3, 3)), shared(point[None], np.eye(3)[:, None]), "one") for point in points
+    ]
     found = distance(points[0], points[1], *ends)
     # a distance does not know of rigid motions: it is the same with them left in
     along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
     whitened = bundle.whiten(bundle.point_jacobian("x", pixels, z)).astype(np.float64)
-    assert found.sigma == pytest.approx(np.linalg.norm(whitened @ np.concatenate([-along, along])), rel=0.02)
+    assert found.sigma == pytest.approx(
+        np.linalg.norm(whitened @ np.concatenate([-along, along])), rel=0.02
+    )
     assert 0 < found.sigma < 0.2 and all(np.sqrt(np.trace(end.covariance)) < 0.2 for end in ends)
     larger = splined_shared(bundle, "x", 1.5)(1.5 * points[:1], np.eye(3)[:, None])
     assert np.allclose(larger, 1.5 * ends[0].shared, rtol=1e-3, atol=1e-6)
     # nor is any distance surer than the scale that it was corrected by
     scaled = splined_shared(bundle, "x", 1.0, 2e-3)
-    ends = [Spread(np.zeros((3, 3)), scaled(point[None], np.eye(3)[:, None]), "one") for point in points]
+    ends = [
+        Spread(np.zeros((3, 3)), scaled(point[None], np.eye(3)[:, None]), "one") for point in points
+    ]
     of_scale = 2e-3 * np.linalg.norm(points[1] - points[0])
-    assert distance(points[0], points[1], *ends).sigma == pytest.approx(np.hypot(found.sigma, of_scale), rel=1e-3)
+    assert distance(points[0], points[1], *ends).sigma == pytest.approx(
+        np.hypot(found.sigma, of_scale), rel=1e-3
+    )

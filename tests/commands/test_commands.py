@@ -33,7 +33,15 @@ def calibrated(recorded: Path) -> dict:
 
 def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
     stereo = calibrated["models"]["stereo"]
-    assert set(stereo) >= {"reprojection_rms_px", "K_camera", "D_camera", "K_projector", "D_projector", "R", "T"}
+    assert set(stereo) >= {
+        "reprojection_rms_px",
+        "K_camera",
+        "D_camera",
+        "K_projector",
+        "D_projector",
+        "R",
+        "T",
+    }
     assert 0.01 < stereo["reprojection_rms_px"]["stereo"] < 0.3
     assert np.linalg.norm(stereo["T"]) == pytest.approx(180, abs=1.5)
     assert stereo["K_projector"][1][1] / stereo["K_projector"][0][0] == pytest.approx(2, abs=0.02)
@@ -41,10 +49,22 @@ def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
     assert len(calibrated["poses_used"]) == 8 and calibrated["poses_left_out"] == {}
 
 
-def test_verify_a_plane_inside_and_a_sphere(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+def test_verify_a_plane_inside_and_a_sphere(
+    calibrated: dict, session: Path, run: Run, tmp_path: Path
+) -> None:
     out = tmp_path / "planes.json"
     status, text, _ = run(
-        "verify", session, "plane_03", "plane_07", "--shape", "plane", "--range", 500, 700, "--json", out
+        "verify",
+        session,
+        "plane_03",
+        "plane_07",
+        "--shape",
+        "plane",
+        "--range",
+        500,
+        700,
+        "--json",
+        out,
     )
     assert status == 0 and "plane_03" in text
     captures = json.loads(out.read_text())["verify"]
@@ -54,15 +74,25 @@ def test_verify_a_plane_inside_and_a_sphere(calibrated: dict, session: Path, run
     stereo, pixelwise = inside["models"]["stereo"], inside["models"]["pixelwise"]
     assert pixelwise["noise_floor_mm"] < pixelwise["rms_mm"] < stereo["rms_mm"] < 0.5
     assert stereo["coverage"] > 0.97 and stereo["excluded"] < 0.02 * stereo["points"]
-    status, text, _ = run("verify", session, "sphere_3", "--shape", "sphere", "--model", "stereo", "--json", out)
+    status, text, _ = run(
+        "verify", session, "sphere_3", "--shape", "sphere", "--model", "stereo", "--json", out
+    )
     sphere = json.loads(out.read_text())["verify"]["sphere_3"]["models"]
     assert list(sphere) == ["stereo"] and 97.0 < sphere["stereo"]["radius_mm"] < 99.0
 
 
-def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
+def test_reconstruct_a_board_pose_and_a_scan(
+    calibrated: dict, session: Path, run: Run, tmp_path: Path
+) -> None:
     ply, grid = tmp_path / "board.ply", tmp_path / "board.npy"
     status, text, _ = run("reconstruct", session, "pose_01", "--out", ply, "--grid", grid)
-    assert status == 0 and "axis" in text and "coverage" in text and "stereo" in text and "pixelwise" in text
+    assert (
+        status == 0
+        and "axis" in text
+        and "coverage" in text
+        and "stereo" in text
+        and "pixelwise" in text
+    )
     points = np.load(grid)
     assert points.shape == (300, 400, 3) and points.dtype == np.float32
     cloud = trimesh.load(ply)
@@ -78,22 +108,34 @@ def test_reconstruct_a_board_pose_and_a_scan(calibrated: dict, session: Path, ru
 @pytest.mark.slow
 def test_a_mesh_with_a_texture(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "part.glb"
-    status, text, _ = run("mesh", session, "object_r2", "--texture", "512", "--model", "stereo", "--out", out)
+    status, text, _ = run(
+        "mesh", session, "object_r2", "--texture", "512", "--model", "stereo", "--out", out
+    )
     assert status == 0 and "texture of 512x512 px" in text
     part = trimesh.load(out, force="mesh")
-    image, uv = np.asarray(part.visual.material.baseColorTexture)[..., 0].astype(float), np.asarray(part.visual.uv)
-    at = (((1 - uv[:, 1]) * 512).astype(int).clip(0, 511), (uv[:, 0] * 512).astype(int).clip(0, 511))
+    image, uv = (
+        np.asarray(part.visual.material.baseColorTexture)[..., 0].astype(float),
+        np.asarray(part.visual.uv),
+    )
+    at = (
+        ((1 - uv[:, 1]) * 512).astype(int).clip(0, 511),
+        (uv[:, 0] * 512).astype(int).clip(0, 511),
+    )
     grey = image[at]  # of the object, whose reflectance is the same everywhere
     middle = np.abs(grey / np.median(grey) - 1)
     assert 0.005 < np.median(middle) < 0.05
-    status, _, error = run("mesh", session, "object_r2", "--texture", "512", "--out", tmp_path / "part.stl")
+    status, _, error = run(
+        "mesh", session, "object_r2", "--texture", "512", "--out", tmp_path / "part.stl"
+    )
     assert status == 2 and not missing_facts(error, ".glb", ".obj")
 
 
 @pytest.mark.slow
 def test_merge_the_object(calibrated: dict, session: Path, run: Run, tmp_path: Path) -> None:
     ply, out = session / "exports" / "merged_1.ply", tmp_path / "merge.json"
-    status, text, _ = run("merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out)
+    status, text, _ = run(
+        "merge", session, "object_r1", "object_r2", "--reference", "object_r3", "--json", out
+    )
     assert status == 0 and "merge/1" in text
     (merged,) = json.loads(out.read_text())["merge"].values()
     pairs = merged["pairs"]
@@ -114,13 +156,21 @@ def test_mesh_of_one_scan_and_of_scans_merged_on_the_way(
 ) -> None:
     stl, out = tmp_path / "object.stl", tmp_path / "mesh.json"
     thinned = ("--method", "volume", "--triangles", 20_000, "--smooth", 2)
-    status, text, _ = run("mesh", session, "object_r3", "object_r2", *thinned, "--out", stl, "--json", out)
+    status, text, _ = run(
+        "mesh", session, "object_r3", "object_r2", *thinned, "--out", stl, "--json", out
+    )
     assert status == 0 and "smoothing" in text and "watertight" in text
     found = json.loads(out.read_text())
     (merged,) = found["merge"]["merge"].values()
-    assert found["method"] == "volume" and 0.1 < found["cell_mm"] < 1.0 and set(merged["pairs"]) == {"object_r2"}
+    assert (
+        found["method"] == "volume"
+        and 0.1 < found["cell_mm"] < 1.0
+        and set(merged["pairs"]) == {"object_r2"}
+    )
     assert 0 < found["smoothed"]["rms_mm"] < found["smoothed"]["max_mm"] < 2.0
-    assert 19_000 < found["triangles"] <= 20_000 and len(trimesh.load(stl).faces) == found["triangles"]
+    assert (
+        19_000 < found["triangles"] <= 20_000 and len(trimesh.load(stl).faces) == found["triangles"]
+    )
     assert trimesh.load(tmp_path / "object_points.ply").vertices.shape[0] > 10_000
     status, text, _ = run("mesh", session, "object_r3")
     assert status == 0 and "grid" in text
@@ -144,10 +194,14 @@ def test_report_and_inspect(calibrated: dict, session: Path, run: Run, tmp_path:
 
 
 @pytest.mark.slow
-def test_reproduce_remakes_the_letters_tables_and_figures(session: Path, run: Run, tmp_path: Path) -> None:
+def test_reproduce_remakes_the_letters_tables_and_figures(
+    session: Path, run: Run, tmp_path: Path
+) -> None:
     out = session.parent  # whose session is what reproduce would simulate, but for fewer poses
     with fit_few_cells():
-        status, text, _ = run("reproduce", "--scale", "0.25", "--out", out, "--json", tmp_path / "figures.json")
+        status, text, _ = run(
+            "reproduce", "--scale", "0.25", "--out", out, "--json", tmp_path / "figures.json"
+        )
     assert status == 0
     found = json.loads((tmp_path / "figures.json").read_text())
     assert len(found["planes"]) == 10 and len(found["spheres"]) == 6
@@ -155,11 +209,15 @@ def test_reproduce_remakes_the_letters_tables_and_figures(session: Path, run: Ru
     assert 0.001 < found["spacing_rms_mm"]["pixelwise"] < 1.0
     assert "0.184" in text and "0.087" in text and "2.13" in text  # the Letter's own means
     page = (out / "report.html").read_text()
-    assert page.count("data:image/webp;base64") >= 14 and "http://" not in page.replace("http://www.w3.org", "")
+    assert page.count("data:image/webp;base64") >= 14 and "http://" not in page.replace(
+        "http://www.w3.org", ""
+    )
 
 
 @pytest.mark.slow
-def test_calibrate_names_an_excluded_pose_and_does_not_use_it(recorded: Path, run: Run, tmp_path: Path) -> None:
+def test_calibrate_names_an_excluded_pose_and_does_not_use_it(
+    recorded: Path, run: Run, tmp_path: Path
+) -> None:
     session = copy_session(recorded / "session", tmp_path / "session")
     with Session.open(session, write=True) as store:
         store.exclude("pose_02", "blurred")
@@ -175,19 +233,30 @@ def test_a_calibration_made_elsewhere_reconstructs_the_same(
 ) -> None:
     stereo = calibrated["models"]["stereo"]
     names = ["K_camera", "D_camera", "K_projector", "D_projector", "R", "T"]
-    write_calibration(tmp_path / "rig.yml", {f"my_{name}": np.array(stereo[name]) for name in names})
+    write_calibration(
+        tmp_path / "rig.yml", {f"my_{name}": np.array(stereo[name]) for name in names}
+    )
     frames = Session.open(session).load_capture("object_r2").frames
     with Session.create(tmp_path / "other") as other:
         sequence = Session.open(session).load_capture("object_r2").sequence
         other.save_capture("part", "scan", sequence, frames, source="test")
     keys = [f"my_{name}" for name in names]
-    status, _, error = run("import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *keys)
+    status, _, error = run(
+        "import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *keys
+    )
     assert (status, error) == (0, "")
     assert run("reconstruct", tmp_path / "other", "part", "--grid", tmp_path / "other.npy")[0] == 0
-    assert run("reconstruct", session, "object_r2", "--model", "stereo", "--grid", tmp_path / "own.npy")[0] == 0
+    assert (
+        run(
+            "reconstruct", session, "object_r2", "--model", "stereo", "--grid", tmp_path / "own.npy"
+        )[0]
+        == 0
+    )
     difference = np.abs(np.load(tmp_path / "other.npy") - np.load(tmp_path / "own.npy"))
     assert np.nanmax(difference) < 1e-3 and np.isfinite(difference[..., 2]).sum() > 10_000
-    status, _, error = run("import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *names)
+    status, _, error = run(
+        "import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *names
+    )
     assert status == 1 and "my_K_camera" in error
 
 
@@ -219,10 +288,22 @@ def test_target_draws_a_sheet(run: Run, tmp_path: Path) -> None:
         (["calibrate"], 2, []),
         (["reconstruct", "SESSION", "pose_99"], 1, ["pose_99"]),
         (["verify", "SESSION", "--shape", "plane"], 2, ["capture"]),
-        (["calibrate", "ONE", "--target", "chessboard:9x7:30"], 3, ["pose_01", 63, "chessboard:9x7:30"]),
+        (
+            ["calibrate", "ONE", "--target", "chessboard:9x7:30"],
+            3,
+            ["pose_01", 63, "chessboard:9x7:30"],
+        ),
         (["simulate", "SESSION"], 1, ["session", "already"]),
-        (["reconstruct", "SESSION", "pose_01", "--depth-range", "nan", "3"], 2, ["--depth-range", "nan"]),
-        (["capture", "SESSION", "new", "--rig", "simulated", "--budget-s", "inf"], 2, ["--budget-s", "inf"]),
+        (
+            ["reconstruct", "SESSION", "pose_01", "--depth-range", "nan", "3"],
+            2,
+            ["--depth-range", "nan"],
+        ),
+        (
+            ["capture", "SESSION", "new", "--rig", "simulated", "--budget-s", "inf"],
+            2,
+            ["--budget-s", "inf"],
+        ),
         (["import", "p18", "SESSION", "SESSION"], 1, ["captures"]),
     ],
 )
@@ -240,5 +321,10 @@ def test_bad_input_ends_in_a_message_and_changes_nothing(
     if "ONE" in arguments:  # a board that no pose shows is looked for in one only
         shutil.copytree(session, "ONE", ignore=shutil.ignore_patterns("pose_0[2-8]", "results"))
     got, out, error = run(*[session if a == "SESSION" else a for a in arguments])
-    assert got == status and not missing_facts(error, *facts) and "Traceback" not in error and out == ""
+    assert (
+        got == status
+        and not missing_facts(error, *facts)
+        and "Traceback" not in error
+        and out == ""
+    )
     assert sorted(p.name for p in (session / "captures").iterdir()) == before

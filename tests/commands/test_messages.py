@@ -1,8 +1,10 @@
-"""What every command prints where it refuses or warns: messages/COMMAND.txt, one file a command, reviewed as a whole.
+"""What every command prints where it refuses or warns: messages/COMMAND.txt, one file a command,
+reviewed as a whole.
 
-A file is a terminal's transcript. The lines that begin with $ are run, one after the other, in a copy of the same small
-folders; what they print must be what stands below them. To add a situation, add its line. With UPDATE_MESSAGES=1 in the
-environment the files are written instead: read their difference before you commit it.
+A file is a terminal's transcript. The lines that begin with $ are run, one after the other, in a
+copy of the same small folders; what they print must be what stands below them. To add a situation,
+add its line. With UPDATE_MESSAGES=1 in the environment the files are written instead: read their
+difference before you commit it.
 """
 
 import contextlib
@@ -54,9 +56,13 @@ form_mm = 5.0
 
 
 def render_plane(sequence: PatternSequence) -> np.ndarray:
-    """Return frames (n, h, w) uint8 of a plane that faces both devices, FOCAL_PX * BASELINE_MM / SHIFT_PX mm away."""
+    """Return frames (n, h, w) uint8 of a plane that faces both devices, FOCAL_PX * BASELINE_MM /
+    SHIFT_PX mm away."""
     first = (PROJECTOR[0] - CAMERA[0]) // 2 + SHIFT_PX
-    images = [render_pattern(sequence, k)[:, first : first + CAMERA[0]] for k in range(len(sequence.frames))]
+    images = [
+        render_pattern(sequence, k)[:, first : first + CAMERA[0]]
+        for k in range(len(sequence.frames))
+    ]
     return np.stack([cv2.convertScaleAbs(image, alpha=0.7, beta=20) for image in images])
 
 
@@ -75,19 +81,24 @@ def make_folders(folder: Path) -> None:
     across = one_axis(both, "x")
     frames = render_plane(both)
 
-    # sessions: empty, scanned, calibrated (before it held captures, which confirm a calibration), and three refused
+    # sessions: empty, scanned, calibrated (before it held captures, which confirm a calibration),
+    # and three refused
     rig = {
         **{f"K_{name}": [[FOCAL_PX, 0, (w - 1) / 2], [0, FOCAL_PX, (h - 1) / 2], [0, 0, 1]]
            for name, (w, h) in (("camera", CAMERA), ("projector", PROJECTOR))},
         **{"D_camera": [0.0] * 5, "D_projector": [0.0] * 5, "R": np.eye(3), "T": [BASELINE_MM, 0, 0]},
     }  # fmt: skip
-    write_calibration(folder / "rig.yml", {name: np.array(value, float) for name, value in rig.items()})
+    write_calibration(
+        folder / "rig.yml", {name: np.array(value, float) for name, value in rig.items()}
+    )
     for name in ("empty", "scanned", "calibrated"):
         with Session.create(folder / name) as session:
             if name == "empty":
                 continue
             if name == "calibrated":
-                import_opencv_calibration(folder / "rig.yml", session, camera=CAMERA, projector=PROJECTOR)
+                import_opencv_calibration(
+                    folder / "rig.yml", session, camera=CAMERA, projector=PROJECTOR
+                )
             session.save_capture("pose_01", "calibration", both, frames, source="made")
             session.save_capture("part", "scan", both, frames, source="made")
             session.save_capture("across", "scan", across, render_plane(across), source="made")
@@ -141,7 +152,10 @@ def run_line(line: str) -> str:
 
 @pytest.mark.parametrize(
     "file",
-    [pytest.param(file, marks=pytest.mark.computes if file.stem in COMPUTING else ()) for file in FILES],
+    [
+        pytest.param(file, marks=pytest.mark.computes if file.stem in COMPUTING else ())
+        for file in FILES
+    ],
     ids=lambda file: file.stem,
 )
 def test_a_command_prints_its_reviewed_messages(

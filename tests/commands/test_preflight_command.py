@@ -41,13 +41,26 @@ def test_a_sound_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     with Session.create(tmp_path / "session") as store:
         save_rig(store, "small", {"driver": "simulated", "scale": 0.25, "exposure_ms": 0.9})
     found = tmp_path / "found.json"
-    arguments = ["preflight", "--rig", "small", "--session", str(tmp_path / "session"), "--json", str(found)]
+    arguments = [
+        "preflight",
+        "--rig",
+        "small",
+        "--session",
+        str(tmp_path / "session"),
+        "--json",
+        str(found),
+    ]
     assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "good     screen: " in said and "settle_ms = " in said and "bad" not in said
     written = json.loads(found.read_text())
     assert written["verdict"] == "good" and 0.1 < written["seconds"] < 3600
-    assert {check["name"] for check in written["checks"]} >= {"screen", "latency", "order", "flicker"}
+    assert {check["name"] for check in written["checks"]} >= {
+        "screen",
+        "latency",
+        "order",
+        "flicker",
+    }
 
 
 def test_a_rig_that_is_not_fit_ends_with_1(
@@ -76,8 +89,12 @@ class FailingCamera(BlindCamera):
         raise self.fault
 
 
-@pytest.mark.parametrize("fault", [OSError("vendor error 0x17"), TypeError("grab() takes no array")])
-@pytest.mark.parametrize("command", [["preflight"], ["capture", "session", "one"]], ids=["preflight", "capture"])
+@pytest.mark.parametrize(
+    "fault", [OSError("vendor error 0x17"), TypeError("grab() takes no array")]
+)
+@pytest.mark.parametrize(
+    "command", [["preflight"], ["capture", "session", "one"]], ids=["preflight", "capture"]
+)
 def test_a_fault_of_a_driver_is_named_as_such(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -87,12 +104,18 @@ def test_a_fault_of_a_driver_is_named_as_such(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     lamp = preset_rig(scale=0.1).projector
-    failing = Driver("failing", "nothing", camera=lambda: FailingCamera(fault), projector=lambda: lamp)
+    failing = Driver(
+        "failing", "nothing", camera=lambda: FailingCamera(fault), projector=lambda: lamp
+    )
     monkeypatch.setitem(drivers(), "failing", failing)
-    Path("failing.toml").write_text(to_toml({"camera": {"driver": "failing"}, "projector": {"driver": "failing"}}))
+    Path("failing.toml").write_text(
+        to_toml({"camera": {"driver": "failing"}, "projector": {"driver": "failing"}})
+    )
     assert main([*command, "--rig", "failing.toml"]) == 1
     message = " ".join(capsys.readouterr().err.split())
-    assert not missing_facts(message, "driver", "the blind camera", f"{type(fault).__name__}: {fault}", "maker")
+    assert not missing_facts(
+        message, "driver", "the blind camera", f"{type(fault).__name__}: {fault}", "maker"
+    )
 
 
 def test_a_rig_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:

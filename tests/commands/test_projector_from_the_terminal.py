@@ -1,4 +1,5 @@
-"""`slviewer capture` with the browser projector: it serves the page, prints its link, waits, and captures."""
+"""`slviewer capture` with the browser projector: it serves the page, prints its link, waits, and
+captures."""
 
 import re
 import threading
@@ -45,7 +46,10 @@ class CountingCamera(Openable):
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setitem(drivers(), "counting", Driver("counting", "nothing", camera=CountingCamera))
     file = tmp_path / "rig.toml"
-    choice = {"camera": {"driver": "counting"}, "projector": {"driver": "browser", "size": list(SIZE)}}
+    choice = {
+        "camera": {"driver": "counting"},
+        "projector": {"driver": "browser", "size": list(SIZE)},
+    }
     file.write_text(to_toml(choice))
     return file
 
@@ -54,7 +58,17 @@ def test_the_page_is_served_waited_for_and_captured_with(
     rig: Path, tmp_path: Path, browser: Browser, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ended: list[int] = []
-    arguments = ["capture", str(tmp_path / "session"), "scan_01", "--rig", str(rig), "--role", "scan", "--port", "0"]
+    arguments = [
+        "capture",
+        str(tmp_path / "session"),
+        "scan_01",
+        "--rig",
+        str(rig),
+        "--role",
+        "scan",
+        "--port",
+        "0",
+    ]
     command = threading.Thread(target=lambda: ended.append(main(arguments)))
     command.start()
     printed = ""
@@ -79,7 +93,17 @@ def test_the_page_is_served_waited_for_and_captured_with(
 def test_a_page_that_nobody_opens_ends_the_command(
     rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["capture", str(tmp_path / "session"), "a", "--rig", str(rig), "--port", "0", "--wait-s", "1"]
+    arguments = [
+        "capture",
+        str(tmp_path / "session"),
+        "a",
+        "--rig",
+        str(rig),
+        "--port",
+        "0",
+        "--wait-s",
+        "1",
+    ]
     assert main(arguments) == 1
     assert not missing_facts(capsys.readouterr().err, "projector page", "1 s")
     assert not (tmp_path / "session").exists()

@@ -1,4 +1,5 @@
-"""`slviewer prove`: what it runs, what it prints, and how it ends; the proofs themselves have tests of their own."""
+"""`slviewer prove`: what it runs, what it prints, and how it ends; the proofs themselves have tests
+of their own."""
 
 import json
 from dataclasses import dataclass

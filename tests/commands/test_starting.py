@@ -27,11 +27,16 @@ def test_help_imports_nothing_heavy_and_lists_every_command() -> None:
     assert all(f"• {name} " in listing for name in COMMANDS)
 
 
-def test_a_command_has_the_arguments_that_its_functions_docstring_describes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["merge", "--help"]) == 0
     said = capsys.readouterr().out
     assert {"--reference", "--start", "--json"} <= set(said.split())
     assert not {"--picked", "--keep-background", "--progress"} & set(said.split())
     assert "three or more points" not in said  # what is behind the arguments is for Python
     merge = inspect.signature(COMMANDS["merge"]).parameters
-    assert merge["captures"].annotation.__origin__ == tuple[str, ...] and merge["model"].default is None
+    assert (
+        merge["captures"].annotation.__origin__ == tuple[str, ...]
+        and merge["model"].default is None
+    )

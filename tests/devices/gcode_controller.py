@@ -38,7 +38,8 @@ BANNER = b"\r\nGrbl 1.1h ['$' for help]\r\n"
 class Controller:
     """Turns nothing, but counts as if; `received` holds the lines and real-time bytes that came.
 
-    A driver that uses `clock` waits for nothing that will not come: the time is over as soon as it would be in vain.
+    A driver that uses `clock` waits for nothing that will not come: the time is over as soon as it
+    would be in vain.
     """
 
     def __init__(self, dialect: Literal["grbl", "marlin"] = "grbl", fault: Fault = "") -> None:
@@ -77,7 +78,11 @@ class Controller:
     @property
     def is_stuck(self) -> bool:
         """Whether it is blocked half of the way."""
-        return self.fault == "stuck" and self.is_moving and self.position >= (self._begin + self._target) / 2
+        return (
+            self.fault == "stuck"
+            and self.is_moving
+            and self.position >= (self._begin + self._target) / 2
+        )
 
     @property
     def is_moving(self) -> bool:
@@ -152,10 +157,13 @@ class Controller:
 
     def _handle_marlin(self, line: str) -> None:
         if line == "M115":
-            self._send(b"FIRMWARE_NAME:Marlin 2.1.2 SOURCE_CODE_URL:github.com PROTOCOL_VERSION:1.0\nok\n")
+            self._send(
+                b"FIRMWARE_NAME:Marlin 2.1.2 SOURCE_CODE_URL:github.com PROTOCOL_VERSION:1.0\nok\n"
+            )
         elif line == "M114":
             self._send(
-                f"X:{self.position:.2f} Y:0.00 Z:0.00 E:0.00 Count X:{80 * self.position:.0f} Y:0 Z:0\nok\n".encode()
+                f"X:{self.position:.2f} Y:0.00 Z:0.00 E:0.00 Count X:{80 * self.position:.0f} Y:0"
+                " Z:0\nok\n".encode()
             )
         elif match := re.fullmatch(r"G1 X(-?[\d.]+) F([\d.]+)", line):
             assert self._relative

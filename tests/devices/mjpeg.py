@@ -1,4 +1,5 @@
-"""A camera on the network: an HTTP server that sends what it sees, picture after picture, on 127.0.0.1."""
+"""A camera on the network: an HTTP server that sends what it sees, picture after picture, on
+127.0.0.1."""
 
 import threading
 import time
@@ -11,16 +12,19 @@ import numpy as np
 
 
 class NetworkCamera(ThreadingHTTPServer):
-    """Looks at `picture`, (h, w) or (h, w, 3) BGR, `fps` times a second, and sends `clump` pictures at a time.
+    """Looks at `picture`, (h, w) or (h, w, 3) BGR, `fps` times a second, and sends `clump` pictures
+    at a time.
 
-    Once it was told to `take` pictures, it sends each of these instead, when it is taken. `sent` counts the
-    pictures that it has sent, or is about to.
+    Once it was told to `take` pictures, it sends each of these instead, when it is taken. `sent`
+    counts the pictures that it has sent, or is about to.
     """
 
     daemon_threads = True
     allow_reuse_address = True
 
-    def __init__(self, picture: np.ndarray, fps: float = 30.0, clump: int = 1, port: int = 0) -> None:
+    def __init__(
+        self, picture: np.ndarray, fps: float = 30.0, clump: int = 1, port: int = 0
+    ) -> None:
         super().__init__(("127.0.0.1", port), _Sender)
         self.picture, self.fps, self.clump = picture, fps, clump
         self.going = threading.Event()
@@ -29,7 +33,9 @@ class NetworkCamera(ThreadingHTTPServer):
         self.taken = 0
         self.sent = 0
         self._shutter = threading.Condition()
-        self._thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        self._thread = threading.Thread(
+            target=self.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True
+        )
         self._thread.start()
 
     @property
@@ -94,7 +100,9 @@ class _Sender(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def network_camera(picture: np.ndarray, fps: float = 30.0, clump: int = 1, port: int = 0) -> Iterator[NetworkCamera]:
+def network_camera(
+    picture: np.ndarray, fps: float = 30.0, clump: int = 1, port: int = 0
+) -> Iterator[NetworkCamera]:
     camera = NetworkCamera(picture, fps, clump, port)
     try:
         yield camera

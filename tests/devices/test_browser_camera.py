@@ -1,4 +1,5 @@
-"""The camera on a page: what it must report to be used, and what its pictures must be (the page: tests/server)."""
+"""The camera on a page: what it must report to be used, and what its pictures must be (the page:
+tests/server)."""
 
 import struct
 import threading
@@ -25,7 +26,8 @@ def hello(shown: Video = VIDEO) -> bytes:
 
 
 class Phone:
-    """A page that answers every request; `pictures` are what it sends, and `settings` what it was told to lock."""
+    """A page that answers every request; `pictures` are what it sends, and `settings` what it was
+    told to lock."""
 
     def __init__(self, channel: CameraChannel, shown: Video = VIDEO) -> None:
         self.channel, self.settings, self.settling_ms, self.asked = channel, [], [], []
@@ -52,7 +54,9 @@ class Phone:
         self.channel.handle_message(self.page, answer)
 
     def report(self, shown: Video) -> None:
-        self.channel.handle_message(self.page, msgspec.json.encode({"op": "video", "video": shown}).decode())
+        self.channel.handle_message(
+            self.page, msgspec.json.encode({"op": "video", "video": shown}).decode()
+        )
 
 
 @pytest.mark.parametrize(
@@ -69,7 +73,9 @@ class Phone:
 def test_a_page_without_pictures_is_refused_with_a_remedy(shown: Video, fact: str) -> None:
     channel = CameraChannel()
     channel.connect(hello(shown), lambda _: None)
-    assert channel.page_state().state == "refused" and not missing_facts(channel.page_state().words, fact)
+    assert channel.page_state().state == "refused" and not missing_facts(
+        channel.page_state().words, fact
+    )
     with pytest.raises(DeviceError):
         BrowserCamera((4, 3), page=channel).open()
 
@@ -79,7 +85,12 @@ def test_without_a_server_or_a_page_there_is_no_camera() -> None:
         BrowserCamera()
     with raises(DeviceError, "size", "unknown"):
         BrowserCamera(page=CameraChannel())
-    for options in ({"size": [0, 5]}, {"size": [9000, 10]}, {"channel": "cyan"}, {"exposure_ms": -1.0}):
+    for options in (
+        {"size": [0, 5]},
+        {"size": [9000, 10]},
+        {"channel": "cyan"},
+        {"exposure_ms": -1.0},
+    ):
         with pytest.raises(InputError):
             BrowserCamera(**{"size": [4, 3], "page": CameraChannel(), **options})
 
@@ -94,7 +105,9 @@ def test_pictures_arrive_byte_for_byte() -> None:
     camera.grab(out)
     assert np.array_equal(out, np.arange(12).reshape(3, 4))
     assert np.array_equal(camera.grab_colour(), np.arange(36).reshape(3, 4, 3))
-    assert phone.settings == [5.0] and camera.settings() == CameraSettings(10.0) and camera.notes == ()
+    assert (
+        phone.settings == [5.0] and camera.settings() == CameraSettings(10.0) and camera.notes == ()
+    )
     phone.report(video(automatic=("exposure", "focus"), exposure_ms=None))
     assert camera.apply(CameraSettings(20.0, 2.0)) == CameraSettings()
     assert phone.settings == [5.0, 20.0]
@@ -128,7 +141,8 @@ def test_a_picture_that_is_none_ends_the_grab() -> None:
 
 
 @pytest.mark.parametrize(
-    "message", [b"", b"\xff" * 9, struct.pack("<I", 2**31) + b"{}", '{"op": "video"}', '{"op": "done"}', "x"]
+    "message",
+    [b"", b"\xff" * 9, struct.pack("<I", 2**31) + b"{}", '{"op": "video"}', '{"op": "done"}', "x"],
 )
 def test_nonsense_is_refused(message: bytes | str) -> None:
     channel = CameraChannel()

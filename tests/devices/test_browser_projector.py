@@ -1,4 +1,5 @@
-"""What a window must be like to show patterns, and which window is the projector (the page: tests/server)."""
+"""What a window must be like to show patterns, and which window is the projector (the page:
+tests/server)."""
 
 import msgspec
 import pytest
@@ -92,12 +93,18 @@ def test_one_window_is_the_projector_until_another_is_asked_for():
     first = channel.connect(hello("a"), sent["first"].append)
     assert channel.page_state().state == "ready" and channel.page_state().size == (1920, 1080)
     assert channel.connect(hello("b"), sent["other"].append) is None and sent["other"] == []
-    again = channel.connect(hello("a"), sent["again"].append)  # reloaded, its old connection not yet gone
+    again = channel.connect(
+        hello("a"), sent["again"].append
+    )  # reloaded, its old connection not yet gone
     assert sent["first"][-1] is None and not missing_facts(first.gone, "reloaded")
     channel.disconnect(first)
     assert channel.page() is again
     other = channel.connect(hello("b", take=True), sent["other"].append)
-    assert sent["again"][-1] is None and not missing_facts(again.gone, "another window") and channel.page() is other
+    assert (
+        sent["again"][-1] is None
+        and not missing_facts(again.gone, "another window")
+        and channel.page() is other
+    )
     channel.disconnect(other)
     assert channel.page_state().state == "waiting" and channel.wait_ready(0.01).state == "waiting"
 
@@ -106,7 +113,9 @@ def test_what_the_page_says_is_judged_by_what_is_expected():
     channel, sent = ProjectorChannel(), []
     page = channel.connect(hello(), sent.append)
     channel.set_pattern_size((912, 1140))
-    assert channel.page_state().state == "refused" and not missing_facts(channel.page_state().words, "912 x 1140")
+    assert channel.page_state().state == "refused" and not missing_facts(
+        channel.page_state().words, "912 x 1140"
+    )
     with raises(DeviceError, "1920 x 1080"):
         channel.page()
     told = len(sent)
@@ -127,7 +136,9 @@ def test_what_the_page_says_is_judged_by_what_is_expected():
         '{"op": "done"}',
         '{"op": "screen", "screen": {}}',
         hello(),
-        msgspec.json.encode({"op": "screen", "screen": {**msgspec.structs.asdict(FULL_HD), "dpr": 0}}),
+        msgspec.json.encode(
+            {"op": "screen", "screen": {**msgspec.structs.asdict(FULL_HD), "dpr": 0}}
+        ),
     ],
 )
 def test_nonsense_is_refused(message):

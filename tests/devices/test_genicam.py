@@ -1,7 +1,8 @@
-"""The GenICam driver on `viky.cti`, the producer of three small colour cameras that the package genicam brings.
+"""The GenICam driver on `viky.cti`, the producer of three small colour cameras that the package
+genicam brings.
 
-Each shows a square of its colour on white, which moves by one pixel with every frame, 20 a second: where it is says
-which frame was seen.
+Each shows a square of its colour on white, which moves by one pixel with every frame, 20 a second:
+where it is says which frame was seen.
 """
 
 import gc
@@ -31,7 +32,9 @@ from slviewer.errors import DeviceError, InputError  # noqa: E402
 from slviewer.fringe.presets import gray  # noqa: E402
 
 VIKY = Path(genicam.__file__).parent / "viky.cti"
-pytestmark = pytest.mark.skipif(not VIKY.is_file(), reason="this build of the package genicam brings no viky.cti")
+pytestmark = pytest.mark.skipif(
+    not VIKY.is_file(), reason="this build of the package genicam brings no viky.cti"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -72,8 +75,13 @@ def column(frame: np.ndarray) -> float:
 
 
 def test_cameras_are_found_and_chosen():
-    assert list_genicam_cameras() == [f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)]
-    assert driver("genicam").list_connected is list_genicam_cameras and driver("genicam").camera is GenicamCamera
+    assert list_genicam_cameras() == [
+        f"Machine Vision Games Ltd. Viky, serial {k}" for k in range(3)
+    ]
+    assert (
+        driver("genicam").list_connected is list_genicam_cameras
+        and driver("genicam").camera is GenicamCamera
+    )
     with raises(InputError, 3, "serial 0", "serial 1", "serial 2"):
         GenicamCamera()
     with raises(InputError, 3, "serial 0", "serial 1", "serial 2"):
@@ -109,7 +117,9 @@ def test_a_hundred_frames_fill_the_array_they_are_given(camera):
     places = np.array([column(frame) for frame in frames])
     steps = np.abs(np.diff(places))
     assert places.min() >= 9.5 and places.max() <= 390.5
-    assert np.median(steps) >= IN_FLIGHT + 1  # no two are the same, and none had begun before the call
+    assert (
+        np.median(steps) >= IN_FLIGHT + 1
+    )  # no two are the same, and none had begun before the call
     assert (steps >= IN_FLIGHT + 1).mean() > 0.9  # where it turns, it may come back to where it was
     assert len({frame.tobytes() for frame in frames}) > 80
 
@@ -130,7 +140,9 @@ def test_colours_and_the_channel_that_is_decoded(serial, colour):
     assert isinstance(camera, ColourCamera)
     camera.open()
     try:
-        assert (grabbed(fast(camera)) == 255).all()  # the square is as bright as the paper in its own colour
+        assert (
+            grabbed(fast(camera)) == 255
+        ).all()  # the square is as bright as the paper in its own colour
         seen = camera.grab_colour()
         assert seen.shape == (400, 400, 3) and seen.dtype == np.uint8
         other = ("red", "green", "blue")[(serial + 1) % 3]
@@ -243,7 +255,9 @@ def test_an_incomplete_frame_ends_this_grab_only(camera, monkeypatch):
 
 
 def test_a_camera_that_vanishes_can_be_opened_again(camera):
-    fast(camera)._link._acquirer.device.module.close()  # what a producer does when the cable is pulled
+    fast(
+        camera
+    )._link._acquirer.device.module.close()  # what a producer does when the cable is pulled
     with pytest.raises(DeviceError):
         grabbed(camera)
     with pytest.raises(DeviceError):
@@ -286,7 +300,8 @@ def test_interrupts_and_other_threads_go_on_while_it_waits():
             ticks[0] += 1
 
     def goes_on() -> bool:
-        """Whether the thread wakes often during three grabs: 9 times where the library waits by itself."""
+        """Whether the thread wakes often during three grabs: 9 times where the library waits by
+        itself."""
         before, began = ticks[0], time.monotonic()
         for _ in range(3):
             grabbed(camera)
@@ -305,7 +320,8 @@ def test_interrupts_and_other_threads_go_on_while_it_waits():
 
 
 def test_a_software_trigger_takes_the_next_frame(camera, monkeypatch):
-    """Viky has none and runs on: here only that each grab fires once, after the buffers that waited are gone."""
+    """Viky has none and runs on: here only that each grab fires once, after the buffers that waited
+    are gone."""
     fired = []
     monkeypatch.setattr(camera, "_trigger", "software")
     monkeypatch.setattr(Features, "fire", lambda self: fired.append(time.monotonic()))

@@ -1,4 +1,5 @@
-"""What is made of a camera's features, on plain objects that have a node's attributes: viky has few of them."""
+"""What is made of a camera's features, on plain objects that have a node's attributes: viky has few
+of them."""
 
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -40,7 +41,10 @@ class Choices:
     @property
     def entries(self) -> list[SimpleNamespace]:
         both = [(name, READ) for name in self.offered] + [(name, NOT_NOW) for name in self.absent]
-        return [SimpleNamespace(symbolic=name, get_access_mode=lambda mode=mode: mode) for name, mode in both]
+        return [
+            SimpleNamespace(symbolic=name, get_access_mode=lambda mode=mode: mode)
+            for name, mode in both
+        ]
 
     def get_access_mode(self) -> int:
         return self.access
@@ -123,7 +127,9 @@ def test_a_camera_is_made_comparable():
 def test_a_line_triggers_where_it_is_named():
     nodes = machine_vision_camera()
     camera = features(nodes)
-    camera.prepare(camera.choose_format("Mono8"), camera.choose_trigger("hardware", "Line3"), "Line3")
+    camera.prepare(
+        camera.choose_format("Mono8"), camera.choose_trigger("hardware", "Line3"), "Line3"
+    )
     assert nodes.TriggerSource.value == "Line3" and nodes.TriggerMode.modes["FrameStart"] == "On"
     for line in (None, "Line7", "Software"):
         with raises(InputError, "Line0", "Line3"):
@@ -150,7 +156,9 @@ def test_a_trigger_without_selector_is_turned_off():
     assert nodes.TriggerMode.value == "Off"
 
 
-@pytest.mark.parametrize(("unit", "there"), [("us", 1000.0), ("µs", 1000.0), ("", 1000.0), ("ms", 1.0), ("s", 1e-3)])
+@pytest.mark.parametrize(
+    ("unit", "there"), [("us", 1000.0), ("µs", 1000.0), ("", 1000.0), ("ms", 1.0), ("s", 1e-3)]
+)
 def test_exposures_are_ms_whatever_the_unit(unit, there):
     nodes = SimpleNamespace(ExposureTime=Number(7 * there, 0.5 * there, 40 * there, unit))
     camera = features(nodes)

@@ -74,7 +74,9 @@ def test_a_camera_by_its_own_clock_gives_so_many_images_a_second():
 def test_mains_light_vanishes_in_an_exposure_of_its_period():
     def swing(exposure_ms: float) -> float:
         time = SteppingClock()
-        rig, _ = imperfect(preset_rig(scale=0.1), Imperfections(room=40, mains_depth=0.5), time.clock)
+        rig, _ = imperfect(
+            preset_rig(scale=0.1), Imperfections(room=40, mains_depth=0.5), time.clock
+        )
         image, means = np.empty(rig.camera.size[::-1], np.uint8), []
         with rig.opened():
             rig.camera.apply(CameraSettings(exposure_ms))
@@ -96,5 +98,7 @@ def test_a_display_that_scales_makes_fine_stripes_grey():
         sequence = gray(rig.projector.size)
         plain = preset_rig(scale=0.1)
         with plain.opened():
-            same = np.abs(capture_frames(rig, sequence).astype(int) - capture_frames(plain, sequence)).mean(axis=(1, 2))
+            same = np.abs(
+                capture_frames(rig, sequence).astype(int) - capture_frames(plain, sequence)
+            ).mean(axis=(1, 2))
     assert same[-1] < 2 < same[0]

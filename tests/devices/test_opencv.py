@@ -20,7 +20,14 @@ from slviewer.devices.drivers import driver
 from slviewer.devices.opencv import OpenCVCamera
 from slviewer.devices.opencv_reader import StreamTiming
 from slviewer.devices.opencv_source import list_sysfs_webcams
-from slviewer.devices.protocols import CameraSettings, ColourCamera, Openable, Rig, check_index, check_level
+from slviewer.devices.protocols import (
+    CameraSettings,
+    ColourCamera,
+    Openable,
+    Rig,
+    check_index,
+    check_level,
+)
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.presets import gray
 from slviewer.fringe.sequence import PatternSequence
@@ -77,7 +84,9 @@ def opened(camera: OpenCVCamera) -> Iterator[OpenCVCamera]:
 
 
 def video(path: Path, pictures: list[np.ndarray]) -> str:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, pictures[0].shape[1::-1])
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, pictures[0].shape[1::-1]
+    )
     for picture in pictures:
         writer.write(picture if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
     writer.release()
@@ -124,7 +133,10 @@ def test_each_channel_of_a_colour_video(tmp_path):
 def test_no_grab_returns_an_older_picture():
     rng = np.random.default_rng(1)
     passed = []  # pictures that were sent during a grab
-    with network_camera(coded(0), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=QUICK)) as camera:
+    with (
+        network_camera(coded(0), FPS) as seen,
+        opened(OpenCVCamera(seen.url, SIZE, timing=QUICK)) as camera,
+    ):
         for k in range(1, 13):
             wait_pictures(seen, 24 if k == 8 else int(rng.integers(3)))  # for a while nobody asks
             seen.picture = coded(k)
@@ -136,7 +148,10 @@ def test_no_grab_returns_an_older_picture():
 
 def test_pictures_that_come_in_clumps_are_never_taken_for_new_ones():
     rng = np.random.default_rng(2)
-    with network_camera(coded(0), FPS, clump=3) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=QUICK)) as camera:
+    with (
+        network_camera(coded(0), FPS, clump=3) as seen,
+        opened(OpenCVCamera(seen.url, SIZE, timing=QUICK)) as camera,
+    ):
         for k in range(1, 6):
             wait_pictures(seen, int(rng.integers(4)))
             seen.picture = coded(k)
@@ -144,7 +159,8 @@ def test_pictures_that_come_in_clumps_are_never_taken_for_new_ones():
 
 
 class Painter(Openable):
-    """A projector whose light is what the network camera sees: the number of the pattern, 255 for even light."""
+    """A projector whose light is what the network camera sees: the number of the pattern, 255 for
+    even light."""
 
     size = (16, 8)
 
@@ -179,14 +195,19 @@ def test_a_stream_says_that_its_settings_are_its_own():
         opened(OpenCVCamera(seen.url, SIZE, exposure_ms=5.0, timing=QUICK)) as camera,
     ):
         (note,) = camera.notes
-        assert "secret" not in note + camera.name and not missing_facts(camera.name, "127.0.0.1/video")
+        assert "secret" not in note + camera.name and not missing_facts(
+            camera.name, "127.0.0.1/video"
+        )
         assert not missing_facts(note, "exposure")
 
 
 def test_a_stream_that_stalls_is_told_and_comes_back():
     clock = Hastened()
     timing = StreamTiming(warm_up_s=0.0, clock=clock)
-    with network_camera(coded(1), FPS) as seen, opened(OpenCVCamera(seen.url, SIZE, timing=timing)) as camera:
+    with (
+        network_camera(coded(1), FPS) as seen,
+        opened(OpenCVCamera(seen.url, SIZE, timing=timing)) as camera,
+    ):
         seen.going.clear()
         asked, clock.step_s = clock(), 1.0
         with raises(DeviceError, "127.0.0.1/video"):
@@ -263,7 +284,9 @@ def test_the_libraries_keep_quiet(tmp_path):
         "    try: OpenCVCamera(source)\n"
         "    except DeviceError as error: print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=True
+    )
     assert done.stdout.count("\n") == 3 and done.stderr == ""
 
 
@@ -285,13 +308,19 @@ def test_options_that_cannot_be_are_refused(options):
 
 
 def test_webcams_are_listed_by_their_names(tmp_path):
-    for node, index, name in (("video0", 0, "HD Webcam"), ("video1", 1, "HD Webcam"), ("video10", 0, "Arducam")):
+    for node, index, name in (
+        ("video0", 0, "HD Webcam"),
+        ("video1", 1, "HD Webcam"),
+        ("video10", 0, "Arducam"),
+    ):
         (tmp_path / node).mkdir()
         (tmp_path / node / "index").write_text(f"{index}\n")
         (tmp_path / node / "name").write_text(f"{name}\n")
     lines = list_sysfs_webcams(tmp_path)
     assert [line.split(",")[0] for line in lines] == ["source 0: HD Webcam", "source 10: Arducam"]
-    assert list_sysfs_webcams(tmp_path / "none") == [] and isinstance(driver("opencv").list_connected(), list)
+    assert list_sysfs_webcams(tmp_path / "none") == [] and isinstance(
+        driver("opencv").list_connected(), list
+    )
 
 
 class _OneAtATime(NetworkCamera):

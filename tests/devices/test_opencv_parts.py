@@ -1,6 +1,7 @@
 """A webcam's controls, and the rhythm by which old pictures are known, without a webcam.
 
-The pictures are real, of a camera of the network; only what a webcam says of its controls is made up here.
+The pictures are real, of a camera of the network; only what a webcam says of its controls is made
+up here.
 """
 
 import cv2
@@ -11,7 +12,12 @@ from mjpeg import network_camera
 
 from slviewer.devices import opencv as opencv_module
 from slviewer.devices.opencv import OpenCVCamera
-from slviewer.devices.opencv_controls import dialect_of, disable_automatics, exposure_ms, set_exposure
+from slviewer.devices.opencv_controls import (
+    dialect_of,
+    disable_automatics,
+    exposure_ms,
+    set_exposure,
+)
 from slviewer.devices.opencv_reader import Connected, Pace, StreamTiming
 from slviewer.devices.opencv_source import connect_source
 from slviewer.devices.protocols import CameraSettings
@@ -23,10 +29,16 @@ QUICK = StreamTiming(warm_up_s=0.0)
 
 
 class Webcam:
-    """A capture with controls {property: value}, of which `stubborn` ones keep their values; exposures end at 500."""
+    """A capture with controls {property: value}, of which `stubborn` ones keep their values;
+    exposures end at 500."""
 
     def __init__(self, capture, backend, controls, stubborn=()):
-        self._capture, self._backend, self.controls, self._stubborn = capture, backend, controls, stubborn
+        self._capture, self._backend, self.controls, self._stubborn = (
+            capture,
+            backend,
+            controls,
+            stubborn,
+        )
 
     def __getattr__(self, name):
         return getattr(self._capture, name)
@@ -95,7 +107,10 @@ def plugged(monkeypatch):
 
         def plug(controls, stubborn=()):
             def instead(source, size, timing):
-                return Connected(Webcam(connect_source(seen.url, None).capture, "V4L2", controls, stubborn), live=True)
+                return Connected(
+                    Webcam(connect_source(seen.url, None).capture, "V4L2", controls, stubborn),
+                    live=True,
+                )
 
             monkeypatch.setattr(opencv_module, "connect_source", instead)
 
@@ -132,7 +147,9 @@ def test_a_webcam_is_set_and_read_back_and_its_automatics_are_switched_off(plugg
 
 
 def test_what_a_webcam_ignores_is_said(plugged):
-    plugged(dict(V4L2), stubborn=(cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_EXPOSURE))
+    plugged(
+        dict(V4L2), stubborn=(cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_FOCUS, cv2.CAP_PROP_EXPOSURE)
+    )
     camera = OpenCVCamera(0, SIZE, exposure_ms=5.0, focus=40, white_balance=4600, timing=QUICK)
     camera.open()
     try:
@@ -155,27 +172,36 @@ def test_a_camera_without_colour_is_read_as_it_is(monkeypatch):
         monkeypatch.setattr(
             opencv_module,
             "connect_source",
-            lambda *_: Connected(Grey(connect_source(seen.url, None).capture, "V4L2", {}), live=True),
+            lambda *_: Connected(
+                Grey(connect_source(seen.url, None).capture, "V4L2", {}), live=True
+            ),
         )
         camera = OpenCVCamera(0, SIZE, timing=QUICK)
         camera.open()
         try:
             out = np.zeros((120, 160), np.uint8)
             camera.grab(out)
-            assert abs(out.astype(int) - 90).max() < 3 and camera.grab_colour().shape == (120, 160, 3)
+            assert abs(out.astype(int) - 90).max() < 3 and camera.grab_colour().shape == (
+                120,
+                160,
+                3,
+            )
         finally:
             camera.close()
 
 
 def rhythm(times: list[float], busy: float = 0.0) -> tuple[list[float | None], Pace]:
-    """What `Pace` says of arrivals at `times`, while the reader computes for a share `busy` of them."""
+    """What `Pace` says of arrivals at `times`, while the reader computes for a share `busy` of
+    them."""
     pace = Pace()
     return [pace.add(now, busy * now) for now in times], pace
 
 
 def test_a_flood_after_a_pause_does_not_look_like_a_rhythm():
     steady = [k / 30 for k in range(60)]
-    flood = [steady[-1] + 3 + k / 500 for k in range(90)]  # what 3 s of 30 pictures have left in the buffers
+    flood = [
+        steady[-1] + 3 + k / 500 for k in range(90)
+    ]  # what 3 s of 30 pictures have left in the buffers
     after = [flood[-1] + (k + 1) / 30 for k in range(30)]
     periods, _ = rhythm(steady + flood + after)
     assert periods[:3] == [None] * 3

@@ -15,11 +15,14 @@ def bit_stream(levels: np.ndarray, bits: int) -> bytes:
 
 
 def gige_packed(levels: np.ndarray, bits: int) -> bytes:
-    """GigE Vision: the upper eight bits of a pixel, the lower ones of it and of the next, the upper of that."""
+    """GigE Vision: the upper eight bits of a pixel, the lower ones of it and of the next, the upper
+    of that."""
     low, flat = bits - 8, [int(level) for level in levels.ravel()]
     data = bytearray()
     for first, second in zip(flat[::2], [*flat[1::2], 0], strict=False):
-        data += bytes([first >> low, (first & (1 << low) - 1) | (second & (1 << low) - 1) << 4, second >> low])
+        data += bytes(
+            [first >> low, (first & (1 << low) - 1) | (second & (1 << low) - 1) << 4, second >> low]
+        )
     return bytes(data[:-1] if len(flat) % 2 else data)
 
 
@@ -35,7 +38,11 @@ def test_what_is_packed_comes_back(kind, bits, packing, shape, padding):
     levels = np.random.default_rng(bits).integers(0, 1 << bits, shape).astype(np.uint16)
     levels.flat[0] = (1 << bits) - 1
     pack = PACKERS[packing]
-    data = pack(levels, bits) if padding == 0 else b"".join(pack(row, bits) + b"\xaa" * padding for row in levels)
+    data = (
+        pack(levels, bits)
+        if padding == 0
+        else b"".join(pack(row, bits) + b"\xaa" * padding for row in levels)
+    )
     found = pixel_format(f"{kind}{bits}{packing}")
     out = np.zeros(shape, found.dtype)
     assert found.nbytes(shape[::-1], padding) == len(data)
@@ -43,7 +50,9 @@ def test_what_is_packed_comes_back(kind, bits, packing, shape, padding):
     np.testing.assert_array_equal(out, levels)
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("Mono8", "u1"), ("Mono10", "<u2"), ("Mono12", "<u2"), ("Mono16", "<u2")])
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("Mono8", "u1"), ("Mono10", "<u2"), ("Mono12", "<u2"), ("Mono16", "<u2")]
+)
 @pytest.mark.parametrize("padding", [0, 2, 3])
 def test_unpacked_levels_and_padded_rows(name, dtype, padding):
     found = pixel_format(name)
@@ -73,7 +82,9 @@ def test_a_mosaic_of_one_colour_is_that_colour(name):
     found = pixel_format(name)
     colour = {"R": 10, "G": 90, "B": 200}
     tile = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}[found.kind[-2:]]
-    mosaic = np.tile(np.array([colour[letter] for letter in tile], found.dtype).reshape(2, 2), (6, 5))
+    mosaic = np.tile(
+        np.array([colour[letter] for letter in tile], found.dtype).reshape(2, 2), (6, 5)
+    )
     rgb = found.rgb(mosaic)
     assert rgb.shape == (12, 10, 3) and rgb.dtype == found.dtype
     assert (rgb == [10, 90, 200]).all()
@@ -103,7 +114,16 @@ def test_the_format_that_is_chosen(offered, best):
 
 
 def test_formats_that_are_not_read_are_none_here():
-    for name in ("YUV422_8", "Mono1p", "Mono14p", "RGB12", "Mono10pmsb", "Coord3D_ABC32f", "", "Mono8s"):
+    for name in (
+        "YUV422_8",
+        "Mono1p",
+        "Mono14p",
+        "RGB12",
+        "Mono10pmsb",
+        "Coord3D_ABC32f",
+        "",
+        "Mono8s",
+    ):
         assert pixel_format(name) is None
     assert best_format(["YUV422_8"]) is None
     with pytest.raises(InputError):

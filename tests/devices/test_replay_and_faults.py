@@ -19,7 +19,9 @@ SEQUENCE = p18(PROJECTOR)
 
 
 def recorded(sequence: PatternSequence, seed: int = 0, dtype: type = np.uint8) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 200, (len(sequence.frames), 12, 16)).astype(dtype)
+    return (
+        np.random.default_rng(seed).integers(0, 200, (len(sequence.frames), 12, 16)).astype(dtype)
+    )
 
 
 def grabbed(rig: Rig) -> np.ndarray:
@@ -53,7 +55,11 @@ def test_a_recorded_dark_frame_is_what_dark_looks_like():
 
 def test_replay_refuses_another_sequence_and_says_so():
     with replay(recorded(SEQUENCE), SEQUENCE).opened() as rig:
-        for other in (gray(PROJECTOR), p18((60, 48)), PatternSequence(PROJECTOR, SEQUENCE.frames, phase_sign=-1)):
+        for other in (
+            gray(PROJECTOR),
+            p18((60, 48)),
+            PatternSequence(PROJECTOR, SEQUENCE.frames, phase_sign=-1),
+        ):
             with pytest.raises(DeviceError):
                 capture_frames(rig, other)
         with pytest.raises(DeviceError):
@@ -126,7 +132,9 @@ def test_drivers_are_found_by_name():
 
 
 def test_a_driver_without_its_package_says_how_to_install_it(monkeypatch):
-    vendor = Driver("vendor", "a camera", packages={"surely_not_there": "pip install 'slviewer[vendor]'"})
+    vendor = Driver(
+        "vendor", "a camera", packages={"surely_not_there": "pip install 'slviewer[vendor]'"}
+    )
     everything = drivers() | {"vendor": vendor}
     monkeypatch.setattr(drivers_module, "drivers", lambda: everything)
     assert available()[-1] is vendor

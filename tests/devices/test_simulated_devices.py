@@ -101,7 +101,9 @@ def test_two_frames_of_one_pattern_differ_by_their_noise(rig):
     bright = first > 90
     noise = (first - second)[bright]
     sensor = letter(0.2).sensor
-    expected = 2 * (sensor.read_variance + sensor.shot_variance * (first[bright].mean() - 3) + 1 / 12)
+    expected = 2 * (
+        sensor.read_variance + sensor.shot_variance * (first[bright].mean() - 3) + 1 / 12
+    )
     assert noise.var() == pytest.approx(expected, rel=0.1)
 
 
@@ -169,7 +171,10 @@ def test_a_draft_shows_the_board_where_it_is_and_captures_are_never_drafts():
         truth = world.rig.camera.project(world.pose.to_camera(world.scene.features))[found.ids]
         assert np.abs(found.pixels - truth).max() < 0.2
         full = capture_frames(rig, WHITE)[0]
-        assert np.abs(np.diff(full.astype(float))).mean() > 1.05 * np.abs(np.diff(draft.astype(float))).mean()
+        assert (
+            np.abs(np.diff(full.astype(float))).mean()
+            > 1.05 * np.abs(np.diff(draft.astype(float))).mean()
+        )
         time.sleep(SETTLED_S + 0.01)
         rig.projector.show_level(255)
         assert abs(seen(rig).astype(float) - full).std() < 4

@@ -32,14 +32,22 @@ def test_a_sequence_is_taken_in_every_exposure_the_shortest_first():
     seen = []
     with rig().opened() as one:
         one.camera.apply(CameraSettings(1.5, 2.0))
-        taken = capture_with_texture(one, SEQUENCE, (4.0, 0.5), progress=lambda done, of: seen.append((done, of)))
+        taken = capture_with_texture(
+            one, SEQUENCE, (4.0, 0.5), progress=lambda done, of: seen.append((done, of))
+        )
         assert one.camera.settings() == CameraSettings(1.5, 2.0) == taken.settings
     assert taken.exposures_ms == (0.5, 4.0) and taken.texture is None
     assert taken.frames.shape == (2 * N, 120, 160)
     short, long = taken.frames[:N].astype(float), taken.frames[N:]
-    clear = (long < 250) & (long > 100)  # chosen by one, measured by both: no pixel is there for its noise
+    clear = (long < 250) & (
+        long > 100
+    )  # chosen by one, measured by both: no pixel is there for its noise
     assert (long[clear] - 3.0).mean() / (short[clear] - 3.0).mean() == pytest.approx(8, rel=0.05)
-    assert seen[0] == (0, 2 * N) and seen[-1] == (2 * N, 2 * N) and [d for d, _ in seen] == sorted(d for d, _ in seen)
+    assert (
+        seen[0] == (0, 2 * N)
+        and seen[-1] == (2 * N, 2 * N)
+        and [d for d, _ in seen] == sorted(d for d, _ in seen)
+    )
     frames, choice = merge_exposures([taken.frames[:N], long], taken.exposures_ms)
     assert frames.max() < 255 and 0.05 < np.mean(choice) < 0.95
 
@@ -74,7 +82,13 @@ def test_the_exposure_is_restored_whatever_happens():
 
 def test_exposures_that_cannot_be_are_refused():
     with rig().opened() as one:
-        for exposures in ((2.0,), (2.0, 2.0), (-1.0, 2.0), tuple(range(1, 12)), (float("nan"), 1.0)):
+        for exposures in (
+            (2.0,),
+            (2.0, 2.0),
+            (-1.0, 2.0),
+            tuple(range(1, 12)),
+            (float("nan"), 1.0),
+        ):
             with pytest.raises(InputError):
                 capture_with_texture(one, SEQUENCE, exposures)
         with raises(DeviceError, "100 ms", "500 ms"):
@@ -93,7 +107,9 @@ def test_a_colour_camera_brings_its_colours_home():
         assert taken.texture is not None and taken.texture.shape == (120, 160, 3)
         illuminated = taken.texture[..., 1] > 60
         ratio = taken.texture[illuminated].astype(float) / taken.texture[illuminated][:, 1:2]
-        np.testing.assert_allclose(ratio.mean(axis=0), [ColouredCamera.RED, 1, ColouredCamera.BLUE], atol=0.02)
+        np.testing.assert_allclose(
+            ratio.mean(axis=0), [ColouredCamera.RED, 1, ColouredCamera.BLUE], atol=0.02
+        )
     with coloured(rig()).opened() as one:
 
         def gone() -> np.ndarray:
@@ -121,7 +137,9 @@ class _Page:
         header = msgspec.json.decode(message[4 : 4 + int.from_bytes(message[:4], "little")])
         self.asked.append(header["op"])
         if "number" in header and self._page is not None:
-            self._channel.handle_message(self._page, msgspec.json.encode({"op": "done", "number": header["number"]}))
+            self._channel.handle_message(
+                self._page, msgspec.json.encode({"op": "done", "number": header["number"]})
+            )
 
 
 def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():

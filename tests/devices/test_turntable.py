@@ -47,7 +47,11 @@ def make_table(controller: Controller | None, **options: Any) -> Turntable:
     if controller is None:
         return SimulatedTurntable(SimulatedWorld(letter(0.05)))
     return GcodeTurntable(
-        controller.port, degrees_per_unit=2.0, limits_deg=[-1000, 1000], timing=timing(controller), **(FAST | options)
+        controller.port,
+        degrees_per_unit=2.0,
+        limits_deg=[-1000, 1000],
+        timing=timing(controller),
+        **(FAST | options),
     )
 
 
@@ -111,7 +115,9 @@ def broken(dialect: Any, fault: Fault) -> str:
             table.turn_to(60.0, give_up)
         if fault in ("stuck", "alarm"):  # it does not turn on unattended, and nothing unlocks it
             stop = "cancel" if dialect == "grbl" else "M410"
-            assert until(lambda: stop in controller.received)  # perhaps after the driver has given up
+            assert until(
+                lambda: stop in controller.received
+            )  # perhaps after the driver has given up
         assert not any("$X" in line for line in controller.received)
         table.close()
     return str(raised.value)
@@ -248,8 +254,16 @@ def test_the_shipped_rig_has_a_turntable_with_something_to_see_on_it() -> None:
     assert 0 < abs(world.table_deg - 90.0) < 0.2
     table.turn_to(360.0)
     assert abs(world.pose.R - before.R).max() < 0.01
-    camera, projector = {"driver": "opencv", "source": 0, "size": [64, 48]}, {"driver": "browser", "size": [9, 9]}
+    camera, projector = (
+        {"driver": "opencv", "source": 0, "size": [64, 48]},
+        {
+            "driver": "browser",
+            "size": [9, 9],
+        },
+    )
     with raises(InputError, "simulated"):
         set_up(
-            {"camera": camera, "projector": projector, "turntable": {"driver": "simulated"}}, None, pages=PageChannels()
+            {"camera": camera, "projector": projector, "turntable": {"driver": "simulated"}},
+            None,
+            pages=PageChannels(),
         )

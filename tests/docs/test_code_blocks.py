@@ -1,7 +1,9 @@
-"""The code blocks of README and docs work: commands and Python are run, TOML is read, or the reason why not is stated.
+"""The code blocks of README and docs work: commands and Python are run, TOML is read, or the reason
+why not is stated.
 
-A block that cannot be run follows a comment: <!-- not run: reason -->. The quick start is run with the built wheel, in
-tests/test_release.py. Most pages work on one simulated session and share the names in it; only -m slow runs them.
+A block that cannot be run follows a comment: <!-- not run: reason -->. The quick start is run with
+the built wheel, in tests/test_release.py. Most pages work on one simulated session and share the
+names in it; only -m slow runs them.
 """
 
 import inspect
@@ -32,7 +34,8 @@ GENERATED = {"cli.md", "python.md"}
 WRITTEN = [p for p in (ROOT / "docs").rglob("*.md") if not {"_build", "gallery"} & set(p.parts)]
 PAGES = [ROOT / "README.md", *sorted(WRITTEN)]
 BLOCK = re.compile(
-    r"(?:^ *<!-- not run: (?P<reason>[^\n]+) -->\n)?^ *```(?P<language>\w*)[^\n]*\n(?P<code>.*?)^ *```",
+    r"(?:^ *<!-- not run: (?P<reason>[^\n]+) -->\n)?^ *```(?P<language>\w*)[^\n]*\n(?P<code>.*?)^"
+    r" *```",
     re.MULTILINE | re.DOTALL,
 )
 BOARD = "circles:21x16:9"
@@ -62,7 +65,8 @@ def pages_with(language: str) -> list[Path]:
     return [
         page
         for page in PAGES
-        if page.name not in {*GENERATED, "quickstart.md"} and any(not b.reason for b in blocks(page, language))
+        if page.name not in {*GENERATED, "quickstart.md"}
+        and any(not b.reason for b in blocks(page, language))
     ]
 
 
@@ -70,10 +74,16 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in GENERATED], ids=name_of)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.name not in GENERATED], ids=name_of
+)
 def test_every_block_states_its_language(page: Path) -> None:
     known = {"bash", "python", "toml", "text", "nginx", "math"}
-    unknown = [block.code for block in blocks(page) if not (block.language in known or page.name == "index.md")]
+    unknown = [
+        block.code
+        for block in blocks(page)
+        if not (block.language in known or page.name == "index.md")
+    ]
     assert not unknown
 
 
@@ -87,11 +97,14 @@ def test_toml_is_valid(page: Path) -> None:
 
 
 def run(line: str) -> None:
-    """Run one command of slviewer in this process; its comment may state that its exit status may be 1."""
+    """Run one command of slviewer in this process; its comment may state that its exit status may
+    be 1."""
     words: list[str] = []
     for word in shlex.split(line, comments=True)[1:]:
         if span := re.fullmatch(r"(.*)\{(\d+)\.\.(\d+)\}", word):  # as a shell does
-            words += [f"{span[1]}{k:0{len(span[2])}d}" for k in range(int(span[2]), int(span[3]) + 1)]
+            words += [
+                f"{span[1]}{k:0{len(span[2])}d}" for k in range(int(span[2]), int(span[3]) + 1)
+            ]
         else:
             words.append(word)
     assert main(words) in ((0, 1) if "# status 1" in line else (0,)), line
@@ -105,7 +118,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, few_cells: None) -> Path
         patch.chdir(folder)
         Path("my-rig.toml").write_text(RIG)
         with pytest.MonkeyPatch.context() as fewer:
-            fewer.setattr(simulation, "turning", lambda: dict(list(turning().items())[:3]))  # those that the pages name
+            fewer.setattr(
+                simulation, "turning", lambda: dict(list(turning().items())[:3])
+            )  # those that the pages name
             run("slviewer simulate my-session --preset turn --poses 8 --scale 0.15")
         with Session.open("my-session", write=True) as session:
             sequence = session.load_capture("object_r1").sequence
@@ -124,7 +139,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, few_cells: None) -> Path
         for shape, radius, wanted in (("plane", 5.0, 1), ("sphere", 15.0, 2)):  # m1, m2, m3
             places = valid[:: len(valid) // 50]
             if shape == "sphere":  # of what is curved like one most lies at the rim
-                places = places[np.argsort(-np.linalg.norm(places - np.median(valid, axis=0), axis=1))]
+                places = places[
+                    np.argsort(-np.linalg.norm(places - np.median(valid, axis=0), axis=1))
+                ]
             for place in places:
                 ball = [f"{x:.1f}" for x in (*place, radius)]
                 wanted -= main(["measure", "my-session", "part_a", shape, "--ball", *ball]) == 0
@@ -140,22 +157,31 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, few_cells: None) -> Path
 
 @pytest.mark.computes
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in pages_with("bash") if p.name not in WITHOUT_SESSION], ids=name_of)
-def test_the_commands_of_a_page_run(page: Path, workspace: Path, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "page", [p for p in pages_with("bash") if p.name not in WITHOUT_SESSION], ids=name_of
+)
+def test_the_commands_of_a_page_run(
+    page: Path, workspace: Path, tmp_path: Path, monkeypatch
+) -> None:
     shutil.copytree(workspace, tmp_path / "work")
     monkeypatch.chdir(tmp_path / "work")
     run_blocks(page)
 
 
 @pytest.mark.computes
-@pytest.mark.parametrize("page", [p for p in pages_with("bash") if p.name in WITHOUT_SESSION], ids=name_of)
-def test_the_commands_of_a_page_without_a_session_run(page: Path, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "page", [p for p in pages_with("bash") if p.name in WITHOUT_SESSION], ids=name_of
+)
+def test_the_commands_of_a_page_without_a_session_run(
+    page: Path, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     run_blocks(page)
 
 
 def run_blocks(page: Path) -> None:
-    """Run the commands of a page in the current folder, where its named TOML files are written first."""
+    """Run the commands of a page in the current folder, where its named TOML files are written
+    first."""
     for block in blocks(page):
         if named := re.match(r"# (\S+\.toml)\n", block.code):
             Path(named[1]).write_text(block.code)
@@ -192,5 +218,9 @@ def test_the_page_of_rig_files_names_every_option() -> None:
             make = rig_factory(found) if part == "rig" else getattr(found, part)
             row = " ".join(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
             if make is not None:
-                missing = [p for p in inspect.signature(make).parameters if p not in provided and f"`{p}`" not in row]
+                missing = [
+                    p
+                    for p in inspect.signature(make).parameters
+                    if p not in provided and f"`{p}`" not in row
+                ]
                 assert not missing, (name, part)

@@ -1,4 +1,5 @@
-"""What the files for deployment run works here; neither Docker nor systemd is started. .ci/run lints the Dockerfile."""
+"""What the files for deployment run works here; neither Docker nor systemd is started. .ci/run
+lints the Dockerfile."""
 
 import configparser
 import json
@@ -33,7 +34,11 @@ def test_the_container_is_not_root_and_holds_nothing_that_is_not_needed() -> Non
 def test_compose_starts_the_same_command_as_the_image() -> None:
     service = yaml.safe_load((DEPLOYMENT / "compose.yaml").read_text())["services"]["slviewer"]
     assert service["command"] == json.loads(re.findall(r"^CMD (.+)$", DOCKERFILE, re.MULTILINE)[-1])
-    assert service["read_only"] and service["cap_drop"] == ["ALL"] and service["volumes"] == ["data:/data"]
+    assert (
+        service["read_only"]
+        and service["cap_drop"] == ["ALL"]
+        and service["volumes"] == ["data:/data"]
+    )
     assert all(port.startswith("127.0.0.1:") for port in service["ports"])
 
 
@@ -55,7 +60,9 @@ def test_the_image_s_command_serves_and_its_health_check_passes(tmp_path: Path) 
     health = json.loads(re.search(r"CMD (\[\"python\".+\])", DOCKERFILE)[1])  # type: ignore[index]
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = str(probe.getsockname()[1])
-    words = [word.replace("/data", str(tmp_path)).replace("0.0.0.0", "127.0.0.1") for word in command[1:]]
+    words = [
+        word.replace("/data", str(tmp_path)).replace("0.0.0.0", "127.0.0.1") for word in command[1:]
+    ]
     server = subprocess.Popen(
         [sys.executable, "-m", "slviewer.cli", *words, "--port", port],
         env=os.environ | {"HOME": str(tmp_path)},
@@ -66,13 +73,19 @@ def test_the_image_s_command_serves_and_its_health_check_passes(tmp_path: Path) 
         end = time.monotonic() + HANG_S
         while True:
             try:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=HANG_S) as answer:
+                with urllib.request.urlopen(
+                    f"http://127.0.0.1:{port}/healthz", timeout=HANG_S
+                ) as answer:
                     assert answer.status == 204
                 break
             except OSError:  # it does not listen yet
                 assert time.monotonic() < end and server.poll() is None
                 time.sleep(0.2)
-        check = [sys.executable, "-c", health[2].replace(":8080", f":{port}").replace("timeout=4", f"timeout={HANG_S}")]
+        check = [
+            sys.executable,
+            "-c",
+            health[2].replace(":8080", f":{port}").replace("timeout=4", f"timeout={HANG_S}"),
+        ]
         assert subprocess.run(check, check=False).returncode == 0
         assert (tmp_path / "tokens.toml").stat().st_mode & 0o077 == 0
     finally:

@@ -1,4 +1,5 @@
-"""The example plugin is installed as a user would install it, passes its own tests, and works in every command."""
+"""The example plugin is installed as a user would install it, passes its own tests, and works in
+every command."""
 
 import os
 import shutil
@@ -37,7 +38,8 @@ def forget_plugins() -> None:
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Install a package in this process until the test ends: write its metadata, as pip does, into a folder.
+    """Install a package in this process until the test ends: write its metadata, as pip does, into
+    a folder.
 
     The package's modules are in that folder, ``site`` of ``tmp_path``, or beside it on the path.
     """
@@ -73,17 +75,31 @@ def test_the_plugin_installs_without_network_and_passes_its_own_tests(tmp_path: 
     site = tmp_path / "site"
     source = tmp_path / "source"  # a build writes into its source
     shutil.copytree(PACKAGE, source)
-    environment = os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{PACKAGE.parents[2]}", "NO_COLOR": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": f"{site}{os.pathsep}{PACKAGE.parents[2]}",
+        "NO_COLOR": "1",
+    }
 
     def run(*command: str | Path) -> str:
         words = [sys.executable, *map(str, command)]
-        done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
     options = ("-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", site)
     run("-m", "pip", "install", *options, source)
-    tests = ("-q", "-p", "no:dash", "-p", "no:cacheprovider", "-o", "addopts=", f"--rootdir={tmp_path}")
+    tests = (
+        "-q",
+        "-p",
+        "no:dash",
+        "-p",
+        "no:cacheprovider",
+        "-o",
+        "addopts=",
+        f"--rootdir={tmp_path}",
+    )
     assert "8 passed" in run("-m", "pytest", *tests, PACKAGE / "tests")
     printed = run("-m", "slviewer.cli", "plugins")
     assert not missing_facts(printed, *ENTRIES, "slviewer-example-plugin 1.0")
@@ -104,7 +120,9 @@ def test_its_parts_are_listed(example: None, run: Run) -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
-def test_its_importer_and_exporter_work_in_commands(example: None, tmp_path: Path, run: Run) -> None:
+def test_its_importer_and_exporter_work_in_commands(
+    example: None, tmp_path: Path, run: Run
+) -> None:
     frames = [
         frame
         for axis, extent in (("x", 240), ("y", 240))
@@ -118,12 +136,17 @@ def test_its_importer_and_exporter_work_in_commands(example: None, tmp_path: Pat
         cv2.imwrite(str(file), cv2.convertScaleAbs(render_pattern(sequence, k), alpha=0.7, beta=20))
     status, printed, _ = run("import", "auto", "part", "session", "--projector", "240x240")
     assert status == 0
-    assert "layout axisfolders" in printed and "1 capture imported as a target pose: part" in printed
+    assert (
+        "layout axisfolders" in printed and "1 capture imported as a target pose: part" in printed
+    )
     status, printed, _ = run("import", "axisfolders", "part", "other", "--projector", "240x240")
     assert status == 0 and "1 capture imported" in printed
     assert run("decode", "session", "part", "--out", "maps")[0] == 0
     write_shape(tmp_path / "cloud.pts", PointSet(np.array([[1000.0, 2, 3]], np.float32)))
-    assert (tmp_path / "cloud.pts").read_text().splitlines() == ["1", "1.0000000 0.0020000 0.0030000 128 128 128 128"]
+    assert (tmp_path / "cloud.pts").read_text().splitlines() == [
+        "1",
+        "1.0000000 0.0020000 0.0030000 128 128 128 128",
+    ]
 
 
 def test_its_board_is_one_of_the_boards(example: None, run: Run) -> None:
@@ -132,13 +155,17 @@ def test_its_board_is_one_of_the_boards(example: None, run: Run) -> None:
     assert status == 1 and "cannot be drawn" in error
 
 
-def test_a_broken_plugin_is_reported_and_stops_nothing(install: Install, tmp_path: Path, run: Run) -> None:
+def test_a_broken_plugin_is_reported_and_stops_nothing(
+    install: Install, tmp_path: Path, run: Run
+) -> None:
     entries = (
         "[slviewer.drivers]\nlost = broken_module:DRIVER\nopencv = json:dumps\n"
         "[slviewer.importers]\nwrong = json:dumps\n[slviewer.boards]\nhexgrid = json:nothing\n"
     )
     install("broken", "1.0", entries)
-    (tmp_path / "site" / "broken_module.py").write_text("raise RuntimeError('the maker forgot a file')\n")
+    (tmp_path / "site" / "broken_module.py").write_text(
+        "raise RuntimeError('the maker forgot a file')\n"
+    )
     status, printed, error = run("plugins")
     printed += error
     assert status == 1

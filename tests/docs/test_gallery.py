@@ -20,7 +20,8 @@ from slviewer.pipeline import simulate as simulation
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SCRIPTS = ("compare_models.py", "decode_and_look.py", "merge_and_mesh.py", "sphere_diameter.py")
-"""Those that take a picture's path and run in this process; tests/test_public_api.py runs the others."""
+"""Those that take a picture's path and run in this process; tests/test_public_api.py runs the
+others."""
 
 pytestmark = pytest.mark.computes
 
@@ -35,7 +36,9 @@ def plots_without_screen() -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_an_example_draws_its_picture(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_example_draws_its_picture(
+    script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     picture = tmp_path / "picture.png"
     monkeypatch.setattr(sys, "argv", [script, str(picture)])
     runpy.run_path(str(EXAMPLES / script), run_name="__main__")
@@ -80,14 +83,18 @@ def test_the_notebook_of_a_live_cloud_runs_on_a_simulated_session(
     monkeypatch.setattr(simulation, "simulate", copy_recorded)
     figures.run_notebook(EXAMPLES / "live_cloud.ipynb", tmp_path)
     printed = capsys.readouterr().out.splitlines()
-    counts = next(line for line in reversed(printed) if line.startswith("[")).strip("[]").split(", ")
+    counts = (
+        next(line for line in reversed(printed) if line.startswith("[")).strip("[]").split(", ")
+    )
     assert len(counts) == 3 and all(int(count) > 5000 for count in counts)
 
 
 def test_every_example_is_run() -> None:
     elsewhere = {"arrays.py", "session.py", "batch_dask.py"}
     assert {path.name for path in EXAMPLES.glob("*.py")} == {*SCRIPTS, *elsewhere}
-    assert importlib.util.find_spec("nbformat") is None or all(_is_notebook(path) for path in EXAMPLES.glob("*.ipynb"))
+    assert importlib.util.find_spec("nbformat") is None or all(
+        _is_notebook(path) for path in EXAMPLES.glob("*.ipynb")
+    )
 
 
 def _is_notebook(path: Path) -> bool:

@@ -1,4 +1,5 @@
-"""Organised clouds with known truth, made without a renderer: rays of a pinhole camera meet shapes."""
+"""Organised clouds with known truth, made without a renderer: rays of a pinhole camera meet
+shapes."""
 
 import numpy as np
 
@@ -39,7 +40,8 @@ def rectangle(u: tuple[int, int], v: tuple[int, int]) -> np.ndarray:
 
 
 def board_before_a_wall(sigma_z: float = 0.05, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A board at 600 mm that fills 55 % of the view before a wall at 900 mm, and the board's pixels."""
+    """A board at 600 mm that fills 55 % of the view before a wall at 900 mm, and the board's
+    pixels."""
     board = rectangle((50, 320), (20, 270))
     z = np.where(board, plane_depth(), plane_depth(900.0, (0.0, 0.1)))
     return cloud(z, sigma_z, seed), board

@@ -51,7 +51,9 @@ def true_model(longer: float = 0.0) -> StereoModel:
         Lens(np.array(record[name]["K"]), np.array(record[name]["D"]), tuple(record[name]["size"]))
         for name in ("camera", "projector")
     ]
-    return StereoModel.from_rig(StereoRig(*lenses, np.array(record["R"]), np.array(record["t"]) * (1 + longer)))
+    return StereoModel.from_rig(
+        StereoRig(*lenses, np.array(record["R"]), np.array(record["t"]) * (1 + longer))
+    )
 
 
 RIG = true_model().rig
@@ -74,14 +76,19 @@ def places_of_the_bar():
 @pytest.fixture(scope="module")
 def bars():
     """(words, phases) of the ball bar in its seven places."""
-    return [(p.words, phases_of(bar(p.T_camera_artefact), i)) for i, p in enumerate(places_of_the_bar())]
+    return [
+        (p.words, phases_of(bar(p.T_camera_artefact), i)) for i, p in enumerate(places_of_the_bar())
+    ]
 
 
 def outcome(artefact, bars, model):
     return conclude_test(
         artefact,
         "stereo",
-        [measure_artefact(artefact, reconstruct_cloud(model, p), words, words, R2) for words, p in bars],
+        [
+            measure_artefact(artefact, reconstruct_cloud(model, p), words, words, R2)
+            for words, p in bars
+        ],
     )
 
 
@@ -122,22 +129,30 @@ def test_a_scale_error_of_200_ppm_is_found(bars, true_test):
 @pytest.mark.computes
 def test_temperature_is_corrected(bars):
     warm = {**GIVEN, "measured": {**GIVEN["measured"], "temperature_C": 30.0}}
-    cold, hot = (outcome(Artefact.from_dict(given), bars[:2], true_model()) for given in (GIVEN, warm))
+    cold, hot = (
+        outcome(Artefact.from_dict(given), bars[:2], true_model()) for given in (GIVEN, warm)
+    )
     assert cold.scale.ppm - hot.scale.ppm == pytest.approx(115, abs=0.5)
     assert hot.positions[0].error(SPACING).U_mm > cold.positions[0].error(SPACING).U_mm
     assert missing_facts("; ".join(hot.lacks), "2 of 7") == []
 
 
 @pytest.mark.computes
-@pytest.mark.parametrize(("limit", "decision"), [(0.2, "pass"), (0.012, "undecided"), (1e-5, "fail")])
+@pytest.mark.parametrize(
+    ("limit", "decision"), [(0.2, "pass"), (0.012, "undecided"), (1e-5, "fail")]
+)
 def test_decisions_heed_the_tests_own_uncertainty(true_test, limit, decision):
-    unsure = Artefact.from_dict({**GIVEN, "calibrated": {**GIVEN["calibrated"], "spacing_U_mm": 0.01}})
+    unsure = Artefact.from_dict(
+        {**GIVEN, "calibrated": {**GIVEN["calibrated"], "spacing_U_mm": 0.01}}
+    )
     if decision == "fail":
         unsure = true_test.artefact
     errors = [0.005, -0.003, 0.001]
     u = unsure.at_measurement(unsure.spacing)[1]
     assert decide([make_length_error(SPACING, "", error, u) for error in errors], limit) == decision
-    judged = conclude_test(replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions)
+    judged = conclude_test(
+        replace(unsure, limits=Limits(spacing_mm=limit)), "stereo", true_test.positions
+    )
     assert judged.decision in ("pass", "fail", "undecided")
 
 
@@ -165,7 +180,9 @@ def test_places_are_seen_by_both_devices():
     bar_held, sphere_held = places_of_the_bar(), sphere_places(RIG, R2, 60.0)
     for place in bar_held + sphere_held:
         T = place.T_camera_artefact
-        assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(T[:3, :3]) == pytest.approx(1)
+        assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(
+            T[:3, :3]
+        ) == pytest.approx(1)
     assert len(bar_held) == 7 and len(plane_places(RIG, R2)) == 6
     depths = [place.T_camera_artefact[2, 3] for place in sphere_held]
     assert min(depths) < R2[0] and max(depths) > R2[1]
@@ -192,7 +209,10 @@ def test_the_examples_are_valid(name):
         ({"measured": {"temperature_C": 20.0, "temperature_U_K": 0.1}}, ["[measured]", "captures"]),
         ({"calibrated": {**GIVEN["calibrated"], "spacing_mm": -1}}, ["spacing_mm", -1]),
         ({"calibrated": {**GIVEN["calibrated"], "spacing_mm": "100"}}, ["spacing_mm", "'100'"]),
-        ({"calibrated": {**GIVEN["calibrated"], "diameter_mm": [1.0, 2.0, 3.0]}}, [3, "diameters", 2]),
+        (
+            {"calibrated": {**GIVEN["calibrated"], "diameter_mm": [1.0, 2.0, 3.0]}},
+            [3, "diameters", 2],
+        ),
         ({"limits": {"colour": 1}}, ["[limits]", "colour"]),
     ],
 )
@@ -206,8 +226,12 @@ def test_repeatability_is_the_noise_whatever_the_shape():
     shape = 600 + 20 * rng.random((60, 80))
     shape[:5] = np.nan
     noise = np.full((60, 80), 0.03)
-    found = repeatability((shape + 0.001 * k + rng.normal(0, 0.03, shape.shape), noise) for k in range(10))
-    assert found.sigma_mm == pytest.approx(0.03, rel=0.06) and found.predicted_mm == pytest.approx(0.03)
+    found = repeatability(
+        (shape + 0.001 * k + rng.normal(0, 0.03, shape.shape), noise) for k in range(10)
+    )
+    assert found.sigma_mm == pytest.approx(0.03, rel=0.06) and found.predicted_mm == pytest.approx(
+        0.03
+    )
     assert found.wandering_mm == pytest.approx(0.009, abs=0.003)
     assert found.pixels == 55 * 80 and np.isnan(found.sigma_map[0, 0])
     with raises(InputError, 2):
@@ -217,7 +241,11 @@ def test_repeatability_is_the_noise_whatever_the_shape():
 def test_a_budget_adds_squares_and_names_what_is_unknown():
     found = ErrorBudget(
         100.0,
-        [Contribution("a", 0.003, "A", ""), Contribution("b", 0.004, "B", ""), Contribution("drift", None, "B", "")],
+        [
+            Contribution("a", 0.003, "A", ""),
+            Contribution("b", 0.004, "B", ""),
+            Contribution("drift", None, "B", ""),
+        ],
     )
     assert found.U_mm == pytest.approx(0.010) and found.unknown == ["drift"]
     assert missing_facts(render_text(found.table()), "excludes", *found.unknown) == []

@@ -35,7 +35,9 @@ def two() -> tuple[dict[str, Cloud], np.ndarray, Comparison]:
     return clouds, board, fit_clouds("plane", clouds, illuminated, depth_range=(590.0, 610.0))
 
 
-def test_every_model_is_measured_over_the_common_pixels(two: tuple[dict[str, Cloud], np.ndarray, Comparison]) -> None:
+def test_every_model_is_measured_over_the_common_pixels(
+    two: tuple[dict[str, Cloud], np.ndarray, Comparison],
+) -> None:
     result = two[2]
     stereo, pixelwise = result.results["stereo"], result.results["pixelwise"]
     assert stereo.points == pixelwise.points == result.common.sum()
@@ -57,7 +59,9 @@ def test_a_larger_wall_that_one_model_alone_measures_is_not_the_shape() -> None:
     near[~rectangle((140, 270), (90, 220))] = np.nan
     for order in (1, -1):
         clouds = dict(
-            list({"stereo": seen(everywhere, "stereo"), "pixelwise": seen(near, "pixelwise")}.items())[::order]
+            list(
+                {"stereo": seen(everywhere, "stereo"), "pixelwise": seen(near, "pixelwise")}.items()
+            )[::order]
         )
         result = fit_clouds("plane", clouds, board)
         assert not result.region[~board].any()
@@ -90,7 +94,9 @@ def test_models_without_common_pixels_are_refused() -> None:
     left[:, 180:] = np.nan
     right[:, :180] = np.nan
     with raises(InputError, "left"):
-        fit_clouds("plane", {"left": seen(left, "left"), "right": seen(right, "right")}, region=board)
+        fit_clouds(
+            "plane", {"left": seen(left, "left"), "right": seen(right, "right")}, region=board
+        )
     with raises(InputError, "left", "right", 0):
         fit_clouds("plane", {"left": seen(left, "left"), "right": seen(right, "right")})
     with pytest.raises(InputError):
@@ -123,12 +129,15 @@ def test_incidence_counts_points_by_depth() -> None:
 
 def test_the_letters_means_follow_from_its_rows() -> None:
     stereo, pixelwise = (
-        np.mean([getattr(row, name) for row in letter.TABLE_1]) for name in ("stereo_mm", "pixelwise_mm")
+        np.mean([getattr(row, name) for row in letter.TABLE_1])
+        for name in ("stereo_mm", "pixelwise_mm")
     )
     assert stereo == pytest.approx(letter.TABLE_1_MEAN_MM[0], abs=6e-4)
     assert pixelwise == pytest.approx(letter.TABLE_1_MEAN_MM[1], abs=6e-4)
     assert stereo / pixelwise == pytest.approx(letter.TABLE_1_RATIO_OF_MEANS, abs=0.005)
-    assert max(row.stereo_mm / row.pixelwise_mm for row in letter.TABLE_1) == pytest.approx(3.59, abs=0.005)
+    assert max(row.stereo_mm / row.pixelwise_mm for row in letter.TABLE_1) == pytest.approx(
+        3.59, abs=0.005
+    )
     assert all(sum(row.incidence) == pytest.approx(100.0, abs=0.11) for row in letter.TABLE_1)
     assert tuple(row.pose for row in letter.TABLE_1 if row.incidence[1] >= 87.0) == (3, 4, 9, 10)
 
@@ -137,10 +146,14 @@ def test_the_letters_means_follow_from_its_rows() -> None:
         radii = [getattr(row, f"{name}_radius_mm") for row in letter.TABLE_2]
         assert rms == pytest.approx(letter.TABLE_2_MEAN_MM[k], abs=6e-4)
         assert np.mean(radii) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][0], abs=1e-3)
-        assert np.std(radii, ddof=1) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][1], abs=2e-3)  # rows have 2 decimals
+        assert np.std(radii, ddof=1) == pytest.approx(
+            letter.TABLE_2_RADIUS_MM[k][1], abs=2e-3
+        )  # rows have 2 decimals
 
 
-def test_tables_show_the_letters_figures_beside_ours(two: tuple[dict[str, Cloud], np.ndarray, Comparison]) -> None:
+def test_tables_show_the_letters_figures_beside_ours(
+    two: tuple[dict[str, Cloud], np.ndarray, Comparison],
+) -> None:
     comparison = two[2]
     table = letter_rows({"plane_01": comparison, "plane_03": comparison})
     assert [row["capture"] for row in table] == ["plane_01", "plane_03", "mean"]
@@ -173,13 +186,17 @@ def test_nothing_to_show_renders_as_nothing() -> None:
     assert render([]) == ""
     assert letter_rows({}) == []
     assert (
-        render([{"model": "stereo", "RMS mm": 0.1234, "noise floor mm": float("nan")}]).splitlines()[-1].endswith("-")
+        render([{"model": "stereo", "RMS mm": 0.1234, "noise floor mm": float("nan")}])
+        .splitlines()[-1]
+        .endswith("-")
     )
 
 
 def test_a_plane_far_off_the_depths_is_all_in_one_range() -> None:
     points = cloud(plane_depth(440.0), 0.02)
-    result = fit_clouds("plane", {"stereo": seen(points, "stereo")}, depth_range=letter.DEPTH_RANGE_MM)
+    result = fit_clouds(
+        "plane", {"stereo": seen(points, "stereo")}, depth_range=letter.DEPTH_RANGE_MM
+    )
     assert result.incidence == {"R1": 100.0, "R2": 0.0, "R3": 0.0}
 
 
@@ -195,7 +212,9 @@ def test_a_plane_that_is_a_minor_part_of_the_scene_is_told_with_its_place() -> N
     rows, columns = (np.flatnonzero(result.region.any(axis=axis)) for axis in (1, 0))
     assert missing_facts(result.region_text(), columns[0], columns[-1], rows[0], rows[-1]) == []
     given = fit_clouds("plane", {"stereo": seen(points, "stereo")}, region=board)
-    assert all(missing_facts(warning, given.region_text()) for warning in given.warnings)  # it was not searched for
+    assert all(
+        missing_facts(warning, given.region_text()) for warning in given.warnings
+    )  # it was not searched for
 
 
 def test_an_rms_far_above_the_floor_by_every_model_is_told() -> None:

@@ -32,7 +32,9 @@ TURN = np.array([[np.cos(0.3), 0, np.sin(0.3)], [0, 1, 0], [-np.sin(0.3), 0, np.
 
 def rig() -> StereoRig:
     camera = Lens(np.array([[450.0, 0, 99.5], [0, 450.0, 74.5], [0, 0, 1]]), np.zeros(5), SIZE)
-    projector = Lens(np.array([[700.0, 0, 228.0], [0, 1400.0, 285.0], [0, 0, 1]]), np.zeros(5), (456, 570))
+    projector = Lens(
+        np.array([[700.0, 0, 228.0], [0, 1400.0, 285.0], [0, 0, 1]]), np.zeros(5), (456, 570)
+    )
     return StereoRig(camera, projector, TURN, -TURN @ np.array([180.0, 0.0, 0.0]))
 
 
@@ -47,7 +49,8 @@ def seen(true: StereoRig, depth: float, name: str = "pose") -> Observation:
     coordinate = true.project(rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[:, None])
     box = (-0.5, -0.5, SIZE[0] - 0.5, SIZE[1] - 0.5)
     surfaces = {
-        axis: fit_polynomial(u, v, 2 * np.pi * coordinate[:, i] / PERIOD, None, box, 7) for i, axis in enumerate("xy")
+        axis: fit_polynomial(u, v, 2 * np.pi * coordinate[:, i] / PERIOD, None, box, 7)
+        for i, axis in enumerate("xy")
     }
     region = np.zeros(SIZE[::-1], bool)
     low, high = true.camera.project(X).min(0).astype(int), true.camera.project(X).max(0).astype(int)
@@ -91,15 +94,26 @@ def test_poses_are_dealt_by_depth() -> None:
 
 def test_a_perfect_model_leaves_nothing_and_an_imperfect_one_its_error() -> None:
     true = rig()
-    models = {"true": Stretched(true), "long": Stretched(true, 1.0005), "rippled": Stretched(true, 1.0, 0.05)}
+    models = {
+        "true": Stretched(true),
+        "long": Stretched(true, 1.0005),
+        "rippled": Stretched(true, 1.0, 0.05),
+    }
     found = measure_held_out(models, seen(true, 600.0), "x", true)
     perfect = found["true"]
     assert perfect.plane_mm < 2e-3 and perfect.board_mm < 4e-3 and abs(perfect.scale_ppm) < 20
-    assert perfect.camera_px < 2e-3 and perfect.projector_px < 4e-3 and perfect.depth_mm == pytest.approx(600, abs=1)
+    assert (
+        perfect.camera_px < 2e-3
+        and perfect.projector_px < 4e-3
+        and perfect.depth_mm == pytest.approx(600, abs=1)
+    )
     assert found["long"].scale_ppm - perfect.scale_ppm == pytest.approx(500, abs=1)
     # stretched by 500 ppm about its middle: the RMS distance of the features from there times that
     spread = np.sqrt(np.mean(np.sum((BOARD.points - BOARD.points.mean(0)) ** 2, axis=1)))
-    assert found["long"].board_mm == pytest.approx(5e-4 * spread, rel=0.05) and found["long"].plane_mm < 2e-3
+    assert (
+        found["long"].board_mm == pytest.approx(5e-4 * spread, rel=0.05)
+        and found["long"].plane_mm < 2e-3
+    )
     assert 0.035 < found["rippled"].plane_mm < 0.055  # along the rays, of a board that is tilted
     assert found["rippled"].projector_px > 5 * perfect.projector_px
     assert len({held.pixels for held in found.values()}) == 1
@@ -130,7 +144,10 @@ def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
     names = ("stereo", "pixelwise", "splined")
 
     def recommended(*errors: float) -> str:
-        fold = {f"p{k}": {name: held(e) for name, e in zip(names, errors, strict=True)} for k in range(4)}
+        fold = {
+            f"p{k}": {name: held(e) for name, e in zip(names, errors, strict=True)}
+            for k in range(4)
+        }
         return gather_results(names, [fold], (("p0", "p1", "p2", "p3"),), {}).recommended
 
     assert recommended(0.3, 0.2, 0.1) == "splined"
@@ -140,10 +157,14 @@ def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
 
 def test_it_survives_saving_and_says_what_failed() -> None:
     fold = {"p0": {"stereo": held(0.2)}, "p1": {"stereo": held(0.4)}}
-    found = gather_results(("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"})
+    found = gather_results(
+        ("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"}
+    )
     assert found.rms("stereo", "board_mm") == pytest.approx(np.sqrt(0.1))
     assert found.recommended == "stereo"
-    assert missing_facts(found.text(), found.recommended, "pixelwise", found.failed["pixelwise"]) == []
+    assert (
+        missing_facts(found.text(), found.recommended, "pixelwise", found.failed["pixelwise"]) == []
+    )
     assert from_plain(json.loads(json.dumps(found.to_json())), CrossValidation) == found
     with raises(InputError, "stereo", "why"):
         gather_results(("stereo",), [], (), {"stereo": "why"})

@@ -21,7 +21,9 @@ def sphere_before_a_wall(sigma_z: float = SIGMA) -> tuple[np.ndarray, np.ndarray
 def test_radius_and_noise_are_found_in_a_whole_cloud(radius: float | None) -> None:
     points, hit = sphere_before_a_wall()
     result = evaluate_sphere(points, None, np.full(points.shape[:2], SIGMA), radius)
-    assert result.radius_mm == pytest.approx(RADIUS, abs=0.01)  # a radius handed in does not hold the fit
+    assert result.radius_mm == pytest.approx(
+        RADIUS, abs=0.01
+    )  # a radius handed in does not hold the fit
     assert np.linalg.norm(result.sphere.centre - CENTRE) < 0.02
     assert 0.9 * hit.sum() < result.points <= hit.sum()
     assert 0.4 * SIGMA < result.rms_mm < SIGMA
@@ -55,7 +57,9 @@ def test_two_spheres_and_their_spacing() -> None:
     assert [result.sphere.centre[0] > 0 for result in results] == [False, True]
     for result in results:
         assert result.radius_mm == pytest.approx(25.0, abs=0.02)
-    assert np.linalg.norm(results[1].sphere.centre - results[0].sphere.centre) == pytest.approx(known, abs=0.02)
+    assert np.linalg.norm(results[1].sphere.centre - results[0].sphere.centre) == pytest.approx(
+        known, abs=0.02
+    )
 
 
 def test_a_wall_is_no_sphere() -> None:

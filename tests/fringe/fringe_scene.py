@@ -13,12 +13,17 @@ OVERSAMPLING = 8
 
 
 def variants(cases: Iterable, *default) -> list:
-    """Return all cases as parameters of a test; only those given as ``default`` are outside the slow tier."""
+    """Return all cases as parameters of a test; only those given as ``default`` are outside the
+    slow tier."""
     cases = list(cases)
     assert all(case in cases for case in default)
     slow = pytest.mark.slow
     return [
-        case if case in default else pytest.param(*case if isinstance(case, tuple) else [case], marks=slow)
+        (
+            case
+            if case in default
+            else pytest.param(*case if isinstance(case, tuple) else [case], marks=slow)
+        )
         for case in cases
     ]
 
@@ -45,7 +50,8 @@ def capture(
 ):
     """(n, h, w) uint8 frames; ``defocus`` in projector px, ``psf`` in camera px along the rows.
 
-    ``gain`` (a number or (h, w)) is white less ambient, in grey levels; noise variance is read^2 + shot * level.
+    ``gain`` (a number or (h, w)) is white less ambient, in grey levels; noise variance is read^2 +
+    shot * level.
     """
     rng = np.random.default_rng(seed)
     frames = np.empty((len(sequence.frames), *coordinate.shape), np.uint8)
@@ -57,7 +63,9 @@ def capture(
         light = np.repeat((levels / 255.0) ** gamma, OVERSAMPLING)
         light = gaussian_filter1d(light, defocus * OVERSAMPLING, mode="nearest")
         position = (np.arange(len(light)) + 0.5) / OVERSAMPLING - 0.5
-        seen = ambient + gaussian_filter1d(gain * np.interp(coordinate, position, light, left=0, right=0), psf, axis=1)
+        seen = ambient + gaussian_filter1d(
+            gain * np.interp(coordinate, position, light, left=0, right=0), psf, axis=1
+        )
         seen += rng.normal(size=seen.shape) * np.sqrt(read**2 + shot * seen)
         frames[i] = np.clip(np.rint(seen), 0, 255)
     return frames
@@ -65,7 +73,9 @@ def capture(
 
 def wrong(phase: PhaseMap, coordinate, part=0.4):
     """How many valid pixels are off by more than a part of the period."""
-    return int(np.count_nonzero(np.abs(phase.coordinate - coordinate)[phase.mask] > part * phase.period_px))
+    return int(
+        np.count_nonzero(np.abs(phase.coordinate - coordinate)[phase.mask] > part * phase.period_px)
+    )
 
 
 def coverage(phase: PhaseMap, region=...):

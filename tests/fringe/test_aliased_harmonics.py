@@ -1,4 +1,5 @@
-"""Gamma in three and four phase steps is measured, corrected and reported, and textures are not taken for it."""
+"""Gamma in three and four phase steps is measured, corrected and reported, and textures are not
+taken for it."""
 
 import numpy as np
 import pytest
@@ -37,7 +38,9 @@ def rms_px(phase, truth):
 
 def share_within(phase, truth, sigmas=3.0):
     sigma_px = phase.sigma_phase * phase.period_px / (2 * np.pi)
-    return float(np.mean(np.abs(phase.coordinate - truth)[phase.mask] < sigmas * sigma_px[phase.mask]))
+    return float(
+        np.mean(np.abs(phase.coordinate - truth)[phase.mask] < sigmas * sigma_px[phase.mask])
+    )
 
 
 def gamma_suspects(sequence, stack, axis="x"):
@@ -87,7 +90,9 @@ def test_the_definition_and_levels_are_corrected_alike():
 
 V, U = np.mgrid[:240, :320]
 TEXTURES = {
-    "black circles": np.where(np.hypot((U + 0.1 * V) % 40 - 20, (V - 0.05 * U) % 40 - 20) < 12, 15.0, 200.0),
+    "black circles": np.where(
+        np.hypot((U + 0.1 * V) % 40 - 20, (V - 0.05 * U) % 40 - 20) < 12, 15.0, 200.0
+    ),
     "white circles": np.where(np.hypot(U % 26 - 13, V % 26 - 13) < 8, 220.0, 30.0),
     "chessboard of one fringe": np.where((U // 30 + V // 30) % 2 > 0, 200.0, 25.0),
     "three stripes a fringe": 120 + 60 * np.cos(2 * np.pi * U / 10),
@@ -99,12 +104,19 @@ TEXTURES = {
 @pytest.mark.parametrize("texture", variants(TEXTURES, "black circles", "three stripes a fringe"))
 @pytest.mark.parametrize("tilt", variants([0.0, 0.1], 0.1))
 def test_textures_raise_no_alarm(monkeypatch, texture, steps, tilt):
-    truth = 40 + 0.6 * U + tilt * V + (2 * np.sin(V / 20) + 20 * (np.hypot(U - 160, V - 120) < 60)) * (tilt > 0)
+    truth = (
+        40
+        + 0.6 * U
+        + tilt * V
+        + (2 * np.sin(V / 20) + 20 * (np.hypot(U - 160, V - 120) < 60)) * (tilt > 0)
+    )
     sequence = complementary(PROJECTOR, steps, 18.0)
     stack = capture(sequence, truth, gain=TEXTURES[texture], shot=0.02)
     phase = decode(sequence, stack, "x")
     assert phase.model_error_rad == 0 and gamma_suspects(sequence, stack) == []
-    np.testing.assert_array_equal(phase.phase, decode_uncorrected(monkeypatch, sequence, stack).phase)
+    np.testing.assert_array_equal(
+        phase.phase, decode_uncorrected(monkeypatch, sequence, stack).phase
+    )
 
 
 @pytest.mark.slow
@@ -114,13 +126,20 @@ def test_a_rendered_board(monkeypatch, gamma):
     turn = np.array([[np.cos(0.3), 0, np.sin(0.3)], [0, 1, 0], [-np.sin(0.3), 0, np.cos(0.3)]])
     board = Board.parse("circles:21x16:9")
     middle = board.points.mean(axis=0)
-    renderer = Renderer(rig, printed_board(board, Pose(turn, np.array([0.0, 0.0, 600.0]) - turn @ middle)))
+    renderer = Renderer(
+        rig, printed_board(board, Pose(turn, np.array([0.0, 0.0, 600.0]) - turn @ middle))
+    )
     sequence = complementary(rig.projector.size, 3, 36.0)
     stack, truth = renderer.capture(sequence), renderer.truth().projector
     for column, axis in enumerate(sequence.axes):
-        phase, before = decode(sequence, stack, axis), decode_uncorrected(monkeypatch, sequence, stack, axis)
+        phase, before = (
+            decode(sequence, stack, axis),
+            decode_uncorrected(monkeypatch, sequence, stack, axis),
+        )
         inside = phase.mask & np.isfinite(truth[..., column])
-        off, off_before = (np.median(np.abs((p.coordinate - truth[..., column])[inside])) for p in (phase, before))
+        off, off_before = (
+            np.median(np.abs((p.coordinate - truth[..., column])[inside])) for p in (phase, before)
+        )
         assert len(gamma_suspects(sequence, stack, axis)) == (gamma != 1)
         assert off_before > 3 * off > 0.03 if gamma != 1 else off == off_before
 

@@ -32,7 +32,9 @@ TWO_PI = 2 * np.pi
 )
 def test_no_wrong_period_survives_blur_and_noise(name, per_px, defocus, psf, gain, read, gamma):
     sequence, truth = SEQUENCES[name], slope(per_px=per_px)
-    frames = capture(sequence, truth, defocus=defocus, psf=psf, gain=gain, read=read, gamma=gamma, ambient=20)
+    frames = capture(
+        sequence, truth, defocus=defocus, psf=psf, gain=gain, read=read, gamma=gamma, ambient=20
+    )
     phase = decode(sequence, frames, "x")
     assert wrong(phase, truth) == 0
     assert coverage(phase) > 0.99
@@ -81,7 +83,9 @@ def test_single_spikes_at_a_code_edge_are_repaired_and_others_masked():
     rng = np.random.default_rng(5)
     for at_edge in (True, False):
         phase = clean.copy()
-        v, u = np.nonzero((part < 0.1 if at_edge else part > 0.2) & (rng.random(clean.shape) < 0.02))
+        v, u = np.nonzero(
+            (part < 0.1 if at_edge else part > 0.2) & (rng.random(clean.shape) < 0.02)
+        )
         phase[v, u] += TWO_PI * rng.choice([-1, 1], len(v)).astype(np.float32)
         settled, reason = _settle(phase)
         if at_edge:
@@ -118,6 +122,8 @@ def test_the_border_of_the_lit_region_stays_and_specks_go():
 def test_pixels_that_mix_two_surfaces_are_masked(name):
     sequence, truth = SEQUENCES[name], slope(160, 240)
     truth[40:120, 80:160] += 31.3
-    phase = decode(sequence, capture(sequence, truth, defocus=4.0, psf=1.5, gain=150, read=2.0), "x")
+    phase = decode(
+        sequence, capture(sequence, truth, defocus=4.0, psf=1.5, gain=150, read=2.0), "x"
+    )
     assert wrong(phase, truth) == 0
     assert phase.mask.mean() > 0.98

@@ -34,15 +34,21 @@ def rms(phase, coordinate):
 def test_the_coordinate_comes_back(name, axis):
     sequence, truth = SEQUENCES[name], slope()
     phase = decode(sequence, capture(sequence, truth, axis=axis, gain=200), axis)
-    assert phase.axis == axis and phase.phase.dtype == np.float32 and phase.phase.shape == truth.shape
+    assert (
+        phase.axis == axis and phase.phase.dtype == np.float32 and phase.phase.shape == truth.shape
+    )
     assert wrong(phase, truth, part=0.4 if phase.steps else 3) == 0
     assert coverage(phase) > 0.995
     assert phase.illuminated.all()
     if name == "gray":
         assert phase.steps == 0 and np.isnan(phase.wrapped).all()
-        assert 0.15 < rms(phase, truth) < 0.32  # 0.29 for columns, less where an edge was recognised
+        assert (
+            0.15 < rms(phase, truth) < 0.32
+        )  # 0.29 for columns, less where an edge was recognised
     else:
-        expected = np.sqrt(np.mean(phase.sigma_phase[phase.mask] ** 2)) * phase.period_px / (2 * np.pi)
+        expected = (
+            np.sqrt(np.mean(phase.sigma_phase[phase.mask] ** 2)) * phase.period_px / (2 * np.pi)
+        )
         assert 0.8 * expected < rms(phase, truth) < 1.15 * expected
 
 
@@ -52,7 +58,10 @@ def test_both_signs_of_the_phase_shift():
     sequence = replace(SEQUENCES["complementary"], phase_sign=-1)
     frames = capture(sequence, truth)
     assert wrong(decode(sequence, frames, "x"), truth) == 0
-    assert wrong(decode(replace(sequence, phase_sign=1), frames, "x"), truth, part=0.1) > truth.size / 2
+    assert (
+        wrong(decode(replace(sequence, phase_sign=1), frames, "x"), truth, part=0.1)
+        > truth.size / 2
+    )
 
 
 @pytest.mark.parametrize("origin", variants([-0.5, -4.5, -9.5], -9.5))
@@ -102,7 +111,9 @@ def test_deeper_grey_levels():
     ten = decode(sequence, frames.astype(np.uint16) * 4, "x")
     np.testing.assert_allclose(ten.phase, eight.phase, atol=1e-4)
     np.testing.assert_allclose(ten.modulation, 4 * eight.modulation, rtol=1e-5)
-    assert ten.noise[0] + 400 * ten.noise[1] == pytest.approx(16 * (eight.noise[0] + 100 * eight.noise[1]), rel=1e-3)
+    assert ten.noise[0] + 400 * ten.noise[1] == pytest.approx(
+        16 * (eight.noise[0] + 100 * eight.noise[1]), rel=1e-3
+    )
 
 
 @pytest.mark.slow
@@ -114,9 +125,9 @@ def test_clipped_pixels_are_saturated_and_noise_at_white_is_not(dtype, times):
     gain[:, :80] = 330.0
     # Full scale of 12 bits is 4095, not 255 * 16: stretch so that clipped samples reach it.
     frames = capture(sequence, truth, gain=gain, ambient=20, read=2.0)
-    frames = np.where(frames == 255, 4095 if times == 16 else 255 * times, frames.astype(np.uint32) * times).astype(
-        dtype
-    )
+    frames = np.where(
+        frames == 255, 4095 if times == 16 else 255 * times, frames.astype(np.uint32) * times
+    ).astype(dtype)
     phase = decode(sequence, frames, "x")
     assert (phase.reason[:, :76] == Reason.SATURATED).all()
     assert phase.illuminated.all()
@@ -166,7 +177,10 @@ def test_beyond_the_projector_is_dark_or_outside():
 def test_scattered_light_without_stripes_is_dark_in_gray_code():
     truth, sequence = slope(), SEQUENCES["gray"]
     frames = capture(sequence, truth, read=1.5).astype(np.int32)
-    scattered = np.rint(frames.mean(axis=2, keepdims=True) * 0.5 + np.random.default_rng(1).normal(size=frames.shape))
+    scattered = np.rint(
+        frames.mean(axis=2, keepdims=True) * 0.5
+        + np.random.default_rng(1).normal(size=frames.shape)
+    )
     frames[:, :, :60] = scattered[:, :, :60]
     phase = decode(sequence, frames.clip(0, 255).astype(np.uint8), "x")
     assert phase.mask[:, :60].mean() < 0.002
@@ -215,8 +229,14 @@ def _only(sequence, *kinds):
     [
         (_only(SEQUENCES["p18"], "phase"), ("18 px",)),
         (_only(SEQUENCES["gray"], "gray"), ("inverses",)),
-        (_only(SEQUENCES["complementary"], "phase", "complementary"), ("complementary", "Gray bits")),
-        (PatternSequence((4096, 4096), SEQUENCES["p18"].frames), ("7 Gray bits", "128 periods", 4096)),
+        (
+            _only(SEQUENCES["complementary"], "phase", "complementary"),
+            ("complementary", "Gray bits"),
+        ),
+        (
+            PatternSequence((4096, 4096), SEQUENCES["p18"].frames),
+            ("7 Gray bits", "128 periods", 4096),
+        ),
         (_only(SEQUENCES["p18"], "texture"), ("axis x", "pattern")),
         (multifrequency((3000, 3000), 4, (18.0, 20.0)), ("axis x", "longer period")),
     ],
@@ -234,7 +254,9 @@ def test_tiny_black_and_white_images_end_masked(name, shape):
     for level in (0, 128, 255):
         phase = decode(sequence, np.full((len(sequence.frames), *shape), level, np.uint8), "x")
         clipped = level == 255 and sequence.periods_px("x")
-        assert (phase.reason == (Reason.SATURATED if clipped else Reason.DARK)).all() and np.isnan(phase.phase).all()
+        assert (phase.reason == (Reason.SATURATED if clipped else Reason.DARK)).all() and np.isnan(
+            phase.phase
+        ).all()
         assert phase.noise[0] >= 0 and phase.noise[1] >= 0
 
 

@@ -1,4 +1,5 @@
-"""What a description says is compared with the frames, and the hypothesis that explains them is named."""
+"""What a description says is compared with the frames, and the hypothesis that explains them is
+named."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +20,16 @@ from slviewer.fringe.description_check import check_description
 from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
 from slviewer.fringe.frame_likeness import FrameLikeness
 from slviewer.fringe.line_sample import sample_lines
-from slviewer.fringe.presets import AXES, bits_for, complementary, gray, gray_bits, multifrequency, p18, phase_steps
+from slviewer.fringe.presets import (
+    AXES,
+    bits_for,
+    complementary,
+    gray,
+    gray_bits,
+    multifrequency,
+    p18,
+    phase_steps,
+)
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 from slviewer.simulation.rig import letter
 
@@ -109,7 +119,9 @@ def test_frames_that_are_all_late_are_named(name: str) -> None:
     assert [(c.cause, c.value) for c in found] == [("frame-lag", 1.0)]
 
 
-@pytest.mark.parametrize("name", variants([name for name in SEQUENCES if name != "three"], "complementary"))
+@pytest.mark.parametrize(
+    "name", variants([name for name in SEQUENCES if name != "three"], "complementary")
+)
 def test_frames_that_are_all_early_are_named(name: str) -> None:
     """Of three steps the first may be missed, and nothing is left of that phase."""
     sequence, frames = taken(name)
@@ -131,7 +143,8 @@ def test_exchanged_frames_are_named(name: str, frame: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "frame"), variants([("gray", 24), ("complementary", 16), ("white", 3)], ("complementary", 16))
+    ("name", "frame"),
+    variants([("gray", 24), ("complementary", 16), ("white", 3)], ("complementary", 16)),
 )
 def test_a_missing_frame_is_named(name: str, frame: int) -> None:
     sequence, frames = taken(name)
@@ -157,18 +170,26 @@ def test_a_repeated_image_is_named(name: str, frame: int) -> None:
 @pytest.mark.parametrize("frame", [5, 6])
 def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
     sequence, frames = taken("complementary")
-    brighter = np.minimum(0.7 * frames + 60 * (np.arange(len(frames)) >= frame)[:, None, None], 255).astype(np.uint8)
+    brighter = np.minimum(
+        0.7 * frames + 60 * (np.arange(len(frames)) >= frame)[:, None, None], 255
+    ).astype(np.uint8)
     assert check_description(sequence, brighter) == ()
     suspects = detect_light_faults(sequence, estimate_frame_light(sequence, brighter))
     assert [(s.fault, s.frame) for s in suspects] == [("room-light", frame)]
     for axis in AXES:
         # Copies, as kernels are compiled anew for arrays that cannot be written.
-        truth, seen = (decode(sequence, stack.copy(), axis).coordinate for stack in (frames, brighter))
+        truth, seen = (
+            decode(sequence, stack.copy(), axis).coordinate for stack in (frames, brighter)
+        )
         assert np.isfinite(seen).sum() > 0.99 * np.isfinite(truth).sum()
-        assert 0.01 < np.sqrt(np.nanmean((seen - truth) ** 2)) < 0.08  # px; rounding to 0.7 of the levels
+        assert (
+            0.01 < np.sqrt(np.nanmean((seen - truth) ** 2)) < 0.08
+        )  # px; rounding to 0.7 of the levels
 
 
-@pytest.mark.parametrize("name", variants([name for name in SEQUENCES if name != "multifrequency"], "three"))
+@pytest.mark.parametrize(
+    "name", variants([name for name in SEQUENCES if name != "multifrequency"], "three")
+)
 def test_bits_in_reverse_order_are_named(name: str) -> None:
     sequence, frames = taken(name)
     frames = frames.copy()
@@ -195,14 +216,21 @@ def test_inverses_taken_for_patterns_are_named(name: str) -> None:
 def test_exchanged_axes_are_named(name: str) -> None:
     sequence, frames = taken(name)
     other = {"x": "y", "y": "x", None: None}
-    exchanged = replace(sequence, frames=tuple(replace(f, axis=other[f.axis]) for f in sequence.frames))
+    exchanged = replace(
+        sequence, frames=tuple(replace(f, axis=other[f.axis]) for f in sequence.frames)
+    )
     assert causes(exchanged, frames) == [("axes-swapped", None)]
 
 
-@pytest.mark.parametrize("kinds", [["phase"], pytest.param(["gray", "complementary"], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kinds", [["phase"], pytest.param(["gray", "complementary"], marks=pytest.mark.slow)]
+)
 def test_steps_or_bits_of_the_other_axis_are_named(kinds: list[str]) -> None:
     sequence, frames = taken("complementary")
-    x, y = ([i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in kinds] for axis in AXES)
+    x, y = (
+        [i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in kinds]
+        for axis in AXES
+    )
     order = np.arange(len(frames))
     order[x], order[y] = y, x
     assert causes(sequence, frames[order])[0][0] == "axes-swapped"
@@ -213,13 +241,19 @@ def test_bits_in_reverse_order_after_the_complementary_one_are_named() -> None:
     sequence, frames = taken("complementary")
     order = np.arange(len(frames))
     for axis in AXES:
-        places = [i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in ("gray", "complementary")]
+        places = [
+            i
+            for i, f in enumerate(sequence.frames)
+            if f.axis == axis and f.kind in ("gray", "complementary")
+        ]
         order[places] = places[::-1]
     assert causes(sequence, frames[order]) == [("bit-order", "x"), ("bit-order", "y")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]])
+@pytest.mark.parametrize(
+    "steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]]
+)
 def test_all_steps_in_another_order_are_named(steps: list[int]) -> None:
     sequence, frames = taken("p18")
     order = np.arange(len(frames))
@@ -257,7 +291,9 @@ def test_the_sign_of_one_axis_mirrors_a_phase_without_code() -> None:
 @pytest.mark.parametrize("name", variants(STEPS_AND_CODE, "three"))
 def test_steps_in_reverse_order_are_named(name: str) -> None:
     sequence, frames = taken(name)
-    steps = tuple(replace(f, step=f.steps - 1 - f.step) if f.kind == "phase" else f for f in sequence.frames)
+    steps = tuple(
+        replace(f, step=f.steps - 1 - f.step) if f.kind == "phase" else f for f in sequence.frames
+    )
     found = check_description(replace(sequence, frames=steps), frames)
     assert [(c.cause, c.axis) for c in found] == [("step-order", "x"), ("step-order", "y")]
     assert not any(missing_facts(c.message, "reverse") for c in found)
@@ -278,7 +314,9 @@ def test_a_stated_origin_is_compared_with_the_fringes(name: str, turns: float) -
 
 def test_steps_that_begin_later_are_named_with_the_offset() -> None:
     sequence, frames = taken("complementary")
-    steps = tuple(replace(f, step=(f.step - 1) % 4) if f.kind == "phase" else f for f in sequence.frames)
+    steps = tuple(
+        replace(f, step=(f.step - 1) % 4) if f.kind == "phase" else f for f in sequence.frames
+    )
     found = check_description(replace(sequence, frames=steps), frames)
     assert found[0].cause == "phase-offset"
     assert found[0].value == pytest.approx(np.pi / 2, abs=0.03)
@@ -289,10 +327,13 @@ CELLS = [("p18", 16.0), ("p18", 36.0), ("three", 20.25), ("complementary", 27.0)
 
 @pytest.mark.parametrize(("name", "cell"), variants(CELLS, ("three", 20.25)))
 def test_cells_unlike_the_fringes_are_named(name: str, cell: float) -> None:
-    """The frames' cells are as wide as their period; described is a period for which they would not be."""
+    """The frames' cells are as wide as their period; described is a period for which they would not
+    be."""
     sequence, frames = taken(name)
     true = sequence.period_px("x")
-    described = tuple(replace(f, period_px=true**2 / cell) if f.kind == "phase" else f for f in sequence.frames)
+    described = tuple(
+        replace(f, period_px=true**2 / cell) if f.kind == "phase" else f for f in sequence.frames
+    )
     bits = replace(sequence, frames=described, gray_cell_px=true)
     found = check_description(bits, frames)
     assert found[0].cause == "gray-cell"
@@ -315,7 +356,9 @@ def test_a_projector_that_is_too_small_is_named(name: str) -> None:
         (lambda frames: np.repeat(frames[-1:], len(frames), axis=0), "dark"),
     ],
 )
-def test_frames_without_a_pattern_are_named(spoil: Callable[[np.ndarray], np.ndarray], cause: str) -> None:
+def test_frames_without_a_pattern_are_named(
+    spoil: Callable[[np.ndarray], np.ndarray], cause: str
+) -> None:
     sequence, frames = taken("three")
     found = check_description(sequence, spoil(frames))
     assert [c.cause for c in found] == [cause]
@@ -323,7 +366,8 @@ def test_frames_without_a_pattern_are_named(spoil: Callable[[np.ndarray], np.nda
 
 
 def test_a_dim_wall_does_not_decide() -> None:
-    """Half of the image sees the patterns by scattered light alone: dimly, and a third of a period away."""
+    """Half of the image sees the patterns by scattered light alone: dimly, and a third of a period
+    away."""
     sequence, frames = taken("complementary")
     dim = np.rint(np.roll(frames, 41, axis=2) * 0.06 + 5).astype(np.uint8)
     both = np.concatenate([frames, dim], axis=2)
@@ -334,13 +378,18 @@ def test_a_dim_wall_does_not_decide() -> None:
 def test_frames_of_no_pattern_that_was_described_are_unreadable() -> None:
     sequence, frames = taken("complementary")
     order = np.random.default_rng(3).permutation(len(frames))
-    assert [cause for cause, _ in causes(sequence, frames[order])][-1] in ("unreadable", "frame-order")
+    assert [cause for cause, _ in causes(sequence, frames[order])][-1] in (
+        "unreadable",
+        "frame-order",
+    )
 
 
 def test_three_frames_may_be_saturated_and_repeated() -> None:
     sequence = PatternSequence((320, 240), tuple(phase_steps("x", 3, 360.0)))
     angle = 2 * np.pi * np.arange(320) / 360
-    frames = np.stack([np.tile(140 + 130 * np.cos(angle - 2 * np.pi * k / 3), (240, 1)) for k in (0, 1, 1)])
+    frames = np.stack(
+        [np.tile(140 + 130 * np.cos(angle - 2 * np.pi * k / 3), (240, 1)) for k in (0, 1, 1)]
+    )
     found = check_description(sequence, np.clip(frames, 0, 255).astype(np.uint8))
     assert found and found[0].cause in ("saturation", "frame-repeated", "step-order", "unreadable")
 
@@ -355,4 +404,6 @@ def test_inverses_may_be_captured_in_another_order_than_their_bits() -> None:
         FrameLikeness(each, sample_lines(each, stack))._finest
         for each, stack in ((turned, blurred[order]), (sequence, blurred))
     )
-    assert as_captured == by_bit and max(by_bit.values()) < 6  # the finest bits are blurred to one grey
+    assert (
+        as_captured == by_bit and max(by_bit.values()) < 6
+    )  # the finest bits are blurred to one grey

@@ -14,13 +14,15 @@ NOISE = 0.5
 
 
 def blurred_fringes(sigma_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Phase (rad, NaN in the dark) and modulation (h, w) float32 of a disc with dark spots, and the phase's true
-    error."""
+    """Phase (rad, NaN in the dark) and modulation (h, w) float32 of a disc with dark spots, and the
+    phase's true error."""
     v, u = (np.mgrid[: SHAPE[0] * FINE, : SHAPE[1] * FINE] + 0.5) / FINE - 0.5
     albedo = 100.0 * (np.hypot(u - 160, v - 120) < 100)
     albedo[np.hypot(u % 80 - 40, v % 80 - 40) < 20] *= 0.3
     phase = 2 * np.pi * (0.9 * u + 0.1 * v + 3e-4 * u**2) / 18
-    phasor = [cv2.GaussianBlur(albedo * part(phase), (0, 0), sigma_px * FINE) for part in (np.cos, np.sin)]
+    phasor = [
+        cv2.GaussianBlur(albedo * part(phase), (0, 0), sigma_px * FINE) for part in (np.cos, np.sin)
+    ]
     z = sum(
         unit * part.reshape(SHAPE[0], FINE, SHAPE[1], FINE).mean((1, 3))
         for unit, part in zip((1, 1j), phasor, strict=True)
@@ -48,7 +50,9 @@ def test_the_error_at_edges_is_predicted_and_removed(sigma_px: float) -> None:
     at_edges = known & (np.abs(displaced.shift) > 5 * noise)
     ratio = np.sqrt(np.mean(error[at_edges] ** 2) / np.mean(displaced.shift[at_edges] ** 2))
     assert 0.5 < ratio < 1.3  # neither explained away nor missed
-    assert np.median(np.abs(displaced.shift[known]) / noise[known]) < 0.4  # little is added far from edges
+    assert (
+        np.median(np.abs(displaced.shift[known]) / noise[known]) < 0.4
+    )  # little is added far from edges
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     at_spots = at_edges & (np.hypot(u - 160, v - 120) < 90)
     assert displaced.is_continuous[at_spots].mean() > 0.75, "the disc is one surface, spots or not"
@@ -63,7 +67,8 @@ def test_the_error_at_edges_is_predicted_and_removed(sigma_px: float) -> None:
 
 @pytest.mark.parametrize("jump", [0.6, 2.0])
 def test_a_step_of_the_surface_is_no_printed_edge(jump: float) -> None:
-    """Two halves at different depth, equally bright: their fringes interfere in between, and nothing is corrected."""
+    """Two halves at different depth, equally bright: their fringes interfere in between, and
+    nothing is corrected."""
     v, u = (np.mgrid[: SHAPE[0] * FINE, : SHAPE[1] * FINE] + 0.5) / FINE - 0.5
     fine = 2 * np.pi * u / 18 + jump * (u > 160.3 + 0.2 * v)
     phasor = [cv2.GaussianBlur(100 * part(fine), (0, 0), 1.2 * FINE) for part in (np.cos, np.sin)]
@@ -88,6 +93,12 @@ def test_blur_is_estimated_from_the_steepest_edges_of_each_tile() -> None:
         phase, modulation, _ = blurred_fringes(sigma_px)
         blur = estimate_camera_blur(modulation, np.isfinite(phase), NOISE)
         assert sigma_px < np.median(blur) < 1.35 * sigma_px
-    flat = np.full((60, 80), 50, np.float32) + np.random.default_rng(1).normal(0, NOISE, (60, 80)).astype(np.float32)
-    assert (estimate_camera_blur(flat, np.ones(flat.shape, bool), NOISE) == np.float32(LEAST_PX)).all()
-    assert (estimate_camera_blur(flat, np.zeros(flat.shape, bool), NOISE) == np.float32(LEAST_PX)).all()
+    flat = np.full((60, 80), 50, np.float32) + np.random.default_rng(1).normal(
+        0, NOISE, (60, 80)
+    ).astype(np.float32)
+    assert (
+        estimate_camera_blur(flat, np.ones(flat.shape, bool), NOISE) == np.float32(LEAST_PX)
+    ).all()
+    assert (
+        estimate_camera_blur(flat, np.zeros(flat.shape, bool), NOISE) == np.float32(LEAST_PX)
+    ).all()

@@ -21,14 +21,20 @@ def scene():
     [(p18(PROJECTOR), 0.05), (complementary(PROJECTOR, 8, 18.0), 0.05), (gray(PROJECTOR), 0.10)],
     ids=["p18", "eight steps", "gray"],
 )
-@pytest.mark.parametrize(("read", "shot"), variants([(1.0, 0.02), (2.5, 0.0), (0.8, 0.06)], (1.0, 0.02)))
+@pytest.mark.parametrize(
+    ("read", "shot"), variants([(1.0, 0.02), (2.5, 0.0), (0.8, 0.06)], (1.0, 0.02))
+)
 def test_shot_and_read_noise(sequence, within, gamma, read, shot):
     truth, gain = scene()
-    a, b = decode(sequence, capture(sequence, truth, gain=gain, read=read, shot=shot, gamma=gamma), "x").noise
+    a, b = decode(
+        sequence, capture(sequence, truth, gain=gain, read=read, shot=shot, gamma=gamma), "x"
+    ).noise
     assert a >= 0 and b >= 0
     for level in (50, 90):
         expected = read**2 + 1 / 12 + shot * level
-        assert abs((a + b * level) / expected - 1) < 2 * within  # of the variance: half of it in sigma
+        assert (
+            abs((a + b * level) / expected - 1) < 2 * within
+        )  # of the variance: half of it in sigma
 
 
 @pytest.mark.parametrize("steps", variants([3, 4, 5, 6, 7], 3, 4))
@@ -36,7 +42,9 @@ def test_few_steps(steps):
     truth, gain = scene()
     sequence = complementary(PROJECTOR, steps, 18.0)
     for gamma in (1.0, 2.2):
-        a, b = decode(sequence, capture(sequence, truth, gain=gain, read=1.5, shot=0.02, gamma=gamma), "x").noise
+        a, b = decode(
+            sequence, capture(sequence, truth, gain=gain, read=1.5, shot=0.02, gamma=gamma), "x"
+        ).noise
         expected = 1.5**2 + 1 / 12 + 0.02 * 80
         assert 0.8 < (a + 80 * b) / expected < 1.3
 
@@ -44,7 +52,9 @@ def test_few_steps(steps):
 def test_the_predicted_phase_noise_is_what_repeats_show():
     truth, gain = scene()
     sequence = p18(PROJECTOR)
-    first, second = (decode(sequence, capture(sequence, truth, gain=gain, read=1.5, seed=s), "x") for s in (0, 1))
+    first, second = (
+        decode(sequence, capture(sequence, truth, gain=gain, read=1.5, seed=s), "x") for s in (0, 1)
+    )
     both = first.mask & second.mask
     seen = np.std((first.phase - second.phase)[both]) / np.sqrt(2)
     predicted = np.sqrt(np.mean(first.sigma_phase[both] ** 2))

@@ -1,4 +1,5 @@
-"""A share of the image before in each image: measured where a series of steps begins; nothing else is taken for it."""
+"""A share of the image before in each image: measured where a series of steps begins; nothing else
+is taken for it."""
 
 from functools import cache
 
@@ -30,13 +31,19 @@ def rendered():
 
 def sampled(fault=None, severity="mild", axis="y"):
     light, renderer = rendered()
-    frames = expose_frames(RIG, light, SEQUENCE, renderer.room_light(), 0, FAULTS[fault] if fault else None, severity)
-    layout, white = axis_layout(SEQUENCE, axis), white_level(SEQUENCE, frames, SEQUENCE.select(axis))
+    frames = expose_frames(
+        RIG, light, SEQUENCE, renderer.room_light(), 0, FAULTS[fault] if fault else None, severity
+    )
+    layout, white = (
+        axis_layout(SEQUENCE, axis),
+        white_level(SEQUENCE, frames, SEQUENCE.select(axis)),
+    )
     return sample_fringe(frames, layout.shifts[-1], measure_noise(layout, frames, white), white)
 
 
 @pytest.mark.parametrize(
-    ("severity", "share"), variants([("mild", 0.02), ("medium", 0.06), ("severe", 0.15)], ("mild", 0.02))
+    ("severity", "share"),
+    variants([("mild", 0.02), ("medium", 0.06), ("severe", 0.15)], ("mild", 0.02)),
 )
 def test_the_share_of_the_image_before_is_measured(severity, share):
     measured, error = measure_ghost_share(sampled("crosstalk", severity))
@@ -53,13 +60,17 @@ OTHERS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("fault", "severity"), variants(OTHERS, (None, "mild"), ("auto-exposure", "mild")))
+@pytest.mark.parametrize(
+    ("fault", "severity"), variants(OTHERS, (None, "mild"), ("auto-exposure", "mild"))
+)
 def test_nothing_else_is_taken_for_it(fault, severity):
     assert detect_ghosting(sampled(fault, severity)) == []
 
 
 def test_the_first_frame_of_a_capture_lacks_the_share_of_the_others():
-    assert measure_ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(0.15, rel=0.25)
+    assert measure_ghost_share(sampled("crosstalk", "severe", "x"))[0] == pytest.approx(
+        0.15, rel=0.25
+    )
     assert detect_ghosting(sampled(axis="x")) == []
     (suspect,) = detect_ghosting(sampled("crosstalk", "severe", "x"))
     assert suspect.frame == 0 and not missing_facts(suspect.sentence, 1, "first")

@@ -94,7 +94,9 @@ def test_presets_are_recognised(name: str) -> None:
     assert guess.sequence.phase_sign == 1 and guess.sequence.phase_offset_rad == 0
     for axis in sequence.axes:
         true_periods, periods = (np.array(s.periods_px(axis)) for s in (sequence, guess.sequence))
-        np.testing.assert_allclose(periods, true_periods * (periods[-1:] / true_periods[-1:]), rtol=2e-3)
+        np.testing.assert_allclose(
+            periods, true_periods * (periods[-1:] / true_periods[-1:]), rtol=2e-3
+        )
     is_scale_unknown = any(not missing_facts(note, "unknown") for note in guess.notes)
     assert is_scale_unknown == bool(sequence.periods_px(sequence.axes[0]))
 
@@ -112,7 +114,9 @@ def test_gray_code_of_pixels_agrees_with_its_projector_alone() -> None:
     assert guess_sequence(frames, (4096, 1140)).doubts
 
 
-@pytest.mark.parametrize("name", variants(["gray", "complementary 4", "two periods"], "complementary 4"))
+@pytest.mark.parametrize(
+    "name", variants(["gray", "complementary 4", "two periods"], "complementary 4")
+)
 def test_shuffled_and_dark_captures_are_unsure(name: str) -> None:
     _, frames = taken(name)
     rng = np.random.default_rng(1)
@@ -123,12 +127,16 @@ def test_shuffled_and_dark_captures_are_unsure(name: str) -> None:
 
 def test_photographs_are_unsure() -> None:
     rng = np.random.default_rng(2)
-    blur = [cv2.GaussianBlur(rng.random((240, 320)), (0, 0), s) for s in (2, 3, 5, 8, 9, 12, 15, 20)]
+    blur = [
+        cv2.GaussianBlur(rng.random((240, 320)), (0, 0), s) for s in (2, 3, 5, 8, 9, 12, 15, 20)
+    ]
     photographs = [255 * (b - b.min()) / np.ptp(b) for b in blur]
     assert guess_sequence(np.array(photographs, np.uint8)).doubts
 
 
-def test_the_command_writes_a_description_that_is_read_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_a_description_that_is_read_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sequence, frames = taken("complementary 4")
     folder = tmp_path / "capture"
     folder.mkdir()
@@ -149,7 +157,9 @@ def test_the_command_writes_a_description_that_is_read_back(tmp_path: Path, caps
 
 
 @pytest.mark.slow
-def test_images_whose_light_is_red_are_read_in_red(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_whose_light_is_red_are_read_in_red(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, frames = taken("complementary 4")
     dark = np.full_like(frames[0], 3)
     for k, frame in enumerate(frames):
@@ -168,7 +178,9 @@ def test_images_whose_light_is_red_are_read_in_red(tmp_path: Path, capsys: pytes
         pytest.param("sltk_shells/scan_0020", "gi" * 22, marks=pytest.mark.slow),
     ],
 )
-def test_real_captures_are_recognised(real_data: Path, tmp_path: Path, folder: str, kinds: str) -> None:
+def test_real_captures_are_recognised(
+    real_data: Path, tmp_path: Path, folder: str, kinds: str
+) -> None:
     toml = tmp_path / "sequence.toml"
     assert main(["import", "frames", "--guess", str(real_data / folder), "--out", str(toml)]) == 0
     sequence = read_description(toml).sequence

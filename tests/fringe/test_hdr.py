@@ -60,11 +60,14 @@ class Shot:
         for stack, exposure in zip(self.stacks, EXPOSURES, strict=True):
             for k, frame in enumerate(stack):
                 keys = rng.integers(0, 2**32, 2, dtype=np.uint32)
-                renderer.frame(profile(self.sequence, k), keys, frame, exposure=renderer.exposure * exposure)
+                renderer.frame(
+                    profile(self.sequence, k), keys, frame, exposure=renderer.exposure * exposure
+                )
         self.frames, self.choice = merge_exposures(self.stacks, EXPOSURES)
 
     def measured(self, frames: np.ndarray):
-        """Phase map, coverage of what is illuminated, and the errors in their own standard deviations, (h, w)."""
+        """Phase map, coverage of what is illuminated, and the errors in their own standard
+        deviations, (h, w)."""
         phase = decode(self.sequence, frames, "x")
         error = (phase.coordinate - self.truth) * (2 * np.pi / phase.period_px)
         return (
@@ -92,7 +95,8 @@ def brute(stacks, exposures, white):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "top", "white"), [(np.uint8, 255, 255), (np.uint16, 4095, 4095), (np.uint16, 65520, 65520)]
+    ("dtype", "top", "white"),
+    [(np.uint8, 255, 255), (np.uint16, 4095, 4095), (np.uint16, 65520, 65520)],
 )
 def test_it_is_what_its_definition_says(dtype, top, white):
     rng = np.random.default_rng(3)
@@ -104,7 +108,9 @@ def test_it_is_what_its_definition_says(dtype, top, white):
     expected, which = brute(stacks, exposures, white)
     np.testing.assert_array_equal(choice, which)
     np.testing.assert_array_equal(frames, expected)
-    assert choice.dtype == np.uint8 and frames.dtype == dtype and set(np.unique(choice)) == {0, 1, 2}
+    assert (
+        choice.dtype == np.uint8 and frames.dtype == dtype and set(np.unique(choice)) == {0, 1, 2}
+    )
     np.testing.assert_array_equal(merge_exposures(list(stacks), exposures)[0], frames)
 
 
@@ -123,13 +129,17 @@ def test_coverage_rises_and_every_error_stays_at_its_noise(shot):
     phase, coverage, normalised = shot.measured(shot.frames)
     assert 0.99 < coverage <= 1
     valid = phase.mask & shot.illuminated
-    assert np.abs(normalised[valid] * phase.sigma_phase[valid]).max() < 1.0  # no fringe order is wrong
+    assert (
+        np.abs(normalised[valid] * phase.sigma_phase[valid]).max() < 1.0
+    )  # no fringe order is wrong
     for index in range(len(EXPOSURES)):
         part = valid & (shot.choice == index)
         assert np.count_nonzero(part) > 0.02 * np.count_nonzero(shot.illuminated)
         assert 0.9 < np.median(np.abs(normalised[part])) / 0.6745 < 1.15
     dark = shot.choice == 2
-    assert np.median(phase.sigma_phase[valid & dark]) < 0.06  # 0.3 at the shortest exposure, were it not masked
+    assert (
+        np.median(phase.sigma_phase[valid & dark]) < 0.06
+    )  # 0.3 at the shortest exposure, were it not masked
 
 
 @pytest.mark.computes
@@ -147,7 +157,8 @@ def test_at_the_borders_of_the_choice_the_phase_is_that_of_the_exposure_chosen(s
         np.testing.assert_array_equal(merged.phase[both], alone.phase[both])
     edge = beside & merged.mask & shot.illuminated
     assert np.count_nonzero(edge) > 300
-    # the lens mixes bright and dark light there, in one exposure too: above the noise, far below a period
+    # the lens mixes bright and dark light there, in one exposure too: above the noise, far below a
+    # period
     assert np.sqrt(np.mean(normalised[edge] ** 2)) < 2.5
 
 
@@ -155,24 +166,33 @@ def test_at_the_borders_of_the_choice_the_phase_is_that_of_the_exposure_chosen(s
 @pytest.mark.parametrize("make", variants([p18, complementary, gray], complementary))
 def test_the_measured_noise_is_that_of_one_exposure(make):
     shot = shot_with(make)
-    single, merged = (decode(shot.sequence, frames, "x").noise for frames in (shot.stacks[0], shot.frames))
+    single, merged = (
+        decode(shot.sequence, frames, "x").noise for frames in (shot.stacks[0], shot.frames)
+    )
     for level in (40, 100, 180):
         true = 1.2 + 1 / 12 + 0.0245 * (level - 3)
-        assert (merged[0] + merged[1] * level) / true == pytest.approx(1, abs=0.15), (single, merged)
+        assert (merged[0] + merged[1] * level) / true == pytest.approx(1, abs=0.15), (
+            single,
+            merged,
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.computes
 def test_noise_that_is_taken_from_neighbours_is_little_disturbed_by_the_borders():
     shot = Shot(lambda size: complementary(size, 3))
-    single, merged = (decode(shot.sequence, frames, "x").noise for frames in (shot.stacks[0], shot.frames))
+    single, merged = (
+        decode(shot.sequence, frames, "x").noise for frames in (shot.stacks[0], shot.frames)
+    )
     for level in (40, 100, 180):
         assert 0.8 < (merged[0] + merged[1] * level) / (single[0] + single[1] * level) < 1.4
 
 
 @pytest.mark.computes
 def test_radiance_is_smooth_where_the_choice_is_not(shot):
-    texture = shot.sequence.frames.index(next(f for f in shot.sequence.frames if f.kind == "texture"))
+    texture = shot.sequence.frames.index(
+        next(f for f in shot.sequence.frames if f.kind == "texture")
+    )
     light = radiance(shot.frames[texture], shot.choice, EXPOSURES)
     once = shot.stacks[0][texture].astype(float)
     clear = shot.illuminated & (once < 255) & (once > 20)

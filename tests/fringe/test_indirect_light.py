@@ -64,8 +64,12 @@ def test_narrow_stripes_are_masked_only_where_indirect_light_prevails():
     assert np.mean(masked.reason[renderer_of(MISLED).truth().mask] == Reason.INDIRECT) < 0.25
 
 
-@pytest.mark.parametrize("sequence_of", variants([p18, complementary, multifrequency, micro, gray], complementary))
-@pytest.mark.parametrize("name", variants([name for name in SCENES if name != MISLED], "unsharp sphere"))
+@pytest.mark.parametrize(
+    "sequence_of", variants([p18, complementary, multifrequency, micro, gray], complementary)
+)
+@pytest.mark.parametrize(
+    "name", variants([name for name in SCENES if name != MISLED], "unsharp sphere")
+)
 def test_a_single_reflection_is_not_masked(sequence_of, name):
     sequence, frames = captured(name, sequence_of)
     phase = decode(sequence, frames, "x")

@@ -19,7 +19,9 @@ SEQUENCES = {
     "multifrequency": multifrequency(PROJECTOR),
     "heterodyne": multifrequency((400, 400), 8, (18.0, 21.0, 25.0)),
     "gray": gray(PROJECTOR),
-    "gray, bits alone": PatternSequence(PROJECTOR, tuple(f for f in gray(PROJECTOR).frames if f.kind != "inverse")),
+    "gray, bits alone": PatternSequence(
+        PROJECTOR, tuple(f for f in gray(PROJECTOR).frames if f.kind != "inverse")
+    ),
 }
 
 
@@ -32,7 +34,11 @@ def step():
 def assert_same(sequence, frames, axis):
     fast, definition = decode(sequence, frames, axis), decode_reference(sequence, frames, axis)
     assert fast.phase.dtype == definition.phase.dtype == np.float32
-    assert fast.noise == definition.noise and fast.steps == definition.steps and fast.period_px == definition.period_px
+    assert (
+        fast.noise == definition.noise
+        and fast.steps == definition.steps
+        and fast.period_px == definition.period_px
+    )
     np.testing.assert_array_equal(fast.reason, definition.reason)
     turn = np.exp(1j * (fast.wrapped.astype(np.float64) - definition.wrapped))
     if fast.steps:
@@ -68,11 +74,15 @@ def test_on_random_and_flat_frames(name):
     assert_same(sequence, np.full((n, 3, 1), 255, np.uint8), "y")
 
 
-@pytest.mark.parametrize("name", variants(SEQUENCES, "p18", "complementary"))  # one kernel; the others take as long
+@pytest.mark.parametrize(
+    "name", variants(SEQUENCES, "p18", "complementary")
+)  # one kernel; the others take as long
 def test_on_random_frames_of_more_bits(name):
     """The kernels are compiled for uint16 as well."""
     sequence = SEQUENCES[name]
-    frames = np.random.default_rng(2).integers(0, 4096, (len(sequence.frames), 23, 31)).astype(np.uint16)
+    frames = (
+        np.random.default_rng(2).integers(0, 4096, (len(sequence.frames), 23, 31)).astype(np.uint16)
+    )
     assert_same(sequence, frames, "y")
 
 
@@ -85,7 +95,9 @@ def test_on_frames_that_are_no_contiguous_array():
 @pytest.mark.parametrize("n", range(3, 25))
 def test_sums_of_four_frames_at_a_time_are_those_of_each(n):
     levels = np.random.default_rng(n).integers(0, 256, n)
-    sequence = PatternSequence(PROJECTOR, tuple(phase_steps("x", n, 18.0)), phase_sign=-1, relative=True)
+    sequence = PatternSequence(
+        PROJECTOR, tuple(phase_steps("x", n, 18.0)), phase_sign=-1, relative=True
+    )
     steps = pack_shifts(axis_layout(sequence, "x"))
     p, q, r, s = levels[steps.frames].T
     angle = 2 * np.pi * np.arange(n) / n

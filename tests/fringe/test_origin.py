@@ -40,7 +40,8 @@ def test_the_wrong_sign_and_a_bit_too_many_are_named():
     with pytest.raises(InputError):
         frame = replace(sequence.frames[sequence.find("gray", "x")[0]], bit=5, bits=0)
         plain = tuple(
-            frame if f.kind == "complementary" and f.axis == "x" else replace(f, bits=0) for f in sequence.frames
+            frame if f.kind == "complementary" and f.axis == "x" else replace(f, bits=0)
+            for f in sequence.frames
         )
         estimate_gray_origin(PatternSequence(PROJECTOR, plain), frames, "x")
 
@@ -56,7 +57,8 @@ def test_nothing_to_compare_with_or_to_see():
 
 @pytest.fixture(scope="module")
 def david(real_data):
-    """Ten frames of a cluttered scene, every second row: four steps, five Gray bits, the complementary bit."""
+    """Ten frames of a cluttered scene, every second row: four steps, five Gray bits, the
+    complementary bit."""
     files = [real_data / "slmaster_david" / "L" / f"{i}.png" for i in range(10)]
     frames = np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files])
     steps = [*phase_steps("x", 4, 18.0), *gray_bits("x", 5), Frame("complementary", "x")]
@@ -91,7 +93,9 @@ def test_a_real_scene_of_another_tool(david):
 def test_real_gray_code_with_inverses(real_data):
     sequence = gray((1024, 768))
     folder = real_data / "kamino_procam_jpg90" / "capture_0"
-    frames = np.stack([cv2.imread(str(folder / f"graycode_{i:02d}.jpg"), cv2.IMREAD_GRAYSCALE) for i in range(42)])
+    frames = np.stack(
+        [cv2.imread(str(folder / f"graycode_{i:02d}.jpg"), cv2.IMREAD_GRAYSCALE) for i in range(42)]
+    )
     for axis, low, high in (("x", 62, 826), ("y", 194, 767)):
         phase = decode(sequence, frames, axis)
         board = np.s_[200:750, 220:1050]  # white paper and black squares

@@ -1,4 +1,5 @@
-"""Photographs of three rigs, as they are and with a fault of real rigs in them: measured, or the fault is named."""
+"""Photographs of three rigs, as they are and with a fault of real rigs in them: measured, or the
+fault is named."""
 
 import importlib.util
 from collections.abc import Callable
@@ -36,7 +37,12 @@ def david() -> PatternSequence:
 
 
 def shells() -> PatternSequence:
-    bits = [Frame(kind, axis, bit=b) for axis in ("x", "y") for b in range(11) for kind in ("gray", "inverse")]
+    bits = [
+        Frame(kind, axis, bit=b)
+        for axis in ("x", "y")
+        for b in range(11)
+        for kind in ("gray", "inverse")
+    ]
     return PatternSequence((1280, 800), tuple(bits))
 
 
@@ -70,7 +76,9 @@ def make_faulty(real_data: Path) -> ModuleType:
     return module
 
 
-def with_fault(script: ModuleType, fault: str, frames: np.ndarray, severity: float = 0.5) -> np.ndarray:
+def with_fault(
+    script: ModuleType, fault: str, frames: np.ndarray, severity: float = 0.5
+) -> np.ndarray:
     faulty = script.FAULTS[fault](list(frames), severity, np.random.default_rng(0))
     return np.stack([np.clip(np.rint(frame), 0, 255).astype(np.uint8) for frame in faulty])
 
@@ -86,7 +94,9 @@ def test_sound_captures_are_not_accused(real_data: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "frame"),
-    variants([(KAMINO, 2), (KAMINO, 27), (KAMINO, 35), (DAVID, 2), (DAVID, 8), (SHELLS, 38)], (DAVID, 8)),
+    variants(
+        [(KAMINO, 2), (KAMINO, 27), (KAMINO, 35), (DAVID, 2), (DAVID, 8), (SHELLS, 38)], (DAVID, 8)
+    ),
 )
 def test_a_repeated_image_is_named(real_data: Path, name: str, frame: int) -> None:
     sequence, frames = photographed(real_data, name)
@@ -97,7 +107,9 @@ def test_a_repeated_image_is_named(real_data: Path, name: str, frame: int) -> No
     assert not missing_facts(found[0].message, f"frame {frame + 1}", f"frame {frame}")
 
 
-@pytest.mark.parametrize(("name", "frame"), variants([(KAMINO, 5), (KAMINO, 40), (DAVID, 7)], (DAVID, 7)))
+@pytest.mark.parametrize(
+    ("name", "frame"), variants([(KAMINO, 5), (KAMINO, 40), (DAVID, 7)], (DAVID, 7))
+)
 def test_exchanged_images_are_named(real_data: Path, name: str, frame: int) -> None:
     sequence, frames = photographed(real_data, name)
     exchanged = frames.copy()
@@ -125,21 +137,34 @@ def test_late_images_are_named(real_data: Path, name: str, make_faulty: ModuleTy
     ],
 )
 def test_light_that_varies_is_corrected_and_named(
-    real_data: Path, name: str, make_faulty: ModuleType, fault: str, causes: set[str], severity: float
+    real_data: Path,
+    name: str,
+    make_faulty: ModuleType,
+    fault: str,
+    causes: set[str],
+    severity: float,
 ) -> None:
     if (name, fault, severity) == (DAVID, "drift", 0.9):
-        causes = {"exposure-drift", "room-light"}  # frames of up to 1.7 times the light: a warning of either helps
+        causes = {
+            "exposure-drift",
+            "room-light",
+        }  # frames of up to 1.7 times the light: a warning of either helps
     sequence, frames = photographed(real_data, name)
     faulty = with_fault(make_faulty, fault, frames, severity)
     assert check_description(sequence, faulty) == ()
-    suspects = {s.fault for s in detect_light_faults(sequence, estimate_frame_light(sequence, faulty))}
+    suspects = {
+        s.fault for s in detect_light_faults(sequence, estimate_frame_light(sequence, faulty))
+    }
     assert suspects & causes and suspects <= causes
     for axis, truth in coordinates(real_data, name).items():
         coordinate = decode(sequence, faulty, axis).coordinate
         both = np.isfinite(truth) & np.isfinite(coordinate)
         wrong = np.abs(coordinate - truth)[both] > (8 if name == DAVID else 1.5)
         # Two fifths of what is seen of the shells is so dim that darker frames lose it.
-        assert both.sum() > (0.5 if name == SHELLS else 0.85) * np.isfinite(truth).sum() and wrong.mean() < 0.01
+        assert (
+            both.sum() > (0.5 if name == SHELLS else 0.85) * np.isfinite(truth).sum()
+            and wrong.mean() < 0.01
+        )
 
 
 @pytest.mark.parametrize("name", variants(PARTS, DAVID))

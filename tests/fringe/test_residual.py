@@ -13,7 +13,11 @@ from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import complementary, gray, gray_bits, multifrequency, p18, phase_steps
 from slviewer.fringe.residual import frame_residuals
-from slviewer.fringe.residual_order import detect_foreign_frames, detect_misordered_steps, recover_step_order
+from slviewer.fringe.residual_order import (
+    detect_foreign_frames,
+    detect_misordered_steps,
+    recover_step_order,
+)
 from slviewer.fringe.residual_sample import Fringe, estimate_roughness, sample_fringe
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.session.importers import procam_calibration
@@ -49,9 +53,12 @@ def sampled_steps(sequence: PatternSequence, stack: np.ndarray) -> Fringe:
 
 
 def step_faults(sequence: PatternSequence, stack: np.ndarray) -> dict[int, str]:
-    """The faults of the finest period's frames under equal light: without an estimate of the light, and its time."""
+    """The faults of the finest period's frames under equal light: without an estimate of the light,
+    and its time."""
     sampled = sampled_steps(sequence, stack)
-    return {s.frame: s.fault for s in detect_misordered_steps(sampled) or detect_foreign_frames(sampled)}
+    return {
+        s.frame: s.fault for s in detect_misordered_steps(sampled) or detect_foreign_frames(sampled)
+    }
 
 
 def told(sequence: PatternSequence, stack: np.ndarray) -> dict[int, str]:
@@ -92,7 +99,9 @@ LIGHTS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "seed"), [("p18", 0), ("gray", 0), ("eight", 1), ("four", 2), ("levels", 0)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("p18", 0), ("gray", 0), ("eight", 1), ("four", 2), ("levels", 0)]
+)
 def test_sound_captures_raise_no_suspects(name, seed):
     assert told(SEQUENCES[name], capture(SEQUENCES[name], COORDINATE, seed=seed)) == {}
 
@@ -107,9 +116,14 @@ def test_gamma_is_a_fault_of_three_steps_alone():
 @pytest.mark.parametrize("how", LIGHTS, ids=str)
 def test_sound_captures_in_any_light_raise_no_suspects(name, how):
     expected = {0: "gamma"} if name == "three" and "gamma" in how else {}
-    coordinate = slope(120, 200, start=20.0)  # in dim light, fewer pixels raise an alarm in one of eight captures
+    coordinate = slope(
+        120, 200, start=20.0
+    )  # in dim light, fewer pixels raise an alarm in one of eight captures
     for seed in range(3):
-        assert told(SEQUENCES[name], capture(SEQUENCES[name], coordinate, seed=seed, **how)) == expected
+        assert (
+            told(SEQUENCES[name], capture(SEQUENCES[name], coordinate, seed=seed, **how))
+            == expected
+        )
 
 
 @pytest.mark.parametrize("name", ["p18", "eight", "five", "levels"])
@@ -123,13 +137,17 @@ def test_a_misplaced_step_fits_its_hypothesis_best(name):
     for k in (first, first + n // 2 - 1):
         assert step_faults(sequence, swapped(stack, k)) == {k: "swapped"}
     assert first + n - 2 in step_faults(sequence, swapped(stack, first + n - 2))
-    assert step_faults(sequence, dropped(stack, first + n // 2 - 1))[first + n // 2 - 1] == "dropped"
+    assert (
+        step_faults(sequence, dropped(stack, first + n // 2 - 1))[first + n // 2 - 1] == "dropped"
+    )
     strange = stack.copy()
     strange[first] = stack[-1]  # what was shown before
     assert step_faults(sequence, strange) == {first: "strange"}
 
 
-@pytest.mark.parametrize("steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]])
+@pytest.mark.parametrize(
+    "steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]]
+)
 def test_the_order_of_all_steps_is_recovered(steps):
     sequence = SEQUENCES["p18"]
     stack = capture(sequence, COORDINATE)
@@ -152,7 +170,9 @@ def test_a_misplaced_step_is_named(name, how):
         assert told(sequence, swapped(stack, k)) == {k: "swapped"}
     assert first + n - 2 in told(sequence, swapped(stack, first + n - 2))
     lost = told(sequence, dropped(stack, first + n // 2 - 1))
-    assert lost.get(first + n // 2 - 1) == "dropped" or (name == "levels" and "gamma" in how and lost)
+    assert lost.get(first + n // 2 - 1) == "dropped" or (
+        name == "levels" and "gamma" in how and lost
+    )
     strange = stack.copy()
     strange[first] = stack[-1]  # what was shown before
     assert told(sequence, strange) == {first: "strange"}
@@ -162,11 +182,15 @@ def test_a_misplaced_step_is_named(name, how):
 
 
 @pytest.mark.parametrize("name", ["p18", "eight", "levels"])
-@pytest.mark.parametrize(("k", "times"), variants([(k, t) for k in (0, 3, 5) for t in (0.95, 1.05)], (3, 1.05)))
+@pytest.mark.parametrize(
+    ("k", "times"), variants([(k, t) for k in (0, 3, 5) for t in (0.95, 1.05)], (3, 1.05))
+)
 def test_a_frame_that_is_lit_otherwise_is_named(name, k, times):
     sequence = SEQUENCES[name]
     here = k + 12 if name == "levels" else k  # a period longer than the view cannot tell
-    found = frame_residuals(sequence, brighter(capture(sequence, COORDINATE, shot=0.02), here, times), "x")
+    found = frame_residuals(
+        sequence, brighter(capture(sequence, COORDINATE, shot=0.02), here, times), "x"
+    )
     assert {s.frame: s.fault for s in found.suspects} == {here: "exposure-drift"}
     assert found.frames[here].light == pytest.approx(times, abs=0.012)
 
@@ -213,8 +237,12 @@ def test_four_steps_know_that_something_is_wrong():
 
 def test_either_of_two_pairs_of_four_steps_may_be_swapped():
     sequence = SEQUENCES["four"]
-    (either,) = detect_misordered_steps(sampled_steps(sequence, swapped(capture(sequence, COORDINATE), 0)))
-    assert either.fault == "swapped" and not missing_facts(either.sentence, "frames 1 and 2", "frames 3 and 4")
+    (either,) = detect_misordered_steps(
+        sampled_steps(sequence, swapped(capture(sequence, COORDINATE), 0))
+    )
+    assert either.fault == "swapped" and not missing_facts(
+        either.sentence, "frames 1 and 2", "frames 3 and 4"
+    )
 
 
 def test_a_late_step_is_named_whatever_the_light():
@@ -232,7 +260,11 @@ def test_a_late_or_swapped_bit_is_named():
 def test_gray_frames_that_are_late_lost_or_swapped_are_named():
     sequence = SEQUENCES["p18"]
     stack = capture(sequence, COORDINATE)
-    for k in (18, 23, 24):  # the scene lies in ten of 128 periods: bits before these are the same everywhere
+    for k in (
+        18,
+        23,
+        24,
+    ):  # the scene lies in ten of 128 periods: bits before these are the same everywhere
         assert told(sequence, late(stack, k)).get(k) == "late"
     for k in (22, 23):
         assert told(sequence, swapped(stack, k)).get(k) == "swapped"
@@ -256,7 +288,9 @@ def test_it_looks_at_a_full_camera_within_a_fraction_of_a_second():
     renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
     sequence = PatternSequence(rig.projector.size, p18(rig.projector.size).frames[:26])
     stack = renderer.capture(sequence)
-    stack[:, 500:560, 700:760] = np.minimum(2.5 * stack[:, 500:560, 700:760].astype(float), 255)  # a specular spot
+    stack[:, 500:560, 700:760] = np.minimum(
+        2.5 * stack[:, 500:560, 700:760].astype(float), 255
+    )  # a specular spot
     assert told(sequence, stack) == {}
     assert told(sequence, late(stack, 9)) == {9: "late"}
     times = []
@@ -290,7 +324,9 @@ def test_photographed_captures(real_data: Path):
     for k in (2, 5, 8):
         assert told(recording.sequence, late(recording.frames, k)) == {k: "late"}
     folder = real_data / "slmaster_david" / "L"
-    stack = np.stack([cv2.imread(str(folder / f"{i}.png"), cv2.IMREAD_GRAYSCALE) for i in range(10)])
+    stack = np.stack(
+        [cv2.imread(str(folder / f"{i}.png"), cv2.IMREAD_GRAYSCALE) for i in range(10)]
+    )
     steps = [*phase_steps("x", 4, 18.0), *gray_bits("x", 5), Frame("complementary", "x")]
     david = PatternSequence((32 * 18, 32 * 18), tuple(steps), gray_origin_px=-9.0)
     assert told(david, stack) == {}

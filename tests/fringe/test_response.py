@@ -14,7 +14,12 @@ from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode
 from slviewer.fringe.patterns import profile, render_pattern
 from slviewer.fringe.presets import complementary, gray
-from slviewer.fringe.response import fit_gamma, linearise_levels, measure_nonlinearity, predict_phase_error
+from slviewer.fringe.response import (
+    fit_gamma,
+    linearise_levels,
+    measure_nonlinearity,
+    predict_phase_error,
+)
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.session.importers.frames import read_description
@@ -28,7 +33,9 @@ PROJECTOR = (256, 128)
 
 
 def noisy(seed=0, sigma=0.002):
-    return SEEN + np.random.default_rng(seed).normal(0, sigma, len(SEEN)) * np.minimum(SHOWN, 255 - SHOWN).clip(0, 1)
+    return SEEN + np.random.default_rng(seed).normal(0, sigma, len(SEEN)) * np.minimum(
+        SHOWN, 255 - SHOWN
+    ).clip(0, 1)
 
 
 def test_a_response_says_its_gamma_and_what_it_costs():
@@ -49,12 +56,16 @@ def test_the_table_straightens_the_response():
 
 
 def ripple_rad(phase, coordinate):
-    """The phase error as a function of the phase itself: what is left of it when noise has averaged out."""
+    """The phase error as a function of the phase itself: what is left of it when noise has averaged
+    out."""
     inside = phase.mask & np.isfinite(coordinate)
     inside[:3] = inside[-3:] = inside[:, :3] = inside[:, -3:] = False
     assert inside.mean() > 0.3
     turns = 2 * np.pi / phase.period_px
-    error, place = (phase.coordinate - coordinate)[inside] * turns, np.mod(coordinate[inside] * turns, 2 * np.pi)
+    error, place = (
+        (phase.coordinate - coordinate)[inside] * turns,
+        np.mod(coordinate[inside] * turns, 2 * np.pi),
+    )
     bins = (place * (48 / (2 * np.pi))).astype(int)
     mean = np.bincount(bins, error, 48) / np.bincount(bins, minlength=48)
     return float((mean - mean.mean()).std())
@@ -64,14 +75,18 @@ def ripple_rad(phase, coordinate):
 @pytest.mark.parametrize(
     ("steps", "before_rad", "times"), variants([(3, 0.15, 20), (4, 0.005, 3)], (3, 0.15, 20))
 )  # noise leaves 1.3 mrad
-def test_phase_errors_of_gamma_shrink_with_the_table_on_a_plane(monkeypatch, steps, before_rad, times):
+def test_phase_errors_of_gamma_shrink_with_the_table_on_a_plane(
+    monkeypatch, steps, before_rad, times
+):
     monkeypatch.setattr(reference, "estimate_aliased_harmonics", lambda *_: AliasedHarmonics())
     rig = letter(0.25, local_distortion_px=0, gamma=2.2)
     renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
     plain = complementary(rig.projector.size, steps, 36.0)
     truth = renderer.truth().projector[..., 0]
     mended = replace(plain, levels=linearise_levels(SHOWN, noisy()))
-    with_gamma, without = (ripple_rad(decode(s, renderer.capture(s), "x"), truth) for s in (plain, mended))
+    with_gamma, without = (
+        ripple_rad(decode(s, renderer.capture(s), "x"), truth) for s in (plain, mended)
+    )
     assert with_gamma > before_rad
     assert with_gamma > times * without > 0.001
 
@@ -113,6 +128,11 @@ def test_a_table_that_cannot_be_is_refused(levels):
 
 
 def test_a_response_that_was_not_measured_is_refused():
-    for shown, seen in [(SHOWN[1:], SEEN[1:]), (SHOWN, SEEN * np.nan), (SHOWN[::-1], SEEN), (SHOWN[:2], SEEN[:2])]:
+    for shown, seen in [
+        (SHOWN[1:], SEEN[1:]),
+        (SHOWN, SEEN * np.nan),
+        (SHOWN[::-1], SEEN),
+        (SHOWN[:2], SEEN[:2]),
+    ]:
         with raises(InputError, "response"):
             linearise_levels(shown, seen)

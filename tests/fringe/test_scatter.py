@@ -1,4 +1,5 @@
-"""Noise of the phase between neighbouring pixels, which the phase steps of a pixel do not contain."""
+"""Noise of the phase between neighbouring pixels, which the phase steps of a pixel do not
+contain."""
 
 import cv2
 import numpy as np
@@ -20,7 +21,9 @@ def frames_of(coordinate=None, **scene):
 
 
 def jpeg(frames, quality):
-    recorded = [cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for frame in frames]
+    recorded = [
+        cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for frame in frames
+    ]
     return np.stack([cv2.imdecode(each, cv2.IMREAD_GRAYSCALE) for each in recorded])
 
 

@@ -29,7 +29,12 @@ def test_p18_is_laid_out_as_its_folders_are():
 
 def test_gray_is_laid_out_as_procam_calibration():
     sequence = gray((1024, 768))
-    assert [(f.kind, f.bit) for f in sequence.frames[:4]] == [("gray", 0), ("inverse", 0), ("gray", 1), ("inverse", 1)]
+    assert [(f.kind, f.bit) for f in sequence.frames[:4]] == [
+        ("gray", 0),
+        ("inverse", 0),
+        ("gray", 1),
+        ("inverse", 1),
+    ]
     assert len(sequence.frames) == 42
     assert [f.kind for f in sequence.frames[-2:]] == ["white", "black"]
     assert sequence.select("x") == [*range(20), 40, 41]
@@ -41,7 +46,10 @@ def test_rendered_cosine_and_bits():
     image = render_pattern(sequence, 1)
     assert image.shape == (30, 50) and image.dtype == np.uint8 and (image == image[0]).all()
     u = np.arange(50)
-    assert np.abs(image[0] - (127.5 + 127.5 * np.cos(2 * np.pi * (u / 16 + 1 / 4)))).max() <= 0.5 + 1e-9
+    assert (
+        np.abs(image[0] - (127.5 + 127.5 * np.cos(2 * np.pi * (u / 16 + 1 / 4)))).max()
+        <= 0.5 + 1e-9
+    )
     bits = sequence.find("gray", "x") + sequence.find("complementary", "x")
     code = np.zeros(50, int)
     for i in bits:
@@ -143,7 +151,9 @@ def test_descriptions_written_before_read_the_same_and_stay_as_they_are():
     written = {"projector": "912x1140", "phase_sign": 1, "gray_origin": -0.5}
     written["frame"] = [f.to_dict() for f in p18((912, 1140)).frames]
     assert p18((912, 1140)).to_dict() == written
-    assert json.dumps(p18((912, 1140)).to_dict()) == json.dumps(written)  # what a capture's hash is made of
+    assert json.dumps(p18((912, 1140)).to_dict()) == json.dumps(
+        written
+    )  # what a capture's hash is made of
     assert PatternSequence.from_dict(written) == p18((912, 1140))
 
 
@@ -177,7 +187,9 @@ def test_conventions_that_cannot_be_are_refused(entry, facts):
 
 def test_a_rendered_cosine_has_the_offset_and_the_sign_of_its_axis():
     sequence = replace(
-        complementary((50, 30), 4, 16.0), phase_sign=PerAxis(1, -1), phase_offset_rad=PerAxis(0.3, np.pi / 2)
+        complementary((50, 30), 4, 16.0),
+        phase_sign=PerAxis(1, -1),
+        phase_offset_rad=PerAxis(0.3, np.pi / 2),
     )
     for axis, sign, offset in (("x", 1, 0.3), ("y", -1, np.pi / 2)):
         i = sequence.find("phase", axis)[1]

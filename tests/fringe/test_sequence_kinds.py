@@ -10,7 +10,15 @@ from fringe_scene import capture, coverage, slope, variants
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, decode_reference
 from slviewer.fringe.phase import Reason
-from slviewer.fringe.presets import bits_for, complementary, gray, gray_bits, multifrequency, p18, phase_steps
+from slviewer.fringe.presets import (
+    bits_for,
+    complementary,
+    gray,
+    gray_bits,
+    multifrequency,
+    p18,
+    phase_steps,
+)
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
 
 pytestmark = pytest.mark.computes
@@ -30,7 +38,9 @@ def mixed(periods, *, cell=None, steps=6, half=False, inverse=False, **conventio
             frames += bits + [replace(bit, kind="inverse") for bit in bits if inverse]
         if half:
             frames.append(Frame("complementary", axis))
-    return PatternSequence(SIZE, (*frames, Frame("white"), Frame("black")), gray_cell_px=cell, **conventions)
+    return PatternSequence(
+        SIZE, (*frames, Frame("white"), Frame("black")), gray_cell_px=cell, **conventions
+    )
 
 
 def cells(width, **conventions):
@@ -40,7 +50,10 @@ def cells(width, **conventions):
 ABSOLUTE = {
     "offset": replace(complementary(SIZE, 5, 18.0), phase_offset_rad=np.pi / 2),
     "offset and sign by axis": replace(
-        p18(SIZE), phase_offset_rad=PerAxis(-2.5, np.pi), phase_sign=PerAxis(-1, 1), gray_origin_px=PerAxis(-3.0, -0.5)
+        p18(SIZE),
+        phase_offset_rad=PerAxis(-2.5, np.pi),
+        phase_sign=PerAxis(-1, 1),
+        gray_origin_px=PerAxis(-3.0, -0.5),
     ),
     "several periods, offset": replace(multifrequency(SIZE), phase_offset_rad=1.0),
     "half a period": mixed((18.0,), cell=9.0),
@@ -79,7 +92,10 @@ def frames_of(sequence, truth, **light):
 def assert_measured(sequence, axis, truth, least_coverage=0.99, **light):
     """Right to the noise predicted, with no pixel off by more than noise can be."""
     phase = decode(sequence, frames_of(sequence, truth, axis=axis, **light), axis)
-    error, sigma = error_px(phase, truth), (phase.sigma_phase * phase.period_px / (2 * np.pi))[INNER]
+    error, sigma = (
+        error_px(phase, truth),
+        (phase.sigma_phase * phase.period_px / (2 * np.pi))[INNER],
+    )
     assert np.nanmax(np.abs(error)) < 0.4 * phase.period_px
     predicted = np.sqrt(np.nanmean(sigma**2))
     assert 0.8 * predicted < np.sqrt(np.nanmean(error**2)) < 1.15 * predicted
@@ -89,7 +105,13 @@ def assert_measured(sequence, axis, truth, least_coverage=0.99, **light):
 
 @pytest.mark.parametrize(
     "name",
-    variants(ABSOLUTE, "offset and sign by axis", "no simple ratio", "half a period, complementary", "three periods"),
+    variants(
+        ABSOLUTE,
+        "offset and sign by axis",
+        "no simple ratio",
+        "half a period, complementary",
+        "three periods",
+    ),
 )
 def test_the_coordinate_comes_back(name):
     sequence = ABSOLUTE[name]
@@ -103,7 +125,9 @@ def test_a_relative_phase_is_right_modulo_what_it_states(name):
     sequence, reach = RELATIVE[name]
     phase = assert_measured(sequence, "x", slope(per_px=1.2))
     assert phase.unambiguous_px == pytest.approx(reach)
-    coordinate = phase.coordinate[phase.mask]  # cut at -0.5 and a whole range beyond, where noise allows
+    coordinate = phase.coordinate[
+        phase.mask
+    ]  # cut at -0.5 and a whole range beyond, where noise allows
     assert -3 < coordinate.min() < 1 and reach - 2 < coordinate.max() < reach + 2
 
 
@@ -131,13 +155,21 @@ def test_the_last_cell_of_a_gray_code_ends_with_the_projector():
     assert np.nanmax(np.abs(phase.coordinate - truth)[last]) < 2.5
 
 
-LIGHTS = [{"read": 1.0}, {"gain": 50, "read": 3.0}, {"defocus": 3.0, "psf": 1.5, "gamma": 2.2, "gain": 290}]
+LIGHTS = [
+    {"read": 1.0},
+    {"gain": 50, "read": 3.0},
+    {"defocus": 3.0, "psf": 1.5, "gamma": 2.2, "gain": 290},
+]
 
 
 @pytest.mark.parametrize(
     "name",
     variants(
-        [*ABSOLUTE, *RELATIVE, "cells"], "no simple ratio", "two periods, cells of the finer", "one period", "cells"
+        [*ABSOLUTE, *RELATIVE, "cells"],
+        "no simple ratio",
+        "two periods, cells of the finer",
+        "one period",
+        "cells",
     ),
 )
 @pytest.mark.parametrize("light", variants(LIGHTS, {"gain": 50, "read": 3.0}))
@@ -148,12 +180,18 @@ def test_kernels_agree_with_the_definition(name, light):
     rng = np.random.default_rng(2)
     stacks = [frames_of(sequence, truth, **light)]
     stacks += [rng.integers(0, 256, (len(sequence.frames), 23, 31)).astype(np.uint8)]
-    stacks += [np.zeros((len(sequence.frames), 5, 7), np.uint8), np.full((len(sequence.frames), 3, 1), 255, np.uint8)]
+    stacks += [
+        np.zeros((len(sequence.frames), 5, 7), np.uint8),
+        np.full((len(sequence.frames), 3, 1), 255, np.uint8),
+    ]
     for frames in stacks:
         fast, definition = decode(sequence, frames, "x"), decode_reference(sequence, frames, "x")
         np.testing.assert_array_equal(fast.reason, definition.reason)
         np.testing.assert_allclose(fast.phase, definition.phase, rtol=0, atol=1e-4)
-        assert fast.unambiguous_px == definition.unambiguous_px and fast.period_px == definition.period_px
+        assert (
+            fast.unambiguous_px == definition.unambiguous_px
+            and fast.period_px == definition.period_px
+        )
 
 
 @pytest.mark.parametrize("name", variants(ABSOLUTE, "half a period", "several periods, offset"))
@@ -206,7 +244,11 @@ def test_what_no_frame_can_tell_is_refused_with_the_figures(sequence, facts):
             decoder(sequence, stack, "x")
 
 
-CODED = {"steps and code": p18(SIZE), "code": gray(SIZE), "cells of half a period": ABSOLUTE["half a period"]}
+CODED = {
+    "steps and code": p18(SIZE),
+    "code": gray(SIZE),
+    "cells of half a period": ABSOLUTE["half a period"],
+}
 
 
 @pytest.mark.parametrize("name", variants(CODED, "cells of half a period"))

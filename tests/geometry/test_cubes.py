@@ -1,4 +1,5 @@
-"""Division of space into cubes: agrees with its definition by rows, also for points far from all others."""
+"""Division of space into cubes: agrees with its definition by rows, also for points far from all
+others."""
 
 import numpy as np
 

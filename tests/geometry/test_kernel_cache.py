@@ -1,4 +1,5 @@
-"""The kernels' machine code: never stale, kept wherever something can be written, done without where nothing can."""
+"""The kernels' machine code: never stale, kept wherever something can be written, done without
+where nothing can."""
 
 import os
 import shutil
@@ -26,7 +27,8 @@ if __name__ != "__main__":
 
 @pytest.fixture
 def install(tmp_path: Path) -> Path:
-    """A folder to import ``slviewer`` from: the real decorator, one kernel, and a file with a constant of its."""
+    """A folder to import ``slviewer`` from: the real decorator, one kernel, and a file with a
+    constant of its."""
     package = tmp_path / "install" / "slviewer"
     (package / "geometry").mkdir(parents=True)
     for name in ("jit.py", "jit_cache.py", "__init__.py"):
@@ -38,7 +40,11 @@ def install(tmp_path: Path) -> Path:
 
 
 def run(install: Path, code: str, **environment: str) -> list[str]:
-    given = {name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    given = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    }
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**given, "PYTHONPATH": str(install), "PYTHONDONTWRITEBYTECODE": "1", **environment},
@@ -51,7 +57,8 @@ def run(install: Path, code: str, **environment: str) -> list[str]:
 
 
 def read_only(install: Path) -> None:
-    """Nothing can be written beside the sources, by root either: a file stands where the folder would be."""
+    """Nothing can be written beside the sources, by root either: a file stands where the folder
+    would be."""
     shutil.rmtree(install / "slviewer" / "__pycache__", ignore_errors=True)
     (install / "slviewer" / "__pycache__").touch()
 
@@ -59,7 +66,9 @@ def read_only(install: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.computes
-def test_another_files_change_is_seen_and_code_is_compiled_once(install: Path, tmp_path: Path) -> None:
+def test_another_files_change_is_seen_and_code_is_compiled_once(
+    install: Path, tmp_path: Path
+) -> None:
     home = {"HOME": str(tmp_path / "home")}
     value, hits, place = run(install, "import slviewer.caller", **home)
     assert (value, hits) == ("6", "0") and Path(place).is_relative_to(install)
@@ -80,7 +89,9 @@ def test_of_two_processes_one_compiles_and_the_other_waits_and_loads(install: Pa
     assert sorted((value, hits) for value, hits, _ in results) == [("6", "0"), ("6", "1")]
 
 
-PLACE = "from slviewer.geometry.jit_cache import cache_folder; print(cache_folder('slviewer.caller'))"
+PLACE = (
+    "from slviewer.geometry.jit_cache import cache_folder; print(cache_folder('slviewer.caller'))"
+)
 
 
 @pytest.mark.process
@@ -127,7 +138,9 @@ def test_where_no_place_is_left_none_is_named(install: Path, tmp_path: Path) -> 
         "def later():\n    from slviewer.helper import FACTOR",
     ],
 )
-def test_every_way_to_import_counts(line: str, install: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_way_to_import_counts(
+    line: str, install: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from slviewer.geometry import jit_cache
 
     monkeypatch.setattr(jit_cache, "PACKAGE", install / "slviewer")

@@ -68,7 +68,9 @@ def test_past_the_fold_there_is_no_ray() -> None:
     lens = Lens([[300.0, 0, 200], [0, 300.0, 150], [0, 0, 1]], [-0.5, 0, 0, 0, 0], (400, 300))
     fold = np.sqrt(2 / 3)  # r (1 - r^2 / 2) grows up to here
     image_of_fold = 300 * fold * (1 - fold**2 / 2)
-    inside, outside = lens.undistort(np.array([[200 + 0.99 * image_of_fold, 150], [200 + 1.01 * image_of_fold, 150]]))
+    inside, outside = lens.undistort(
+        np.array([[200 + 0.99 * image_of_fold, 150], [200 + 1.01 * image_of_fold, 150]])
+    )
     assert inside[0] < fold
     assert np.isnan(outside).all()
     assert np.isnan(lens.distort(np.array([1.01 * fold, 0]))).all()
@@ -94,7 +96,11 @@ def test_scaled_keeps_what_a_pixel_sees(lens: Lens) -> None:
 
 def test_dict_round_trip(lens: Lens) -> None:
     again = from_plain(json.loads(json.dumps(to_plain(lens))), Lens)
-    assert np.array_equal(again.K, lens.K) and np.array_equal(again.D, lens.D) and again.size == lens.size
+    assert (
+        np.array_equal(again.K, lens.K)
+        and np.array_equal(again.D, lens.D)
+        and again.size == lens.size
+    )
 
 
 def test_opencv_shapes_are_accepted() -> None:
@@ -113,7 +119,9 @@ def test_opencv_shapes_are_accepted() -> None:
         (K, D, (0, 300), ("0x300",)),
     ],
 )
-def test_other_models_are_refused(matrix: np.ndarray, distortion: object, size: tuple[int, int], facts: tuple) -> None:
+def test_other_models_are_refused(
+    matrix: np.ndarray, distortion: object, size: tuple[int, int], facts: tuple
+) -> None:
     with raises(InputError, *facts):
         Lens(matrix, distortion, size)  # type: ignore[arg-type]
 

@@ -23,5 +23,7 @@ def test_a_turn_about_a_point_leaves_it_there() -> None:
     centre, shift = np.array([10.0, -20.0, 500.0]), np.array([1.0, 2.0, 3.0])
     T = turn_about(np.array([0.0, 0.0, np.pi / 2]), centre, shift)
     assert move_points(T, centre[None])[0] == pytest.approx(centre + shift)
-    assert move_points(T, centre[None] + [1.0, 0.0, 0.0])[0] == pytest.approx(centre + shift + [0.0, 1.0, 0.0])
+    assert move_points(T, centre[None] + [1.0, 0.0, 0.0])[0] == pytest.approx(
+        centre + shift + [0.0, 1.0, 0.0]
+    )
     assert np.isnan(move_points(T, np.full((1, 3), np.nan))).all()

@@ -15,14 +15,20 @@ def plane_points(n: int, noise: float, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-150, 150, (2, n))
     points = np.column_stack([x, y, 600 + 0.2 * x - 0.1 * y])
-    return points + rng.normal(0, noise, (n, 1)) * np.array([0.2, -0.1, -1]) / np.linalg.norm([0.2, -0.1, -1])
+    return points + rng.normal(0, noise, (n, 1)) * np.array([0.2, -0.1, -1]) / np.linalg.norm(
+        [0.2, -0.1, -1]
+    )
 
 
-def sphere_points(n: int, noise: float, seed: int = 0, centre: np.ndarray = CENTRE, r: float = RADIUS) -> np.ndarray:
+def sphere_points(
+    n: int, noise: float, seed: int = 0, centre: np.ndarray = CENTRE, r: float = RADIUS
+) -> np.ndarray:
     """The cap that a camera sees, 60 degrees wide on each side."""
     rng = np.random.default_rng(seed)
     z, angle = rng.uniform(-1, -0.5, n), rng.uniform(0, 2 * np.pi, n)
-    directions = np.column_stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
+    directions = np.column_stack(
+        [np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z]
+    )
     return centre + directions * (r + rng.normal(0, noise, (n, 1)))
 
 

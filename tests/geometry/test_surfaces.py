@@ -15,12 +15,15 @@ LOCAL_RAD = 0.15 * 2 * np.pi / 18
 
 
 def phase(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(smooth phase of a tilted board, 0 to 320 rad; local distortion with waves of a third of the image)."""
+    """(smooth phase of a tilted board, 0 to 320 rad; local distortion with waves of a third of the
+    image)."""
     smooth = 0.8 * u + 0.02 * v + 2e-4 * (u - 200) * (v - 150) + 3e-4 * (u - 200) ** 2
     return smooth, LOCAL_RAD * np.sin(2 * np.pi * u / (400 / 3)) * np.cos(2 * np.pi * v / 100)
 
 
-def samples(n: int = 12_000, noise: float = 0.01, stray: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def samples(
+    n: int = 12_000, noise: float = 0.01, stray: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     u, v = rng.uniform(BOX[0], BOX[2], n), rng.uniform(BOX[1], BOX[3], n)
     values = sum(phase(u, v)) + rng.normal(0, noise, n)
@@ -36,9 +39,13 @@ def grids() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return smooth, local, inside
 
 
-@pytest.mark.parametrize(("noise", "stray", "robust"), [(0.0, 0.0, False), (0.01, 0.0, True), (0.01, 0.04, True)])
+@pytest.mark.parametrize(
+    ("noise", "stray", "robust"), [(0.0, 0.0, False), (0.01, 0.0, True), (0.01, 0.04, True)]
+)
 def test_spline_keeps_local_distortion(noise: float, stray: float, robust: bool) -> None:
-    surface = fit_spline(*samples(noise=noise, stray=stray), None, BOX, cells=(12, 10), robust=robust)
+    surface = fit_spline(
+        *samples(noise=noise, stray=stray), None, BOX, cells=(12, 10), robust=robust
+    )
     grid = surface.evaluate_grid(SHAPE)
     smooth, local, inside = grids()
     assert np.array_equal(np.isfinite(grid), inside)
@@ -63,7 +70,9 @@ def test_weights_and_invalid_samples() -> None:
 def test_cells_without_samples_are_held() -> None:
     u, v, values = samples()
     hole = np.hypot(u - 210, v - 150) < 45
-    grid = fit_spline(u[~hole], v[~hole], values[~hole], None, BOX, robust=True).evaluate_grid(SHAPE)
+    grid = fit_spline(u[~hole], v[~hole], values[~hole], None, BOX, robust=True).evaluate_grid(
+        SHAPE
+    )
     smooth, local, inside = grids()
     assert np.abs((grid - smooth - local)[inside]).max() < 5 * LOCAL_RAD
 
@@ -72,12 +81,16 @@ def test_cells_without_samples_are_held() -> None:
 def test_grid_window_and_scattered_pixels_agree(kind: str) -> None:
     u, v, values = samples(3_000)
     fitted = (
-        fit_spline(u, v, values, None, BOX) if kind == "spline" else fit_polynomial(u, v, values, None, BOX, degree=7)
+        fit_spline(u, v, values, None, BOX)
+        if kind == "spline"
+        else fit_polynomial(u, v, values, None, BOX, degree=7)
     )
     grid = fitted.evaluate_grid(SHAPE)
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
     assert np.allclose(fitted.evaluate(column, row), grid, rtol=0, atol=1e-9, equal_nan=True)
-    assert np.array_equal(fitted.evaluate_grid((50, 70), (100, 90)), grid[90:140, 100:170], equal_nan=True)
+    assert np.array_equal(
+        fitted.evaluate_grid((50, 70), (100, 90)), grid[90:140, 100:170], equal_nan=True
+    )
 
 
 def test_polynomials_are_reproduced() -> None:
@@ -88,7 +101,9 @@ def test_polynomials_are_reproduced() -> None:
     inside = grids()[2]
     for fitted in (
         fit_polynomial(u, v, values, None, BOX, 5),
-        fit_polynomial(u, v, values, None, (400, 300), 5, robust=True),  # the samples cover a part of the box only
+        fit_polynomial(
+            u, v, values, None, (400, 300), 5, robust=True
+        ),  # the samples cover a part of the box only
         fit_spline(u, v, values, None, BOX),
     ):
         assert np.abs(fitted.evaluate_grid(SHAPE) - truth)[inside].max() < 1e-6

@@ -10,19 +10,35 @@ from facts import raises
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate, triangulate_pixels
+from slviewer.geometry.triangulation import (
+    depth_per_px,
+    points_from_depth,
+    triangulate,
+    triangulate_pixels,
+)
 from slviewer.records.plain import from_plain, to_plain
 
 pytestmark = pytest.mark.computes
 
 
 def make_rig(k1: float = -0.08, vertical: bool = False) -> StereoRig:
-    """A quarter of the Letter's rig; its projector's rows are half as high as its columns are wide."""
-    camera = Lens([[890.0, 0, 201.3], [0, 891.0, 149.1], [0, 0, 1]], [k1, 0.1, 0.0004, -0.0003, 0.01], (400, 300))
-    projector = Lens([[1400.0, 0, 455.0], [0, 2800.0, 569.0], [0, 0, 1]], [k1, 0.02, 0.0005, 0.0006, 0], (912, 1140))
+    """A quarter of the Letter's rig; its projector's rows are half as high as its columns are
+    wide."""
+    camera = Lens(
+        [[890.0, 0, 201.3], [0, 891.0, 149.1], [0, 0, 1]],
+        [k1, 0.1, 0.0004, -0.0003, 0.01],
+        (400, 300),
+    )
+    projector = Lens(
+        [[1400.0, 0, 455.0], [0, 2800.0, 569.0], [0, 0, 1]],
+        [k1, 0.02, 0.0005, 0.0006, 0],
+        (912, 1140),
+    )
     turn = [-0.3, 0.02, 0.01] if vertical else [0.01, 0.3, 0.01]
     shift = [4.0, -180.0, 20] if vertical else [-180.0, 3, 20]
-    return StereoRig(camera, projector, cv2.Rodrigues(np.array(turn))[0], np.array(shift).reshape(3, 1))
+    return StereoRig(
+        camera, projector, cv2.Rodrigues(np.array(turn))[0], np.array(shift).reshape(3, 1)
+    )
 
 
 def wavy_depths(rig: StereoRig) -> np.ndarray:
@@ -57,13 +73,18 @@ def test_exact_coordinates_give_exact_depth(axis: str, vertical: bool) -> None:
 def test_projector_projection_agrees_with_opencv() -> None:
     rig = make_rig()
     points = np.random.default_rng(0).uniform([-100, -80, 500], [100, 80, 700], (200, 3))
-    theirs = cv2.projectPoints(points, rig.R, rig.t, rig.projector.K, rig.projector.D)[0].reshape(-1, 2)
+    theirs = cv2.projectPoints(points, rig.R, rig.t, rig.projector.K, rig.projector.D)[0].reshape(
+        -1, 2
+    )
     assert np.abs(rig.project(points) - theirs).max() < 1e-8
-    assert np.allclose(rig.to_projector(points), (rig.T_projector_camera @ np.c_[points, np.ones(200)].T).T[:, :3])
+    assert np.allclose(
+        rig.to_projector(points), (rig.T_projector_camera @ np.c_[points, np.ones(200)].T).T[:, :3]
+    )
 
 
 def test_what_ignoring_the_other_coordinate_costs() -> None:
-    """Undistorting (u_p, middle row) and trusting eq. 6 is wrong by tenths of a mm; the first guess alone by more."""
+    """Undistorting (u_p, middle row) and trusting eq. 6 is wrong by tenths of a mm; the first guess
+    alone by more."""
     rig = make_rig(k1=-0.08)
     z, _, pixels = truth(rig)
     middle = np.full_like(pixels[..., 0], rig.projector.K[1, 2])
@@ -131,7 +152,9 @@ def test_depth_per_px_is_the_derivative(axis: str) -> None:
     rig = make_rig()
     z = wavy_depths(rig)
     i, step = "xy".index(axis), 1e-3
-    near, far = (rig.project(np.dstack([rig.camera.rays() * d[..., None], d])) for d in (z - step, z + step))
+    near, far = (
+        rig.project(np.dstack([rig.camera.rays() * d[..., None], d])) for d in (z - step, z + step)
+    )
     numeric = np.abs(2 * step / (far - near)[..., i])
     found = depth_per_px(rig, axis, z)
     # as slopes: along an epipolar line of the rows, depth per row is infinite

@@ -45,11 +45,20 @@ CORNERS = ((-30, -30), (30, -30), (30, 30), (-30, 30))
 """Of an outline around a place on the page, px."""
 
 
-def capture_scans(folder: Path, world: SimulatedWorld, angles_deg: dict[str, float], patterns: str = "gray") -> None:
+def capture_scans(
+    folder: Path, world: SimulatedWorld, angles_deg: dict[str, float], patterns: str = "gray"
+) -> None:
     """Capture {scan: angle of the table} of what stands before a simulated rig."""
     for name, angle_deg in angles_deg.items():
         world.turn_table(angle_deg)
-        capture(folder, name, {}, role="scan", patterns=patterns, set_up=lambda *_: RigSetup(simulated_rig(world)))
+        capture(
+            folder,
+            name,
+            {},
+            role="scan",
+            patterns=patterns,
+            set_up=lambda *_: RigSetup(simulated_rig(world)),
+        )
 
 
 class Views:
@@ -59,7 +68,9 @@ class Views:
         self._app = app
         self._positions: list[np.ndarray] = []
         app.server.viser.on_client_connect(
-            lambda client: client.camera.on_update(lambda camera: self._positions.append(np.array(camera.position)))
+            lambda client: client.camera.on_update(
+                lambda camera: self._positions.append(np.array(camera.position))
+            )
         )
 
     def wait_for(self, page: Page, points: np.ndarray) -> None:
@@ -68,7 +79,9 @@ class Views:
         low, high = np.nanpercentile(points.reshape(-1, 3), [2, 98], axis=0)
 
         def has_moved() -> bool:
-            is_meant = np.linalg.norm(client.camera.look_at - (low + high) / 2) < 0.1 * np.linalg.norm(high - low)
+            is_meant = np.linalg.norm(
+                client.camera.look_at - (low + high) / 2
+            ) < 0.1 * np.linalg.norm(high - low)
             reported = self._positions[-1] if self._positions else np.full(3, np.inf)
             return bool(is_meant and np.allclose(reported, client.camera.position, atol=0.5))
 
@@ -99,7 +112,9 @@ def shared_wizard(
 
 
 @pytest.fixture
-def wizard(shared_wizard: tuple[Opened, App, Operator, Views]) -> tuple[Opened, App, Operator, Views]:
+def wizard(
+    shared_wizard: tuple[Opened, App, Operator, Views],
+) -> tuple[Opened, App, Operator, Views]:
     """The page in the step Scan, without edits, errors or region."""
     opened, app, operator, views = shared_wizard
     for name in ("one", "two"):
@@ -127,7 +142,8 @@ def to_screen(app: App, page: Page, point: np.ndarray) -> tuple[float, float]:
 
 
 def draw_outline(page: Page, x: float, y: float) -> None:
-    """Click the corners of an outline around (x, y) px, each once the wizard has the one before, and close it."""
+    """Click the corners of an outline around (x, y) px, each once the wizard has the one before,
+    and close it."""
     for count, (dx, dy) in enumerate(CORNERS, 1):
         page.mouse.click(x + dx, y + dy)
         expect(page.get_by_text(re.compile(f"{count} corners? set"))).to_be_visible()
@@ -136,7 +152,8 @@ def draw_outline(page: Page, x: float, y: float) -> None:
 
 
 def wait_for_frames(page: Page, count: int = 3) -> None:
-    """Wait until the page has drawn so many frames: what lies below the mouse is looked up in each of them."""
+    """Wait until the page has drawn so many frames: what lies below the mouse is looked up in each
+    of them."""
     for _ in range(count):
         page.evaluate("new Promise(requestAnimationFrame)")
 
@@ -155,7 +172,9 @@ def count_selected(page: Page) -> int:
     return int(text.split(" of ")[0].replace(",", ""))
 
 
-def test_points_are_selected_deleted_and_restored(wizard: tuple[Opened, App, Operator, Views]) -> None:
+def test_points_are_selected_deleted_and_restored(
+    wizard: tuple[Opened, App, Operator, Views],
+) -> None:
     opened, app, operator, views = wizard
     page = opened.page
     assert operator.session is not None
@@ -225,7 +244,10 @@ def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
 
     click(page, "Delete selected")
     wait_until(page, lambda: edits() == [1, 1])
-    assert sum(load_edits(operator.session, name).active[0].points for name in ("one", "two")) == selected
+    assert (
+        sum(load_edits(operator.session, name).active[0].points for name in ("one", "two"))
+        == selected
+    )
     click(page, "Undo edit")
     wait_until(page, lambda: edits() == [0, 0])
     click(page, "Redo edit")
@@ -234,7 +256,9 @@ def test_points_of_two_scans_are_deleted_and_restored_in_step_merge(
     assert opened.errors == []
 
 
-def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Operator, Views]) -> None:
+def test_region_is_set_by_numbers_and_by_handle(
+    wizard: tuple[Opened, App, Operator, Views],
+) -> None:
     opened, app, operator, _ = wizard
     page = opened.page
     assert operator.session is not None
@@ -255,7 +279,11 @@ def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Opera
     assert 0.2 * total < load_scan_cloud(operator.session, "one").measured_count < 0.9 * total
     expect(page.get_by_text(re.compile("removed by edits and region"))).to_be_visible()
     page.locator("xpath=//*[normalize-space(text())='Handles']/following::input[1]").check()
-    for share in 10 * (0.3, 0.25, 0.35):  # of the box, along the arrow; what is drawn just then may take the drag
+    for share in 10 * (
+        0.3,
+        0.25,
+        0.35,
+    ):  # of the box, along the arrow; what is drawn just then may take the drag
         wait_until_still(page)
         start = region()
         arrow = np.array([share * max(start.size_mm), 0, 0])
@@ -266,7 +294,9 @@ def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Opera
         page.mouse.move(x + 20, y, steps=4)
         page.mouse.move(x + 60, y, steps=6)
         page.mouse.up()
-        if operator.wait_for(lambda _: abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1, 2.0):
+        if operator.wait_for(
+            lambda _: abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1, 2.0
+        ):
             break
     assert abs(region().centre_mm[0] - automatic.centre_mm[0]) > 1
     assert np.allclose(region().size_mm[1:], automatic.size_mm[1:], atol=0.11)
@@ -274,7 +304,9 @@ def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Opera
         field(page, "Centre (mm)").fill("5000")
         if operator.wait_for(lambda _: abs(region().centre_mm[0] - 5000) < 0.1, 10.0):
             break
-    expect(page.get_by_text(re.compile(r"none of its \d+ points lies in the region"))).to_be_visible()
+    expect(
+        page.get_by_text(re.compile(r"none of its \d+ points lies in the region"))
+    ).to_be_visible()
     page.locator("xpath=//*[normalize-space(text())='Use region']/following::input[1]").uncheck()
     wait_until(page, lambda: region() is None)
     expect(page.get_by_text(re.compile("points shown; the file has all"))).to_be_visible()
@@ -282,7 +314,9 @@ def test_region_is_set_by_numbers_and_by_handle(wizard: tuple[Opened, App, Opera
     assert opened.errors == []
 
 
-def test_six_clicks_make_textured_mesh_of_part_without_its_table(tmp_path: Path, browser: Browser) -> None:
+def test_six_clicks_make_textured_mesh_of_part_without_its_table(
+    tmp_path: Path, browser: Browser
+) -> None:
     folder, rig = tmp_path / "session", letter(0.25)
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
@@ -322,10 +356,16 @@ def test_six_clicks_make_textured_mesh_of_part_without_its_table(tmp_path: Path,
     mesh = trimesh.load(tmp_path / "part.glb", force="mesh")
     points = 1000 * mesh.vertices * [1, -1, -1]  # GLB: m, y up
     stone = turning(1)["turn_01"]
-    truth = trimesh.Trimesh(turn_pose(stone.pose, names["c"]).to_camera(stone.vertices), stone.triangles)
+    truth = trimesh.Trimesh(
+        turn_pose(stone.pose, names["c"]).to_camera(stone.vertices), stone.triangles
+    )
     away, nearest = cKDTree(truth.vertices).query(points)
-    height = np.abs(np.sum((points - truth.vertices[nearest]) * truth.vertex_normals[nearest], axis=1))
-    assert 0.02 < np.median(height) < 0.2 and np.percentile(height, 99) < 0.6  # the calibration is without distortion
+    height = np.abs(
+        np.sum((points - truth.vertices[nearest]) * truth.vertex_normals[nearest], axis=1)
+    )
+    assert (
+        0.02 < np.median(height) < 0.2 and np.percentile(height, 99) < 0.6
+    )  # the calibration is without distortion
     assert away.max() < 3.0  # nothing is left of the table
     assert np.asarray(mesh.visual.material.baseColorTexture).shape[:2] == (2048, 2048)
 
@@ -371,12 +411,18 @@ def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Bro
             return [] if seen is None else [part.decision for part in seen.parts]
 
         wait_until(page, lambda: len(decisions()) == 2)
-        assert decisions() == ["undecided", "undecided"]  # the plan's own tolerance is as small as the uncertainty
+        assert decisions() == [
+            "undecided",
+            "undecided",
+        ]  # the plan's own tolerance is as small as the uncertainty
         expect(page.get_by_text("2 undecided", exact=True)).to_be_visible()
 
         plan = read_plan(folder / OWN_PLAN)
         (diameter,) = (each for each in plan.characteristic if each.kind == "diameter")
-        wide = (replace(diameter, lower=195.0, upper=199.0), replace(diameter, name="small", lower=190.0, upper=191.0))
+        wide = (
+            replace(diameter, lower=195.0, upper=199.0),
+            replace(diameter, name="small", lower=190.0, upper=191.0),
+        )
         write_plan(replace(plan, name="ball", characteristic=wide[:1]), tmp_path / "ball.toml")
         write_plan(replace(plan, name="small", characteristic=wide), tmp_path / "small.toml")
         for count, (name, judged) in enumerate((("ball", "2 pass"), ("small", "2 fail")), 2):

@@ -1,4 +1,5 @@
-"""Every step and every finding has its section in the help, and every section of a finding is one's."""
+"""Every step and every finding has its section in the help, and every section of a finding is
+one's."""
 
 import posixpath
 import re
@@ -64,19 +65,28 @@ def test_links_between_pages_lead_to_pages_and_headings() -> None:
         main = html[html.index("<main>") : html.index("</main>")]
         for address in re.findall(r'href="([^":]*)"', main):
             path, _, anchor = address.partition("#")
-            target = posixpath.normpath(posixpath.join(posixpath.dirname(name), path)) if path else name
+            target = (
+                posixpath.normpath(posixpath.join(posixpath.dirname(name), path)) if path else name
+            )
             assert pages.file(target), (name, address)
             assert not anchor or anchor in pages.anchors(target), (name, address)
 
 
 def test_findings_checks_and_refusals_link_to_their_sections() -> None:
     findings = [
-        Finding(cause, "note" if i % 2 else "doubtful", "it is so", "do this") for i, cause in enumerate(CAUSES)
+        Finding(cause, "note" if i % 2 else "doubtful", "it is so", "do this")
+        for i, cause in enumerate(CAUSES)
     ]
     linked = hrefs(verdict_html(Verdict.of(findings), True, None))
     assert sorted(linked) == sorted(f"help/{FINDINGS_PAGE}#{cause}" for cause in CAUSES)
-    checks = tuple(Check(name, "good" if name == "noise" else "bad", "So.", "Do.", {}) for name in CHECK_NAMES)
+    checks = tuple(
+        Check(name, "good" if name == "noise" else "bad", "So.", "Do.", {}) for name in CHECK_NAMES
+    )
     linked = hrefs(checks_table(Preflight(checks, None, None, None, 1.0)))
-    assert linked == [f"help/{FINDINGS_PAGE}#check-{name}" for name in CHECK_NAMES if name != "noise"]
-    assert hrefs(merge_failure_html("no", {}, None, "plane")) == [f"help/{FINDINGS_PAGE}#merge-plane"]
+    assert linked == [
+        f"help/{FINDINGS_PAGE}#check-{name}" for name in CHECK_NAMES if name != "noise"
+    ]
+    assert hrefs(merge_failure_html("no", {}, None, "plane")) == [
+        f"help/{FINDINGS_PAGE}#merge-plane"
+    ]
     assert hrefs(merge_failure_html("no", {})) == hrefs(help_link("merge"))

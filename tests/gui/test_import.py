@@ -27,7 +27,8 @@ def operator(tmp_path: Path) -> Iterator[Operator]:
 
 
 def zip_of_captures() -> bytes:
-    """Two captures of Gray code with inverses, one of which lacks an image, and a file that is no image."""
+    """Two captures of Gray code with inverses, one of which lacks an image, and a file that is no
+    image."""
     sequence, data, rng = gray(PROJECTOR), io.BytesIO(), np.random.default_rng(1)
     with zipfile.ZipFile(data, "w") as out:
         for name in ("capture_0", "capture_1"):
@@ -38,13 +39,17 @@ def zip_of_captures() -> bytes:
                     .astype(np.uint8)
                 )
                 if (name, i) != ("capture_1", 4):
-                    out.writestr(f"set/{name}/graycode_{i:02d}.png", cv2.imencode(".png", frame)[1].tobytes())
+                    out.writestr(
+                        f"set/{name}/graycode_{i:02d}.png", cv2.imencode(".png", frame)[1].tobytes()
+                    )
         out.writestr("set/notes.txt", "x")
     return data.getvalue()
 
 
 @pytest.mark.slow
-def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(opened: Opened, operator: Operator) -> None:
+def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(
+    opened: Opened, operator: Operator
+) -> None:
     page = opened.page
     click(page, "3. Poses")
     page.get_by_text("Import captures", exact=True).click()
@@ -59,7 +64,9 @@ def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(opened: Opened, op
             expect(page.get_by_text(re.compile("the file is no zip")).first).to_be_visible()
             expect(button(page, "Upload zip")).to_be_enabled()
     expect(page.get_by_text("1 capture imported as a target pose: capture_0").first).to_be_visible()
-    expect(page.get_by_text(re.compile("not imported: capture_1: it lacks graycode_04")).first).to_be_visible()
+    expect(
+        page.get_by_text(re.compile("not imported: capture_1: it lacks graycode_04")).first
+    ).to_be_visible()
     expect(page.get_by_text(re.compile("notes.txt in the zip")).first).to_be_visible()
     session = operator.session
     assert session is not None and session.load_capture("capture_0").sequence.projector == PROJECTOR

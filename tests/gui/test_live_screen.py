@@ -23,7 +23,11 @@ SCALE = 0.15
 def app(tmp_path: Path) -> Iterator[App]:
     folder = tmp_path / "session"
     true_calibration(folder, letter(SCALE))
-    slow = {"driver": "simulated", "scale": SCALE, "settle_ms": 30}  # the browser needs the cores too
+    slow = {
+        "driver": "simulated",
+        "scale": SCALE,
+        "settle_ms": 30,
+    }  # the browser needs the cores too
     with Operator(folder, slow, timing=CALM) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
         operator.place("object")
@@ -44,7 +48,9 @@ def test_live_clouds_are_shown_saved_and_stopped(browser: Browser, app: App) -> 
     expect(page.get_by_text("Nothing is saved yet")).to_be_visible()
     click(page, "Save cloud")
     expect(page.get_by_text("scan_01").first).to_be_visible()
-    assert app.operator.wait_for(lambda s: s.live is not None and s.live.shown_per_s > 0, PATIENCE_S)
+    assert app.operator.wait_for(
+        lambda s: s.live is not None and s.live.shown_per_s > 0, PATIENCE_S
+    )
     app.shell.go("merge")  # to leave the step ends it
     assert app.operator.wait_for(lambda s: s.live is None, PATIENCE_S)
     assert found.errors == []
@@ -59,7 +65,8 @@ def test_live_rate_is_measured_beside_stalled_viewer() -> None:
     assert found.captures_per_s + found.captures_per_s_stalled > 0
     assert found.clouds_per_s > 0 and found.shown_per_s > 0 and found.latency_ms > 1
     assert (
-        set(vars(found)) > {"latency_ms", "growth_mb", "growth_files", "growth_threads"} and "240x180" in found.text()
+        set(vars(found)) > {"latency_ms", "growth_mb", "growth_files", "growth_threads"}
+        and "240x180" in found.text()
     )
 
 

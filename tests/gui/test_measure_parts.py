@@ -7,7 +7,12 @@ import pytest
 from facts import missing_facts
 
 from slviewer.gui.measure_drawing import drawn, format_quantity, label, lifted
-from slviewer.gui.measure_html import deviation_figure, deviation_html, measurement_html, measurements_table
+from slviewer.gui.measure_html import (
+    deviation_figure,
+    deviation_html,
+    measurement_html,
+    measurements_table,
+)
 from slviewer.gui.measure_section import cursor_html, cursor_points
 from slviewer.gui.measure_surface import paint_surface
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
@@ -25,7 +30,9 @@ CENTRE = np.array([10.0, 20.0, 500.0])
 TOP = CENTRE - np.array([0.0, 0.0, 30.0])
 
 
-def made(kind: str, quantities: list[Quantity], of: tuple[str, ...] = (), stale: bool = False, **data) -> Measurement:
+def made(
+    kind: str, quantities: list[Quantity], of: tuple[str, ...] = (), stale: bool = False, **data
+) -> Measurement:
     name = f"<b>{kind}</b>"
     data["quantities"] = to_plain(quantities)
     return Measurement(f"m_{kind}", name, kind, "scan_01", "stereo", "", data, of, stale)
@@ -40,7 +47,11 @@ POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=to_plain(Feature(
 
 
 def text(html: str) -> str:
-    return re.sub(r"&#(\d+);", lambda m: chr(int(m[1])), html).replace("\u2060", "").replace("\xa0", " ")
+    return (
+        re.sub(r"&#(\d+);", lambda m: chr(int(m[1])), html)
+        .replace("\u2060", "")
+        .replace("\xa0", " ")
+    )
 
 
 def test_tool_states_instruction_and_ends_after_its_picks() -> None:
@@ -53,7 +64,9 @@ def test_tool_states_instruction_and_ends_after_its_picks() -> None:
     tool.select("Distance")
     assert tool.pick((1, 2)) is None and "second" in tool.instruction
     assert tool.pick((1, 2)) is None and "second" in tool.instruction  # a double click
-    assert tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.instruction  # ready for the next distance
+    assert (
+        tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.instruction
+    )  # ready for the next distance
     tool.select("Point")
     assert tool.pick(7) == (7,)
     tool.select("Sphere")
@@ -67,31 +80,47 @@ def test_drawing_lies_where_it_was_measured() -> None:
     segments, place = drawn(SPHERE, {})  # type: ignore[misc]
     away = np.linalg.norm(segments[:-3].reshape(-1, 3) - CENTRE, axis=1)
     assert np.allclose(away, 1.01 * 25) and np.array_equal(place, CENTRE)
-    width = made("distance", [Quantity("distance", 80.0, "mm", 0.1)], ends=[[-40, 0, 500], [40, 0, 500]])
+    width = made(
+        "distance", [Quantity("distance", 80.0, "mm", 0.1)], ends=[[-40, 0, 500], [40, 0, 500]]
+    )
     segments, place = drawn(width, {})  # type: ignore[misc]
     assert np.allclose(segments[0, 0], [-40, 0, 500]) and np.allclose(segments[2, 1], [40, 0, 500])
     assert np.allclose(place, [0, 0, 488]) and label(width) == "<b>distance</b>: 80.000 ± 0.200 mm"
-    related = made("relation", [Quantity("distance from the centre", 30.0, "mm", 0.1)], of=("m_point", "m_sphere"))
+    related = made(
+        "relation",
+        [Quantity("distance from the centre", 30.0, "mm", 0.1)],
+        of=("m_point", "m_sphere"),
+    )
     assert drawn(related, {"m_point": POINT}) is None  # the sphere was deleted
     segments, _ = drawn(related, {"m_point": POINT, "m_sphere": SPHERE})  # type: ignore[misc]
     assert np.allclose(segments[0, 0], TOP) and np.allclose(segments[2, 1], CENTRE)
     tube = Feature("cylinder", CENTRE, np.array([0.0, 1.0, 0.0]), 8.0)
-    cylinder = made("cylinder", [], fit={"feature": to_plain(tube)}, region={"kind": "ball", "size": [12.0]})
+    cylinder = made(
+        "cylinder", [], fit={"feature": to_plain(tube)}, region={"kind": "ball", "size": [12.0]}
+    )
     segments, _ = drawn(cylinder, {})  # type: ignore[misc]
-    assert np.allclose(np.abs(segments[:-1, :, 1] - CENTRE[1]), 12) and np.ptp(segments[..., 0]) == pytest.approx(16.16)
-    plane = made("plane", [], fit={"feature": to_plain(Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])))})
+    assert np.allclose(np.abs(segments[:-1, :, 1] - CENTRE[1]), 12) and np.ptp(
+        segments[..., 0]
+    ) == pytest.approx(16.16)
+    plane = made(
+        "plane", [], fit={"feature": to_plain(Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])))}
+    )
     segments, _ = drawn(plane, {})  # type: ignore[misc]
     assert np.allclose(segments[:-1, :, 2], CENTRE[2] - 0.15)
 
 
 @pytest.mark.computes
 def test_a_section_is_read_off_at_its_cursors() -> None:
-    plane = CutPlane.through(np.array([0.0, 0, 500]), np.array([100.0, 0, 500]), np.array([0.0, 0, -1]))
+    plane = CutPlane.through(
+        np.array([0.0, 0, 500]), np.array([100.0, 0, 500]), np.array([0.0, 0, -1])
+    )
     t = np.linspace(0, np.pi, 721)
     arc = np.stack([50 - 50 * np.cos(t), 50 * np.sin(t)], axis=1)
     cursors = cursor_points([arc], (10.0, 90.0, 50.0))
     assert cursors[:, 1] == pytest.approx([30, 30, 50], abs=1e-3)
-    assert np.allclose(lifted(plane, cursors), [[10, 0, 470], [90, 0, 470], [50, 0, 450]], atol=1e-3)
+    assert np.allclose(
+        lifted(plane, cursors), [[10, 0, 470], [90, 0, 470], [50, 0, 450]], atol=1e-3
+    )
     words = text(cursor_html(cursors))
     assert "80.000 mm" in words and "50.000 mm" in words and "0.000 mm" in words
     assert missing_facts(text(cursor_html(np.array([[0.0, 0], [2, 0], [1, 0]]))), "line") == []
@@ -100,7 +129,9 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     assert "enlarged" in section_plot("s", [flat]).caption
     cut = made("section", [], plane=to_plain(plane))
     segments, place = drawn(cut, {}, [arc])  # type: ignore[misc]
-    assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(449)  # the highest point, a little off
+    assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(
+        449
+    )  # the highest point, a little off
 
 
 def test_measurements_as_text() -> None:
@@ -109,12 +140,21 @@ def test_measurements_as_text() -> None:
     assert format_quantity(Quantity("angle", 90.0, "deg", 0.01, whole=False)) == "90.000 ± 0.020°*"
     full = text(measurement_html(SPHERE, {"scan_01": "Lion <i>"}))
     assert missing_facts(full, "25.000 ± 0.020 mm*", "rough", "Lion <i>") == []
-    assert "<b>sphere" not in measurement_html(SPHERE, {}) and missing_facts(full, "calibration") == []
+    assert (
+        "<b>sphere" not in measurement_html(SPHERE, {}) and missing_facts(full, "calibration") == []
+    )
     stale = made("point", [Quantity("x", 1.0, "mm")], stale=True)
     listed = text(measurements_table([SPHERE, stale], "", {}))
     assert listed.index("point on scan_01, stale") < listed.index("sphere on scan_01")
     statistics = {"points": 900, "left_out": 100}
-    verdict = {"tolerance_mm": 0.1, "decision": "undecided", "U_mm": 0.02, "inside": 90.0, "close": 9.0, "outside": 1.0}
+    verdict = {
+        "tolerance_mm": 0.1,
+        "decision": "undecided",
+        "U_mm": 0.02,
+        "inside": 90.0,
+        "close": 9.0,
+        "outside": 1.0,
+    }
     told = text(deviation_html({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
     facts = (f"± 0.1 mm: {DECIDED['undecided']}", "90.00 %", "9.00 %", "1.00 %", "10.0 %", "2 mm")
     assert missing_facts(told, *facts) == []
@@ -125,7 +165,12 @@ def test_measurements_as_text() -> None:
 def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:
     points = np.stack([np.arange(5.0), np.zeros(5), np.full(5, 300.0)], axis=1).astype(np.float32)
     merge = MeasuredSurface(
-        points, np.full(5, 0.1, np.float32), "merge/1", "stereo", {}, texture=np.full((5, 3), 9, np.uint8)
+        points,
+        np.full(5, 0.1, np.float32),
+        "merge/1",
+        "stereo",
+        {},
+        texture=np.full((5, 3), 9, np.uint8),
     )
     assert place_at(merge, np.zeros(3), points[3]) == 3
     drawn_points, painted, _ = paint_surface(merge, "texture")

@@ -54,7 +54,15 @@ from slviewer.wizard.result_views import ScanCloud
 from slviewer.wizard.snapshot import ScanView
 
 REJECTED = Verdict.of(
-    [Finding("moved", "rejected", "pose_03 moved by 0.9 px", "hold the <b>board</b> still", ("pose_03",))]
+    [
+        Finding(
+            "moved",
+            "rejected",
+            "pose_03 moved by 0.9 px",
+            "hold the <b>board</b> still",
+            ("pose_03",),
+        )
+    ]
 )
 
 
@@ -62,7 +70,8 @@ REJECTED = Verdict.of(
 def measured(
     recorded: Path, tmp_path_factory: pytest.TempPathFactory, browser: Browser
 ) -> Iterator[tuple[Page, Operator, list[str]]]:
-    """A page on a copy of the recorded session, without a rig, and without the model that takes longest to compare."""
+    """A page on a copy of the recorded session, without a rig, and without the model that takes
+    longest to compare."""
     folder = copy_session(recorded / "session", tmp_path_factory.mktemp("measured") / "session")
     with Session.open(folder, write=True) as store:
         store.trash_result("calibration/splined")
@@ -77,7 +86,9 @@ def measured(
         wizard.close()
 
 
-def test_calibration_shows_poses_and_fit_of_a_pixel(measured: tuple[Page, Operator, list[str]]) -> None:
+def test_calibration_shows_poses_and_fit_of_a_pixel(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
     page, _, errors = measured
     click(page, "4. Calibrate")
     expect(page.get_by_text("Reprojection RMS, camera")).to_be_visible()
@@ -85,7 +96,9 @@ def test_calibration_shows_poses_and_fit_of_a_pixel(measured: tuple[Page, Operat
     choose(page, "Pose", "pose_02")
     expect(page.get_by_text("pose_02, camera: measured minus predicted features")).to_be_visible()
     choose(page, "Residuals", "projector")
-    expect(page.get_by_text("pose_02, projector: measured minus predicted features")).to_be_visible()
+    expect(
+        page.get_by_text("pose_02, projector: measured minus predicted features")
+    ).to_be_visible()
     expect(page.get_by_text(re.compile(r"Fit of camera pixel \(\d+, \d+\) to"))).to_be_visible()
     field(page, "Pixel u").fill("150")
     field(page, "Pixel v").fill("120")
@@ -129,12 +142,16 @@ def test_models_are_compared_on_request_and_comparison_can_be_cancelled(
 
 
 @pytest.mark.slow
-def test_plane_and_sphere_are_measured_and_exported(measured: tuple[Page, Operator, list[str]]) -> None:
+def test_plane_and_sphere_are_measured_and_exported(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
     page, _, errors = measured
     click(page, "5. Verify")
     choose(page, "Capture", "plane_03")
     click(page, "Measure plane")
-    expect(page.get_by_text("errors on one colour scale, red is towards the camera")).to_be_visible()
+    expect(
+        page.get_by_text("errors on one colour scale, red is towards the camera")
+    ).to_be_visible()
     choose(page, "Capture", "sphere_3")
     click(page, "Measure sphere")
     expect(page.get_by_text("errors on one colour scale, red is outwards")).to_be_visible()
@@ -155,11 +172,14 @@ def pick_two_places(page: Page) -> None:
     none = page.get_by_text(re.compile("^Pair 1: click a point on"))
     expect(none).to_be_visible()
     expect(button(page, "Merge 2 scans")).to_be_disabled()
-    # until the two stand side by side, the reference may be where the scan will be: only the answer tells them apart
+    # until the two stand side by side, the reference may be where the scan will be: only the answer
+    # tells them apart
     click_until(page, (385, 400), re.compile(r"click the same point on .* on the right\.$"))
     click_until(page, (640, 400), re.compile("^[1-9] of 3 pairs picked"))
     said = page.get_by_text(re.compile(r"^(Pair \d|\d pairs): "))
-    while not said.inner_text().startswith("Pair 1: click a point on"):  # one sent twice began another pair
+    while not said.inner_text().startswith(
+        "Pair 1: click a point on"
+    ):  # one sent twice began another pair
         with suppress(NotShownError):  # the text was of before: all points are taken back
             button(page, "Undo last point").click(timeout=5000)
     expect(page.get_by_text("0 of 3 pairs picked")).to_be_visible()
@@ -190,7 +210,9 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     choose(page, "Start from", "current position")
     click(page, "Merge 2 scans")
     expect(page.get_by_text("Not merged.")).to_be_visible()
-    expect(page.get_by_text("Or use the initial alignment by features, or by picked points.").first).to_be_visible()
+    expect(
+        page.get_by_text("Or use the initial alignment by features, or by picked points.").first
+    ).to_be_visible()
     pick_two_places(page)
     choose(page, "Start from", "features")
     click(page, "Merge 2 scans")
@@ -208,7 +230,10 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
     merged = read_ply(tmp_path / "merged.ply")
     snapshot = operator.snapshot()
     assert snapshot.session is not None and snapshot.session.merge is not None
-    assert len(merged.points) == snapshot.session.merge.record.points and np.isfinite(merged.points).all()
+    assert (
+        len(merged.points) == snapshot.session.merge.record.points
+        and np.isfinite(merged.points).all()
+    )
     choose(page, "Source", "Lion <b>1</b> (object_r2)")
     choose(page, "Type", "mesh")
     choose(page, "File type", "GLB")
@@ -222,9 +247,15 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
         page.get_by_role("link", name="Download object_r2_mesh.glb").click()
     download.value.save_as(tmp_path / "part.glb")
     part = trimesh.load(tmp_path / "part.glb", force="mesh")
-    assert 4000 < len(part.faces) <= 6000 and 0.08 < part.extents.max() < 0.2  # the ammonite, 140 mm wide
+    assert (
+        4000 < len(part.faces) <= 6000 and 0.08 < part.extents.max() < 0.2
+    )  # the ammonite, 140 mm wide
     expect(
-        page.get_by_text(re.compile(r"^object_r2: (5\d{3}|6000) triangles by grid.*smoothing moved the surface by"))
+        page.get_by_text(
+            re.compile(
+                r"^object_r2: (5\d{3}|6000) triangles by grid.*smoothing moved the surface by"
+            )
+        )
     ).to_be_visible()
     choose(page, "Texture", "1024 px")
     click(page, "Write again")
@@ -255,11 +286,15 @@ def surface_of_object(operator: Operator) -> str:
     """The name in the list of surfaces of `object_r2`, which another test may have renamed."""
     session = operator.snapshot().session
     assert session is not None
-    return next(display_name(scan.name, scan.label) for scan in session.scans if scan.name == "object_r2")
+    return next(
+        display_name(scan.name, scan.label) for scan in session.scans if scan.name == "object_r2"
+    )
 
 
 @pytest.mark.slow
-def test_distance_is_measured_between_two_clicks(measured: tuple[Page, Operator, list[str]]) -> None:
+def test_distance_is_measured_between_two_clicks(
+    measured: tuple[Page, Operator, list[str]],
+) -> None:
     page, operator, errors = measured
     if operator.wait_until_idle(PATIENCE_S).scan("object_r2").cloud != "fresh":  # type: ignore[union-attr]
         assert operator.reconstruct("object_r2")
@@ -277,7 +312,9 @@ def measure_distance(page: Page, operator: Operator, count: int) -> None:
     page.mouse.click(590, 420)
     width = came(operator, count)
     assert width.kind == "distance" and 5 < width.quantities[0].value < 140
-    expect(page.get_by_text(re.compile(rf"{width.quantities[0].value:.3f} ±\s0\.\d+\smm")).first).to_be_visible()
+    expect(
+        page.get_by_text(re.compile(rf"{width.quantities[0].value:.3f} ±\s0\.\d+\smm")).first
+    ).to_be_visible()
 
 
 @pytest.mark.slow
@@ -309,8 +346,12 @@ def test_part_is_measured_and_compared_with_its_nominal(
     click_until(page, (540, 400), "points in the ball")
     click(page, "Fit sphere")
     radius = came(operator, before + 3).quantities[0]
-    assert radius.U is not None and abs(radius.value - 98.0) < max(2 * radius.U, 0.1)  # the simulated sphere's, mm
-    expect(page.get_by_text(re.compile("ball of radius 30"))).to_be_visible()  # or the name typed is that of before
+    assert radius.U is not None and abs(radius.value - 98.0) < max(
+        2 * radius.U, 0.1
+    )  # the simulated sphere's, mm
+    expect(
+        page.get_by_text(re.compile("ball of radius 30"))
+    ).to_be_visible()  # or the name typed is that of before
     field(page, "New name").fill("Ball <i>")
     page.get_by_role("button", name="Rename", exact=True).click()
     expect(page.get_by_text("Ball <i>").first).to_be_visible()
@@ -353,7 +394,9 @@ def click_until(page: Page, place: tuple[int, int], answer: str | re.Pattern[str
     for _ in range(40):
         page.mouse.click(*place)
         try:
-            return page.get_by_text(answer).first.wait_for(timeout=5000)  # a second click too early is a second point
+            return page.get_by_text(answer).first.wait_for(
+                timeout=5000
+            )  # a second click too early is a second point
         except NotShownError:
             continue
     raise AssertionError(f"no click brought {answer!r}")
@@ -361,7 +404,9 @@ def click_until(page: Page, place: tuple[int, int], answer: str | re.Pattern[str
 
 def came(operator: Operator, count: int) -> Measurement:
     """The last of so many measurements, once it is there."""
-    found = operator.wait_for(lambda s: s.session is not None and len(s.session.measurements) == count, PATIENCE_S)
+    found = operator.wait_for(
+        lambda s: s.session is not None and len(s.session.measurements) == count, PATIENCE_S
+    )
     assert found is not None and found.session is not None, operator.snapshot().notices[-1].text
     return found.session.measurements[-1]
 
@@ -375,7 +420,9 @@ def test_rejected_calibration_states_reason_and_blocks_scans_until_accepted(
     click(page, "4. Calibrate")
     expect(page.get_by_text("no problems detected")).to_be_visible()
     choose(page, "Model", "stereo")
-    expect(page.get_by_text("stereo is used (your choice); pixelwise is recommended")).to_be_visible()
+    expect(
+        page.get_by_text("stereo is used (your choice); pixelwise is recommended")
+    ).to_be_visible()
     meta, arrays = store.load_result("calibration/stereo")
     meta = {key: value for key, value in meta.items() if key not in ("hash", "arrays", "checksums")}
     store.save_result("calibration/stereo", {**meta, "verdict": REJECTED.to_json()}, arrays)
@@ -384,9 +431,13 @@ def test_rejected_calibration_states_reason_and_blocks_scans_until_accepted(
     expect(page.get_by_text("do not measure with it")).to_be_visible()
     expect(page.get_by_text("Hold the <b>board</b> still.")).to_be_visible()
     click(page, "pose_03")
-    expect(page.get_by_text(re.compile("pose_03, .*: measured minus predicted features"))).to_be_visible()
+    expect(
+        page.get_by_text(re.compile("pose_03, .*: measured minus predicted features"))
+    ).to_be_visible()
     click(page, "6. Scan")
-    expect(page.get_by_text("The calibration was rejected: pose_03 moved by 0.9 px").first).to_be_visible()
+    expect(
+        page.get_by_text("The calibration was rejected: pose_03 moved by 0.9 px").first
+    ).to_be_visible()
     click(page, "4. Calibrate")
     page.get_by_label("Accept anyway").check()
     assert operator.wait_for(lambda s: s.step("scan").state != "blocked", PATIENCE_S)
@@ -399,7 +450,9 @@ def test_no_label_is_cut_at_1280_by_800(measured: tuple[Page, Operator, list[str
     assert page.viewport_size == SIZE
     for number, step in enumerate(operator.wait_until_idle(PATIENCE_S).steps, 1):
         click(page, f"{number}. {step.title}")
-        expect(page.locator("div", has_text=re.compile(rf"^{number}\s+{step.title}")).first).to_be_visible()
+        expect(
+            page.locator("div", has_text=re.compile(rf"^{number}\s+{step.title}")).first
+        ).to_be_visible()
         wait_until_still(page, 1000)  # what the panel computes may replace its instruction
         assert cut_labels(page) == [], step.title
 
@@ -411,12 +464,19 @@ def test_no_label_is_cut_beside_results(measured: tuple[Page, Operator, list[str
 
 def test_comparison_and_verdict_as_html() -> None:
     poses = {
-        m: {"pose_1": HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)} for m, p in (("stereo", 0.2), ("splined", 0.02))
+        m: {"pose_1": HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)}
+        for m, p in (("stereo", 0.2), ("splined", 0.02))
     }
     compared = CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"})
     html = report_table(comparison_table(compared, "splined"))
-    assert re.search(r"font-weight:600\">0&#46;020", html) and "<few>" not in html and html.index("stereo") > 0
-    assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(REJECTED, True, None)
+    assert (
+        re.search(r"font-weight:600\">0&#46;020", html)
+        and "<few>" not in html
+        and html.index("stereo") > 0
+    )
+    assert named_poses(REJECTED, None) == ("pose_03",) and "before" not in verdict_html(
+        REJECTED, True, None
+    )
     assert "gave no calibration" in verdict_html(REJECTED, False, None)
 
 
@@ -447,14 +507,20 @@ def test_purpose_of_captures_and_order_of_scans() -> None:
     def scan(name: str, purpose: str = "scan") -> ScanView:
         return ScanView(name, name, purpose, "", "fresh", Reconstruction(), b"")  # type: ignore[arg-type]
 
-    assert [shape_of(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == ["plane", "sphere", "scan"]
+    assert [shape_of(scan(n)) for n in ("plane_01", "sphere_2", "object_r1")] == [
+        "plane",
+        "sphere",
+        "scan",
+    ]
     assert shape_of(scan("scan_01", "plane")) == "plane"
     names = [s.name for s in sort_scans([scan("a"), scan("plane_1"), scan("b")])]
     assert names == ["b", "a", "plane_1"]
 
 
 def test_tables_escape_names_and_mark_the_best() -> None:
-    def found(rms: dict[str, float], shape: Shape = "plane", **figures: Any) -> Stored[Verification]:
+    def found(
+        rms: dict[str, float], shape: Shape = "plane", **figures: Any
+    ) -> Stored[Verification]:
         models = {name: ModelFit(100, 0, mm, 0.03, 0.9, **figures) for name, mm in rms.items()}
         record = Verification(shape=shape, models=models, incidence={"R1": 0, "R2": 90, "R3": 10})
         return Stored("a", "<img src=x>", record)
@@ -464,7 +530,10 @@ def test_tables_escape_names_and_mark_the_best() -> None:
     assert re.search(r"font-weight:600\">0&#46;100", html) and html.count("90&#46;0") == 2
     ball = found({"stereo": 0.2}, "sphere", radius_mm=97.9, centre_mm=(0.0, 0.0, 500.0))
     other = Stored("b", "b", found({"stereo": 0.2}, "sphere", centre_mm=(12.5, 0.0, 500.0)).record)
-    assert "97&#46;900" in records_html([ball]) and records_html([ball, other]).count("12&#46;500") == 1
+    assert (
+        "97&#46;900" in records_html([ball])
+        and records_html([ball, other]).count("12&#46;500") == 1
+    )
     assert records_html([]) == ""
 
 
@@ -472,12 +541,16 @@ def test_cloud_is_coloured_by_chosen_quantity() -> None:
     points = np.full((4, 5, 3), np.nan, np.float32)
     points[1:, 1:] = np.stack(np.broadcast_arrays(0.0, 1.0, np.linspace(500, 600, 4)), axis=-1)
     flat = np.ones((4, 5), np.float32)
-    cloud = ScanCloud("a", "stereo", "x", points, flat, flat, flat, np.full((4, 5), 7, np.uint8), {})
+    cloud = ScanCloud(
+        "a", "stereo", "x", points, flat, flat, flat, np.full((4, 5), 7, np.uint8), {}
+    )
     painted, words = paint_cloud(cloud, "depth")
     assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words
     noisy = replace(cloud, sigma_z=3 * flat, sigma_calibration=4 * flat)
     np.testing.assert_allclose(uncertainty(noisy)[1:, 1:], 5.0)
-    assert "5&#46;000" in paint_cloud(noisy, "uncertainty")[1] and "5&#46;000" in point_html(noisy, 4, 2)
+    assert "5&#46;000" in paint_cloud(noisy, "uncertainty")[1] and "5&#46;000" in point_html(
+        noisy, 4, 2
+    )
     assert "noise only" in paint_cloud(cloud, "uncertainty")[1].replace("&#32;", " ")
     assert paint_cloud(cloud, "texture")[0][0, 0] == 7
     assert "measure this capture" in paint_cloud(cloud, "error")[1].replace("&#32;", " ")

@@ -1,4 +1,5 @@
-"""Devices as people have them, driven by the wizard: a camera on the network looks at the projector page."""
+"""Devices as people have them, driven by the wizard: a camera on the network looks at the projector
+page."""
 
 import re
 import sys
@@ -50,7 +51,9 @@ def test_network_camera_captures_projector_page(browser: Browser, tmp_path: Path
     pages = PageChannels()
     with (
         network_camera(np.full((SCREEN[1], SCREEN[0], 3), 40, np.uint8)) as camera,
-        Operator(tmp_path / "session", set_up=partial(set_up, pages=pages), timing=CALM) as operator,
+        Operator(
+            tmp_path / "session", set_up=partial(set_up, pages=pages), timing=CALM
+        ) as operator,
     ):
         app = App(operator, Serving(port=0), pages=pages)
         page = new_page(browser)
@@ -63,25 +66,51 @@ def test_network_camera_captures_projector_page(browser: Browser, tmp_path: Path
             expect(page.get_by_text("Projector page: waiting for the page")).to_be_visible()
             content = page.content()  # whoever only watches reads this too
             grants = app.server.access.grants.values()
-            assert not [grant for grant in grants if any(one in content for one in (grant.token, grant.value))]
+            assert not [
+                grant
+                for grant in grants
+                if any(one in content for one in (grant.token, grant.value))
+            ]
             projector.goto(app.server.link("project"))
             expect(page.get_by_text("Projector page: ready 320 x 240")).to_be_visible()
             opened.enter("Camera ID", camera.url)
             click(page, "Use these devices")
             watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
-            expect(page.get_by_text(re.compile(r"camera 320\s×\s240\spx, projector 320\s×\s240\spx"))).to_be_visible()
-            expect(page.get_by_text("its settings are its own").or_(page.get_by_text("settings")).first).to_be_visible()
+            expect(
+                page.get_by_text(re.compile(r"camera 320\s×\s240\spx, projector 320\s×\s240\spx"))
+            ).to_be_visible()
+            expect(
+                page.get_by_text("its settings are its own").or_(page.get_by_text("settings")).first
+            ).to_be_visible()
 
             operator.choose_target("circles:7x5:10")
             operator.choose_patterns("complementary")
             operator.capture_pose()
-            watch(operator, projector, camera, "capture", lambda s: bool(s.session and s.session.poses))
+            watch(
+                operator,
+                projector,
+                camera,
+                "capture",
+                lambda s: bool(s.session and s.session.poses),
+            )
             coordinates(tmp_path / "session")
 
             operator.capture_pose()
-            watch(operator, projector, camera, "frame", lambda s: s.rig.capture is not None and s.rig.capture.frame > 3)
+            watch(
+                operator,
+                projector,
+                camera,
+                "frame",
+                lambda s: s.rig.capture is not None and s.rig.capture.frame > 3,
+            )
             projector.reload()
-            lost = watch(operator, projector, camera, "fault", lambda s: any(n.level == "error" for n in s.notices))
+            lost = watch(
+                operator,
+                projector,
+                camera,
+                "fault",
+                lambda s: any(n.level == "error" for n in s.notices),
+            )
             (fault,) = (n for n in lost.notices if n.level == "error")
             assert missing_facts(fault.text, "discarded") == []
             watch(operator, projector, camera, "open rig", lambda s: s.rig.state == "open")
@@ -95,7 +124,8 @@ def test_network_camera_captures_projector_page(browser: Browser, tmp_path: Path
 
 
 def coordinates(folder: Path) -> None:
-    """The camera looks straight at the screen, so that each pixel must read its own column and row."""
+    """The camera looks straight at the screen, so that each pixel must read its own column and
+    row."""
     capture = Session.open(folder).load_capture("pose_01")
     truth = np.meshgrid(np.arange(SCREEN[0]), np.arange(SCREEN[1]))
     for axis, own in zip(("x", "y"), truth, strict=True):

@@ -1,4 +1,5 @@
-"""The frame of the page, as someone sees it who opens it: the step, a guest, the links, the help, a failure."""
+"""The frame of the page, as someone sees it who opens it: the step, a guest, the links, the help, a
+failure."""
 
 import webbrowser
 from collections.abc import Iterator
@@ -8,7 +9,18 @@ import pytest
 import zstandard
 from facts import raises
 from playwright.sync_api import Browser, Locator, Page, expect
-from wizard_page import CALM, PATIENCE_S, RIG, Opened, button, choose, click, field, new_page, wait_until
+from wizard_page import (
+    CALM,
+    PATIENCE_S,
+    RIG,
+    Opened,
+    button,
+    choose,
+    click,
+    field,
+    new_page,
+    wait_until,
+)
 
 from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.errors import UsageError
@@ -56,12 +68,16 @@ def shared_guest(browser: Browser, app: App) -> Iterator[Opened]:
     page.context.close()
 
 
-def test_guest_sees_same_step_and_changes_nothing(opened: Opened, shared_guest: Opened, app: App) -> None:
+def test_guest_sees_same_step_and_changes_nothing(
+    opened: Opened, shared_guest: Opened, app: App
+) -> None:
     guest = shared_guest.page
     click(opened.page, "2. Target")
     expect(button(guest, "Use this board")).to_be_visible()
     shared_guest.send(lambda: click(guest, "1. Rig"), "GuiUpdateMessage")
-    click(opened.page, "Use this board")  # what the operator requests after that is all that happens
+    click(
+        opened.page, "Use this board"
+    )  # what the operator requests after that is all that happens
     expect(guest.get_by_text("In use: circles:21x16:9")).to_be_visible()
     assert app.shell.current == "target"
 
@@ -70,12 +86,18 @@ def test_refused_rig_leaves_the_one_in_use(opened: Opened, app: App, tmp_path: P
     page, operator = opened.page, app.operator
     assert operator.session is not None
     camera = {"driver": "opencv", "source": str(tmp_path / "no.avi")}
-    save_rig(operator.session, "gone", {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}})
+    save_rig(
+        operator.session,
+        "gone",
+        {"camera": camera, "projector": {"driver": "browser", "size": [640, 480]}},
+    )
     assert operator.set_hands_free(False)  # anything that has the session read anew
     click(page, "1. Rig")
     for count in (1, 2):  # it can be tried again
         choose(page, "Rig", "gone")
-        assert operator.wait_for(lambda s, n=count: sum("no.avi" in each.text for each in s.notices) == n, PATIENCE_S)  # type: ignore[misc]
+        assert operator.wait_for(
+            lambda s, n=count: sum("no.avi" in each.text for each in s.notices) == n, PATIENCE_S
+        )  # type: ignore[misc]
         expect(page.get_by_text("no.avi").first).to_be_visible()
         expect(field(page, "Rig")).to_have_value("Simulated, quarter size")
     assert operator.snapshot().rig.state == "open"
@@ -87,7 +109,9 @@ def test_camera_password_is_sent_to_operators_only(
 ) -> None:
     page, guest = opened.page, shared_guest.page
     received: list[bytes | str] = []
-    guest.on("websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame)))
+    guest.on(
+        "websocket", lambda socket: socket.on("framereceived", lambda frame: received.append(frame))
+    )
     guest.reload()
     expect(guest.get_by_text("View only")).to_be_visible()
     click(page, "1. Rig")
@@ -108,7 +132,9 @@ def unpacked(frame: bytes | str) -> str:
     """The text of a frame that viser's server sent."""
     assert isinstance(frame, bytes)
     size = int.from_bytes(frame[8:16], "little")
-    inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size], int.from_bytes(frame[:8], "little"))
+    inner = zstandard.ZstdDecompressor().decompress(
+        frame[16 : 16 + size], int.from_bytes(frame[:8], "little")
+    )
     return inner.decode("latin-1")
 
 
@@ -125,7 +151,11 @@ def test_browser_opens_one_time_link_from_private_file(
         (address,) = given
         file = Path(address.removeprefix("file://"))
         assert file.stat().st_mode & 0o777 == 0o600 and file.parent.stat().st_mode & 0o777 == 0o700
-        assert not [grant for grant in app.server.access.grants.values() if grant.token in address + file.read_text()]
+        assert not [
+            grant
+            for grant in app.server.access.grants.values()
+            if grant.token in address + file.read_text()
+        ]
         page.goto(address)
         page.wait_for_url("**/operate-*/")
         wait_until(page, lambda: not file.exists())
@@ -137,11 +167,15 @@ def test_invalid_session_folder_is_reported(opened: Opened, tmp_path: Path) -> N
     page = opened.page
     opened.enter("Folder", str(tmp_path / "a file"))
     click(page, "Open session")
-    expect(page.get_by_role("alert").filter(has_text="Error").filter(has_text="a file").first).to_be_visible()
+    expect(
+        page.get_by_role("alert").filter(has_text="Error").filter(has_text="a file").first
+    ).to_be_visible()
     assert opened.errors == []
 
 
-def test_help_opens_in_another_tab(opened: Opened, shared_guest: Opened, app: App, browser: Browser) -> None:
+def test_help_opens_in_another_tab(
+    opened: Opened, shared_guest: Opened, app: App, browser: Browser
+) -> None:
     page, operator, viewer = opened.page, app.operator, shared_guest.page
 
     def follow(link: Locator, heading: str) -> Page:
@@ -167,7 +201,11 @@ def test_help_opens_in_another_tab(opened: Opened, shared_guest: Opened, app: Ap
     address = tab.url
     tab.close()
 
-    save_verdict(operator.session, Verdict.of([Finding("moved", "rejected", "pose_03 moved", "hold it still")]), ())
+    save_verdict(
+        operator.session,
+        Verdict.of([Finding("moved", "rejected", "pose_03 moved", "hold it still")]),
+        (),
+    )
     operator.choose_target("circles:21x16:9")
     click(page, "4. Calibrate")
     finding = page.locator("a[href$='#moved']")

@@ -1,4 +1,5 @@
-"""An operation of a dozen lines is a command, a function and a job, and its figure is in every view."""
+"""An operation of a dozen lines is a command, a function and a job, and its figure is in every
+view."""
 
 import csv
 import json
@@ -50,7 +51,9 @@ def brightness(job: Job, settings: BrightnessSettings) -> Iterator[Found[Brightn
     """Measure how bright a capture is."""
     capture = job.store.load_capture(settings.capture)
     mean = 100 * float(capture.frames.mean()) / 255
-    yield Found(capture.name, Brightness(mean_percent=mean, inputs=job.store.input_hashes(capture.name)))
+    yield Found(
+        capture.name, Brightness(mean_percent=mean, inputs=job.store.input_hashes(capture.name))
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +67,9 @@ def registered() -> Iterator[None]:
 @pytest.fixture
 def session(recorded: Path, tmp_path: Path) -> Path:
     """The captures alone: certificates repeat no calibration."""
-    others = shutil.ignore_patterns("calibration", "poses", "evidence", "compiled", "plane_*", "sphere_*")
+    others = shutil.ignore_patterns(
+        "calibration", "poses", "evidence", "compiled", "plane_*", "sphere_*"
+    )
     return copy_session(recorded / "session", tmp_path / "session", others)
 
 
@@ -83,7 +88,9 @@ def test_terminal_json_csv_report_and_certificate_hold_the_figure(
     assert main(["report", str(session), "--out", str(report)]) == 0
     page = report.read_text()
     assert "Brightness" in page and "How bright captures are." in page and f">{shown}<" in page
-    assert read_certificate(report)[1].figures["brightness/object_r1"] == {"mean_percent": record["mean_percent"]}
+    assert read_certificate(report)[1].figures["brightness/object_r1"] == {
+        "mean_percent": record["mean_percent"]
+    }
     states = {check.what: check.state for check in verify_report(session, report).checks}
     assert states["brightness/object_r1"] == "same"
 
@@ -95,7 +102,9 @@ def test_python_and_wizard_store_what_the_terminal_does(session: Path, tmp_path:
     with Operator(again) as operator:
         assert operator.run("brightness", capture="object_r1")
         view = operator.wait_until_idle(HANG_S).session
-        assert view is not None and [each.record for each in view.list_records(Brightness)] == [found]
+        assert view is not None and [each.record for each in view.list_records(Brightness)] == [
+            found
+        ]
     with Session.open(session) as one, Session.open(again) as other:
         assert one.load_result("brightness/object_r1") == other.load_result("brightness/object_r1")
 

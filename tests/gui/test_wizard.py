@@ -1,4 +1,5 @@
-"""The whole wizard, as someone works with it: to a file that others can read, watched, killed, and with bad cables."""
+"""The whole wizard, as someone works with it: to a file that others can read, watched, killed, and
+with bad cables."""
 
 import logging
 import math
@@ -106,16 +107,24 @@ def test_wizard_leads_from_unknown_rig_to_merged_mesh(
         stand(page, "object")
         for name in ("scan_01", "scan_02"):
             press(page, "Capture scan", lambda n=name: bare.snapshot().scan(n) is not None)  # type: ignore[misc]
-            assert bare.wait_for(lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
+            assert bare.wait_for(
+                lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S
+            )  # type: ignore[misc]
         click(page, "7. Merge")
         click(page, "Merge 2 scans")
         expect(page.get_by_text(re.compile("in the frame of"))).to_be_visible()
         merged = session_of(bare).merge
-        assert merged is not None and merged.record.reference == "scan_02" and set(merged.record.pairs) == {"scan_01"}
+        assert (
+            merged is not None
+            and merged.record.reference == "scan_02"
+            and set(merged.record.pairs) == {"scan_01"}
+        )
         pair = merged.record.pairs["scan_01"]
         rms, overlap, T = pair.rms_mm, pair.overlap, np.array(pair.T_reference_scan)
         assert 0.0 < rms < 0.2 and overlap > 0.95
-        assert np.linalg.norm((T @ [0, 0, 600, 1])[:3] - [0, 0, 600]) < 0.5  # the object was not moved
+        assert (
+            np.linalg.norm((T @ [0, 0, 600, 1])[:3] - [0, 0, 600]) < 0.5
+        )  # the object was not moved
 
         click(page, "9. Export")
         choose(page, "Type", "mesh")
@@ -196,17 +205,22 @@ def verify(page: Page, operator: Operator) -> None:
         for model, fit in view.record.models.items()
         if fit.rms_mm is not None and fit.noise_floor_mm is not None
     }
-    assert set(rms) == {(shape, model) for shape in ("plane", "sphere") for model in ("stereo", "pixelwise")}
+    assert set(rms) == {
+        (shape, model) for shape in ("plane", "sphere") for model in ("stereo", "pixelwise")
+    }
     assert 0.8 < rms["plane", "pixelwise"] < 2.0 < rms["plane", "stereo"] < 8.0
     assert 0.8 < rms["sphere", "pixelwise"] < 2.0 < rms["sphere", "stereo"] < 5.0
 
 
 def bring(page: Page, operator: Operator, depth: float) -> None:
-    """Type a distance until what stands before the rig is there: a busy page may draw an older number over it."""
+    """Type a distance until what stands before the rig is there: a busy page may draw an older
+    number over it."""
     for _ in range(10):
         for typed in (depth + 1, depth):
             field(page, "Depth, mm").fill(str(typed))
-        if operator.wait_for(lambda s: s.world is not None and abs(s.world.T_camera_object[2, 3] - depth) < 0.5, 30.0):
+        if operator.wait_for(
+            lambda s: s.world is not None and abs(s.world.T_camera_object[2, 3] - depth) < 0.5, 30.0
+        ):
             return
     raise AssertionError(f"nothing came to {depth} mm")
 
@@ -216,27 +230,32 @@ def scan(page: Page, operator: Operator) -> None:
     click(page, "6. Scan")
     stand(page, "object")
     choose(page, "Patterns", "micro")
-    chosen = operator.wait_for(lambda s: s.session is not None and s.session.patterns == "micro", PATIENCE_S)
+    chosen = operator.wait_for(
+        lambda s: s.session is not None and s.session.patterns == "micro", PATIENCE_S
+    )
     assert chosen, "micro was chosen, the session has other patterns"
     for number, depth in enumerate(DEPTHS_MM, 1):
         bring(page, operator, depth)
         name = f"scan_{number:02d}"
         press(page, "Capture scan", lambda n=name: operator.snapshot().scan(n) is not None)  # type: ignore[misc]
-        assert operator.wait_for(lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S)  # type: ignore[misc]
+        assert operator.wait_for(
+            lambda s, n=name: (v := s.scan(n)) is not None and v.cloud == "fresh", PATIENCE_S
+        )  # type: ignore[misc]
         expect(page.get_by_text(name).first).to_be_visible()
     expect(page.get_by_text("6 poses, 5 scans")).to_be_visible()
     click_cloud_until(page, page.get_by_text("Clicked point").is_visible)
 
     click(page, "4. Calibrate")  # its curves, at a pixel of this cloud
-    # far from the click: the pixel that is shown first may be the clicked one. It also waits for this step: Scan has
-    # something called Cloud as well
+    # far from the click: the pixel that is shown first may be the clicked one. It also waits for
+    # this step: Scan has something called Cloud as well
     field(page, "Pixel u").fill("20")
     choose(page, "Cloud", "scan_01")
     click_cloud_until(page, lambda: field(page, "Pixel u").input_value() != "20")
 
 
 def click_cloud_until(page: Page, answers: Callable[[], bool]) -> None:
-    """Click on the cloud, to which the view moves by itself, until it answers; a busy machine draws it late."""
+    """Click on the cloud, to which the view moves by itself, until it answers; a busy machine draws
+    it late."""
     clicked = -math.inf
 
     def try_again() -> bool:
@@ -287,7 +306,9 @@ def take_home(page: Page, operator: Operator, folder: Path) -> None:
     merged = session_of(operator).merge
     assert merged is not None and isinstance(cloud, trimesh.PointCloud)
     assert len(cloud.vertices) == merged.record.points and np.isfinite(cloud.vertices).all()
-    assert cloud.extents == pytest.approx([141, 126, 31], abs=3)  # the ammonite's size, mm, less its steep rim
+    assert cloud.extents == pytest.approx(
+        [141, 126, 31], abs=3
+    )  # the ammonite's size, mm, less its steep rim
 
 
 def session_of(operator: Operator) -> SessionView:
@@ -300,7 +321,9 @@ def session_of(operator: Operator) -> SessionView:
 
 
 @pytest.mark.slow
-def test_viewer_sees_poses_and_changes_nothing(opened: Opened, operator: Operator, app: App, browser: Browser) -> None:
+def test_viewer_sees_poses_and_changes_nothing(
+    opened: Opened, operator: Operator, app: App, browser: Browser
+) -> None:
     operator.choose_target(TARGET)
     page, watching = opened.page, visit(browser, app.server.link("watch"))
     guest = watching.page
@@ -323,7 +346,11 @@ def test_viewer_sees_poses_and_changes_nothing(opened: Opened, operator: Operato
     expect(pose_row(guest, "pose_02", "good")).to_be_visible()
     after = operator.snapshot()
     assert app.shell.current == "poses" and not after.hands_free
-    assert after.session is not None and before.session is not None and after.session.folder == before.session.folder
+    assert (
+        after.session is not None
+        and before.session is not None
+        and after.session.folder == before.session.folder
+    )
     assert [pose.name for pose in after.session.poses] == ["pose_01", "pose_02"]
     assert opened.errors == []
     guest.context.close()
@@ -336,7 +363,16 @@ class Program:
     """`slviewer wizard` as a process of its own."""
 
     def __init__(self, session: Path, *arguments: str) -> None:
-        command = [sys.executable, "-m", "slviewer.cli", "wizard", str(session), "--port", "0", "--no-browser"]
+        command = [
+            sys.executable,
+            "-m",
+            "slviewer.cli",
+            "wizard",
+            str(session),
+            "--port",
+            "0",
+            "--no-browser",
+        ]
         self._process = subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         said = next((line for line in self._process.stdout if "slviewer is ready" in line), "")
@@ -382,7 +418,9 @@ def test_killed_capture_costs_no_earlier_pose(tmp_path: Path, browser: Browser) 
     page.context.close()
     with Session.open(tmp_path / "session") as session:
         frames = [session.load_capture(name).frames for name in session.capture_names()]
-        assert len(frames) == 2 and all(np.asarray(f).shape == np.asarray(frames[0]).shape for f in frames)
+        assert len(frames) == 2 and all(
+            np.asarray(f).shape == np.asarray(frames[0]).shape for f in frames
+        )
 
 
 # devices that fail

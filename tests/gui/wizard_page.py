@@ -4,16 +4,26 @@ import re
 import time
 from collections.abc import Callable
 
-from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, TimeoutError, ViewportSize, expect
+from playwright.sync_api import (
+    Browser,
+    ConsoleMessage,
+    Locator,
+    Page,
+    TimeoutError,
+    ViewportSize,
+    expect,
+)
 
 from slviewer.wizard.timing import Timing
 
 SIZE: ViewportSize = {"width": 1280, "height": 800}
 CALM = Timing(previews_per_s=2.0, trials=20)
-"""Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in software."""
+"""Fewer previews, and fewer places tried before one is suggested: a browser draws beside them, in
+software."""
 RIG = {"driver": "simulated", "scale": 0.25}
 PATIENCE_S = 600.0
-"""After which something hangs: a busy machine may take minutes for kernels and for a browser that draws in software."""
+"""After which something hangs: a busy machine may take minutes for kernels and for a browser that
+draws in software."""
 PATIENCE_MS = 1000 * PATIENCE_S
 SMALL_CANVAS = """
 for (const side of ["width", "height"]) {
@@ -26,7 +36,8 @@ HTMLCanvasElement.prototype.getContext = function (kind, options) {
   return getContext.call(this, kind, { ...options, antialias: false });
 };
 """
-"""Draws the scene with a sixteenth of the pixels: here they are drawn in software, and no test looks at them."""
+"""Draws the scene with a sixteenth of the pixels: here they are drawn in software, and no test
+looks at them."""
 FEW_FRAMES = """
 const nextFrame = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = draw => setTimeout(() => nextFrame(draw), 80);
@@ -36,7 +47,8 @@ window.cancelAnimationFrame = clearTimeout;
 
 
 UNKNOWN = "Tried to update non-existent component"
-"""Of viser's client, which applies the updates of a batch after its removals; seen once in thousands of pages."""
+"""Of viser's client, which applies the updates of a batch after its removals; seen once in
+thousands of pages."""
 
 
 class Opened:
@@ -61,17 +73,22 @@ class Opened:
         self._sent.append(frame if isinstance(frame, bytes) else frame.encode())
 
     def send(self, act: Callable[[], None], content: str) -> None:
-        """Do something in the page, and wait until the page has sent the server a message with this content."""
+        """Do something in the page, and wait until the page has sent the server a message with this
+        content."""
         before = len(self._sent)
         act()
-        wait_until(self.page, lambda: any(content.encode() in frame for frame in self._sent[before:]))
+        wait_until(
+            self.page, lambda: any(content.encode() in frame for frame in self._sent[before:])
+        )
 
     def enter(self, label: str, text: str) -> None:
-        """Type a text into the input beside this label, and wait until the server has it: it is sent with a delay."""
+        """Type a text into the input beside this label, and wait until the server has it: it is
+        sent with a delay."""
         self.send(lambda: field(self.page, label).fill(text), text)
 
     def _is_repeated(self) -> bool:
-        """Whether such a message came before: a handle of ours that is gone would be updated again and again."""
+        """Whether such a message came before: a handle of ours that is gone would be updated again
+        and again."""
         self._unknown += 1
         return self._unknown > 1
 
@@ -106,12 +123,14 @@ STILL = """quiet => new Promise(done => {
 
 
 def wait_until_still(page: Page, quiet_ms: float = 250) -> None:
-    """Wait until nothing on the page has changed for so long; at most some seconds where a live image is shown."""
+    """Wait until nothing on the page has changed for so long; at most some seconds where a live
+    image is shown."""
     page.evaluate(STILL, quiet_ms)
 
 
 def click(page: Page, name: str) -> None:
-    """Click the button that says so once the page stands still: what is drawn anew just then may take the click."""
+    """Click the button that says so once the page stands still: what is drawn anew just then may
+    take the click."""
     expect(button(page, name)).to_be_enabled()
     wait_until_still(page)
     button(page, name).click()
@@ -123,7 +142,8 @@ def field(page: Page, label: str) -> Locator:
 
 
 def choose(page: Page, label: str, option: str) -> None:
-    """Choose an option of the dropdown beside this label; it closes where the panel is drawn anew meanwhile."""
+    """Choose an option of the dropdown beside this label; it closes where the panel is drawn anew
+    meanwhile."""
     for _ in range(4):
         field(page, label).click()
         try:
@@ -136,7 +156,8 @@ def choose(page: Page, label: str, option: str) -> None:
 
 
 def press(page: Page, name: str, came: Callable[[], bool]) -> None:
-    """Press a button until what it asks for has come: what is drawn anew just then may take the click."""
+    """Press a button until what it asks for has come: what is drawn anew just then may take the
+    click."""
     for _ in range(4):
         button(page, name).click()
         end = time.monotonic() + 30.0
@@ -153,7 +174,8 @@ def pose_row(page: Page, name: str, state: str) -> Locator:
 
 
 def capture_pose(page: Page, name: str) -> None:
-    """Put the simulated board where it is asked for, and capture it as this pose, which must be good."""
+    """Put the simulated board where it is asked for, and capture it as this pose, which must be
+    good."""
     expect(button(page, "Place board")).to_be_enabled()
     click(page, "Place board")
     click(page, "Capture pose")
@@ -174,5 +196,6 @@ BROKEN_LABELS = """() => [...document.querySelectorAll("label, button, th, [role
 
 
 def cut_labels(page: Page) -> list[str]:
-    """Texts on the page that do not fit: cut off, or with a line break inside a word or between figure and unit."""
+    """Texts on the page that do not fit: cut off, or with a line break inside a word or between
+    figure and unit."""
     return [*page.evaluate(CUT_LABELS), *page.evaluate(BROKEN_LABELS)]

@@ -22,7 +22,9 @@ def sphere(n: int, radius: float, cap: float, sigma: float, seed: int = 0) -> np
     rng = np.random.default_rng(seed)
     c, t = rng.uniform(np.cos(cap), 1, n), rng.uniform(0, 2 * np.pi, n)
     q = np.sqrt(1 - c * c)
-    return (radius + sigma * rng.normal(size=(n, 1))) * np.stack([q * np.cos(t), q * np.sin(t), -c], 1) + MIDDLE
+    return (radius + sigma * rng.normal(size=(n, 1))) * np.stack(
+        [q * np.cos(t), q * np.sin(t), -c], 1
+    ) + MIDDLE
 
 
 def cylinder(

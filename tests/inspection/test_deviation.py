@@ -1,4 +1,5 @@
-"""Deviation from a nominal model: against analytic truth, and against the simulated object's own mesh."""
+"""Deviation from a nominal model: against analytic truth, and against the simulated object's own
+mesh."""
 
 import numpy as np
 import pytest
@@ -32,7 +33,9 @@ def looked_at(scene: MeshScene, width: int = 200) -> tuple[np.ndarray, np.ndarra
 def noisy(points: np.ndarray, seed: int = 0) -> np.ndarray:
     return (
         points
-        + points / points[..., 2:] * (NOISE * np.random.default_rng(seed).normal(size=points.shape[:2]))[..., None]
+        + points
+        / points[..., 2:]
+        * (NOISE * np.random.default_rng(seed).normal(size=points.shape[:2]))[..., None]
     )
 
 
@@ -86,7 +89,9 @@ def test_a_table_is_left_out_and_told(ammonite, found) -> None:
     again = deviation(together, nominal, normals=normals, initial=found.T_nominal_scan)
     assert again.statistics()["rms"] < 0.05
     left_out = ~again.counted[len(scan) :]
-    assert left_out.mean() > 0.97 and again.reach_mm == pytest.approx(0.02 * NominalSurface(nominal).diagonal)
+    assert left_out.mean() > 0.97 and again.reach_mm == pytest.approx(
+        0.02 * NominalSurface(nominal).diagonal
+    )
 
 
 def bumped(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -114,7 +119,10 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     points, normals = box_scan(0.01)
     R, t = rotation(np.radians([160.0, 10.0, 20.0])), np.array([10.0, -5.0, 480.0])
     found = deviation(
-        points @ R.T + t, Mesh(box.vertices, box.faces), normals=normals @ R.T, initial=np.linalg.inv(_pose(R, t))
+        points @ R.T + t,
+        Mesh(box.vertices, box.faces),
+        normals=normals @ R.T,
+        initial=np.linalg.inv(_pose(R, t)),
     )
     x, y = points[:12_000, 0] - 8, points[:12_000, 1] - 4
     plateau = np.hypot(x, y) < 0.7
@@ -122,12 +130,17 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
     height = np.nanmean(found.signed[:12_000][plateau]) - np.nanmean(found.signed[:12_000][away])
     assert height == pytest.approx(0.1, abs=0.005)
     verdict = judge_deviation(found, np.full(len(points), 0.01), 0.06)
-    assert verdict.decision == "fail" and verdict.highest[1] == "fail" and verdict.lowest[1] == "pass"
+    assert (
+        verdict.decision == "fail" and verdict.highest[1] == "fail" and verdict.lowest[1] == "pass"
+    )
     assert verdict.inside > 90 and 0.05 < verdict.outside < 5
     assert verdict.inside + verdict.outside + verdict.close == pytest.approx(100)
     assert from_plain(to_plain(verdict), ToleranceVerdict) == verdict
     assert judge_deviation(found, np.full(len(points), 0.01), 0.3).decision == "pass"
-    assert judge_deviation(found, np.full(len(points), 0.01), verdict.highest[0]).decision == "undecided"
+    assert (
+        judge_deviation(found, np.full(len(points), 0.01), verdict.highest[0]).decision
+        == "undecided"
+    )
 
 
 @pytest.mark.slow
@@ -138,9 +151,15 @@ def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
     z = np.array([-0.5, 0.5, -0.7071])  # the camera sees all three sides
     x = np.cross([0.0, 1.0, 0.0], z)
     R = np.stack([x / np.linalg.norm(x), np.cross(z, x) / np.linalg.norm(x), z])
-    scan, facing, nominal = points @ R.T + [10, -5, 480], normals @ R.T, Mesh(box.vertices, box.faces)
+    scan, facing, nominal = (
+        points @ R.T + [10, -5, 480],
+        normals @ R.T,
+        Mesh(box.vertices, box.faces),
+    )
     views = placing.VIEWS[-2:]  # corners; a box has no front
-    start = placing.search_start(scan, facing, NominalSurface(nominal), None, lambda share: None, views)
+    start = placing.search_start(
+        scan, facing, NominalSurface(nominal), None, lambda share: None, views
+    )
     found = deviation(scan, nominal, normals=facing, initial=start.T_reference_scan)
     assert 0.0095 < found.statistics()["rms"] < 0.0125 and found.statistics()["left_out"] < 100
 
@@ -167,7 +186,11 @@ def test_an_open_nominal_has_two_sides_and_nothing_beyond_its_rim() -> None:
     sheet = Mesh([[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]], [[0, 1, 2], [0, 2, 3]])
     surface = NominalSurface(sheet)
     away, _ = surface.signed(np.array([[0, 0, 0.3], [3, 4, -0.2], [12.0, 0, 0.1], [10.05, 0, 0.3]]))
-    assert away[:2] == pytest.approx([0.3, -0.2], abs=1e-5) and away[2] == np.inf and np.isfinite(away[3])
+    assert (
+        away[:2] == pytest.approx([0.3, -0.2], abs=1e-5)
+        and away[2] == np.inf
+        and np.isfinite(away[3])
+    )
 
 
 def test_round_sharp_corners_of_a_closed_nominal_nothing_is_beyond() -> None:
@@ -188,20 +211,33 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
 
 
 def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
-    monkeypatch.setattr(placing, "register_prepared", lambda *given, **options: pytest.fail("a pose was refined"))
+    monkeypatch.setattr(
+        placing, "register_prepared", lambda *given, **options: pytest.fail("a pose was refined")
+    )
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
     box = trimesh.creation.box((120, 100, 70))
     other = NominalSurface(Mesh(box.vertices, box.faces))
     with raises(Refused, "nominal model", "%") as refusal:
-        placing.search_start(points[seen][::3], normals[seen][::3], other, None, lambda share: None, placing.VIEWS[:2])
+        placing.search_start(
+            points[seen][::3],
+            normals[seen][::3],
+            other,
+            None,
+            lambda share: None,
+            placing.VIEWS[:2],
+        )
     assert refusal.value.reason == "overlap"
     with raises(InputError, "triangles"):
         NominalSurface(Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)))
 
 
 def test_colours_run_from_blue_through_pale_to_red() -> None:
-    blue, pale, red, more, unknown = deviation_colours(np.array([-0.1, 0.0, 0.1, 0.5, np.nan]), 0.1).tolist()
+    blue, pale, red, more, unknown = deviation_colours(
+        np.array([-0.1, 0.0, 0.1, 0.5, np.nan]), 0.1
+    ).tolist()
     assert blue[2] > 2 * blue[0] and min(pale) > 200 and red[0] > 3 * red[2]
     assert more == red and tuple(unknown) == EXCLUDED_COLOUR
-    assert colour_limit(np.array([np.nan, 1.0]), 0.2) == 0.2 and colour_limit(np.full(9, -0.3)) == pytest.approx(0.3)
+    assert colour_limit(np.array([np.nan, 1.0]), 0.2) == 0.2 and colour_limit(
+        np.full(9, -0.3)
+    ) == pytest.approx(0.3)

@@ -1,4 +1,5 @@
-"""Shapes fitted to regions: right within what they say of themselves, and refused where the region holds another."""
+"""Shapes fitted to regions: right within what they say of themselves, and refused where the region
+holds another."""
 
 import json
 
@@ -23,15 +24,21 @@ def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     sigma = found.spread.sigmas[3]
     assert abs(found.feature.radius - 50.0) < 3 * sigma and 0.002 < sigma < 0.03
     assert np.linalg.norm(found.feature.place - MIDDLE) < 0.06
-    assert 0.028 < found.rms < 0.032 and 0.11 < found.form < 0.125  # 95 % of a normal's width: 3.92 sigma
+    assert (
+        0.028 < found.rms < 0.032 and 0.11 < found.form < 0.125
+    )  # 95 % of a normal's width: 3.92 sigma
     assert found.rms < abs(found.maximum) < 0.2
-    assert 0.13 < found.left_out / 6000 < 0.15 and missing_facts(found.warnings[0], "excluded") == []
+    assert (
+        0.13 < found.left_out / 6000 < 0.15 and missing_facts(found.warnings[0], "excluded") == []
+    )
     radius, diameter, *_ = found.quantities()
     assert diameter.value == 2 * radius.value and abs(diameter.U / sigma - 4) < 0.05
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("length", "arc"), [(50.0, 6.2), (50.0, 0.7), (5.0, 2.5)], ids=["round", "narrow", "short"])
+@pytest.mark.parametrize(
+    ("length", "arc"), [(50.0, 6.2), (50.0, 0.7), (5.0, 2.5)], ids=["round", "narrow", "short"]
+)
 def test_a_cylinder_is_found_from_anywhere(length: float, arc: float) -> None:
     points, axis = cylinder(6000, 20.0, length, arc, 0.03)
     found = fit_feature("cylinder", strewn(points, 0.1))
@@ -66,7 +73,9 @@ def test_a_plane_with_strays_is_level_within_its_uncertainty() -> None:
         ("point", plane(200, 30.0, 0.03), ("point", "picked")),
     ],
 )  # fmt: skip
-def test_a_region_that_holds_another_shape_is_refused_with_what_it_holds(kind, points, facts) -> None:
+def test_a_region_that_holds_another_shape_is_refused_with_what_it_holds(
+    kind, points, facts
+) -> None:
     with raises(InputError, *facts):
         fit_feature(kind, points)
 
@@ -112,7 +121,9 @@ def test_a_features_parameters_move_it_as_its_jacobian_says(kind) -> None:
     for k in range(feature.parameters):
         step = np.zeros(feature.parameters)
         step[k] = 1e-6
-        numeric = (feature.moved(step).distance(points) - feature.moved(-step).distance(points)) / 2e-6
+        numeric = (
+            feature.moved(step).distance(points) - feature.moved(-step).distance(points)
+        ) / 2e-6
         assert np.allclose(numeric, J[:, k], atol=1e-5)
 
 
@@ -123,4 +134,9 @@ def test_a_saved_fit_gives_the_same_feature_and_quantities() -> None:
     assert feature.radius == fit.feature.radius and np.array_equal(feature.place, fit.feature.place)
     quantities = from_plain(json.loads(to_json(fit.quantities())), list[Quantity])
     assert quantities == fit.quantities()
-    assert missing_facts(quantities[0].text(), "radius", f"{quantities[0].value:.4f}", f"{quantities[0].U:.4f}") == []
+    assert (
+        missing_facts(
+            quantities[0].text(), "radius", f"{quantities[0].value:.4f}", f"{quantities[0].U:.4f}"
+        )
+        == []
+    )

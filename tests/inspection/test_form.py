@@ -17,7 +17,9 @@ pytestmark = pytest.mark.computes
 N, NOISE = 3000, 0.02
 
 
-def plate(seed: int, bow: float = 0.0, slope: float = 0.0, noise: float = NOISE, upright: bool = False) -> np.ndarray:
+def plate(
+    seed: int, bow: float = 0.0, slope: float = 0.0, noise: float = NOISE, upright: bool = False
+) -> np.ndarray:
     """A plate of 40 x 40 mm, bowed by so much from its middle to its corners."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-20, 20, (N, 3))
@@ -62,8 +64,11 @@ def test_lobes_are_roundness_and_cylindricity() -> None:
 def test_a_tilted_plate_is_out_of_parallel_by_its_rise() -> None:
     below = fit_feature("plane", plate(5))
     tilted, side = plate(6, slope=0.002), plate(7, slope=0.002, upright=True)
-    assert_covers(orientation_error("parallelism", fit_feature("plane", tilted), tilted, below), 0.08, 0.03)
-    # the side leans along the datum alone, so that it is out of square only by its rise along the datum's normal
+    assert_covers(
+        orientation_error("parallelism", fit_feature("plane", tilted), tilted, below), 0.08, 0.03
+    )
+    # the side leans along the datum alone, so that it is out of square only by its rise along the
+    # datum's normal
     upright = orientation_error("perpendicularity", fit_feature("plane", side), side, below)
     assert upright.U is not None and upright.value < 0.05
     with raises(InputError, "degrees", "parallelism"):
@@ -72,7 +77,9 @@ def test_a_tilted_plate_is_out_of_parallel_by_its_rise() -> None:
 
 def test_an_axis_is_out_of_square_by_its_lean() -> None:
     points = cylinder(8, 0.0, tilt=0.004)
-    q = orientation_error("perpendicularity", fit_feature("cylinder", points), points, fit_feature("plane", plate(9)))
+    q = orientation_error(
+        "perpendicularity", fit_feature("cylinder", points), points, fit_feature("plane", plate(9))
+    )
     assert_covers(q, 0.004 * 30, 0.03)
 
 
@@ -81,14 +88,18 @@ def test_position_is_the_diameter_of_the_zone() -> None:
     c, t = rng.uniform(np.cos(1.0), 1, N), rng.uniform(0, 2 * np.pi, N)
     out = np.stack([np.sqrt(1 - c**2) * np.cos(t), np.sqrt(1 - c**2) * np.sin(t), c], 1)
     points = (10 + NOISE * rng.normal(size=(N, 1))) * out + [0.03, 0.02, 0.01]
-    q = position_error(fit_feature("sphere", points), points, Feature("sphere", np.zeros(3), None, 10.0))
+    q = position_error(
+        fit_feature("sphere", points), points, Feature("sphere", np.zeros(3), None, 10.0)
+    )
     assert_covers(q, 2 * np.linalg.norm([0.03, 0.02, 0.01]), 0.015)
 
 
 def test_profile_is_twice_the_largest_deviation() -> None:
     points = plate(11, bow=0.1)
     nominal = Feature("plane", np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    assert_covers(profile_error(points, nominal.distance(points), nominal.normals(points)), 0.2, 0.06)
+    assert_covers(
+        profile_error(points, nominal.distance(points), nominal.normals(points)), 0.2, 0.06
+    )
 
 
 def test_a_dent_too_fine_for_the_smooth_part_widens_the_uncertainty() -> None:
@@ -109,7 +120,8 @@ def test_too_few_points_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "decision"), [(5.0, "pass"), (5.95, "undecided"), (6.05, "undecided"), (6.2, "fail"), (3.8, "fail")]
+    ("value", "decision"),
+    [(5.0, "pass"), (5.95, "undecided"), (6.05, "undecided"), (6.2, "fail"), (3.8, "fail")],
 )
 def test_limits_are_decided_with_a_guard_band(value: float, decision: str) -> None:
     assert judge_limits(value, 0.1, 4.0, 6.0) == decision
@@ -117,7 +129,9 @@ def test_limits_are_decided_with_a_guard_band(value: float, decision: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["flatness", "roundness", "cylindricity", "parallelism", "position", "profile"])
+@pytest.mark.parametrize(
+    "kind", ["flatness", "roundness", "cylindricity", "parallelism", "position", "profile"]
+)
 def test_uncertainty_covers_the_truth_of_drawn_parts(kind: str) -> None:
     cases = [CASES[kind](40, np.random.default_rng([77, i])) for i in range(30)]
     errors = np.array([(q.value - truth) / (q.U or np.inf) for truth, q in cases])

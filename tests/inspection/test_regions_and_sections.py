@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.inspection.regions import Region
-from slviewer.inspection.section import CutPlane, measure_cursors, nearest_on_section, radius_through, section
+from slviewer.inspection.section import (
+    CutPlane,
+    measure_cursors,
+    nearest_on_section,
+    radius_through,
+    section,
+)
 from slviewer.records.plain import from_plain, to_plain
 
 
@@ -19,8 +25,12 @@ def test_regions_hold_the_points_they_were_made_of() -> None:
     points[3] = np.nan
     finite = np.isfinite(points[..., 0])
     ball, box = Region.ball([0, 0, 0], 3.0), Region.box([1, 1, 1], [-2, -2, -2])
-    assert np.array_equal(ball.within(points), finite & (np.linalg.norm(np.nan_to_num(points), axis=-1) <= 3))
-    assert np.array_equal(box.within(points), finite & ((points >= -2) & (points <= 1)).all(axis=-1))
+    assert np.array_equal(
+        ball.within(points), finite & (np.linalg.norm(np.nan_to_num(points), axis=-1) <= 3)
+    )
+    assert np.array_equal(
+        box.within(points), finite & ((points >= -2) & (points <= 1)).all(axis=-1)
+    )
     plain = {"kind": "ball", "centre": [1.0, 2.0, 3.0], "size": [4.0], "axes": None}
     assert to_plain(Region.ball([1, 2, 3], 4.0)) == plain
 
@@ -51,9 +61,9 @@ def test_a_ball_is_cut_in_a_circle_that_its_cursors_read() -> None:
     a, b, c = line[[0, 40, 90]]
     assert radius_through(a, b, c).value == pytest.approx(32.0, abs=0.3)
     top = nearest_on_section([line], 1.0)
-    assert top[1] == pytest.approx(32.0, abs=0.2) and nearest_on_section([line], 1.0, -20)[1] == pytest.approx(
-        -32.0, abs=0.2
-    )
+    assert top[1] == pytest.approx(32.0, abs=0.2) and nearest_on_section([line], 1.0, -20)[
+        1
+    ] == pytest.approx(-32.0, abs=0.2)
     read = {q.name: q.value for q in measure_cursors(np.array([0.0, 1.0]), np.array([3.0, 5.0]))}
     assert read == {"distance": 5.0, "along": 3.0, "height difference": 4.0}
 
@@ -67,10 +77,16 @@ def test_an_open_surface_is_cut_in_lines_from_left_to_right_the_longest_first() 
     faces, vertices = triangulate_grid(points, 50.0), points[np.isfinite(points[..., 0])]
     plane = CutPlane.through([0, 12.5, 500], [10, 12.5, 500], [0, 0, -1])
     lines = section(vertices, faces, plane)
-    assert [len(line) > 5 for line in lines] == [True, True] and np.ptp(lines[0][:, 0]) == 24 > np.ptp(lines[1][:, 0])
+    assert [len(line) > 5 for line in lines] == [True, True] and np.ptp(
+        lines[0][:, 0]
+    ) == 24 > np.ptp(lines[1][:, 0])
     for line in lines:
-        assert (np.diff(line[:, 0]) > 0).all() and np.allclose(line[:, 1], 2 * np.sin(line[:, 0] / 5), atol=0.03)
-    assert from_plain(json.loads(json.dumps(to_plain(plane))), CutPlane).normal == pytest.approx(plane.normal)
+        assert (np.diff(line[:, 0]) > 0).all() and np.allclose(
+            line[:, 1], 2 * np.sin(line[:, 0] / 5), atol=0.03
+        )
+    assert from_plain(json.loads(json.dumps(to_plain(plane))), CutPlane).normal == pytest.approx(
+        plane.normal
+    )
 
 
 def test_sections_that_cannot_be_are_refused() -> None:
@@ -96,4 +112,6 @@ def test_a_box_along_a_view_holds_its_points_and_keeps_its_axes() -> None:
     assert not region.within(beyond).any()
     stored = from_plain({k: v for k, v in to_plain(region).items()}, Region)
     assert np.allclose(stored.axes, axes) and stored.within(inside).all()
-    assert np.linalg.norm(region.edges()[:, 0] - region.edges()[:, 1], axis=1).max() == pytest.approx(20, rel=0.02)
+    assert np.linalg.norm(
+        region.edges()[:, 0] - region.edges()[:, 1], axis=1
+    ).max() == pytest.approx(20, rel=0.02)

@@ -37,19 +37,27 @@ def test_every_pair_of_kinds_has_its_meaning_in_either_order() -> None:
 
 def test_figures_that_can_be_told_by_hand() -> None:
     assert read(point, Feature("point", B)) == {"distance": 50.0}
-    assert read(point, ball) == pytest.approx({"distance from the centre": 50.0, "distance from the surface": 40.0})
+    assert read(point, ball) == pytest.approx(
+        {"distance from the centre": 50.0, "distance from the surface": 40.0}
+    )
     assert read(Feature("point", A - 7 * Z), flat) == {"height": 7.0}
     assert read(flat, other) == pytest.approx({"angle": 0.0, "distance": 5.0})
     tilted = Feature("plane", B, -Z * np.cos(0.1) + X * np.sin(0.1))
     assert read(flat, tilted)["angle"] == pytest.approx(np.degrees(0.1))
     assert read(flat, ball) == pytest.approx({"height of the centre": 0.0, "gap": -10.0})
     assert read(flat, rod) == pytest.approx({"angle": 0.0, "height of the axis": 0.0})
-    assert read(ball, Feature("sphere", A, None, 5.0)) == pytest.approx({"distance of the centres": 50.0, "gap": 35.0})
-    assert read(point, rod) == pytest.approx({"distance from the axis": 40.0, "distance from the surface": 36.0})
+    assert read(ball, Feature("sphere", A, None, 5.0)) == pytest.approx(
+        {"distance of the centres": 50.0, "gap": 35.0}
+    )
+    assert read(point, rod) == pytest.approx(
+        {"distance from the axis": 40.0, "distance from the surface": 36.0}
+    )
     crossing = Feature("cylinder", B + 12 * Z + 99 * Y, Y, 3.0)
     assert read(rod, crossing) == pytest.approx({"angle": 90.0, "distance of the axes": 12.0})
     beside = Feature("cylinder", B + 9 * Y + 70 * X, X * np.cos(0.02) + Z * np.sin(0.02), 3.0)
-    assert read(rod, beside)["distance of the axes"] == pytest.approx(9.05, abs=0.06)  # in the middle of the regions
+    assert read(rod, beside)["distance of the axes"] == pytest.approx(
+        9.05, abs=0.06
+    )  # in the middle of the regions
 
 
 def test_a_distances_uncertainty_is_that_along_it() -> None:
@@ -58,7 +66,9 @@ def test_a_distances_uncertainty_is_that_along_it() -> None:
     none = Spread(np.zeros((3, 3)))
     found = distance(A, B, sure_across, none)
     assert found.value == pytest.approx(50.0) and found.sigma == pytest.approx(0.05)
-    assert missing_facts(found.text(), "50.0000 ± 0.1000 mm", "k = 2", "without", "calibration") == []
+    assert (
+        missing_facts(found.text(), "50.0000 ± 0.1000 mm", "k = 2", "without", "calibration") == []
+    )
     assert replace(found, whole=True).text().endswith("50.0000 ± 0.1000 mm (k = 2)")
     across = np.cross(along, Z)
     assert distance(A, B, Spread(0.05**2 * np.outer(across, across)), none).sigma < 1e-4
@@ -75,4 +85,6 @@ def test_what_one_calibration_leaves_uncertain_of_both_cancels() -> None:
 def test_an_angle_of_zero_has_an_uncertainty() -> None:
     found = relation(flat, spread(flat, 1e-3), other, spread(other, 1e-3))[0]
     assert found.value == pytest.approx(0.0, abs=1e-9) and 0.05 < found.sigma < 0.2  # degrees
-    assert propagate_covariance(lambda step: float(np.linalg.norm(step)), np.diag([9.0, 0.0])) == pytest.approx(3.0)
+    assert propagate_covariance(
+        lambda step: float(np.linalg.norm(step)), np.diag([9.0, 0.0])
+    ) == pytest.approx(3.0)

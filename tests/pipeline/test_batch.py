@@ -1,4 +1,5 @@
-"""`slviewer batch` with a real Dask scheduler and real worker processes: as alone, also when one of them is killed.
+"""`slviewer batch` with a real Dask scheduler and real worker processes: as alone, also when one of
+them is killed.
 
 By default one test has its workers in this process, and one starts its own; the others are slow.
 """
@@ -40,7 +41,8 @@ SPHERES, PLANES = ("sphere_1", "sphere_3"), ("plane_03", "plane_04", "plane_05")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of two spheres and three planes whose imported calibration is the truth; read-only."""
+    """A session of two spheres and three planes whose imported calibration is the truth;
+    read-only."""
     folder = tmp_path_factory.mktemp("batch") / "session"
     rig = letter(0.15, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
@@ -49,7 +51,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save_true_stereo(store, rig)
         for i, name in enumerate((*SPHERES, *PLANES)):
             store.save_capture(
-                name, "scan", sequence, Renderer(rig, plan[name]).capture(sequence, i), source="simulated"
+                name,
+                "scan",
+                sequence,
+                Renderer(rig, plan[name]).capture(sequence, i),
+                source="simulated",
             )
         save_sound_checks(store)
     return folder
@@ -57,7 +63,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def clouds(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The clouds that `reconstruct` alone makes; the machine code of all workers is compiled then too."""
+    """The clouds that `reconstruct` alone makes; the machine code of all workers is compiled then
+    too."""
     out = tmp_path_factory.mktemp("clouds")
     for name in (*SPHERES, *PLANES):
         reconstruct(made, name, out=out / f"{name}_stereo.ply")
@@ -76,7 +83,9 @@ def meshes(made: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, by
 @pytest.fixture
 def session(made: Path, tmp_path: Path) -> Path:
     """A copy to work in."""
-    return Path(shutil.copytree(made, tmp_path / "session", ignore=shutil.ignore_patterns("exports")))
+    return Path(
+        shutil.copytree(made, tmp_path / "session", ignore=shutil.ignore_patterns("exports"))
+    )
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -88,13 +97,24 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 class Cluster:
-    """A scheduler and two workers as ``dask scheduler`` and ``dask worker`` start them, on loopback."""
+    """A scheduler and two workers as ``dask scheduler`` and ``dask worker`` start them, on
+    loopback."""
 
     def __init__(self, folder: Path):
         self.file = folder / "scheduler.json"
         self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
-        where = ("--nthreads", "1", "--no-nanny", "--local-directory", str(folder), "--host", "127.0.0.1")
-        self.workers = {name: self._start("worker", "--name", name, *where) for name in ("victim", "other")}
+        where = (
+            "--nthreads",
+            "1",
+            "--no-nanny",
+            "--local-directory",
+            str(folder),
+            "--host",
+            "127.0.0.1",
+        )
+        self.workers = {
+            name: self._start("worker", "--name", name, *where) for name in ("victim", "other")
+        }
 
     def ready(self) -> None:
         """Wait until both workers can be given work."""
@@ -106,7 +126,9 @@ class Cluster:
     def given(self, name: str) -> int:
         """How many tasks a worker was given and has not answered."""
         with Client(self.address, set_as_default=False) as client:
-            addresses = {w["name"]: address for address, w in client.scheduler_info()["workers"].items()}
+            addresses = {
+                w["name"]: address for address, w in client.scheduler_info()["workers"].items()
+            }
             return len(client.processing()[addresses[name]])
 
     def end(self) -> None:
@@ -115,14 +137,24 @@ class Cluster:
             process.wait()
 
     def _start(self, what: str, *arguments: str) -> subprocess.Popen[bytes]:
-        program = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--scheduler-file", str(self.file)]
+        program = [
+            sys.executable,
+            "-m",
+            f"distributed.cli.dask_{what}",
+            "--scheduler-file",
+            str(self.file),
+        ]
         return subprocess.Popen(
-            [*program, "--no-dashboard", *arguments], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            [*program, "--no-dashboard", *arguments],
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
         )
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory, clouds: dict[str, bytes]) -> Iterator[Cluster]:
+def cluster(
+    tmp_path_factory: pytest.TempPathFactory, clouds: dict[str, bytes]
+) -> Iterator[Cluster]:
     found = Cluster(tmp_path_factory.mktemp("dask"))
     try:
         found.ready()
@@ -148,10 +180,16 @@ def made_in(session: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
-    "scheduler", ["threads", pytest.param("processes", marks=[pytest.mark.process, pytest.mark.slow])], indirect=True
+    "scheduler",
+    ["threads", pytest.param("processes", marks=[pytest.mark.process, pytest.mark.slow])],
+    indirect=True,
 )
 def test_a_batch_makes_what_the_commands_make_and_names_what_failed(
-    session: Path, tmp_path: Path, clouds: dict[str, bytes], scheduler: str, capsys: pytest.CaptureFixture[str]
+    session: Path,
+    tmp_path: Path,
+    clouds: dict[str, bytes],
+    scheduler: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     remote = Path(shutil.copytree(session, tmp_path / "remote"))
     (session / "captures" / "plane_04" / "frames.zarr" / "c.3.0.0").unlink()
@@ -161,7 +199,9 @@ def test_a_batch_makes_what_the_commands_make_and_names_what_failed(
     assert main(["batch", *where, "--do", "reconstruct", *arguments]) == 1
     said = capsys.readouterr()
     assert made_in(remote) == clouds
-    assert made_in(session) == {name: data for name, data in clouds.items() if not name.startswith("plane_04")}
+    assert made_in(session) == {
+        name: data for name, data in clouds.items() if not name.startswith("plane_04")
+    }
     failed = [line for line in said.out.splitlines() if line.startswith("failed: ")]
     assert len(failed) == 2 and not missing_facts(said.out, "9 captures", "2 failed")
     for facts in ((session, "plane_04"), (tmp_path / "nowhere",)):
@@ -175,9 +215,13 @@ def test_a_batch_makes_what_the_commands_make_and_names_what_failed(
 @pytest.mark.process
 @pytest.mark.slow
 def test_verifications_of_a_session_become_one(session: Path, made: Path, cluster: Cluster) -> None:
-    found = batch([session], "verify", captures=["sphere_*"], shape="sphere", scheduler=cluster.address)
+    found = batch(
+        [session], "verify", captures=["sphere_*"], shape="sphere", scheduler=cluster.address
+    )
     assert not found.failed and [done.capture for done in found.done] == list(SPHERES)
-    alone = json.loads(json.dumps(verify(made, SPHERES, "sphere").to_json(), default=to_plain))["verify"]
+    alone = json.loads(json.dumps(verify(made, SPHERES, "sphere").to_json(), default=to_plain))[
+        "verify"
+    ]
     (written,) = made_in(session).values()
     together = json.loads(written)["verify"]
     assert list(together) == list(SPHERES)
@@ -187,23 +231,30 @@ def test_verifications_of_a_session_become_one(session: Path, made: Path, cluste
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_a_cancelled_batch_leaves_whole_files(session: Path, clouds: dict[str, bytes], cluster: Cluster) -> None:
+def test_a_cancelled_batch_leaves_whole_files(
+    session: Path, clouds: dict[str, bytes], cluster: Cluster
+) -> None:
     def stop(done: float, doing: str) -> None:
         if done > 0:
             raise Cancelled("stopped")
 
     with raises(Cancelled):
         batch([session], "reconstruct", scheduler=cluster.address, progress=stop)
-    # the scheduler forgets a cancelled piece at once; a worker in the middle of one ends it, and clears up
+    # the scheduler forgets a cancelled piece at once; a worker in the middle of one ends it, and
+    # clears up
     with Client(cluster.address, set_as_default=False) as client:
-        until(lambda: not any(client.run(lambda dask_worker: len(dask_worker.state.tasks)).values()))
+        until(
+            lambda: not any(client.run(lambda dask_worker: len(dask_worker.state.tasks)).values())
+        )
     found = made_in(session)
     assert found and found.items() < clouds.items()
 
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_a_killed_worker_costs_a_retry(session: Path, meshes: dict[str, bytes], cluster: Cluster) -> None:
+def test_a_killed_worker_costs_a_retry(
+    session: Path, meshes: dict[str, bytes], cluster: Cluster
+) -> None:
     victim, lost = cluster.workers["victim"], []
 
     def kill(done: float, doing: str) -> None:
@@ -222,13 +273,17 @@ def test_a_killed_worker_costs_a_retry(session: Path, meshes: dict[str, bytes], 
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.computes
-def test_workers_of_its_own(session: Path, clouds: dict[str, bytes], capsys: pytest.CaptureFixture[str]) -> None:
+def test_workers_of_its_own(
+    session: Path, clouds: dict[str, bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["batch", str(session), "--do", "reconstruct", "--captures", "plane_03"]) == 0
     assert not missing_facts(capsys.readouterr().out, "1 captures", "0 failed")
     assert made_in(session) == {"plane_03_stereo.ply": clouds["plane_03_stereo.ply"]}
 
 
-def test_a_batch_that_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_that_cannot_begin_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with raises(UsageError, "--shape"):
         batch([tmp_path], "verify")
     with raises(UsageError, "--do verify"):

@@ -1,4 +1,5 @@
-"""Where workers of a batch deliver: many into the same exports at once, some of which die on the way."""
+"""Where workers of a batch deliver: many into the same exports at once, some of which die on the
+way."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -35,7 +36,9 @@ def test_two_attempts_at_one_piece_share_nothing(tmp_path: Path) -> None:
         list(pool.map(attempt, (1, 2)))
     found = {path.name: path.read_bytes() for path in (tmp_path / "exports").iterdir()}
     assert sorted(found) == sorted(names), "nothing is left of either"
-    assert all(content in (b"\1" * 50_000, b"\2" * 50_000) for content in found.values()), "each file is of one attempt"
+    assert all(content in (b"\1" * 50_000, b"\2" * 50_000) for content in found.values()), (
+        "each file is of one attempt"
+    )
 
 
 def test_what_a_killed_worker_leaves_goes_with_its_batch_alone(tmp_path: Path) -> None:

@@ -42,8 +42,14 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_a_camera_is_calibrated_from_pictures(pictures: Path, run: Run, tmp_path: Path) -> None:
     out, found = tmp_path / "camera.yml", tmp_path / "camera.json"
-    status, text, error = run("calibrate", pictures, "--target", BOARD, "--camera-only", "--out", out, "--json", found)
-    assert status == 0 and not missing_facts(text, "good", "wall.png") and not missing_facts(error, "wall.png")
+    status, text, error = run(
+        "calibrate", pictures, "--target", BOARD, "--camera-only", "--out", out, "--json", found
+    )
+    assert (
+        status == 0
+        and not missing_facts(text, "good", "wall.png")
+        and not missing_facts(error, "wall.png")
+    )
     data = json.loads(found.read_text())
     K, true = np.array(data["K_camera"]), np.array(rig_record(RIG)["camera"]["K"])
     assert 0.005 < data["reprojection_rms_px"] < 0.05
@@ -54,6 +60,10 @@ def test_a_camera_is_calibrated_from_pictures(pictures: Path, run: Run, tmp_path
 
 
 def test_pictures_are_chosen_and_too_few_are_refused(pictures: Path, run: Run) -> None:
-    status, _, error = run("calibrate", pictures, "--target", BOARD, "--camera-only", "--poses", "board_[01].png")
+    status, _, error = run(
+        "calibrate", pictures, "--target", BOARD, "--camera-only", "--poses", "board_[01].png"
+    )
     assert status == 3 and not missing_facts(error, "2 usable poses")
-    assert run("calibrate", pictures, "--target", BOARD, "--camera-only", "--exclude", "none*")[0] == 2
+    assert (
+        run("calibrate", pictures, "--target", BOARD, "--camera-only", "--exclude", "none*")[0] == 2
+    )

@@ -34,12 +34,22 @@ def bench() -> FaultBench:
 
 def fill(folder: Path, bench: FaultBench, period_px: float = 18.0, force: bool = False) -> None:
     """Save the poses, their fringes described as of this period."""
-    frames = tuple(replace(f, period_px=period_px) if f.kind == "phase" else f for f in bench.sequence.frames)
+    frames = tuple(
+        replace(f, period_px=period_px) if f.kind == "phase" else f for f in bench.sequence.frames
+    )
     sequence = replace(bench.sequence, frames=frames)
     with Session.open_or_create(folder) as store:
         for i in range(POSES):
             name = f"pose_{i:02d}"
-            store.save_capture(name, "calibration", sequence, bench.frames(i), source="test", board=BOARD, force=force)
+            store.save_capture(
+                name,
+                "calibration",
+                sequence,
+                bench.frames(i),
+                source="test",
+                board=BOARD,
+                force=force,
+            )
 
 
 @pytest.fixture
@@ -60,26 +70,39 @@ def made(bench: FaultBench, tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_a_verdict_is_told_and_kept(session: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "found.json"
-    status, text, _ = run("calibrate", session, "--target", BOARD, "--models", "stereo", "--json", out)
+    status, text, _ = run(
+        "calibrate", session, "--target", BOARD, "--models", "stereo", "--json", out
+    )
     assert status == 0 and not missing_facts(text, "good")
     assert json.loads(out.read_text())["verdict"] == {"level": "good", "findings": []}
     assert not missing_facts(run("inspect", session)[1], "verdict", "good")
     with Session.open(session) as store:
-        assert store.state_of("calibration/verdict") == "fresh" and store.state_of("evidence/pose_01") == "fresh"
+        assert (
+            store.state_of("calibration/verdict") == "fresh"
+            and store.state_of("evidence/pose_01") == "fresh"
+        )
         assert rejection_reason(store) == ""
 
 
-def test_a_rejected_calibration_is_refused_by_every_command(session: Path, tmp_path: Path, run: Run) -> None:
+def test_a_rejected_calibration_is_refused_by_every_command(
+    session: Path, tmp_path: Path, run: Run
+) -> None:
     finding = Finding("fringe-period", "rejected", "the period differs", "set period_px = 16")
     with Session.open(session, write=True) as store:
         stereo = load_stereo(store)
         save_rejected(store, stereo, {}, Verdict((finding,)), tuple(stereo.poses))
         verdict = load_last_verdict(store)
-        assert verdict is not None and verdict.level == "rejected" and verdict.causes == ("fringe-period",)
+        assert (
+            verdict is not None
+            and verdict.level == "rejected"
+            and verdict.causes == ("fringe-period",)
+        )
         assert available_models(store) == ("stereo",)
         assert "period_px" in rejection_reason(store)
     refuse(session, "pose_01", "pose_02", tmp_path / "cloud.ply", run)
-    status, _, error = run("reconstruct", session, "pose_01", "--out", tmp_path / "cloud.ply", "--accept-rejected")
+    status, _, error = run(
+        "reconstruct", session, "pose_01", "--out", tmp_path / "cloud.ply", "--accept-rejected"
+    )
     assert status == 0 and missing_facts(error, "rejected")
 
 
@@ -92,20 +115,30 @@ def refuse(session: Path, pose: str, other: str, ply: Path, run: Run) -> None:
         ("merge", session, pose, other, "--reference", pose, "--out", ply),
     ):
         status, _, error = run(*command)
-        assert status == 3 and not missing_facts(error, "rejected", "--accept-rejected", "period_px")
+        assert status == 3 and not missing_facts(
+            error, "rejected", "--accept-rejected", "period_px"
+        )
     assert not ply.exists()
 
 
 @pytest.mark.slow
-def test_a_rejected_calibration_is_kept_and_refused(bench: FaultBench, made: Path, tmp_path: Path, run: Run) -> None:
+def test_a_rejected_calibration_is_kept_and_refused(
+    bench: FaultBench, made: Path, tmp_path: Path, run: Run
+) -> None:
     session, ply = made, tmp_path / "cloud.ply"
     fill(session, bench, period_px=16.0, force=True)
     status, _, error = run("calibrate", session, "--target", BOARD)
     assert status == 3 and not missing_facts(error, "16 px")
     with Session.open(session) as store:
         verdict = load_last_verdict(store)
-        assert verdict is not None and verdict.level == "rejected" and verdict.causes[0] == "fringe-period"
-        assert available_models(store) == ("stereo",)  # those of the poses before do not belong to it
+        assert (
+            verdict is not None
+            and verdict.level == "rejected"
+            and verdict.causes[0] == "fringe-period"
+        )
+        assert available_models(store) == (
+            "stereo",
+        )  # those of the poses before do not belong to it
         assert "period_px" in rejection_reason(store)
     refuse(session, "pose_00", "pose_01", ply, run)
     pose = ("pose_00", "--out", ply)
@@ -120,8 +153,12 @@ def test_a_rejected_calibration_is_kept_and_refused(bench: FaultBench, made: Pat
 
 
 @pytest.mark.slow
-def test_where_nothing_came_of_it_the_session_keeps_what_it_had(session: Path, tmp_path: Path, run: Run) -> None:
-    status, _, error = run("calibrate", session, "--target", "circles:20x16:9", "--poses", "pose_0[1-4]")
+def test_where_nothing_came_of_it_the_session_keeps_what_it_had(
+    session: Path, tmp_path: Path, run: Run
+) -> None:
+    status, _, error = run(
+        "calibrate", session, "--target", "circles:20x16:9", "--poses", "pose_0[1-4]"
+    )
     assert status == 3 and not missing_facts(error, "21x16", "20x16")
     with Session.open(session) as store:
         assert available_models(store) == ("stereo", "pixelwise", "splined")
@@ -135,9 +172,13 @@ def test_where_nothing_came_of_it_the_session_keeps_what_it_had(session: Path, t
 def test_a_description_that_contradicts_itself(session: Path, run: Run) -> None:
     with Session.open(session, write=True) as store:
         for shot in store.captures("calibration")[:3]:
-            frames = tuple(replace(f, period_px=6.0) if f.kind == "phase" else f for f in shot.sequence.frames)
+            frames = tuple(
+                replace(f, period_px=6.0) if f.kind == "phase" else f for f in shot.sequence.frames
+            )
             sequence = replace(shot.sequence, frames=frames)
-            store.save_capture(shot.name, "calibration", sequence, shot.frames, source="", board=BOARD, force=True)
+            store.save_capture(
+                shot.name, "calibration", sequence, shot.frames, source="", board=BOARD, force=True
+            )
     status, _, error = run("calibrate", session, "--target", BOARD, "--poses", "pose_0[1-3]")
     assert status == 3 and not missing_facts(error, "128 periods")
     with Session.open(session) as store:
@@ -146,14 +187,18 @@ def test_a_description_that_contradicts_itself(session: Path, run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_a_pose_that_moved_is_left_out_with_its_reason(bench: FaultBench, made: Path, run: Run) -> None:
+def test_a_pose_that_moved_is_left_out_with_its_reason(
+    bench: FaultBench, made: Path, run: Run
+) -> None:
     session = made
     frames = bench.frames(2).copy()
     pose = bench.poses[2]
     half = len(frames) // 2
     frames[half:] = bench.render(replace(pose, t=pose.t + np.array([0.6, 0.2, 0.0])), 2)[half:]
     with Session.open(session, write=True) as store:
-        store.save_capture("pose_02", "calibration", bench.sequence, frames, source="test", board=BOARD, force=True)
+        store.save_capture(
+            "pose_02", "calibration", bench.sequence, frames, source="test", board=BOARD, force=True
+        )
     status, text, error = run("calibrate", session, "--target", BOARD, "--models", "stereo")
     assert status == 0 and not missing_facts(error, "pose_02")
     assert not missing_facts(text, "good", "pose_02")

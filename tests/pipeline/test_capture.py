@@ -30,7 +30,8 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session with one pose in a single exposure, and one in three; and a rig's file beside it."""
+    """A session with one pose in a single exposure, and one in three; and a rig's file beside
+    it."""
     folder = tmp_path_factory.mktemp("captures")
     (folder / "rig.toml").write_text(to_toml({"what": "Quarter size.", **RIG, "exposure_ms": 0.9}))
     begin = ["capture", str(folder / "session")]
@@ -66,24 +67,48 @@ def test_several_exposures_measure_the_dark_circles_and_find_the_board_where_it_
     assert np.count_nonzero(dark) > 1000
     gain = np.median(single.sigma_phase[dark]) / np.median(several.sigma_phase[dark])
     assert 3 < gain < 10  # 9 times the light, whose own noise grows too
-    both = single.mask & several.mask & (three.exposure_choice > 0)  # the first of both has the same noise
-    z = (single.phase - several.phase)[both] / np.hypot(single.sigma_phase, several.sigma_phase)[both]
-    assert 0.9 < np.median(np.abs(z)) / 0.6745 < 1.1 and np.count_nonzero(np.abs(z) > 8) < 1e-3 * z.size
+    both = (
+        single.mask & several.mask & (three.exposure_choice > 0)
+    )  # the first of both has the same noise
+    z = (single.phase - several.phase)[both] / np.hypot(single.sigma_phase, several.sigma_phase)[
+        both
+    ]
+    assert (
+        0.9 < np.median(np.abs(z)) / 0.6745 < 1.1
+        and np.count_nonzero(np.abs(z) > 8) < 1e-3 * z.size
+    )
 
 
 @pytest.mark.computes
 def test_a_recording_is_captured_again_to_the_last_bit(folder: Path, run: Run, tmp_path: Path):
-    (tmp_path / "replay.toml").write_text(to_toml({"driver": "replay", "source": str(folder / "session")}))
-    status, text, _ = run(
-        "capture", tmp_path / "session", "scan_01", "--rig", tmp_path / "replay.toml", "--role", "scan"
+    (tmp_path / "replay.toml").write_text(
+        to_toml({"driver": "replay", "source": str(folder / "session")})
     )
-    assert status == 0 and not missing_facts(text, "scan_01", "400x300", "912x1140", "x and y", "32 frames")
+    status, text, _ = run(
+        "capture",
+        tmp_path / "session",
+        "scan_01",
+        "--rig",
+        tmp_path / "replay.toml",
+        "--role",
+        "scan",
+    )
+    assert status == 0 and not missing_facts(
+        text, "scan_01", "400x300", "912x1140", "x and y", "32 frames"
+    )
     with Session.open(folder / "session") as old, Session.open(tmp_path / "session") as new:
         again = new.load_capture("scan_01")
         np.testing.assert_array_equal(again.frames, old.load_capture("pose_01").frames)
     assert again.role == "scan" and again.meta["board"] is None
     status, _, error = run(
-        "capture", tmp_path / "session", "scan_02", "--rig", tmp_path / "replay.toml", "--exposures-ms", 1, 2
+        "capture",
+        tmp_path / "session",
+        "scan_02",
+        "--rig",
+        tmp_path / "replay.toml",
+        "--exposures-ms",
+        1,
+        2,
     )
     assert status == 1 and error
 
@@ -109,16 +134,30 @@ def test_patterns_names_and_force(run: Run, tmp_path: Path):
         (("--rig", "nothing"), 1, ["'nothing'", "simulated"]),
         (("--rig", "simulated", "--patterns", "zigzag"), 1, ["'zigzag'", "complementary", "p18"]),
         (("--rig", "simulated", "--exposures-ms", "4", "4"), 1, ["4", "once"]),
-        (("--rig", "simulated", "--exposures-ms", "4", "8", "--exposure-ms", "2"), 1, ["exposure", "several"]),
-        (("--rig", "simulated", "--auto-exposure", "--exposure-ms", "2"), 1, ["exposure", "several"]),
+        (
+            ("--rig", "simulated", "--exposures-ms", "4", "8", "--exposure-ms", "2"),
+            1,
+            ["exposure", "several"],
+        ),
+        (
+            ("--rig", "simulated", "--auto-exposure", "--exposure-ms", "2"),
+            1,
+            ["exposure", "several"],
+        ),
         (("--rig", "simulated", "--auto-exposure", "--budget-s", "0"), 1, ["above 0"]),
-        (("--rig", "simulated", "--auto-exposure", "--region", "900", "0", "5", "5"), 1, ["region", "900 0 5 5"]),
+        (
+            ("--rig", "simulated", "--auto-exposure", "--region", "900", "0", "5", "5"),
+            1,
+            ["region", "900 0 5 5"],
+        ),
         (("--rig", "simulated", "--board", "squares:3"), 1, ["squares:3"]),
         (("--rig", "simulated", "--role", "pose"), 2, ["pose"]),
         ((), 2, ["--rig"]),
     ],
 )
-def test_capture_refuses_wrong_arguments_and_leaves_nothing(run: Run, tmp_path: Path, arguments, status: int, facts):
+def test_capture_refuses_wrong_arguments_and_leaves_nothing(
+    run: Run, tmp_path: Path, arguments, status: int, facts
+):
     ended, _, error = run("capture", tmp_path / "session", "a", *arguments)
     assert ended == status and not missing_facts(error, *facts), error
     assert not (tmp_path / "session").exists()
@@ -137,7 +176,9 @@ def test_a_capture_that_is_cancelled_leaves_nothing(tmp_path: Path):
         capture(tmp_path / "session", "a/b", RIG)
 
 
-def test_a_disk_without_room_is_found_before_the_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_disk_without_room_is_found_before_the_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     import shutil
 
     usage = shutil.disk_usage(tmp_path)
@@ -171,7 +212,9 @@ def test_devices_says_what_there_is(run: Run):
     assert not missing
 
 
-def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatch: pytest.MonkeyPatch):
+def test_devices_says_what_is_connected_and_what_is_missing(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+):
     def none_to_ask() -> list[str]:
         raise DeviceError("no producer is installed: install one")
 
@@ -185,7 +228,12 @@ def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatc
             camera=camera,
             list_connected=lambda: ["never"],
         ),
-        Driver("near", "nothing", camera=camera, list_connected=lambda: ["the camera A", "the camera B"]),
+        Driver(
+            "near",
+            "nothing",
+            camera=camera,
+            list_connected=lambda: ["the camera A", "the camera B"],
+        ),
         Driver("empty", "nothing", camera=camera, list_connected=list),
         Driver("blind", "nothing", camera=camera, list_connected=none_to_ask),
     ):
@@ -202,15 +250,21 @@ def test_devices_says_what_is_connected_and_what_is_missing(run: Run, monkeypatc
     assert "never" not in text
     found = {view.name: view for view in list_drivers()}
     assert (
-        not missing_facts(found["far"].missing, "no_such_package", "pip install it") and found["far"].connected is None
+        not missing_facts(found["far"].missing, "no_such_package", "pip install it")
+        and found["far"].connected is None
     )
     assert found["near"].connected == ("the camera A", "the camera B") and not found["near"].missing
     assert found["empty"].connected == () and not found["empty"].missing
-    assert found["blind"].trouble == "no producer is installed: install one" and found["blind"].connected is None
+    assert (
+        found["blind"].trouble == "no producer is installed: install one"
+        and found["blind"].connected is None
+    )
 
 
 @pytest.mark.computes
-def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     from slviewer.pipeline import capture as module
 
     def interrupted(*_: object) -> list[str]:
@@ -225,7 +279,9 @@ def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(tmp_path: Path,
     monkeypatch.setattr(module, "save_check", refused)
     said: list[str] = []
     capture(tmp_path / "fresh", "b", {"driver": "simulated", "scale": 0.1}, warn=said.append)
-    assert len(said) == 1 and not missing_facts(said[0], "b", "saved", "the disk is full: free some space")
+    assert len(said) == 1 and not missing_facts(
+        said[0], "b", "saved", "the disk is full: free some space"
+    )
     with Session.open(tmp_path / "fresh") as store:
         assert [len(shot.frames) for shot in store.captures()] == [32, 32]
 
@@ -236,7 +292,10 @@ def test_what_the_camera_took_in_place_of_a_setting_is_reported(tmp_path: Path):
     said: list[str] = []
     with rig.opened():
         set_camera(rig, {"exposure_ms": 1000.0}, None, 20.0, said.append)
-        assert [missing_facts(*note) for note in zip(said, ("100 ms", "16"), ("1000 ms", "20"), strict=True)] == [
+        assert [
+            missing_facts(*note)
+            for note in zip(said, ("100 ms", "16"), ("1000 ms", "20"), strict=True)
+        ] == [
             [],
             [],
         ]
@@ -246,7 +305,13 @@ def test_what_the_camera_took_in_place_of_a_setting_is_reported(tmp_path: Path):
         set_camera(rig, {}, 1000.0, None, said.append)
     assert said == ["its exposure is 100 ms, 1000 ms were requested"]
     said.clear()
-    capture(tmp_path / "fresh", "a", {"driver": "simulated", "scale": 0.1}, exposures_ms=[0.5, 1000], warn=said.append)
+    capture(
+        tmp_path / "fresh",
+        "a",
+        {"driver": "simulated", "scale": 0.1},
+        exposures_ms=[0.5, 1000],
+        warn=said.append,
+    )
     assert any(not missing_facts(text, "100 ms", "1000 ms") for text in said)
 
 

@@ -42,7 +42,10 @@ def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> No
     with raises(InputError, "pose_01", "gray_origin", "phase_offset") as refusal:
         check_capture("pose_01", wrong, frames, decode_frames("pose_01", wrong, frames))
     stated = {
-        key: float(value) for key, value in re.findall(r"(gray_origin|phase_offset) = (-?[\d.]+\d)", str(refusal.value))
+        key: float(value)
+        for key, value in re.findall(
+            r"(gray_origin|phase_offset) = (-?[\d.]+\d)", str(refusal.value)
+        )
     }
     assert -0.6 < stated["gray_origin"] < -0.4 and 3.1 < abs(stated["phase_offset"]) < 3.2
     assert "gray_origin" in check.contradictions[0].message

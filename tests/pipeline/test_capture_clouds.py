@@ -1,4 +1,5 @@
-"""Commands refuse a capture that does not belong to the session's calibration, whichever command it is."""
+"""Commands refuse a capture that does not belong to the session's calibration, whichever command it
+is."""
 
 import re
 from collections.abc import Callable
@@ -30,7 +31,12 @@ def captured() -> tuple[PatternSequence, np.ndarray]:
     """A plate at 600 mm, both axes."""
     sequence = multifrequency(RIG.projector.size, 4)
     plate = BoardScene(
-        Pose(np.eye(3), np.array([-60.0, -50.0, 600.0])), None, (0, 0), (120, 100), FLAT, np.zeros((0, 2))
+        Pose(np.eye(3), np.array([-60.0, -50.0, 600.0])),
+        None,
+        (0, 0),
+        (120, 100),
+        FLAT,
+        np.zeros((0, 2)),
     )
     renderer = Renderer(RIG, plate)
     return sequence, renderer.capture(sequence, 1)
@@ -38,14 +44,17 @@ def captured() -> tuple[PatternSequence, np.ndarray]:
 
 @pytest.fixture
 def session(tmp_path: Path, captured: tuple[PatternSequence, np.ndarray]) -> Path:
-    """The plate as it is, as a scan of a projector twice the size, and by a camera that was cropped."""
+    """The plate as it is, as a scan of a projector twice the size, and by a camera that was
+    cropped."""
     sequence, frames = captured
     with Session.create(tmp_path / "session") as store:
         save_true_stereo(store, RIG)
         store.save_capture("sound", "scan", sequence, frames, source="test")
         large = replace(sequence, projector_size=tuple(2 * n for n in RIG.projector.size))
         store.save_capture("large", "scan", large, frames, source="test")
-        store.save_capture("cropped", "scan", sequence, np.ascontiguousarray(frames[:, :-4]), source="test")
+        store.save_capture(
+            "cropped", "scan", sequence, np.ascontiguousarray(frames[:, :-4]), source="test"
+        )
         save_sound_checks(store)
     return tmp_path / "session"
 
@@ -87,7 +96,9 @@ def test_an_inverted_calibration_is_refused_and_may_be_insisted_on(session: Path
     assert not missing_facts(error, "R", "T", "inverted")
 
 
-def test_sigma_is_raised_where_the_axes_miss_each_other(session: Path, run: Run, tmp_path: Path) -> None:
+def test_sigma_is_raised_where_the_axes_miss_each_other(
+    session: Path, run: Run, tmp_path: Path
+) -> None:
     assert run("reconstruct", session, "sound", "--out", tmp_path / "sound.ply")[0] == 0
     nod = np.array([[1, 0, 0], [0, 1, -2e-4], [0, 2e-4, 1]])
     turn = np.linalg.svd(nod)
@@ -95,5 +106,7 @@ def test_sigma_is_raised_where_the_axes_miss_each_other(session: Path, run: Run,
         save_true_stereo(store, RIG, R=turn.U @ turn.Vh @ RIG.R, T=turn.U @ turn.Vh @ RIG.t)
     status, _, error = run("reconstruct", session, "sound", "--out", tmp_path / "bumped.ply")
     assert status == 0 and "factor" in error
-    sound, bumped = (read_ply(tmp_path / f"{name}.ply").scalars["sigma_noise"] for name in ("sound", "bumped"))
+    sound, bumped = (
+        read_ply(tmp_path / f"{name}.ply").scalars["sigma_noise"] for name in ("sound", "bumped")
+    )
     assert np.median(bumped) > 5 * np.median(sound)

@@ -32,8 +32,12 @@ pytestmark = pytest.mark.computes
 
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A session with an imported calibration, measurements of a plane, and a sphere; and the report of it."""
-    folder, rig = tmp_path_factory.mktemp("certified") / "session", letter(0.15, local_distortion_px=0.0)
+    """A session with an imported calibration, measurements of a plane, and a sphere; and the report
+    of it."""
+    folder, rig = (
+        tmp_path_factory.mktemp("certified") / "session",
+        letter(0.15, local_distortion_px=0.0),
+    )
     sequence = one_axis(p18(rig.projector.size), "x")
     plan = letter_plan(rig, Board.parse("circles:21x16:9"), 3)
     with Session.create(folder) as store:
@@ -62,10 +66,14 @@ def measured_report(folder: Path, model: str) -> Path:
         store.save_result(f"scale/{model}", applied, {})
         plane = load_surface(store, "plane_01")
         middle = tuple(int(v) for v in np.argwhere(plane.measured).mean(axis=0)[::-1])
-        first = add_fit(store, plane, "plane", Region.ball(plane.points[middle[1], middle[0]], 20.0))
+        first = add_fit(
+            store, plane, "plane", Region.ball(plane.points[middle[1], middle[0]], 20.0)
+        )
         add_distance(store, plane, (middle[0] - 20, middle[1]), (middle[0] + 20, middle[1]))
         add_section(store, plane, (middle[0] - 20, middle[1]), (middle[0] + 20, middle[1]))
-        second = add_fit(store, plane, "plane", Region.ball(plane.points[middle[1], middle[0] + 30], 15.0))
+        second = add_fit(
+            store, plane, "plane", Region.ball(plane.points[middle[1], middle[0] + 30], 15.0)
+        )
         add_relation(store, first.id, second.id)
         report(store, page)
     return page
@@ -97,11 +105,16 @@ def test_the_figures_of_a_report_follow_from_the_frames(
     assert expected | {"page", "measurements/m1", "measurements/m5"} <= set(states(found))
     assert sorted(path.name for path in folder.rglob("*")) == before
     certificate = read_certificate(page)[1]
-    assert all(len(c["frames"]) in (26, 52) and len(set(c["frames"])) > 20 for c in certificate.captures.values())
+    assert all(
+        len(c["frames"]) in (26, 52) and len(set(c["frames"])) > 20
+        for c in certificate.captures.values()
+    )
     assert "verify-report" in page.read_text() and "<script" not in page.read_text()
 
 
-def test_a_number_changed_in_the_page_is_found(certified: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_number_changed_in_the_page_is_found(
+    certified: tuple[Path, Path], tmp_path: Path
+) -> None:
     folder, page = certified
     text = page.read_text()
     distance = read_certificate(page)[1].figures["measurements/m2"]["distance, mm"]
@@ -128,23 +141,32 @@ def test_a_figure_forged_with_its_digest_does_not_follow_from_the_frames(
     (tmp_path / "forged.html").write_text(before + html.escape(forged).join(CERTIFICATE) + after)
     found = verify_report(folder, tmp_path / "forged.html")
     assert [check.what for check in found.checks if check.state == "differs"] == ["measurements/m2"]
-    assert not missing_facts(found.text(), "measurements/m2", "distance, mm") and "measurements/m2" in found.failure
+    assert (
+        not missing_facts(found.text(), "measurements/m2", "distance, mm")
+        and "measurements/m2" in found.failure
+    )
 
 
-def test_other_frames_are_found(certified: tuple[Path, Path], tmp_path: Path, run: Callable[..., tuple]) -> None:
+def test_other_frames_are_found(
+    certified: tuple[Path, Path], tmp_path: Path, run: Callable[..., tuple]
+) -> None:
     folder = shutil.copytree(certified[0], tmp_path / "session")
     with Session.open(folder, write=True) as store:
         capture = store.load_capture("plane_01")
         frames = capture.frames.copy()
         frames[7, 50, 50] ^= 1
-        store.save_capture("plane_01", capture.role, capture.sequence, frames, source="changed", force=True)
+        store.save_capture(
+            "plane_01", capture.role, capture.sequence, frames, source="changed", force=True
+        )
         store.trash_capture("sphere_3")
     status, out, error = run("verify-report", folder, certified[1])
     assert status == 1 and not missing_facts(error, "frames of plane_01", "frames of sphere_3")
     assert not missing_facts(out, "frames of plane_01", "frame 8", "frames of sphere_3")
 
 
-def test_pages_without_a_certificate_are_refused(certified: tuple[Path, Path], tmp_path: Path) -> None:
+def test_pages_without_a_certificate_are_refused(
+    certified: tuple[Path, Path], tmp_path: Path
+) -> None:
     page = tmp_path / "page.html"
     for content, reason in (
         ("<html></html>", "no certificate"),

@@ -65,7 +65,9 @@ def measured(tmp_path_factory) -> Path:
         save_true_stereo(store, rig)
         for i, place in enumerate(bar_places(load_stereo(store).rig, (500.0, 700.0), 100.0, 38.1)):
             renderer = Renderer(rig, bar(place))
-            store.save_capture(f"bar_{i}", "scan", sequence, renderer.capture(sequence, i), source="simulated")
+            store.save_capture(
+                f"bar_{i}", "scan", sequence, renderer.capture(sequence, i), source="simulated"
+            )
         save_sound_checks(store)
     return folder
 
@@ -81,7 +83,10 @@ def bare(tmp_path: Path) -> Path:
 @pytest.fixture
 def still(measured: Path, tmp_path: Path) -> Path:
     """A copy of the seven bars, with four more captures of the first one."""
-    folder, rig = Path(shutil.copytree(measured, tmp_path / "session")), letter(0.25, seed=2, local_distortion_px=0)
+    folder, rig = (
+        Path(shutil.copytree(measured, tmp_path / "session")),
+        letter(0.25, seed=2, local_distortion_px=0),
+    )
     sequence = one_axis(p18(rig.projector.size), "x")
     with Session.open(folder, write=True) as store:
         place = bar_places(load_stereo(store).rig, (500.0, 700.0), 100.0, 38.1)[0]
@@ -146,7 +151,8 @@ def calibrated(recorded: Path, tmp_path: Path) -> Path:
 
 
 def capture_board(folder: Path, name: str) -> None:
-    """Capture the board later: with the rig as it was (same), turned by 0.2 mrad (panned), or along one_axis alone."""
+    """Capture the board later: with the rig as it was (same), turned by 0.2 mrad (panned), or along
+    one_axis alone."""
     rig = letter(0.25)  # the recorded one
     both, turn = complementary(rig.projector.size, steps=4), rotation(np.array([0.0, 2e-4, 0.0]))
     pose = target_poses(replace(rig, seed=6), BOARD, 3)[0]
@@ -175,11 +181,19 @@ def test_check_answers_and_remembers(calibrated: Path) -> None:
     second = check(calibrated, "panned")
     panned = second.only
     assert panned.verdict == "recalibrate" and not missing_facts(panned.reasons[0], "pan")
-    assert not missing_facts(second.text(), "same", "still good", f"{panned.scale_ppm:.0f}".replace("-", "−"))
+    assert not missing_facts(
+        second.text(), "same", "still good", f"{panned.scale_ppm:.0f}".replace("-", "−")
+    )
     single = check(calibrated, "one_axis").only
-    assert single.verdict == "still good" and any(not missing_facts(s, "axis x") for s in single.unseen)
+    assert single.verdict == "still good" and any(
+        not missing_facts(s, "axis x") for s in single.unseen
+    )
     with Session.open(calibrated) as store:
-        assert [each.capture for each in load_drift_history(store)] == ["same", "panned", "one_axis"]
+        assert [each.capture for each in load_drift_history(store)] == [
+            "same",
+            "panned",
+            "one_axis",
+        ]
         assert load_drift_history(store)[1] == panned
         assert store.state_of(REFERENCE) == "fresh"
 

@@ -1,4 +1,5 @@
-"""The checks for plugins accept the drivers that come with slviewer, and name what a bad one does."""
+"""The checks for plugins accept the drivers that come with slviewer, and name what a bad one
+does."""
 
 import re
 from dataclasses import replace
@@ -143,10 +144,19 @@ def layout(describe=None, is_capture=None):
     def good(folder, name, projector):
         images, _ = match_images(folder, PATTERN)
         frames = tuple(phase_steps("x", 3, 30))
-        return ImportableRecording(name, PatternSequence(projector, frames), tuple(images.values()), folder), []
+        return (
+            ImportableRecording(
+                name, PatternSequence(projector, frames), tuple(images.values()), folder
+            ),
+            [],
+        )
 
     return define_layout(
-        "shots", "images", describe or good, is_capture or (lambda f: has_images(f, PATTERN)), (90, 60)
+        "shots",
+        "images",
+        describe or good,
+        is_capture or (lambda f: has_images(f, PATTERN)),
+        (90, 60),
     )
 
 
@@ -163,16 +173,21 @@ def test_an_importer_that_reads_incomplete_captures_is_named(capture):
     assert any(not missing_facts(fault, "complete") for fault in check_importer(layout(), capture))
 
 
-SHOWN = PatternSequence((96, 72), (Frame("white"), Frame("black"), *phase_steps("x", 4, 12), *gray_bits("x", 3)))
+SHOWN = PatternSequence(
+    (96, 72), (Frame("white"), Frame("black"), *phase_steps("x", 4, 12), *gray_bits("x", 3))
+)
 
 
 @pytest.fixture
 def rendered(tmp_path: Path) -> Path:
-    """A capture of the sequence SHOWN by a camera with the projector's own pixels, 16 bits with noise."""
+    """A capture of the sequence SHOWN by a camera with the projector's own pixels, 16 bits with
+    noise."""
     (folder := tmp_path / "rendered").mkdir()
     rng = np.random.default_rng(0)
     for k in range(len(SHOWN.frames)):
-        image = 8 * (render_pattern(SHOWN, k) * 0.7 + 20.0) + rng.normal(0, 4, SHOWN.projector_size[::-1])
+        image = 8 * (render_pattern(SHOWN, k) * 0.7 + 20.0) + rng.normal(
+            0, 4, SHOWN.projector_size[::-1]
+        )
         cv2.imwrite(str(folder / f"shot{k:02d}.png"), image.round().astype(np.uint16))
     return folder
 
@@ -196,7 +211,10 @@ def test_an_importer_that_misdescribes_frames_is_named_as_an_import_does(rendere
     def describe(folder, name, projector):
         images, _ = match_images(folder, PATTERN)
         check_complete(images, "shot", len(SHOWN.frames))
-        return ImportableRecording(name, replace(SHOWN, **wrong), tuple(images.values()), folder), []
+        return (
+            ImportableRecording(name, replace(SHOWN, **wrong), tuple(images.values()), folder),
+            [],
+        )
 
     faults = check_importer(layout(describe), rendered)
     assert len(faults) == bool(wrong) and all(named in fault for fault in faults), faults
@@ -206,7 +224,9 @@ def fails(*_):
     raise KeyError("oops")
 
 
-@pytest.mark.parametrize(("parts", "named"), [({"describe": fails}, "oops"), ({"is_capture": fails}, "oops")])
+@pytest.mark.parametrize(
+    ("parts", "named"), [({"describe": fails}, "oops"), ({"is_capture": fails}, "oops")]
+)
 def test_an_importer_that_raises_is_named(capture, parts, named):
     assert any(named in fault for fault in check_importer(layout(**parts), capture))
 
@@ -226,7 +246,12 @@ def test_a_capture_that_its_layout_cannot_describe_is_skipped_with_the_reason(ca
             raise KeyError("oops")
         images, _ = match_images(folder, PATTERN)
         frames = tuple(phase_steps("x", 3, 30))
-        return ImportableRecording(name, PatternSequence(projector, frames), tuple(images.values()), folder), []
+        return (
+            ImportableRecording(
+                name, PatternSequence(projector, frames), tuple(images.values()), folder
+            ),
+            [],
+        )
 
     (capture.parent / "two").mkdir()
     (capture.parent / "two" / "shot0.png").write_bytes((capture / "shot0.png").read_bytes())

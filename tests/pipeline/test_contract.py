@@ -1,4 +1,5 @@
-"""One operation, one record: the terminal, Python and the wizard store the same results of the same session."""
+"""One operation, one record: the terminal, Python and the wizard store the same results of the same
+session."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ pytestmark = pytest.mark.computes
 
 @dataclass(frozen=True)
 class Operation:
-    """An operation in the words of the terminal, of Python and of the wizard, and the results that it stores."""
+    """An operation in the words of the terminal, of Python and of the wizard, and the results that
+    it stores."""
 
     terminal: tuple[str, ...]
     python: Callable[[Path], object]
@@ -103,13 +105,21 @@ def by_wizard(operation: Operation, session: Path) -> None:
     with Operator(session) as operator:
         assert operation.wizard(operator)
         operator.wait_until_idle(HANG_S)
-        assert [notice.text for notice in operator.snapshot().notices if notice.level == "error"] == []
+        assert [
+            notice.text for notice in operator.snapshot().notices if notice.level == "error"
+        ] == []
 
 
-DOORS = {"terminal": by_terminal, "python": lambda operation, session: operation.python(session), "wizard": by_wizard}
+DOORS = {
+    "terminal": by_terminal,
+    "python": lambda operation, session: operation.python(session),
+    "wizard": by_wizard,
+}
 
 
-def records(session: Path, names: tuple[str, ...]) -> dict[str, tuple[dict[str, Any], dict[str, np.ndarray]]]:
+def records(
+    session: Path, names: tuple[str, ...]
+) -> dict[str, tuple[dict[str, Any], dict[str, np.ndarray]]]:
     with Session.open(session) as store:
         assert {store.state_of(name) for name in names} == {"fresh"}
         return {name: store.load_result(name) for name in names}
@@ -119,7 +129,8 @@ def records(session: Path, names: tuple[str, ...]) -> dict[str, tuple[dict[str, 
 def done(
     request: pytest.FixtureRequest, recorded: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Operation, dict[str, Path]]:
-    """An operation, and a session for each door by which it was asked for; all were equal before."""
+    """An operation, and a session for each door by which it was asked for; all were equal
+    before."""
     folder, operation = tmp_path_factory.mktemp("contract"), OPERATIONS[request.param]
     first = copy_session(recorded / "session", folder / "first")
     with Session.open(first, write=True) as store:
@@ -133,7 +144,8 @@ def done(
 
 
 def assert_same(found: Any, wanted: Any, place: str) -> None:
-    """Assert that values of a record are the same; ICP sums in parallel, so that its last digits vary."""
+    """Assert that values of a record are the same; ICP sums in parallel, so that its last digits
+    vary."""
     assert type(found) is type(wanted), place
     if isinstance(wanted, dict):
         assert found.keys() == wanted.keys(), place
@@ -157,13 +169,21 @@ def test_every_door_stores_the_same_record(done: tuple[Operation, dict[str, Path
             own = {"drift/1": ("hash", "time"), "acceptance/1": ("hash", "time")}.get(
                 name, () if name.startswith(("clouds/", "verify/")) else ("hash",)
             )
-            assert_same(*({k: v for k, v in each.items() if k not in own} for each in (other[name][0], meta)), name)
+            assert_same(
+                *(
+                    {k: v for k, v in each.items() if k not in own}
+                    for each in (other[name][0], meta)
+                ),
+                name,
+            )
             assert arrays.keys() == other[name][1].keys()
             for key, array in arrays.items():
                 np.testing.assert_array_equal(array, other[name][1][key], f"{name}, {key}")
 
 
-def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[Operation, dict[str, Path]]) -> None:
+def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(
+    done: tuple[Operation, dict[str, Path]],
+) -> None:
     operation, sessions = done
     with Operator(sessions["terminal"]) as operator:
         view = operator.wait_until_idle(HANG_S).session
@@ -173,30 +193,41 @@ def test_what_the_terminal_made_is_done_in_the_wizard_and_certified(done: tuple[
     with Session.open(sessions["terminal"]) as store:
         certificate = make_certificate(store)
     assert set(operation.stored) <= set(certificate.results)
-    assert {name for name in operation.stored if not name.startswith(("placement/", "acceptance/"))} <= set(
-        certificate.figures
-    )
+    assert {
+        name for name in operation.stored if not name.startswith(("placement/", "acceptance/"))
+    } <= set(certificate.figures)
 
 
 def test_verify_stores_the_cloud_that_reconstruct_does(recorded: Path, tmp_path: Path) -> None:
-    first, second = (copy_session(recorded / "session", tmp_path / name) for name in ("verified", "reconstructed"))
+    first, second = (
+        copy_session(recorded / "session", tmp_path / name)
+        for name in ("verified", "reconstructed")
+    )
     sl.verify(first, ["plane_03"], "plane")
     sl.reconstruct(second, "plane_03")
-    (verified,), (made,) = (records(session, ("clouds/plane_03",)).values() for session in (first, second))
+    (verified,), (made,) = (
+        records(session, ("clouds/plane_03",)).values() for session in (first, second)
+    )
     assert verified[0] == made[0]  # with the checksums of the arrays
 
 
-def test_a_changed_capture_makes_the_record_stale(done: tuple[Operation, dict[str, Path]], tmp_path: Path) -> None:
+def test_a_changed_capture_makes_the_record_stale(
+    done: tuple[Operation, dict[str, Path]], tmp_path: Path
+) -> None:
     operation, sessions = done
     folder = copy_session(sessions["python"], tmp_path / "session")
     with Session.open(folder, write=True) as store:
         capture = store.load_capture(operation.capture)
         frames = np.maximum(capture.frames, 1)
-        store.save_capture(operation.capture, "scan", capture.sequence, frames, source="simulated", force=True)
+        store.save_capture(
+            operation.capture, "scan", capture.sequence, frames, source="simulated", force=True
+        )
         assert {store.state_of(name) for name in operation.stored} == {"stale"}
 
 
-def test_a_session_in_use_is_read_and_the_result_is_not_stored(recorded: Path, tmp_path: Path) -> None:
+def test_a_session_in_use_is_read_and_the_result_is_not_stored(
+    recorded: Path, tmp_path: Path
+) -> None:
     session, warnings = copy_session(recorded / "session", tmp_path / "session"), list[str]()
     with Session.open(session, write=True) as store:
         settings = ReconstructSettings("object_r1", out=tmp_path / "cloud.ply")

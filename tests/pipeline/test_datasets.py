@@ -1,4 +1,5 @@
-"""Example data: an archive is unpacked whole, once, and only if it is what it says; downloads are cached."""
+"""Example data: an archive is unpacked whole, once, and only if it is what it says; downloads are
+cached."""
 
 import hashlib
 import json
@@ -36,7 +37,8 @@ class Files(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def released(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """A release on a server of the loopback address that offers the sample as ``letter``; yields what is requested."""
+    """A release on a server of the loopback address that offers the sample as ``letter``; yields
+    what is requested."""
     data = asset("datasets/sample.zip").read_bytes()
     served = tmp_path / "served"
     served.mkdir()
@@ -51,7 +53,9 @@ def released(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[s
     }
     (tmp_path / "released.json").write_text(json.dumps({"letter": record}), "utf-8")
     monkeypatch.setattr(
-        datasets, "asset", lambda name: tmp_path / "released.json" if name.endswith("released.json") else asset(name)
+        datasets,
+        "asset",
+        lambda name: tmp_path / "released.json" if name.endswith("released.json") else asset(name),
     )
     yield Files.requested
     server.shutdown()
@@ -72,7 +76,9 @@ def test_a_given_folder_is_made_and_never_overwritten(tmp_path: Path) -> None:
         sl.datasets.fetch("sample", tmp_path / "new")
 
 
-def test_an_unknown_name_and_a_wrong_hash_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_name_and_a_wrong_hash_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with raises(sl.SlviewerError, "'unknown'", "sample"):
         sl.datasets.fetch("unknown")
     with raises(sl.SlviewerError, "'letter'", "assets/make_sample_data.py letter"):
@@ -95,7 +101,9 @@ def test_a_released_data_set_is_downloaded_once(tmp_path: Path, released: list[s
     assert len(released) == 1
 
 
-def test_a_cancelled_download_leaves_nothing_that_the_next_takes_for_whole(cache: Path, released: list[str]) -> None:
+def test_a_cancelled_download_leaves_nothing_that_the_next_takes_for_whole(
+    cache: Path, released: list[str]
+) -> None:
     def cancel(done: float, doing: str) -> None:
         if done > 0.3:
             raise KeyboardInterrupt
@@ -106,7 +114,9 @@ def test_a_cancelled_download_leaves_nothing_that_the_next_takes_for_whole(cache
     assert (sl.datasets.fetch("letter") / "poses").is_dir()
 
 
-def test_what_is_not_the_data_set_is_refused_and_not_cached(tmp_path: Path, cache: Path, released: list[str]) -> None:
+def test_what_is_not_the_data_set_is_refused_and_not_cached(
+    tmp_path: Path, cache: Path, released: list[str]
+) -> None:
     (tmp_path / "served" / "letter.zip").write_bytes(b"another file")
     with raises(sl.SlviewerError, "letter.zip", "hash"):
         sl.datasets.fetch("letter")

@@ -40,7 +40,8 @@ def captured(sequence_of: Callable) -> Captured:
 
 @pytest.fixture(scope="module")
 def part() -> Captured:
-    """A sphere in patterns of both axes: the sequence, and its frames (n, h, w), only to be read."""
+    """A sphere in patterns of both axes: the sequence, and its frames (n, h, w), only to be
+    read."""
     return captured(complementary)
 
 
@@ -51,7 +52,8 @@ def recorded_session(folder: Path, sequence: PatternSequence, stack: np.ndarray)
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """The one channel of an uncompressed EXR of 32-bit floats, by the offsets that the file states."""
+    """The one channel of an uncompressed EXR of 32-bit floats, by the offsets that the file
+    states."""
     data = path.read_bytes()
     assert struct.unpack_from("<2i", data) == (20000630, 2)
     at, window = 8, (0, 0, 0, 0)
@@ -70,7 +72,9 @@ def read_exr(path: Path) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file_format", [pytest.param("npy", marks=pytest.mark.slow), "exr"])
-def test_files_hold_what_was_decoded(tmp_path: Path, run: Run, part: Captured, file_format: str) -> None:
+def test_files_hold_what_was_decoded(
+    tmp_path: Path, run: Run, part: Captured, file_format: str
+) -> None:
     session, out = recorded_session(tmp_path / "session", *part), tmp_path / "out"
     with Session.open(session, write=True) as store:
         save_sound_checks(store)
@@ -85,13 +89,19 @@ def test_files_hold_what_was_decoded(tmp_path: Path, run: Run, part: Captured, f
 
     described = json.loads((out / "decoded.json").read_text())
     for axis, phase in phases.items():
-        stored, coordinate, sigma = (load(f"{name}_{axis}") for name in ("phase", "coordinate", "sigma"))
+        stored, coordinate, sigma = (
+            load(f"{name}_{axis}") for name in ("phase", "coordinate", "sigma")
+        )
         assert stored.dtype == coordinate.dtype == np.float32
         assert np.array_equal(stored, phase.phase, equal_nan=True)
         assert np.array_equal(load(f"modulation_{axis}"), phase.modulation)
-        assert np.allclose(2 * np.pi * coordinate / phase.period_px, stored, equal_nan=True, rtol=1e-6)
+        assert np.allclose(
+            2 * np.pi * coordinate / phase.period_px, stored, equal_nan=True, rtol=1e-6
+        )
         file = out / described["files"][f"reason_{axis}"]
-        reason = np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        reason = (
+            np.load(file) if file.suffix == ".npy" else cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        )
         assert reason.dtype == np.uint8 and np.array_equal(reason, phase.reason)
         assert np.array_equal(reason == Reason.VALID, np.isfinite(stored)) and np.array_equal(
             np.isfinite(sigma), np.isfinite(stored)
@@ -112,7 +122,8 @@ def test_gray_code_alone_states_its_quantisation(tmp_path: Path, run: Run) -> No
     assert run("decode", session, "part", "--out", out)[0] == 0
     axes = json.loads((out / "decoded.json").read_text())["axes"]
     assert all(
-        axis["steps"] == 0 and axis["median_sigma_px"] == pytest.approx(0.29, abs=0.005) for axis in axes.values()
+        axis["steps"] == 0 and axis["median_sigma_px"] == pytest.approx(0.29, abs=0.005)
+        for axis in axes.values()
     )
 
 

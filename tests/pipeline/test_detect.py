@@ -33,14 +33,21 @@ def photographs(tmp_path: Path) -> Path:
 
 
 @pytest.mark.computes
-def test_one_photograph_gives_a_table_and_an_overlay(photographs: Path, tmp_path: Path, capsys) -> None:
+def test_one_photograph_gives_a_table_and_an_overlay(
+    photographs: Path, tmp_path: Path, capsys
+) -> None:
     overlay, table = tmp_path / "out" / "overlay.png", tmp_path / "out" / "corners.csv"
     image = str(photographs / "board.png")
-    assert main(["detect", image, "--target", str(BOARD), "--out", str(overlay), "--csv", str(table)]) == 0
+    assert (
+        main(["detect", image, "--target", str(BOARD), "--out", str(overlay), "--csv", str(table)])
+        == 0
+    )
     printed = capsys.readouterr().out
     assert not missing_facts(printed, "35 of 35 circles") and len(printed.splitlines()) == 37
     rows = list(csv.DictReader(table.open()))
-    places = np.array([[float(row[name]) for name in ("index", "x_mm", "y_mm", "u_px", "v_px")] for row in rows])
+    places = np.array(
+        [[float(row[name]) for name in ("index", "x_mm", "y_mm", "u_px", "v_px")] for row in rows]
+    )
     np.testing.assert_array_equal(places[:, 0], np.arange(35))
     np.testing.assert_allclose(places[:, 1:3], BOARD.points[:, :2])
     off = np.linalg.norm(places[:, 3:] - VIEW.truth(BOARD), axis=1)
@@ -54,7 +61,9 @@ def test_one_photograph_gives_a_table_and_an_overlay(photographs: Path, tmp_path
 
 
 @pytest.mark.computes
-def test_several_photographs_give_a_line_each_and_status_1(photographs: Path, tmp_path: Path, capsys) -> None:
+def test_several_photographs_give_a_line_each_and_status_1(
+    photographs: Path, tmp_path: Path, capsys
+) -> None:
     overlays = tmp_path / "overlays"
     assert main(["detect", str(photographs), "--target", str(BOARD), "--out", str(overlays)]) == 1
     printed = capsys.readouterr()

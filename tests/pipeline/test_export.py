@@ -1,4 +1,5 @@
-"""Everything that a session holds, as files for other programs: without a rig, by Python and by the command."""
+"""Everything that a session holds, as files for other programs: without a rig, by Python and by the
+command."""
 
 import csv
 import json
@@ -32,12 +33,18 @@ W, H = 64, 48
 SPHERE = np.array([4.0, -3.0, 640.0]), 60.0
 R = cv2.Rodrigues(np.array([0.01, 0.3, -0.02]))[0]
 RIG = StereoRig(
-    Lens(np.array([[160.0, 0, 31], [0, 161.0, 23], [0, 0, 1]]), np.array([-0.05, 0.01, 1e-3, 0, 0]), (W, H)),
+    Lens(
+        np.array([[160.0, 0, 31], [0, 161.0, 23], [0, 0, 1]]),
+        np.array([-0.05, 0.01, 1e-3, 0, 0]),
+        (W, H),
+    ),
     Lens(np.array([[700.0, 0, 230.0], [0, 1400.0, 280.0], [0, 0, 1]]), np.zeros(5), (456, 570)),
     R,
     -R @ np.array([180.0, 5.0, 8.0]),
 )
-T_REFERENCE_SCAN = np.block([[cv2.Rodrigues(np.array([0, 0.2, 0]))[0], np.array([[3.0], [1], [20]])], [0, 0, 0, 1]])
+T_REFERENCE_SCAN = np.block(
+    [[cv2.Rodrigues(np.array([0, 0.2, 0]))[0], np.array([[3.0], [1], [20]])], [0, 0, 0, 1]]
+)
 
 
 def seen() -> np.ndarray:
@@ -56,7 +63,10 @@ def pixelwise() -> PixelwiseModel:
     c = np.array([500.0, 0.4, 1e-4, 0.1, 0.05])[:, None, None] * rng.uniform(0.9, 1.1, (5, H, W))
     ones = np.ones((H, W))
     return PixelwiseModel(
-        {"x": PixelFit(c, np.ones((3, H, W)), 9 * ones, 10 * ones, 60 * ones, ones)}, {"x": 18.0}, {}, "x"
+        {"x": PixelFit(c, np.ones((3, H, W)), 9 * ones, 10 * ones, 60 * ones, ones)},
+        {"x": 18.0},
+        {},
+        "x",
     )
 
 
@@ -66,14 +76,29 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Session.create(folder) as store:
         sequence = PRESETS["complementary"]((456, 570))
         for name in ("scan_01", "scan_02"):
-            store.save_capture(name, "scan", sequence, np.zeros((len(sequence.frames), H, W), np.uint8), source="made")
+            store.save_capture(
+                name,
+                "scan",
+                sequence,
+                np.zeros((len(sequence.frames), H, W), np.uint8),
+                source="made",
+            )
         board = {
-            f"pose_{k:02d}": np.block([[np.eye(3), np.array([[k], [0], [600 + k]])], [0, 0, 0, 1]]) for k in (2, 10)
+            f"pose_{k:02d}": np.block([[np.eye(3), np.array([[k], [0], [600 + k]])], [0, 0, 0, 1]])
+            for k in (2, 10)
         }
         figures = {"stereo": 0.1, "camera": 0.08, "projector": 0.12}
         depths = (560.0, 700.0)
         stereo = StereoModel(
-            RIG, "circles:7x5:20", ("x", "y"), figures, board, {"pose_02": (0.1, 0.2)}, {}, depths, {"camera": 1.0}
+            RIG,
+            "circles:7x5:20",
+            ("x", "y"),
+            figures,
+            board,
+            {"pose_02": (0.1, 0.2)},
+            {},
+            depths,
+            {"camera": 1.0},
         )
         save_stereo(store, stereo, {}, {})
         save_fitted(store, pixelwise(), {}, {})
@@ -81,14 +106,27 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
         z = points[..., 2]
         sigma = np.where(np.isfinite(z), np.float32(0.02), np.nan).astype(np.float32)
         texture = np.random.default_rng(1).integers(0, 256, (H, W), dtype=np.uint8)
-        arrays = {"points": points, "sigma_z": sigma, "sigma_calibration": sigma / 2, "texture": texture, "phase": z}
+        arrays = {
+            "points": points,
+            "sigma_z": sigma,
+            "sigma_calibration": sigma / 2,
+            "texture": texture,
+            "phase": z,
+        }
         meta = {"model": "pixelwise", "axis": "x", "scales": {"pixelwise": 1.0}}
         for name in ("scan_01", "scan_02"):
-            store.save_result(f"clouds/{name}", {**meta, "inputs": store.input_hashes(name)}, arrays)
+            store.save_result(
+                f"clouds/{name}", {**meta, "inputs": store.input_hashes(name)}, arrays
+            )
         mask = np.isfinite(z)
         there = points[mask]
         outwards = (there - SPHERE[0]) / SPHERE[1]
-        write_ply(store.exports / "merged_1.ply", there, normals=outwards, scalars={"sigma_noise": sigma[mask]})
+        write_ply(
+            store.exports / "merged_1.ply",
+            there,
+            normals=outwards,
+            scalars={"sigma_noise": sigma[mask]},
+        )
         pair = {"rms_mm": 0.05, "overlap": 0.8, "T_reference_scan": T_REFERENCE_SCAN.tolist()}
         merge = {
             "reference": "scan_01",
@@ -96,10 +134,27 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "pairs": {"scan_02": pair},
             "points": len(there),
         }
-        store.save_result("merge/1", {**merge, "ply": "merged_1.ply", "model": "pixelwise", "inputs": {}}, {})
-        row = {"rms_mm": 0.05, "noise_floor_mm": 0.04, "radius_mm": None, "points": 9, "set_aside": 0, "coverage": 1.0}
-        verified = {"shape": "plane", "models": {"stereo": row}, "incidence": None, "scales": {}, "centres_mm": {}}
-        store.save_result("verify/scan_02", {**verified, "inputs": store.input_hashes("scan_02")}, {})
+        store.save_result(
+            "merge/1", {**merge, "ply": "merged_1.ply", "model": "pixelwise", "inputs": {}}, {}
+        )
+        row = {
+            "rms_mm": 0.05,
+            "noise_floor_mm": 0.04,
+            "radius_mm": None,
+            "points": 9,
+            "set_aside": 0,
+            "coverage": 1.0,
+        }
+        verified = {
+            "shape": "plane",
+            "models": {"stereo": row},
+            "incidence": None,
+            "scales": {},
+            "centres_mm": {},
+        }
+        store.save_result(
+            "verify/scan_02", {**verified, "inputs": store.input_hashes("scan_02")}, {}
+        )
         store.decide("names", {"scan_02": "=1+1"})
     return folder
 
@@ -135,7 +190,9 @@ def test_a_merge_and_one_surface_through_it(kept: Path, tmp_path: Path) -> None:
     found = trimesh.load(surface.path)
     assert len(found.faces) > 100
     off = np.abs(np.linalg.norm(found.vertices - SPHERE[0], axis=1) - SPHERE[1])
-    assert np.median(off) < 0.3 and off.max() < 10  # beyond the limb, which so few pixels show, it is cut a little late
+    assert (
+        np.median(off) < 0.3 and off.max() < 10
+    )  # beyond the limb, which so few pixels show, it is cut a little late
 
 
 @pytest.mark.process  # which reads a storage of OpenCV
@@ -147,21 +204,33 @@ def test_a_calibration_comes_back(kept: Path, tmp_path: Path, suffix: str) -> No
     np.testing.assert_allclose(read["T"], RIG.t, atol=1e-12)
     np.testing.assert_allclose(read["D_camera"], RIG.camera.D, atol=1e-12)
     text = path.read_text()
-    assert not missing_facts(text, "reprojection_rms_px_projector", "projector_size", "k1 k2 p1 p2 k3", "OpenCV", "mm")
+    assert not missing_facts(
+        text, "reprojection_rms_px_projector", "projector_size", "k1 k2 p1 p2 k3", "OpenCV", "mm"
+    )
 
 
 def test_poses_chain(kept: Path, tmp_path: Path) -> None:
     poses = json.loads(export(kept, "poses", out=tmp_path / "p.json").path.read_text())
     assert [target["name"] for target in poses["targets"]] == ["pose_02", "pose_10"]
-    assert poses["targets"][0]["camera_rms_px"] == 0.1 and poses["targets"][1]["T_camera_board"][2][3] == 610
+    assert (
+        poses["targets"][0]["camera_rms_px"] == 0.1
+        and poses["targets"][1]["T_camera_board"][2][3] == 610
+    )
     T_reference_projector = np.array(poses["projector"]["T_reference_projector"])
     np.testing.assert_allclose(T_reference_projector[:3, 3], [180, 5, 8], atol=1e-9)
     (merge,) = poses["merges"]
-    assert merge["reference"] == "scan_01" and [scan["name"] for scan in merge["scans"]] == ["scan_01", "scan_02"]
+    assert merge["reference"] == "scan_01" and [scan["name"] for scan in merge["scans"]] == [
+        "scan_01",
+        "scan_02",
+    ]
     first, second = merge["scans"]
     assert np.array_equal(first["T_reference_scan"], np.eye(4))
-    np.testing.assert_allclose(second["T_reference_projector"], T_REFERENCE_SCAN @ T_reference_projector, atol=1e-9)
-    storage = cv2.FileStorage(str(export(kept, "poses", out=tmp_path / "p.yaml").path), cv2.FILE_STORAGE_READ)
+    np.testing.assert_allclose(
+        second["T_reference_projector"], T_REFERENCE_SCAN @ T_reference_projector, atol=1e-9
+    )
+    storage = cv2.FileStorage(
+        str(export(kept, "poses", out=tmp_path / "p.yaml").path), cv2.FILE_STORAGE_READ
+    )
     scan = storage.getNode("merges").at(0).getNode("scans").at(1)
     np.testing.assert_allclose(scan.getNode("T_reference_scan").mat(), T_REFERENCE_SCAN, atol=1e-12)
     storage.release()
@@ -175,7 +244,17 @@ def test_coefficients_say_how_they_are_used(kept: Path, tmp_path: Path) -> None:
     c0, c1, c2, c3, c4 = held["x_coefficients"]
     z = (c0 + c1 * phi) / (1 + c2 * phi) * held["scale_factor"]
     ones = np.ones((H, W), np.float32)
-    phase = PhaseMap("x", float(held["x_period_px"]), phi, phi, ones, ones, np.zeros((H, W), np.uint8), (1.0, 0.0), 18)
+    phase = PhaseMap(
+        "x",
+        float(held["x_period_px"]),
+        phi,
+        phi,
+        ones,
+        ones,
+        np.zeros((H, W), np.uint8),
+        (1.0, 0.0),
+        18,
+    )
     np.testing.assert_allclose(np.stack([c3 * z, c4 * z, z], -1), model.points(phase), rtol=1e-5)
     assert "z = (c0 + c1 phi)/(1 + c2 phi)" in str(held["about"])
     with raises(InputError, "pixelwise", "splined"):
@@ -184,8 +263,12 @@ def test_coefficients_say_how_they_are_used(kept: Path, tmp_path: Path) -> None:
 
 def test_the_table_of_figures(kept: Path, tmp_path: Path) -> None:
     rows = list(csv.DictReader(export(kept, "table", out=tmp_path / "t.csv").path.open()))
-    found = [(row["record"], row["label"], row["RMS mm"]) for row in rows if row["kind"] == "verify"]
-    assert found == [("scan_02", "'=1+1", "0.05")] and {row["up to date"] for row in rows} == {"yes"}
+    found = [
+        (row["record"], row["label"], row["RMS mm"]) for row in rows if row["kind"] == "verify"
+    ]
+    assert found == [("scan_02", "'=1+1", "0.05")] and {row["up to date"] for row in rows} == {
+        "yes"
+    }
 
 
 @pytest.mark.computes
@@ -206,13 +289,17 @@ def test_the_command_says_what_it_wrote(kept: Path, run: Run, tmp_path: Path) ->
 
 
 @pytest.mark.computes
-def test_a_mesh_is_made_as_planned_and_says_what_that_did(kept: Path, run: Run, tmp_path: Path) -> None:
+def test_a_mesh_is_made_as_planned_and_says_what_that_did(
+    kept: Path, run: Run, tmp_path: Path
+) -> None:
     planned = ("--triangles", 500, "--smooth", 2, "--fill-holes", 0)
     status, said, _ = run("export", kept, "mesh", "scan_01", "--out", tmp_path / "m.ply", *planned)
     assert status == 0 and "smoothing" in said and "thinning" in said
     assert 100 < len(trimesh.load(tmp_path / "m.ply").faces) <= 500
     assert b"smoothing" in (tmp_path / "m.ply").read_bytes()[:1500]
-    status, _, error = run("export", kept, "mesh", "scan_01", "--out", tmp_path / "w.stl", "--watertight")
+    status, _, error = run(
+        "export", kept, "mesh", "scan_01", "--out", tmp_path / "w.stl", "--watertight"
+    )
     assert status == 1 and error
     assert not (tmp_path / "w.stl").exists()
 

@@ -48,8 +48,9 @@ def captured_again(index):
 def displaced(late=None, repeated=None, dropped=None, swapped=None, lag=0, axes="xy"):
     """The sequence of a capture of the board, and frames that do not follow it.
 
-    Frame ``late`` shows the pattern before; ``repeated`` is the image before once more; ``dropped`` is lost, and all
-    that follow come too early; ``swapped`` has changed places with the next one; all are ``lag`` images behind.
+    Frame ``late`` shows the pattern before; ``repeated`` is the image before once more; ``dropped``
+    is lost, and all that follow come too early; ``swapped`` has changed places with the next one;
+    all are ``lag`` images behind.
     """
     sequence, stack = captured(p18)
     order = np.arange(len(stack))
@@ -130,8 +131,13 @@ def test_a_saved_check_is_read_until_the_checks_change(tmp_path):
         session.save_capture("part", "scan", sequence, stack, source="a test")
         assert load_check(session, "part") is None
         saved = save_check(session, session.load_capture("part"))
-        assert load_check(session, "part").warnings() == saved.warnings() and len(saved.warnings()) <= 4
-        assert any(not missing_facts(message, "one image", "behind") for message in saved.warnings())
+        assert (
+            load_check(session, "part").warnings() == saved.warnings()
+            and len(saved.warnings()) <= 4
+        )
+        assert any(
+            not missing_facts(message, "one image", "behind") for message in saved.warnings()
+        )
         meta, _ = session.load_result("trust/part")
         older = {**saved.to_json(), "inputs": meta["inputs"], "version": meta["version"] - 1}
         session.save_result("trust/part", older, {})

@@ -1,4 +1,5 @@
-"""What a camera or a file states as its full scale is stored with the capture, and judges it everywhere."""
+"""What a camera or a file states as its full scale is stored with the capture, and judges it
+everywhere."""
 
 import struct
 import zlib
@@ -39,7 +40,8 @@ DARK, BRIGHT = 0.04, 3.0
 
 
 class DeepCamera(SimulatedCamera):
-    """The simulated camera with a higher full scale in a uint16; ``share`` of it is what 8 bits would be."""
+    """The simulated camera with a higher full scale in a uint16; ``share`` of it is what 8 bits
+    would be."""
 
     dtype = np.dtype(np.uint16)
 
@@ -66,7 +68,9 @@ def deep_rig(share: float, full_scale: int = 4095) -> Rig:
 def captured(folder: Path, share: float, full_scale: int = 4095) -> list[str]:
     warnings: list[str] = []
     bench = RigSetup(deep_rig(share, full_scale))
-    capture(folder, "a", {"driver": "test"}, role="scan", set_up=lambda *_: bench, warn=warnings.append)
+    capture(
+        folder, "a", {"driver": "test"}, role="scan", set_up=lambda *_: bench, warn=warnings.append
+    )
     return warnings
 
 
@@ -86,7 +90,9 @@ def test_a_dark_capture_is_dark_everywhere(tmp_path: Path) -> None:
         assert cv2.imdecode(np.frombuffer(make_thumbnail(shot), np.uint8), 0).max() < 20
         assert stated_full_scale(replay(frames, shot.sequence).camera) == 4095
     exposure = check_recorded_rig(folder, "a").check("exposure")
-    assert exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05
+    assert (
+        exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05
+    )
     lit = frames[np.argmax(frames.mean(axis=(1, 2)))]
     assert brightness(lit, 4095)[1] < 0.05 < DIM < brightness(lit)[1]
     assert reduced(lit, full_scale=4095)[0].max() < 15
@@ -106,7 +112,9 @@ def test_the_rig_is_judged_by_its_full_scale() -> None:
     rig = deep_rig(DARK)
     with rig.opened():
         exposure = preflight(rig).check("exposure")
-    assert exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05
+    assert (
+        exposure.verdict == "bad" and 0.03 < exposure.figures["bright_share_of_full_scale"] < 0.05
+    )
 
 
 @pytest.mark.computes
@@ -121,15 +129,21 @@ def test_pixels_at_the_full_scale_are_saturated(tmp_path: Path, full_scale: int)
     phase = decode(sequence, frames, "x")
     clipped = (phase.reason == Reason.SATURATED).mean()
     assert 0.05 < clipped < 0.9
-    np.testing.assert_array_equal(decode_reference(sequence, frames, "x").reason == Reason.SATURATED, phase.reason == 2)
+    np.testing.assert_array_equal(
+        decode_reference(sequence, frames, "x").reason == Reason.SATURATED, phase.reason == 2
+    )
     assert any("saturated" in message for message in loss_warnings(sequence, frames, {"x": phase}))
     assert check_recorded_rig(folder, "a").check("exposure").figures["saturated_share"] > 0.05
-    unstated = (decode(replace(sequence, full_scale=None), frames, "x").reason == Reason.SATURATED).mean()
+    unstated = (
+        decode(replace(sequence, full_scale=None), frames, "x").reason == Reason.SATURATED
+    ).mean()
     assert unstated == (clipped if full_scale == 4095 else 0)
 
 
 def test_a_full_scale_that_the_frames_contradict_is_refused() -> None:
-    sequence = PatternSequence((64, 48), tuple(phase_steps("x", 4, 64.0)), relative=True, full_scale=1023)
+    sequence = PatternSequence(
+        (64, 48), tuple(phase_steps("x", 4, 64.0)), relative=True, full_scale=1023
+    )
     frames = np.stack([np.uint16(16) * render_pattern(sequence, k) for k in range(4)])
     with raises(InputError, "full_scale", 1023, 4080):
         decode(sequence, frames, "x")
@@ -147,18 +161,26 @@ def test_an_image_is_shown_by_its_full_scale() -> None:
     image = np.array([[0, 2000, 4000, 4095]], np.uint16)
     assert to_eight_bits(image, 4095).tolist() == [[0, 125, 250, 255]]
     assert to_eight_bits(image, 4000).tolist() == [[0, 128, 255, 255]]
-    assert to_eight_bits(image[:, :2], 4095).tolist() == [[0, 125]] and to_eight_bits(image // 16).max() == 255
+    assert (
+        to_eight_bits(image[:, :2], 4095).tolist() == [[0, 125]]
+        and to_eight_bits(image // 16).max() == 255
+    )
 
 
 def png(image: np.ndarray, bits: int) -> bytes:
     """A PNG that states its significant bits."""
     data, chunk = cv2.imencode(".png", image)[1].tobytes(), b"sBIT" + bytes([bits])
-    return data[:33] + struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    return (
+        data[:33] + struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    )
 
 
 def pgm(image: np.ndarray, largest: int) -> bytes:
     """A PGM that states its largest grey level."""
-    return f"P5\n{image.shape[1]} {image.shape[0]}\n{largest}\n".encode() + image.astype(">u2").tobytes()
+    return (
+        f"P5\n{image.shape[1]} {image.shape[0]}\n{largest}\n".encode()
+        + image.astype(">u2").tobytes()
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,11 +199,15 @@ def test_files_that_state_their_bits(tmp_path: Path, name, encode, stated, scale
     (tmp_path / name).write_bytes(encode(image, stated))
     read = read_frames([tmp_path / name])
     np.testing.assert_array_equal(read.stack[0], image)
-    assert read.full_scale == expected and read_frames([tmp_path / name], full_scale=600).full_scale == 600
+    assert (
+        read.full_scale == expected
+        and read_frames([tmp_path / name], full_scale=600).full_scale == 600
+    )
 
 
 def write_frames(folder: Path, order: list[int] | None = None, head: str = "") -> Path:
-    """Fringes and a Gray code as dark PNGs of 12 bits, named from 00, with their TOML; the files in another order."""
+    """Fringes and a Gray code as dark PNGs of 12 bits, named from 00, with their TOML; the files in
+    another order."""
     sequence = gray((120, 90))
     folder.mkdir()
     rng = np.random.default_rng(0)

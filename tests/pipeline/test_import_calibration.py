@@ -1,4 +1,5 @@
-"""Calibrations from other programs, against the file's own statements and against a capture of the session."""
+"""Calibrations from other programs, against the file's own statements and against a capture of the
+session."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +24,11 @@ Run = Callable[..., tuple[int, str, str]]
 CAMERA, PROJECTOR = (160, 120), (456, 570)
 R = cv2.Rodrigues(np.array([0.01, 0.3, -0.02]))[0]
 RIG = StereoRig(
-    Lens(np.array([[400.0, 0, 78], [0, 402.0, 57], [0, 0, 1]]), np.array([-0.05, 0.01, 1e-3, 0, 0]), CAMERA),
+    Lens(
+        np.array([[400.0, 0, 78], [0, 402.0, 57], [0, 0, 1]]),
+        np.array([-0.05, 0.01, 1e-3, 0, 0]),
+        CAMERA,
+    ),
     Lens(np.array([[700.0, 0, 230.0], [0, 1400.0, 280.0], [0, 0, 1]]), np.zeros(5), PROJECTOR),
     R,
     -R @ np.array([180.0, 5.0, 8.0]),
@@ -45,19 +50,31 @@ def scaled(K: np.ndarray, factor: float) -> np.ndarray:
 def save_wall(session: Path) -> None:
     """A capture of a slanted wall along both axes, noise of one grey level."""
     u, v = np.meshgrid(np.arange(CAMERA[0], dtype=float), np.arange(CAMERA[1], dtype=float))
-    rays = np.column_stack([RIG.camera.undistort(np.column_stack([u.ravel(), v.ravel()])), np.ones(u.size)])
+    rays = np.column_stack(
+        [RIG.camera.undistort(np.column_stack([u.ravel(), v.ravel()])), np.ones(u.size)]
+    )
     depth = 600 / (1 + 0.3 * rays[:, 0] + 0.2 * rays[:, 1])
     seen = RIG.project(rays * depth[:, None])
     sequence, rng = multifrequency(PROJECTOR, steps=4), np.random.default_rng(5)
     frames = [
-        110 + 80 * np.cos(2 * np.pi * (seen[:, int(frame.axis == "y")] / frame.period_px + frame.step / frame.steps))
-        if frame.kind == "phase"
-        else np.full(u.size, 190.0)
+        (
+            110
+            + 80
+            * np.cos(
+                2
+                * np.pi
+                * (seen[:, int(frame.axis == "y")] / frame.period_px + frame.step / frame.steps)
+            )
+            if frame.kind == "phase"
+            else np.full(u.size, 190.0)
+        )
         for frame in sequence.frames
     ]
     stack = np.array(frames).reshape(-1, *u.shape) + rng.normal(0, 1, (len(frames), *u.shape))
     with Session.open_or_create(session) as store:
-        store.save_capture("wall", "scan", sequence, stack.round().astype(np.uint8), source="simulated")
+        store.save_capture(
+            "wall", "scan", sequence, stack.round().astype(np.uint8), source="simulated"
+        )
         save_sound_checks(store)
 
 
@@ -92,9 +109,12 @@ def test_common_names_are_recognised(tmp_path: Path, names: tuple[str, ...]) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "names", [COMMON_NAMES[0], *(pytest.param(names, marks=pytest.mark.slow) for names in COMMON_NAMES[1:])]
+    "names",
+    [COMMON_NAMES[0], *(pytest.param(names, marks=pytest.mark.slow) for names in COMMON_NAMES[1:])],
 )
-def test_common_names_are_imported_and_stated(session: Path, run: Run, tmp_path: Path, names: tuple[str, ...]) -> None:
+def test_common_names_are_imported_and_stated(
+    session: Path, run: Run, tmp_path: Path, names: tuple[str, ...]
+) -> None:
     path = file(tmp_path, entries(), names)
     status, out, err = run("import", "opencv-calibration", path, session)
     assert status == 0 and err == ""
@@ -112,7 +132,9 @@ def test_names_that_are_not_known_or_not_unique_are_asked_for(run: Run, tmp_path
     assert status == 1 and not missing_facts(err, "--keys", *"ABCDRT")
     path = file(tmp_path, entries(), M1=np.eye(3), D1=np.zeros(5), M2=np.eye(3), D2=np.zeros(5))
     status, _, err = run("import", "opencv-calibration", path, tmp_path / "s")
-    assert status == 1 and not missing_facts(err, "K_camera", "D_camera", "M1", "D1", "M2", "D2", "--keys")
+    assert status == 1 and not missing_facts(
+        err, "K_camera", "D_camera", "M1", "D1", "M2", "D2", "--keys"
+    )
     assert not (tmp_path / "s").exists()
 
 
@@ -130,7 +152,9 @@ INVERSE = {"R": RIG.R.T, "T": -RIG.R.T @ RIG.t}
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            {"K_camera": scaled(RIG.camera.K, 2)}, ["wall", "camera's matrix", "halve", "fx"], marks=pytest.mark.slow
+            {"K_camera": scaled(RIG.camera.K, 2)},
+            ["wall", "camera's matrix", "halve", "fx"],
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -138,7 +162,9 @@ def test_a_capture_contradicts_a_calibration(
     session: Path, run: Run, tmp_path: Path, changes: dict, facts: list[str]
 ) -> None:
     assert run("import", "opencv-calibration", file(tmp_path, entries()), session)[0] == 0
-    status, _, err = run("import", "opencv-calibration", file(tmp_path, entries(**changes)), session, "--force")
+    status, _, err = run(
+        "import", "opencv-calibration", file(tmp_path, entries(**changes)), session, "--force"
+    )
     assert status == 1 and not missing_facts(err, *facts), err
     with Session.open(session) as store:  # nothing was replaced
         kept = store.load_result("calibration/stereo", only=())[0]["imported"]
@@ -158,12 +184,20 @@ def test_a_capture_that_arrives_later_contradicts_a_calibration(run: Run, tmp_pa
 
 
 @pytest.mark.slow
-def test_sizes_that_contradict_each_other_are_refused(session: Path, run: Run, tmp_path: Path) -> None:
+def test_sizes_that_contradict_each_other_are_refused(
+    session: Path, run: Run, tmp_path: Path
+) -> None:
     path = file(tmp_path, entries(), cam_size=np.array([320, 240]), pro_size=np.array(PROJECTOR))
     status, _, err = run("import", "opencv-calibration", path, session)
     assert status == 1 and not missing_facts(err, "camera", "320x240", "cam_size", "160x120")
-    status, _, err = run("import", "opencv-calibration", path, tmp_path / "new", "--projector", "912x1140")
-    assert status == 1 and not missing_facts(err, "912x1140", "456x570") and not (tmp_path / "new").exists()
+    status, _, err = run(
+        "import", "opencv-calibration", path, tmp_path / "new", "--projector", "912x1140"
+    )
+    assert (
+        status == 1
+        and not missing_facts(err, "912x1140", "456x570")
+        and not (tmp_path / "new").exists()
+    )
     status, out, _ = run("import", "opencv-calibration", path, tmp_path / "new")
     assert status == 0 and not missing_facts(out, "camera 320x240")
 
@@ -171,12 +205,21 @@ def test_sizes_that_contradict_each_other_are_refused(session: Path, run: Run, t
 def test_a_principal_point_outside_of_the_image_is_noticed(run: Run, tmp_path: Path) -> None:
     path = file(tmp_path, entries(K_projector=scaled(RIG.projector.K, 2.2)))
     status, _, err = run(
-        "import", "opencv-calibration", path, tmp_path / "s", "--projector", "456x570", "--camera", "160x120"
+        "import",
+        "opencv-calibration",
+        path,
+        tmp_path / "s",
+        "--projector",
+        "456x570",
+        "--camera",
+        "160x120",
     )
     assert status == 0 and not missing_facts(err, "(506, 616)", "456x570", "scale")
 
 
-def test_inspect_describes_a_session_with_an_imported_calibration_alone(run: Run, tmp_path: Path) -> None:
+def test_inspect_describes_a_session_with_an_imported_calibration_alone(
+    run: Run, tmp_path: Path
+) -> None:
     session = tmp_path / "s"
     assert run("import", "opencv-calibration", file(tmp_path, entries()), session)[0] == 0
     status, out, err = run("inspect", session)

@@ -1,4 +1,5 @@
-"""Folders that other tools made, through the command line: what is kept, what is skipped, and what is said of it."""
+"""Folders that other tools made, through the command line: what is kept, what is skipped, and what
+is said of it."""
 
 import re
 import shutil
@@ -32,7 +33,8 @@ PROJECTOR = (120, 90)
 
 
 def photographed(sequence: PatternSequence, seed: int) -> list[np.ndarray]:
-    """What a camera with the projector's own pixels records: 8 bits, noise of one grey level, ambient light."""
+    """What a camera with the projector's own pixels records: 8 bits, noise of one grey level,
+    ambient light."""
     rng = np.random.default_rng(seed)
     return [
         np.clip(render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, PROJECTOR[::-1]), 0, 255)
@@ -63,13 +65,18 @@ def unchanged(err: str) -> set[str]:
 def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Path) -> None:
     write_captures(tmp_path / "source", 3)
     session, options = tmp_path / "session", ("--projector", "120x90")
-    assert run("import", "procam-calibration", tmp_path / "source" / "capture_1", session, *options)[0] == 0
+    assert (
+        run("import", "procam-calibration", tmp_path / "source" / "capture_1", session, *options)[0]
+        == 0
+    )
     chunk = session / "captures/capture_1/frames.zarr/c.2.0.0"
     sound = chunk.read_bytes()
     status, out, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
     assert status == 0 and not missing_facts(out, "3 captures") and unchanged(err) == {"capture_1"}
     assert not (session / "trash").exists()
-    chunk.write_bytes(sound[:100] + bytes(len(sound) - 100))  # the remedy for damage is to import again
+    chunk.write_bytes(
+        sound[:100] + bytes(len(sound) - 100)
+    )  # the remedy for damage is to import again
     status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
     assert status == 0 and unchanged(err) == {"capture_0", "capture_2"}
     assert any(not missing_facts(line, "capture_1", "damaged") for line in err.splitlines())
@@ -82,7 +89,8 @@ def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Pat
 
 @pytest.fixture
 def faulty(tmp_path: Path) -> Path:
-    """Five captures: one with a file cut short, one with a missing file, one in the dark, two sound."""
+    """Five captures: one with a file cut short, one with a missing file, one in the dark, two
+    sound."""
     folders = write_captures(tmp_path / "source", 5)
     cut = folders[1] / "graycode_03.png"
     cut.write_bytes(cut.read_bytes()[:200])
@@ -93,45 +101,70 @@ def faulty(tmp_path: Path) -> Path:
     return tmp_path / "source"
 
 
-def test_readable_captures_are_imported_and_the_others_named(faulty: Path, run: Run, tmp_path: Path) -> None:
+def test_readable_captures_are_imported_and_the_others_named(
+    faulty: Path, run: Run, tmp_path: Path
+) -> None:
     session = tmp_path / "session"
     status, out, err = run("import", "procam-calibration", faulty, session, "--projector", "120x90")
-    assert status == 0 and not missing_facts(out, "2 captures", "target poses", "capture_0", "capture_4")
+    assert status == 0 and not missing_facts(
+        out, "2 captures", "target poses", "capture_0", "capture_4"
+    )
     warnings = [line for line in err.splitlines() if line.startswith("warning: ")]
     assert len(warnings) == 3
-    for name, fact in (("capture_1", "graycode_03.png"), ("capture_2", "graycode_07"), ("capture_3", "modulation")):
+    for name, fact in (
+        ("capture_1", "graycode_03.png"),
+        ("capture_2", "graycode_07"),
+        ("capture_3", "modulation"),
+    ):
         assert any(name in line and fact in line for line in warnings), (name, warnings)
     with Session.open(session) as store:
         assert store.capture_names() == ["capture_0", "capture_4"]
 
 
 def test_strict_refuses_the_folder(faulty: Path, run: Run, tmp_path: Path) -> None:
-    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict")
+    status, _, err = run(
+        "import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict"
+    )
     assert status == 1 and not missing_facts(err, "capture_2") and "graycode_07" in err
-    (faulty / "capture_2" / "graycode_07.png").write_bytes((faulty / "capture_0" / "graycode_07.png").read_bytes())
-    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict")
+    (faulty / "capture_2" / "graycode_07.png").write_bytes(
+        (faulty / "capture_0" / "graycode_07.png").read_bytes()
+    )
+    status, _, err = run(
+        "import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90", "--strict"
+    )
     assert status == 1 and not missing_facts(err, "capture_1", "graycode_03.png")
     assert not (tmp_path / "s").exists()
 
 
-def test_a_folder_without_a_readable_capture_is_an_error(faulty: Path, run: Run, tmp_path: Path) -> None:
+def test_a_folder_without_a_readable_capture_is_an_error(
+    faulty: Path, run: Run, tmp_path: Path
+) -> None:
     for name in ("capture_0", "capture_4"):
         for file in (faulty / name).iterdir():
             file.unlink()
         (faulty / name).rmdir()
-    status, _, err = run("import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90")
+    status, _, err = run(
+        "import", "procam-calibration", faulty, tmp_path / "s", "--projector", "120x90"
+    )
     assert status == 1 and not missing_facts(err, "3 captures")
     assert not missing_facts(err, "graycode_03.png", "modulation") and "graycode_07" in err
     assert not (tmp_path / "s").exists()
 
 
 def write_colour(source: Path, exposures: tuple[float, ...] = ()) -> Path:
-    """Four steps of a fringe along both axes, in red light on a colour camera, described by a TOML in the folder."""
+    """Four steps of a fringe along both axes, in red light on a colour camera, described by a TOML
+    in the folder."""
     lines = ['order = "name"'] if not exposures else []
     sequence = PatternSequence(PROJECTOR, (*phase_steps("x", 4, 132.0), *phase_steps("y", 4, 99.0)))
     for exposure in exposures or (1.0,):
         for axis, period in (("x", 132.0), ("y", 99.0)):
-            lines += ["[[frames]]", 'kind = "phase"', f'axis = "{axis}"', "steps = 4", f"period_px = {period}"]
+            lines += [
+                "[[frames]]",
+                'kind = "phase"',
+                f'axis = "{axis}"',
+                "steps = 4",
+                f"period_px = {period}",
+            ]
             if exposures:
                 lines += [f"exposure_ms = {exposure}", f'files = "{exposure:g}ms/{axis}*.png"']
         for i, frame in enumerate(photographed(sequence, 7)):
@@ -148,22 +181,47 @@ def write_colour(source: Path, exposures: tuple[float, ...] = ()) -> Path:
 def test_the_default_channel_of_colour_frames_is_stated_once(run: Run, tmp_path: Path) -> None:
     source, session = write_colour(tmp_path / "source"), tmp_path / "session"
     shutil.copytree(source / "scan", source / "scan_2")
-    status, out, err = run("import", "auto", source, session, "--projector", "120x90", "--role", "scan")
-    assert status == 0 and not missing_facts(out, "layout frames") and err.count("green channel") == 1
+    status, out, err = run(
+        "import", "auto", source, session, "--projector", "120x90", "--role", "scan"
+    )
+    assert (
+        status == 0 and not missing_facts(out, "layout frames") and err.count("green channel") == 1
+    )
     status, _, err = run(
-        "import", "frames", source, session, "--projector", "120x90", "--channel", "red", "--prefix", "red"
+        "import",
+        "frames",
+        source,
+        session,
+        "--projector",
+        "120x90",
+        "--channel",
+        "red",
+        "--prefix",
+        "red",
     )
     assert status == 0 and "channel" not in err
     with Session.open(session) as store:
         green, red = store.load_capture("scan"), store.load_capture("red_scan")
         assert red.frames.max() > 2 * green.frames.max()
-        assert green.meta["settings"]["channel"] == "green" and red.meta["settings"]["channel"] == "red"
+        assert (
+            green.meta["settings"]["channel"] == "green"
+            and red.meta["settings"]["channel"] == "red"
+        )
 
 
 def test_exposures_of_a_toml_become_those_of_the_session(run: Run, tmp_path: Path) -> None:
     source, session = write_colour(tmp_path / "source", (4.0, 1.0)), tmp_path / "session"
     status, _, err = run(
-        "import", "auto", source, session, "--projector", "120x90", "--channel", "red", "--role", "scan"
+        "import",
+        "auto",
+        source,
+        session,
+        "--projector",
+        "120x90",
+        "--channel",
+        "red",
+        "--role",
+        "scan",
     )
     assert status == 0, err
     with Session.open(session) as store:
@@ -183,16 +241,28 @@ def test_a_projector_size_that_is_not_stated_is_said(run: Run, tmp_path: Path) -
     assert status == 0 and not missing_facts(out, "unknown size")
 
 
-def test_the_size_of_the_session_is_named_only_where_it_was_used(run: Run, tmp_path: Path, monkeypatch) -> None:
+def test_the_size_of_the_session_is_named_only_where_it_was_used(
+    run: Run, tmp_path: Path, monkeypatch
+) -> None:
     write_captures(tmp_path / "source", 1)
     session, warnings = tmp_path / "session", []
-    assert run("import", "procam-calibration", tmp_path / "source", session, "--projector", "120x90")[0] == 0
+    assert (
+        run("import", "procam-calibration", tmp_path / "source", session, "--projector", "120x90")[
+            0
+        ]
+        == 0
+    )
     images = re.compile(r"graycode_(\d+)")
 
     def make_layout(stated: tuple[int, int] | None) -> FolderLayout:
-        def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
+        def describe(
+            folder: Path, name: str, projector: tuple[int, int]
+        ) -> tuple[ImportableRecording, list[str]]:
             files = match_images(folder, images)[0]
-            return ImportableRecording(name, gray(stated or projector), tuple(files.values()), folder), []
+            return (
+                ImportableRecording(name, gray(stated or projector), tuple(files.values()), folder),
+                [],
+            )
 
         return define_layout("own", "images", describe, lambda folder: has_images(folder, images))
 
@@ -210,11 +280,17 @@ def test_a_wrong_exposure_is_reported(tmp_path: Path, run: Run, gain: float, wor
     for number, frame in enumerate(photographed(sequence, 0)):
         bright = np.clip(np.rint(frame * gain), 0, 255).astype(np.uint8)
         assert cv2.imwrite(str(folder / f"{number}.png"), bright)
-    lines = [f'[[frame]]\nfile = "{k}.png"\n' + _toml(frame.to_dict()) for k, frame in enumerate(steps)]
+    lines = [
+        f'[[frame]]\nfile = "{k}.png"\n' + _toml(frame.to_dict()) for k, frame in enumerate(steps)
+    ]
     (tmp_path / "frames.toml").write_text('projector = "120x90"\n' + "\n".join(lines))
-    status, _, err = run("import", "frames", folder, tmp_path / "session", "--sequence", tmp_path / "frames.toml")
+    status, _, err = run(
+        "import", "frames", folder, tmp_path / "session", "--sequence", tmp_path / "frames.toml"
+    )
     assert status == (gain > 1) and (word in err if word else "warning" not in err), err
 
 
 def _toml(values: dict) -> str:
-    return "\n".join(f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in values.items())
+    return "\n".join(
+        f'{k} = "{v}"' if isinstance(v, str) else f"{k} = {v}" for k, v in values.items()
+    )

@@ -31,8 +31,11 @@ POSE = transform_from_rvec([2.9, 0.1, 0.2], [5.0, -3.0, 500.0])
 CORNER = transform_from_rvec([0.0, 0.0, 0.0], [40.0, 40.0, 0.0])
 
 
-def synthesised_part(seed: int, diameter: float = 20.0, motion: np.ndarray | None = None) -> MeasuredSurface:
-    """A table (z = 0, x and y from -40 to 40) with two side walls and a sphere on it, centred at 0, 0, 10."""
+def synthesised_part(
+    seed: int, diameter: float = 20.0, motion: np.ndarray | None = None
+) -> MeasuredSurface:
+    """A table (z = 0, x and y from -40 to 40) with two side walls and a sphere on it, centred at 0,
+    0, 10."""
     rng = np.random.default_rng(seed)
     n = 2500
     flat = np.stack([*rng.uniform(-40, 40, (2, n)), np.zeros(n)], 1)
@@ -48,7 +51,9 @@ def synthesised_part(seed: int, diameter: float = 20.0, motion: np.ndarray | Non
     ball = (diameter / 2 + NOISE * rng.normal(size=(n, 1))) * out + [0, 0, 10]
     points = np.concatenate([flat, wall_x, wall_y, ball])
     points = move_points(POSE if motion is None else motion @ POSE, points).astype(np.float32)
-    return MeasuredSurface(points, np.full(len(points), NOISE, np.float32), f"part {seed}", "splined", {})
+    return MeasuredSurface(
+        points, np.full(len(points), NOISE, np.float32), f"part {seed}", "splined", {}
+    )
 
 
 def make_plan(limit: float = TOLERANCE) -> Plan:
@@ -57,10 +62,23 @@ def make_plan(limit: float = TOLERANCE) -> Plan:
         return PlanRegion("box", tuple((a + b) / 2), tuple((b - a) / 2))
 
     features = (
-        PlanFeature("table", "plane", box((56, 2, -3), (78, 78, 3)), (67.0, 40.0, 0.0), (0.0, 0.0, 1.0)),
-        PlanFeature("left", "plane", box((-3, 2, 3), (3, 78, 18)), (0.0, 40.0, 10.0), (1.0, 0.0, 0.0)),
-        PlanFeature("front", "plane", box((2, -3, 3), (78, 3, 18)), (40.0, 0.0, 10.0), (0.0, 1.0, 0.0)),
-        PlanFeature("ball", "sphere", PlanRegion("ball", (40.0, 40.0, 10.0), (12.0,)), (40.0, 40.0, 10.0), None, 10.0),
+        PlanFeature(
+            "table", "plane", box((56, 2, -3), (78, 78, 3)), (67.0, 40.0, 0.0), (0.0, 0.0, 1.0)
+        ),
+        PlanFeature(
+            "left", "plane", box((-3, 2, 3), (3, 78, 18)), (0.0, 40.0, 10.0), (1.0, 0.0, 0.0)
+        ),
+        PlanFeature(
+            "front", "plane", box((2, -3, 3), (78, 3, 18)), (40.0, 0.0, 10.0), (0.0, 1.0, 0.0)
+        ),
+        PlanFeature(
+            "ball",
+            "sphere",
+            PlanRegion("ball", (40.0, 40.0, 10.0), (12.0,)),
+            (40.0, 40.0, 10.0),
+            None,
+            10.0,
+        ),
         PlanFeature("nothing", "plane", PlanRegion("ball", (0.0, 0.0, 300.0), (5.0,))),
     )
     characteristics = (
@@ -70,7 +88,9 @@ def make_plan(limit: float = TOLERANCE) -> Plan:
         Characteristic("square", "perpendicularity", ("left", "table"), upper=0.05),
     )
     start = CORNER @ np.linalg.inv(POSE)
-    alignment = Alignment("3-2-1", None, ("table", "left", "front"), tuple(map(tuple, start.tolist())))  # type: ignore[arg-type]
+    alignment = Alignment(
+        "3-2-1", None, ("table", "left", "front"), tuple(map(tuple, start.tolist()))
+    )  # type: ignore[arg-type]
     return Plan("ball on a table", features, characteristics, alignment)
 
 
@@ -103,16 +123,25 @@ def test_a_wrong_plan_is_refused_by_name(tmp_path: Path, old: str, new: str, nam
 @pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
-    ("count", "wrong"), [(6, {1: 1, 4: -1}), pytest.param(20, {3: 1, 8: -1, 13: 1, 17: -1}, marks=pytest.mark.slow)]
+    ("count", "wrong"),
+    [(6, {1: 1, 4: -1}), pytest.param(20, {3: 1, 8: -1, 13: 1, 17: -1}, marks=pytest.mark.slow)],
 )
-def test_exactly_the_parts_out_of_tolerance_fail(tmp_path: Path, count: int, wrong: dict[int, int]) -> None:
+def test_exactly_the_parts_out_of_tolerance_fail(
+    tmp_path: Path, count: int, wrong: dict[int, int]
+) -> None:
     rng = np.random.default_rng(7)
     sources = []
     for k in range(count):
-        off = wrong[k] * (TOLERANCE + 3 * SIGMA) if k in wrong else np.clip(SIGMA * rng.normal(), -0.04, 0.04)
+        off = (
+            wrong[k] * (TOLERANCE + 3 * SIGMA)
+            if k in wrong
+            else np.clip(SIGMA * rng.normal(), -0.04, 0.04)
+        )
         # parts lie a little differently each time
         motion = transform_from_rvec(0.001 * rng.normal(size=3), 0.3 * rng.normal(size=3))
-        sources.append((f"part {k}", lambda report, k=k, off=off, m=motion: synthesised_part(k, 20 + off, m)))
+        sources.append(
+            (f"part {k}", lambda report, k=k, off=off, m=motion: synthesised_part(k, 20 + off, m))
+        )
     inspection = inspect_surfaces(make_plan(), sources)
     assert inspection.parts_that("fail") == [f"part {k}" for k in wrong]
     assert len(inspection.parts_that("pass")) == count - len(wrong)
@@ -124,10 +153,16 @@ def test_exactly_the_parts_out_of_tolerance_fail(tmp_path: Path, count: int, wro
     assert capability.cpk[1] < capability.cpk[0] <= capability.cp[0] < 1
     written = write_inspection(inspection, tmp_path)
     page, table, _ = (path.read_text("utf-8-sig") for path in written.files)
-    assert page.count("data:image/webp") == 4 and "http://" not in page and f"part {max(wrong)}" in page
+    assert (
+        page.count("data:image/webp") == 4
+        and "http://" not in page
+        and f"part {max(wrong)}" in page
+    )
     rows = list(csv.DictReader(table.splitlines()))
     assert len(rows) == 4 * count
-    assert [row["part"] for row in rows if row["decision"] == "fail"] == [f"part {k}" for k in wrong]
+    assert [row["part"] for row in rows if row["decision"] == "fail"] == [
+        f"part {k}" for k in wrong
+    ]
 
 
 @pytest.mark.slow
@@ -140,7 +175,9 @@ def test_what_cannot_be_measured_is_named_and_takes_nothing_with_it(tmp_path: Pa
     def broken(report: object) -> MeasuredSurface:
         raise InputError("no such scan")
 
-    inspection = inspect_surfaces(plan, [("good", lambda report: synthesised_part(1)), ("broken", broken)])
+    inspection = inspect_surfaces(
+        plan, [("good", lambda report: synthesised_part(1)), ("broken", broken)]
+    )
     good, bad = inspection.parts
     assert [each.decision for each in good.results] == ["pass"] * 4 + ["undecided"]
     assert not missing_facts(good.results[-1].reason, 0, "points")
@@ -162,14 +199,21 @@ def test_capability_of_known_spread() -> None:
 @pytest.mark.slow
 @pytest.mark.computes
 def test_a_plan_by_best_fit_measures_profiles_from_the_nominal_model(tmp_path: Path) -> None:
-    """The nominal is a block with one sloping side; the part lies elsewhere, with a dent of 0.2 mm in its top."""
+    """The nominal is a block with one sloping side; the part lies elsewhere, with a dent of 0.2 mm
+    in its top."""
     mesh = trimesh.creation.box((80.0, 60.0, 40.0))
     low = mesh.vertices[:, 2] < 0
-    mesh.vertices[low] += np.column_stack([np.where(mesh.vertices[low, 0] > 0, 25.0, 0.0), *np.zeros((2, low.sum()))])
+    mesh.vertices[low] += np.column_stack(
+        [np.where(mesh.vertices[low, 0] > 0, 25.0, 0.0), *np.zeros((2, low.sum()))]
+    )
     mesh.export(tmp_path / "box.stl")
     features = (
         PlanFeature(
-            "top", "plane", PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0)), (20.0, 0.0, 20.0), (0, 0, 1)
+            "top",
+            "plane",
+            PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0)),
+            (20.0, 0.0, 20.0),
+            (0, 0, 1),
         ),
         PlanFeature("sound", "surface", PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
         PlanFeature("dented", "surface", PlanRegion("box", (-20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
@@ -188,10 +232,16 @@ def test_a_plan_by_best_fit_measures_profiles_from_the_nominal_model(tmp_path: P
         points, faces = trimesh.sample.sample_surface(mesh, 16000, seed=5)
         seen = mesh.face_normals[faces][:, 2] > -0.5
         points, normals = np.array(points)[seen], mesh.face_normals[faces][seen]
-        dent = 0.2 * np.exp(-((points[:, 0] + 20) ** 2 + points[:, 1] ** 2) / 60) * (normals[:, 2] > 0.9)
+        dent = (
+            0.2
+            * np.exp(-((points[:, 0] + 20) ** 2 + points[:, 1] ** 2) / 60)
+            * (normals[:, 2] > 0.9)
+        )
         points += (NOISE * rng.normal(size=len(points)) - dent)[:, None] * normals
         points = move_points(POSE, points).astype(np.float32)
-        return MeasuredSurface(points, np.full(len(points), NOISE, np.float32), "box", "splined", {})
+        return MeasuredSurface(
+            points, np.full(len(points), NOISE, np.float32), "box", "splined", {}
+        )
 
     result = inspect_surfaces(read, [("one", load)])
     sound, dented, top = result.parts[0].results

@@ -1,4 +1,5 @@
-"""A capture of which much is masked says why: saturation, or fringes near the least that is decoded."""
+"""A capture of which much is masked says why: saturation, or fringes near the least that is
+decoded."""
 
 import dataclasses
 

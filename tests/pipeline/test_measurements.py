@@ -43,7 +43,8 @@ RADIUS = 25.0
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """A session whose imported calibration is the truth, with a scan of the demo object and one of two balls."""
+    """A session whose imported calibration is the truth, with a scan of the demo object and one of
+    two balls."""
     folder = tmp_path_factory.mktemp("measuring") / "session"
     rig = letter(0.2, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
@@ -95,7 +96,9 @@ def tops(balls, regions) -> list[tuple[int, int]]:
     return found
 
 
-def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_path, regions, tops) -> None:
+def test_what_is_measured_is_kept_listed_and_true(
+    folder, balls, run: Run, tmp_path, regions, tops
+) -> None:
     a, b = tops
     first, second = (
         measurements.add_fit(folder, balls, "sphere", ball_about(balls, r), n)
@@ -108,10 +111,17 @@ def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_p
     over = measurements.add_relation(folder, point.id, first.id)
 
     radius = first.quantities[0]
-    assert abs(radius.value - RADIUS) < max(3 * radius.sigma, 0.02) and 0 < radius.sigma < 0.1 and not radius.whole
+    assert (
+        abs(radius.value - RADIUS) < max(3 * radius.sigma, 0.02)
+        and 0 < radius.sigma < 0.1
+        and not radius.whole
+    )
     true = np.linalg.norm(CENTRES[1] - CENTRES[0])
     distance = apart.quantities[0]
-    assert abs(distance.value - true) < max(3 * distance.sigma, 0.02) and apart.of == (first.id, second.id)
+    assert abs(distance.value - true) < max(3 * distance.sigma, 0.02) and apart.of == (
+        first.id,
+        second.id,
+    )
     assert abs(width.quantities[0].value - true) < 3 and width.quantities[0].sigma > 0
     assert abs(over.quantities[1].value) < 0.3  # the point lies on the ball's surface
     plane, lines = measurements.section_lines(folder, cut.id)
@@ -122,10 +132,16 @@ def test_what_is_measured_is_kept_listed_and_true(folder, balls, run: Run, tmp_p
     assert [each.id for each in listed] == ["m1", "m2", "m3", "m4", "m5", "m6", "m7"]
     assert not any(each.stale for each in listed) and listed[2].name == "L – R"
     status, said, _ = run("inspect", folder)
-    assert status == 0 and not missing_facts(said, "7 measurements", "L (sphere on balls)") and "radius 25.0" in said
+    assert (
+        status == 0
+        and not missing_facts(said, "7 measurements", "L (sphere on balls)")
+        and "radius 25.0" in said
+    )
     assert measurements.export_measurements(folder, tmp_path / "m.csv") == 7
     rows = list(csv.DictReader(io.StringIO((tmp_path / "m.csv").read_text("utf-8-sig"))))
-    assert rows[0]["name"] == "L" and rows[0]["unit"] == "mm" and rows[0]["calibration in U"] == "no"
+    assert (
+        rows[0]["name"] == "L" and rows[0]["unit"] == "mm" and rows[0]["calibration in U"] == "no"
+    )
     assert float(rows[0]["U (k = 2)"]) == pytest.approx(2 * radius.sigma, rel=1e-4)
 
 
@@ -135,7 +151,9 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
     assert one.name == "distance 1"
     with Session.open(folder, write=True) as store:
         assert rename_measurement(store, one.id, "=width").name == "=width"
-        assert ",'=width," in measurements.measurements_csv(store).replace("m1,'", "m1,'")  # no formula in a table
+        assert ",'=width," in measurements.measurements_csv(store).replace(
+            "m1,'", "m1,'"
+        )  # no formula in a table
         assert rename_measurement(store, one.id, "").name == "distance 1"
         two = measurements.add_distance(store, balls, b, a, "back")
         trash_measurement(store, two.id)
@@ -150,8 +168,13 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
 
 
 @pytest.mark.slow
-def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(folder, balls, regions) -> None:
-    fits = [measurements.add_fit(folder, balls, "sphere", ball_about(balls, region)) for region in regions]
+def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(
+    folder, balls, regions
+) -> None:
+    fits = [
+        measurements.add_fit(folder, balls, "sphere", ball_about(balls, region))
+        for region in regions
+    ]
     measurements.add_relation(folder, fits[0].id, fits[1].id)
     with Session.open(folder, write=True) as store:
         trash_measurement(store, fits[1].id)
@@ -161,14 +184,18 @@ def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(f
     assert not any(each.stale for each in measurements.load_measurements(folder))
     with Session.open(folder, write=True) as store:
         other = store.load_capture("object")
-        store.save_capture("balls", "scan", other.sequence, other.frames[::1], source="again", force=True)
+        store.save_capture(
+            "balls", "scan", other.sequence, other.frames[::1], source="again", force=True
+        )
     assert all(each.stale for each in measurements.load_measurements(folder))
     assert "[stale" in measurements.describe_measurement(measurements.load_measurements(folder)[0])
     with raises(InputError, "stale"):
         measurements.add_relation(folder, fits[0].id, fits[1].id)
 
 
-def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, regions, tops) -> None:
+def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(
+    folder, balls, regions, tops
+) -> None:
     with raises(InputError):
         measurements.add_distance(folder, balls, (0, 0), tops[0])
     with raises(InputError, "balls"):
@@ -187,9 +214,20 @@ def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(folder, balls, r
 
 
 @pytest.mark.slow
-def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: Run, tmp_path, balls, tops) -> None:
+def test_a_scan_is_compared_with_its_nominal_from_the_command_line(
+    folder, run: Run, tmp_path, balls, tops
+) -> None:
     ammonite = asset("objects/ammonite.ply")
-    arguments = ("compare", folder, "object", ammonite, "--tolerance", 1.5, "--json", tmp_path / "c.json")
+    arguments = (
+        "compare",
+        folder,
+        "object",
+        ammonite,
+        "--tolerance",
+        1.5,
+        "--json",
+        tmp_path / "c.json",
+    )
     status, said, wrong = run(*arguments, "--out", tmp_path / "d.ply")
     assert status == 0, wrong
     assert "PASS" in said
@@ -199,7 +237,9 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: 
     written = read_ply(tmp_path / "d.ply")
     assert written.faces is not None and len(written.faces) and written.colours is not None
     assert len(written.points) == found["statistics_mm"]["points"]
-    assert np.sqrt(np.mean(written.scalars["deviation"] ** 2)) == pytest.approx(found["statistics_mm"]["rms"], rel=1e-3)
+    assert np.sqrt(np.mean(written.scalars["deviation"] ** 2)) == pytest.approx(
+        found["statistics_mm"]["rms"], rel=1e-3
+    )
 
     measurements.add_section(folder, balls, *tops, "across")
     measurements.add_distance(folder, balls, *tops)
@@ -207,7 +247,9 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(folder, run: 
     assert not missing_facts(said, "object", "ammonite.ply", "deviation", "mean")
     report(folder, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
-    assert not missing_facts(page, "Measurements", "Section across", "Deviation from nominal", "ammonite.ply")
+    assert not missing_facts(
+        page, "Measurements", "Section across", "Deviation from nominal", "ammonite.ply"
+    )
 
     box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
     status, _, wrong = run("compare", folder, "object", tmp_path / "inch.stl")
@@ -226,25 +268,47 @@ def test_a_damaged_measurement_is_told_not_guessed(folder, balls, tops) -> None:
 
 
 @pytest.mark.slow
-def test_the_terminal_measures_relates_names_and_writes_a_table(folder, balls, run: Run, tmp_path, tops) -> None:
+def test_the_terminal_measures_relates_names_and_writes_a_table(
+    folder, balls, run: Run, tmp_path, tops
+) -> None:
     (u, v), (x, y) = tops
     for centre, name in zip(CENTRES, ("left", "right"), strict=True):
         top = centre - [0, 0, RADIUS]
-        status, said, wrong = run("measure", folder, "balls", "sphere", "--ball", *top, 14, "--name", name)
+        status, said, wrong = run(
+            "measure", folder, "balls", "sphere", "--ball", *top, 14, "--name", name
+        )
         assert status == 0 and f"{name} (sphere on balls): radius 2" in said, wrong
-        (warning,) = [line for line in wrong.splitlines() if line.startswith("warning: ") and name in line]
+        (warning,) = [
+            line for line in wrong.splitlines() if line.startswith("warning: ") and name in line
+        ]
         assert not missing_facts(warning, "U", "calibration", "stereo", "splined"), wrong
     status, said, _ = run("measure", folder, "balls", "distance", "--at", u, v, x, y)
     assert status == 0 and said.startswith("m3 ") and "distance 8" in said
     status, said, wrong = run(
-        "measurements", folder, "--relate", "m1", "m2", "--name", "m3", "tops", "--csv", tmp_path / "m.csv"
+        "measurements",
+        folder,
+        "--relate",
+        "m1",
+        "m2",
+        "--name",
+        "m3",
+        "tops",
+        "--csv",
+        tmp_path / "m.csv",
     )
     assert not missing_facts(wrong, "left – right", "U", "calibration", "stereo")
-    assert status == 0 and not missing_facts(said, "left – right", "tops", "distance", "4 measurements")
+    assert status == 0 and not missing_facts(
+        said, "left – right", "tops", "distance", "4 measurements"
+    )
     assert (tmp_path / "m.csv").read_text("utf-8-sig").startswith("id,name,kind")
     assert "m4" not in run("measurements", folder, "--delete", "m4")[1]
     assert "m4" in run("measurements", folder, "--bring-back")[1]
-    for wrong_use in (("plane",), ("plane", "--ball", 1, 2), ("distance", "--at", 3, 4), ("point",)):
+    for wrong_use in (
+        ("plane",),
+        ("plane", "--ball", 1, 2),
+        ("distance", "--at", 3, 4),
+        ("point",),
+    ):
         status, _, wrong = run("measure", folder, "balls", *wrong_use)
         option = "--ball" if wrong_use[0] == "plane" else "--at"
         assert status == 2 and not missing_facts(wrong, option), wrong
@@ -256,9 +320,21 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     with Session.open(folder, write=True) as store:
         points = balls.points[chosen]
         sigma = np.full(len(points), 0.05, np.float32)
-        write_ply(store.exports / "merged_1.ply", points, normals=balls.normals[chosen], scalars={"sigma": sigma})
+        write_ply(
+            store.exports / "merged_1.ply",
+            points,
+            normals=balls.normals[chosen],
+            scalars={"sigma": sigma},
+        )
         inputs = store.input_hashes("balls")
-        made = Merge(reference="balls", scans=["balls"], pairs={}, ply="merged_1.ply", model="stereo", inputs=inputs)
+        made = Merge(
+            reference="balls",
+            scans=["balls"],
+            pairs={},
+            ply="merged_1.ply",
+            model="stereo",
+            inputs=inputs,
+        )
         save_record(store, "1", made, {})
     on = load_surface(folder, "merge/1")
     region = regions[0]
@@ -266,7 +342,9 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     assert abs(one.quantities[0].value - RADIUS) < 0.05 and one.source == "merge/1"
     assert measurements.add_distance(folder, on, 0, 5).quantities[0].sigma > 0
     ends = [
-        int(np.argmin(np.linalg.norm(on.points - c - [dx, 0, -20.0], axis=1))) for c in CENTRES[:1] for dx in (-15, 15)
+        int(np.argmin(np.linalg.norm(on.points - c - [dx, 0, -20.0], axis=1)))
+        for c in CENTRES[:1]
+        for dx in (-15, 15)
     ]
     cut = measurements.add_section(folder, on, *ends)
     plane, lines = measurements.section_lines(folder, cut.id)
@@ -274,7 +352,9 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
     radii = np.concatenate([np.linalg.norm(line - middle, axis=1) for line in lines])
     apart = abs(float((CENTRES[0] - plane.origin) @ plane.normal))
     on_ball = radii[radii < RADIUS + 2]
-    assert len(on_ball) > 50 and np.median(on_ball) == pytest.approx(np.sqrt(RADIUS**2 - apart**2), abs=0.1)
+    assert len(on_ball) > 50 and np.median(on_ball) == pytest.approx(
+        np.sqrt(RADIUS**2 - apart**2), abs=0.1
+    )
     with raises(InputError, "index"):
         measurements.add_point(folder, on, (3, 4))
     other = measurements.add_fit(folder, balls, "sphere", ball_about(balls, region))
@@ -297,14 +377,22 @@ def test_measurements_are_repeated_by_a_plan(made: Path, run: Run, tmp_path: Pat
     status, text, _ = run("plan", session, "--out", plan, "--tolerance", 0.5)
     assert status == 0 and not missing_facts(text, "6 characteristics", "2 features")
     results = tmp_path / "results"
-    status, text, _ = run("inspect-parts", plan, tmp_path / "parts", "--scan", "balls", "--out", results)
+    status, text, _ = run(
+        "inspect-parts", plan, tmp_path / "parts", "--scan", "balls", "--out", results
+    )
     assert status == 0, text
     data = json.loads((results / "parts.json").read_text())
     assert [each["decision"] for each in data["parts"]] == ["pass"]
     true = float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
     values = {each["name"]: each["value"] for each in data["parts"][0]["results"]}
-    apart = next(value for name, value in values.items() if name.endswith("distance of the centres"))
+    apart = next(
+        value for name, value in values.items() if name.endswith("distance of the centres")
+    )
     assert apart == pytest.approx(true, abs=0.1)
     # the other scan shows no balls there: it is named, and the status says so
     status, text, error = run("inspect-parts", plan, session, "--out", results)
-    assert status == 1 and not missing_facts(error, "object") and not missing_facts(text, "not measured")
+    assert (
+        status == 1
+        and not missing_facts(error, "object")
+        and not missing_facts(text, "not measured")
+    )

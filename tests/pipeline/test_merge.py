@@ -1,4 +1,5 @@
-"""What `merge` is told of where scans lie, before it computes anything; the whole way is in test_commands."""
+"""What `merge` is told of where scans lie, before it computes anything; the whole way is in
+test_commands."""
 
 from pathlib import Path
 
@@ -49,12 +50,22 @@ def test_a_plate_is_merged_by_its_markers(tmp_path: Path) -> None:
     world = SimulatedWorld(rig)
     poses = [
         Pose(rotation(np.radians(turns)), np.array(place))
-        for turns, place in (((4.0, -6.0, 2.0), (0.0, 0.0, 620.0)), ((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0)))
+        for turns, place in (
+            ((4.0, -6.0, 2.0), (0.0, 0.0, 620.0)),
+            ((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0)),
+        )
     ]
     for name, pose in zip(("one", "two"), poses, strict=True):
         world.place("marked", pose)
         bench = RigSetup(simulated_rig(world))
-        capture(session, name, {}, role="scan", patterns="complementary", set_up=lambda *_, bench=bench: bench)
+        capture(
+            session,
+            name,
+            {},
+            role="scan",
+            patterns="complementary",
+            set_up=lambda *_, bench=bench: bench,
+        )
     with raises(Refused, "markers"):
         merge(session, ["two"], "one")
     made = merged(session, ["two"], "one", start="markers")
@@ -66,9 +77,14 @@ def test_a_plate_is_merged_by_its_markers(tmp_path: Path) -> None:
     (pair,) = made.record.markers
     assert pair.ids == [0, 1, 2, 3, 4, 5] and pair.moved == [] and 0.001 < pair.rms_mm < 0.05
     assert made.record.pairs["two"].start == "markers" and (pair.scan, pair.onto) == ("two", "one")
-    (table, *_) = Merge.tables({"1": made.record})
+    table, *_ = Merge.tables({"1": made.record})
     (row,) = table.rows
-    assert dict(zip([c.heading for c in table.columns], table.values(row), strict=True))["common markers"] == 6
+    assert (
+        dict(zip([c.heading for c in table.columns], table.values(row), strict=True))[
+            "common markers"
+        ]
+        == 6
+    )
 
 
 @pytest.mark.slow
@@ -81,7 +97,9 @@ def test_scans_without_markers_are_refused_with_what_to_do(tmp_path: Path) -> No
         world.place("plane")
         world.move(distance_mm=depth)
         bench = RigSetup(simulated_rig(world))
-        capture(session, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench)
+        capture(
+            session, name, {}, role="scan", patterns="gray", set_up=lambda *_, bench=bench: bench
+        )
     warnings: list[str] = []
     with raises(InputError, "slviewer target markers"):
         merged(session, ["two"], "one", start="markers", warn=warnings.append)
@@ -102,7 +120,14 @@ def test_the_mat_on_a_turntable_gives_its_axis(tmp_path: Path) -> None:
         world.turn_table(12.0 * (k - 1))
         poses.append(rigid_transform(world.pose.R, world.pose.t))
         bench = RigSetup(simulated_rig(world))
-        capture(session, name, {}, role="scan", patterns="complementary", set_up=lambda *_, bench=bench: bench)
+        capture(
+            session,
+            name,
+            {},
+            role="scan",
+            patterns="complementary",
+            set_up=lambda *_, bench=bench: bench,
+        )
     made = merged(session, names, "one", start="turntable", angle=11.0, out=tmp_path / "merged.ply")
     for k, name in enumerate(names[1:], 1):
         points = made.clouds[name].measured[::50].astype(float)
@@ -111,5 +136,13 @@ def test_the_mat_on_a_turntable_gives_its_axis(tmp_path: Path) -> None:
         assert 0.001 < np.linalg.norm(gap, axis=1).max() < 0.1
     warnings: list[str] = []
     with raises(Refused):
-        merged(session, names, "one", start="turntable", angle=30.0, out=tmp_path / "m.ply", warn=warnings.append)
+        merged(
+            session,
+            names,
+            "one",
+            start="turntable",
+            angle=30.0,
+            out=tmp_path / "m.ply",
+            warn=warnings.append,
+        )
     assert any(not missing_facts(warning, "markers", "18.0 degrees") for warning in warnings)

@@ -50,9 +50,14 @@ def test_noise_follows_baseline_distance_and_steps():
     def sigma(distance=600.0, **how):
         return planned("global-shutter-2mp", "projector-1080p", distance, **how).sigma_middle
 
-    assert sigma(baseline=60, period_px=16) / sigma(baseline=120, period_px=16) == pytest.approx(2, rel=0.05)
-    assert sigma(light=PlannedLight(4)) / sigma(light=PlannedLight(16)) == pytest.approx(2, rel=1e-6)
-    # of similar triangles every length grows with the distance, and so does the error; the blur of a pupil does not
+    assert sigma(baseline=60, period_px=16) / sigma(baseline=120, period_px=16) == pytest.approx(
+        2, rel=0.05
+    )
+    assert sigma(light=PlannedLight(4)) / sigma(light=PlannedLight(16)) == pytest.approx(
+        2, rel=1e-6
+    )
+    # of similar triangles every length grows with the distance, and so does the error; the blur of
+    # a pupil does not
     assert sigma(1200.0, baseline=400) / sigma(baseline=200) == pytest.approx(2, rel=0.06)
 
 
@@ -75,7 +80,9 @@ def test_fields_follow_the_lens_and_the_throw():
     assert plan.projector_field == pytest.approx((250, 125), rel=1e-4)
     assert plan.camera_px == pytest.approx(plan.camera_field[0] / 1600)
     assert plan.coverage == pytest.approx(250 * 125 / np.prod(plan.camera_field), rel=0.05)
-    wide, narrow = (planned("global-shutter-2mp", "projector-1080p", 600.0, lens=f) for f in (8.0, 16.0))
+    wide, narrow = (
+        planned("global-shutter-2mp", "projector-1080p", 600.0, lens=f) for f in (8.0, 16.0)
+    )
     assert wide.camera_field[0] == pytest.approx(2 * narrow.camera_field[0])
 
 
@@ -83,7 +90,9 @@ def test_fields_follow_the_lens_and_the_throw():
 def test_advice_names_what_is_wrong():
     planned = plan_rig("webcam-1080p", "lightcrafter4500", 500.0, baseline=50.0, reflectance=0.1)
     advice = " ".join(planned.advice())
-    assert not missing_facts(advice, f"{100 * planned.plan.coverage:.0f} %", "baseline", "modulation")
+    assert not missing_facts(
+        advice, f"{100 * planned.plan.coverage:.0f} %", "baseline", "modulation"
+    )
     assert plan_rig("global-shutter-2mp", "projector-1080p", 600.0).advice() == []
 
 

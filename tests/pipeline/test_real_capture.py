@@ -1,4 +1,5 @@
-"""A photographed rig: five poses of a chessboard, Gray code with inverses (the procam-calibration sample)."""
+"""A photographed rig: five poses of a chessboard, Gray code with inverses (the procam-calibration
+sample)."""
 
 import json
 from pathlib import Path
@@ -17,13 +18,27 @@ pytestmark = [pytest.mark.computes, pytest.mark.slow]  # two calibrations from l
 
 @pytest.fixture(scope="module")
 def kamino(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The imported session, calibrated with stereo alone for the board turned, then with all models for the board."""
+    """The imported session, calibrated with stereo alone for the board turned, then with all models
+    for the board."""
     session = tmp_path_factory.mktemp("kamino") / "session"
     source = real_data / "kamino_procam_jpg90"
     assert main(["import", "procam-calibration", str(source), str(session)]) == 0
     for board, models in (("9x7", ["--models", "stereo"]), ("7x9", [])):
         out = session.parent / f"{board}.json"
-        assert main(["calibrate", str(session), "--target", f"chessboard:{board}:75", *models, "--json", str(out)]) == 0
+        assert (
+            main(
+                [
+                    "calibrate",
+                    str(session),
+                    "--target",
+                    f"chessboard:{board}:75",
+                    *models,
+                    "--json",
+                    str(out),
+                ]
+            )
+            == 0
+        )
     return session
 
 
@@ -31,19 +46,27 @@ def kamino(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_calibrates_as_well_as_plain_opencv(kamino: Path, board: str) -> None:
     found = json.loads((kamino.parent / f"{board}.json").read_text())
     rms = found["models"]["stereo"]["reprojection_rms_px"]
-    assert 0.05 < rms["camera"] <= 0.40 and 0.05 < rms["projector"] <= 0.30 and 0.05 < rms["stereo"] <= 0.35
+    assert (
+        0.05 < rms["camera"] <= 0.40
+        and 0.05 < rms["projector"] <= 0.30
+        and 0.05 < rms["stereo"] <= 0.35
+    )
     assert found["models"]["stereo"]["K_projector"][0][0] == pytest.approx(1890, abs=25)
     assert len(found["poses_used"]) == 5
 
 
 @pytest.mark.slow
-def test_poses_give_the_board(kamino: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_poses_give_the_board(
+    kamino: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for k in (0, 4):
         ply = tmp_path / f"{k}.ply"
         assert main(["reconstruct", str(kamino), f"capture_{k}", "--out", str(ply)]) == 0
         text = capsys.readouterr().out
         with Session.open(kamino) as store:
-            assert load_record(store, Reconstruction, f"capture_{k}").axis == "y"  # the baseline is vertical
+            assert (
+                load_record(store, Reconstruction, f"capture_{k}").axis == "y"
+            )  # the baseline is vertical
         assert "stereo" in text and "pixelwise" in text and "coverage" in text
         points = np.asarray(trimesh.load(ply).vertices)
         centred = points - points.mean(0)

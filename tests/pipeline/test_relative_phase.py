@@ -1,4 +1,5 @@
-"""A scan whose patterns do not cover the projector: measured where its depths are known, refused where not."""
+"""A scan whose patterns do not cover the projector: measured where its depths are known, refused
+where not."""
 
 import json
 import re
@@ -28,11 +29,13 @@ DEPTH = 600.0
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A plate at 600 mm: with patterns that cover the projector, with periods of 128 and 16 px alone, and with these by
-    a tool that did not state the projector's size."""
+    """A plate at 600 mm: with patterns that cover the projector, with periods of 128 and 16 px
+    alone, and with these by a tool that did not state the projector's size."""
     absolute = multifrequency(RIG.projector.size, 4)
     finer = [i for i, f in enumerate(absolute.frames) if f.axis is None or f.period_px < 200]
-    relative = PatternSequence(RIG.projector.size, tuple(absolute.frames[i] for i in finer), relative=True)
+    relative = PatternSequence(
+        RIG.projector.size, tuple(absolute.frames[i] for i in finer), relative=True
+    )
     pose = Pose(np.eye(3), np.array([-90.0, -70.0, DEPTH]))
     plate = BoardScene(pose, None, (0, 0), (180, 140), FLAT, np.zeros((0, 2)))
     frames = Renderer(RIG, plate).capture(absolute, 1)
@@ -68,12 +71,18 @@ def test_a_depth_range_makes_the_phase_absolute(session: Path, run: Run, name: s
 
 
 def test_another_range_masks_what_it_does_not_hold(session: Path, run: Run) -> None:
-    status, _, error = run("reconstruct", session, "relative", "--axis", "x", "--depth-range", 700, 760)
+    status, _, error = run(
+        "reconstruct", session, "relative", "--axis", "x", "--depth-range", 700, 760
+    )
     assert status == 1 and error
 
 
-def test_a_range_that_holds_several_depths_is_refused_with_one_that_does_not(session: Path, run: Run) -> None:
-    status, _, error = run("reconstruct", session, "relative", "--axis", "x", "--depth-range", 300, 1500)
+def test_a_range_that_holds_several_depths_is_refused_with_one_that_does_not(
+    session: Path, run: Run
+) -> None:
+    status, _, error = run(
+        "reconstruct", session, "relative", "--axis", "x", "--depth-range", 300, 1500
+    )
     assert status == 1 and not missing_facts(error, "128 px", 300, "1500 mm", "narrower"), error
     (far,) = re.findall(r"\b300 to (\d+) mm", error)
     assert 320 < int(far) < 600

@@ -33,8 +33,14 @@ def folder(tmp_path: Path) -> Path:
 def test_the_trash_is_listed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["restore", str(folder)]) == 0
     lines = capsys.readouterr().out.split("---\n")[1].splitlines()
-    assert [line.split()[:2] for line in lines if line.startswith("scan_01")] == [["scan_01", "capture"]] * 2
-    assert {line.split()[0] for line in lines} == {"scan_01", "calibration/stereo", "calibration/splined"}
+    assert [line.split()[:2] for line in lines if line.startswith("scan_01")] == [
+        ["scan_01", "capture"]
+    ] * 2
+    assert {line.split()[0] for line in lines} == {
+        "scan_01",
+        "calibration/stereo",
+        "calibration/splined",
+    }
 
 
 def test_what_has_the_name_now_takes_its_place_in_the_trash(folder: Path) -> None:

@@ -1,4 +1,5 @@
-"""Rigs by name: what is shipped can be chosen, what is saved comes back, what is mistyped is named."""
+"""Rigs by name: what is shipped can be chosen, what is saved comes back, what is mistyped is
+named."""
 
 import tomllib
 from pathlib import Path
@@ -18,7 +19,12 @@ BENCH = {
     "settle_ms": 40.5,
     "focal_px": 3555.6,
     "exposure_ms": 8,
-    "camera": {"driver": "fake", "source": 'a "quoted" \\ path\n', "mono": True, "modes": ["red", "größer"]},
+    "camera": {
+        "driver": "fake",
+        "source": 'a "quoted" \\ path\n',
+        "mono": True,
+        "modes": ["red", "größer"],
+    },
     "projector": {"driver": "fake", "size": [912, 1140], "gamma": 1e-07},
 }
 
@@ -29,8 +35,12 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def projector(size: tuple[int, int], gamma: float = 1.0, page: object = None) -> None: ...
 
-    monkeypatch.setitem(drivers(), "fake", Driver("fake", "nothing", camera=camera, projector=projector, page=True))
-    lacking = Driver("lacking", "nothing", packages={"no_such_package": "pip install it"}, camera=camera)
+    monkeypatch.setitem(
+        drivers(), "fake", Driver("fake", "nothing", camera=camera, projector=projector, page=True)
+    )
+    lacking = Driver(
+        "lacking", "nothing", packages={"no_such_package": "pip install it"}, camera=camera
+    )
     monkeypatch.setitem(drivers(), "lacking", lacking)
     monkeypatch.setitem(drivers(), "lamp", Driver("lamp", "nothing", projector=projector))
 
@@ -71,7 +81,12 @@ def test_what_is_saved_comes_back_and_hides_what_is_shipped(session: Session, fa
 def test_a_choice_as_toml_is_the_same_choice():
     nothing = {**BENCH, "gain": None, "camera": {**BENCH["camera"], "serial": None}}
     assert tomllib.loads(to_toml(nothing)) == BENCH
-    odd = {"driver": "x", "odd key": "ü", "deep": {"a": {"b": [1, 2.5, -3, "t"]}, "empty": []}, "big": 10**12}
+    odd = {
+        "driver": "x",
+        "odd key": "ü",
+        "deep": {"a": {"b": [1, 2.5, -3, "t"]}, "empty": []},
+        "big": 10**12,
+    }
     assert tomllib.loads(to_toml(odd)) == odd
     with raises(InputError, "TOML"):
         to_toml({"driver": object()})
@@ -88,7 +103,10 @@ def test_a_choice_as_toml_is_the_same_choice():
         ({"gain": True}, ["gain = True", "number"]),
         ({"name": 3}, ["name = 3", "text"]),
         ({"name": "a\u202eb"}, [r"name = 'a\u202eb'", "text"]),
-        ({"camera": {"driver": "fake", "source": "0", "monochrome": True}}, ["'monochrome'", "source", "mono"]),
+        (
+            {"camera": {"driver": "fake", "source": "0", "monochrome": True}},
+            ["'monochrome'", "source", "mono"],
+        ),
         ({"camera": {"driver": "fake"}}, ["fake", "source"]),
         ({"camera": {"driver": "fale", "source": "0"}}, ["'fale'", "fake", "lacking"]),
         ({"camera": {"driver": "lamp"}}, ["lamp", "camera"]),

@@ -32,7 +32,8 @@ pytestmark = pytest.mark.computes
 
 @pytest.fixture(scope="module")
 def made(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session whose calibration is the truth, with the recorded scan of an object, twice in different noise."""
+    """A session whose calibration is the truth, with the recorded scan of an object, twice in
+    different noise."""
     folder = tmp_path_factory.mktemp("editing") / "session"
     true_calibration(folder, letter(0.25))
     with Session.open(recorded / "session") as store:
@@ -41,7 +42,9 @@ def made(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     noise = np.random.default_rng(0).integers(0, 2, frames.shape, np.uint8)
     with Session.open(folder, write=True) as store:
         store.save_capture("one", "scan", scan.sequence, frames, source="recorded")
-        store.save_capture("two", "scan", scan.sequence, np.maximum(frames, noise) - noise, source="recorded")
+        store.save_capture(
+            "two", "scan", scan.sequence, np.maximum(frames, noise) - noise, source="recorded"
+        )
         save_sound_checks(store)
     return folder
 
@@ -66,7 +69,8 @@ def middle_half(points: np.ndarray) -> str:
 
 
 def left_half(points: np.ndarray) -> list[float]:
-    """The polygon, u v of its corners, of the camera's columns up to the middle one of what was measured."""
+    """The polygon, u v of its corners, of the camera's columns up to the middle one of what was
+    measured."""
     u = float(np.median(np.argwhere(np.isfinite(points[..., 2]))[:, 1]))
     return [-1, -1, u, -1, u, len(points), -1, len(points)]
 
@@ -76,7 +80,9 @@ def count(points: np.ndarray) -> int:
 
 
 @pytest.mark.slow
-def test_every_command_uses_the_region_of_the_session(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
+def test_every_command_uses_the_region_of_the_session(
+    session: Path, cloud: np.ndarray, tmp_path: Path
+) -> None:
     total = count(cloud)
     text = set_region(session, roi=middle_half(cloud))
     assert "(on)" in text
@@ -98,7 +104,10 @@ def test_every_command_uses_the_region_of_the_session(session: Path, cloud: np.n
     assert reconstructed(session, "one", out=tmp_path / "all.ply", roi="off").points == total
     assert "off" in set_region(session, roi="off")
     assert reconstructed(session, "one", out=tmp_path / "all.ply").points == total
-    assert reconstructed(session, "one", out=tmp_path / "all.ply", roi=middle_half(cloud)).points == wanted
+    assert (
+        reconstructed(session, "one", out=tmp_path / "all.ply", roi=middle_half(cloud)).points
+        == wanted
+    )
     set_region(session, roi="on")
     assert reconstructed(session, "one", out=tmp_path / "all.ply").points == wanted
     assert "(on)" in set_region(session, around="one")
@@ -108,7 +117,10 @@ def test_every_command_uses_the_region_of_the_session(session: Path, cloud: np.n
 def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
     centre = np.nanmedian(cloud, axis=(0, 1))
     file = tmp_path / "box.toml"
-    file.write_text(f"centre_mm = {centre.tolist()}\nsize_mm = [60.0, 30.0, 400.0]\nrotation_deg = [0.0, 0.0, 45.0]\n")
+    file.write_text(
+        f"centre_mm = {centre.tolist()}\nsize_mm = [60.0, 30.0, 400.0]\nrotation_deg = [0.0, 0.0,"
+        " 45.0]\n"
+    )
     region = parse_region(str(file))
     made = reconstructed(session, "one", out=tmp_path / "cut.ply", roi=str(file))
     assert made.points == int(region.contains(cloud).sum()) > 100
@@ -118,16 +130,27 @@ def test_a_region_of_a_file_may_be_turned(session: Path, cloud: np.ndarray, tmp_
 
 
 @pytest.mark.slow
-def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_path: Path, capfd) -> None:
+def test_a_region_beside_the_scan_is_refused_with_numbers(
+    session: Path, tmp_path: Path, capfd
+) -> None:
     facts = {}
     for name in ("one", "two"):
         cloud = load_surface(session, name).points
         depths = cloud[..., 2][np.isfinite(cloud[..., 2])]
-        facts[name] = (name, f"{count(cloud)} points", f"z {depths.min():.0f} to {depths.max():.0f} mm")
+        facts[name] = (
+            name,
+            f"{count(cloud)} points",
+            f"z {depths.min():.0f} to {depths.max():.0f} mm",
+        )
     box = "0,1,0,1,10,20"
     for name, compute in (
         ("one", lambda: reconstructed(session, "one", roi=box)),
-        ("two", lambda: merged(session, ["two"], "one", out=tmp_path / "m.ply", start="identity", roi=box)),
+        (
+            "two",
+            lambda: merged(
+                session, ["two"], "one", out=tmp_path / "m.ply", start="identity", roi=box
+            ),
+        ),
         ("one", lambda: measure(session, "one", "plane", ball=(0, 0, 500, 20), roi=box)),
     ):
         with raises(InputError, *facts[name]):
@@ -146,7 +169,9 @@ def test_a_region_beside_the_scan_is_refused_with_numbers(session: Path, tmp_pat
     assert "1000.0 x 1000.0 x 1990.0 mm" in capfd.readouterr().out
 
 
-def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tmp_path: Path, capfd) -> None:
+def test_edits_are_stored_undone_and_redone(
+    session: Path, cloud: np.ndarray, tmp_path: Path, capfd
+) -> None:
     total = count(cloud)
     h, w = cloud.shape[:2]
     half = left_half(cloud)
@@ -174,7 +199,13 @@ def test_edits_are_stored_undone_and_redone(session: Path, cloud: np.ndarray, tm
         edit_scan(session, "one", undo=2)
     with raises(InputError, "all", "one"):
         edit_scan(session, "one", polygon=[0, 0, w, 0, w, h, 0, h])
-    for wrong in ({"polygon": [1, 2]}, {"part": [1]}, {"undo": 1, "redo": 1}, {"invert": True}, {"margin": 1.0}):
+    for wrong in (
+        {"polygon": [1, 2]},
+        {"part": [1]},
+        {"undo": 1, "redo": 1},
+        {"invert": True},
+        {"margin": 1.0},
+    ):
         with raises(UsageError):
             edit_scan(session, "one", **wrong)
 
@@ -185,17 +216,25 @@ def load(session: Path) -> EditHistory:
 
 
 @pytest.mark.slow
-def test_the_report_and_the_files_list_region_and_edits(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
+def test_the_report_and_the_files_list_region_and_edits(
+    session: Path, cloud: np.ndarray, tmp_path: Path
+) -> None:
     report(session, tmp_path / "before.html")
     assert "Region and edits" not in (tmp_path / "before.html").read_text()
     edited = edit_scan(session, "one", polygon=left_half(cloud))
     text = set_region(session, roi="-500,500,-500,500,10,2000")
     report(session, tmp_path / "after.html")
     page = (tmp_path / "after.html").read_text()
-    assert "Region and edits" in page and edited.edits[0] in page and "1000.0 x 1000.0 x 1990.0 mm" in page + text
+    assert (
+        "Region and edits" in page
+        and edited.edits[0] in page
+        and "1000.0 x 1000.0 x 1990.0 mm" in page + text
+    )
     written = mesh(session, ["one"], tmp_path / "mesh.ply").out.read_bytes()[:3000]
     assert edited.edits[0].encode() in written
-    header = export(session, "cloud", "one").path.read_bytes()[:3000].split(b"end_header")[0].decode()
+    header = (
+        export(session, "cloud", "one").path.read_bytes()[:3000].split(b"end_header")[0].decode()
+    )
     assert edited.edits[0] in header and "1000.0 x 1000.0 x 1990.0 mm" in header
 
 
@@ -222,10 +261,14 @@ def test_results_are_stale_once_edits_or_region_change(session: Path, cloud: np.
 
 
 @pytest.mark.slow
-def test_a_report_is_checked_with_the_edits_it_was_made_with(session: Path, cloud: np.ndarray, tmp_path: Path) -> None:
+def test_a_report_is_checked_with_the_edits_it_was_made_with(
+    session: Path, cloud: np.ndarray, tmp_path: Path
+) -> None:
     edit_scan(session, "one", polygon=left_half(cloud))
     set_region(session, roi="-500,500,-40,500,10,2000")
-    v, u = np.argwhere(np.isfinite(cloud[..., 2]) & (np.arange(cloud.shape[1]) > left_half(cloud)[2] + 1))[5000]
+    v, u = np.argwhere(
+        np.isfinite(cloud[..., 2]) & (np.arange(cloud.shape[1]) > left_half(cloud)[2] + 1)
+    )[5000]
     fitted = measure(session, "one", "point", at=(int(u), int(v)))
     own = measure(session, "one", "point", at=(int(u), int(v)), roi="off")
     page = tmp_path / "report.html"
@@ -239,7 +282,9 @@ def test_a_report_is_checked_with_the_edits_it_was_made_with(session: Path, clou
     assert "edits" in states[f"measurements/{fitted.id}"].detail
 
 
-def test_edits_of_another_capture_or_damaged_ones_are_not_applied(session: Path, cloud: np.ndarray) -> None:
+def test_edits_of_another_capture_or_damaged_ones_are_not_applied(
+    session: Path, cloud: np.ndarray
+) -> None:
     edit_scan(session, "one", polygon=left_half(cloud))
     with Session.open(session, write=True) as store:
         one, other = store.load_capture("one"), store.load_capture("two")

@@ -38,12 +38,23 @@ def test_verifications_keep_their_figures_and_can_be_repeated(session: Session) 
     models = old["models"]
     assert isinstance(models, dict) and isinstance(old["centres_mm"], dict)
     for name, fit in found.models.items():
-        kept = (fit.points, fit.excluded, fit.rms_mm, fit.noise_floor_mm, fit.coverage, fit.radius_mm)
+        kept = (
+            fit.points,
+            fit.excluded,
+            fit.rms_mm,
+            fit.noise_floor_mm,
+            fit.coverage,
+            fit.radius_mm,
+        )
         keys = ("points", "set_aside", "rms_mm", "noise_floor_mm", "coverage", "radius_mm")
         assert kept == tuple(models[name][key] for key in keys)
         assert fit.centre_mm == tuple(old["centres_mm"][name])
     assert found.models["splined"].masked == old["masked"]["splined"]  # type: ignore[index]
-    assert found.incidence == old["incidence"] and found.inputs == old["inputs"] and found.scales == old["scales"]
+    assert (
+        found.incidence == old["incidence"]
+        and found.inputs == old["inputs"]
+        and found.scales == old["scales"]
+    )
     assert found.settings == {"captures": ["sphere_1"], "shape": "sphere", "models": list(models)}
     both = {name: load_record(session, Verification, name) for name in ("sphere_1", "sphere_2")}
     assert centre_distances_mm(both)["sphere_1", "sphere_2"] == pytest.approx(
@@ -53,10 +64,18 @@ def test_verifications_keep_their_figures_and_can_be_repeated(session: Session) 
 
 def test_clouds_and_merges_keep_their_figures(session: Session) -> None:
     old, cloud = as_stored("clouds/object_r1"), load_record(session, Reconstruction, "object_r1")
-    assert [cloud.points, cloud.model, cloud.noise_mm] == [old["points"], old["model"], old["noise_mm"]]
+    assert [cloud.points, cloud.model, cloud.noise_mm] == [
+        old["points"],
+        old["model"],
+        old["noise_mm"],
+    ]
     assert cloud.settings == {"capture": "object_r1", "model": "splined", "axis": "x"}
     old, merge = as_stored("merge/1"), load_record(session, Merge, "1")
-    assert [merge.scans, merge.reference, merge.points] == [old["scans"], old["reference"], old["points"]]
+    assert [merge.scans, merge.reference, merge.points] == [
+        old["scans"],
+        old["reference"],
+        old["points"],
+    ]
     assert len(merge.registered) == 3 and len(merge.loops) == 1 and merge.excluded["edges"] > 100
     shown = [pair.moved_mm for pair in merge.registered]
     assert all(moved is not None and 100 < moved < 400 for moved in shown)
@@ -65,10 +84,17 @@ def test_clouds_and_merges_keep_their_figures(session: Session) -> None:
 def test_places_and_drift_checks_keep_their_figures(session: Session) -> None:
     old, place = as_stored("placement/object_r3"), load_record(session, Placement, "object_r3")
     assert [place.onto, place.rms_mm, place.overlap] == [old["onto"], old["rms_mm"], old["overlap"]]
-    assert place.T_first_scan is not None and list(map(list, place.T_first_scan)) == old["T_first_scan"]
+    assert (
+        place.T_first_scan is not None
+        and list(map(list, place.T_first_scan)) == old["T_first_scan"]
+    )
     old, drift = as_stored("drift/1"), load_record(session, Drift, "1")
     kept = old["checked"]
-    assert isinstance(kept, dict) and drift.inputs == old["inputs"] and drift.settings == {"capture": "later"}
+    assert (
+        isinstance(kept, dict)
+        and drift.inputs == old["inputs"]
+        and drift.settings == {"capture": "later"}
+    )
     plain = json.loads(json.dumps(to_plain(drift)))
     assert all(plain[key] == value for key, value in kept.items() if key != "calibration")
 
@@ -77,7 +103,7 @@ def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None
     for result in session.result_names():
         kind, _, name = result.partition("/")
         record = load_record(session, RECORDS[kind], name)
-        (table, *_) = RECORDS[kind].tables({name: record})
+        table, *_ = RECORDS[kind].tables({name: record})
         assert record.summary() and table.rows and table.columns[0].title
         assert record.figures() or kind == "placement"
 
@@ -94,6 +120,8 @@ def test_records_of_one_label_are_all_named(session: Session) -> None:
 
 def test_a_record_of_other_types_is_damaged(session: Session) -> None:
     path = session.folder / "results" / "verify" / "sphere_1" / "meta.json"
-    path.write_text(json.dumps({**as_stored("verify/sphere_1"), "models": {"stereo": {"points": -1}}}))
+    path.write_text(
+        json.dumps({**as_stored("verify/sphere_1"), "models": {"stereo": {"points": -1}}})
+    )
     with pytest.raises(DamagedError):
         load_record(session, Verification, "sphere_1")

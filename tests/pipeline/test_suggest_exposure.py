@@ -16,13 +16,20 @@ READ, SHOT, DARK = 1.0, 0.05, 4.0
 
 
 class Bench:
-    """A camera that sees the projector's light on a scene; ``light`` (h, w): grey levels per ms under white."""
+    """A camera that sees the projector's light on a scene; ``light`` (h, w): grey levels per ms
+    under white."""
 
     name = "the bench"
     dtype = np.dtype(np.uint8)
 
     def __init__(self, light, room=0.1, exposures=(0.01, 1000.0), gains=(1.0, 16.0), reports=True):
-        self.light, self.room, self.exposures, self.gains, self.reports = light, room, exposures, gains, reports
+        self.light, self.room, self.exposures, self.gains, self.reports = (
+            light,
+            room,
+            exposures,
+            gains,
+            reports,
+        )
         self.size, self.now, self.shown, self.sequence = SIZE, CameraSettings(1.0, 1.0), None, None
         self.rng, self.applied, self.grabs = np.random.default_rng(0), [], 0
         rows, columns = np.indices(light.shape)
@@ -37,8 +44,13 @@ class Bench:
         return self.now if self.reports else CameraSettings()
 
     def apply(self, settings):
-        exposure, gain = settings.exposure_ms or self.now.exposure_ms, settings.gain or self.now.gain
-        self.now = CameraSettings(float(np.clip(exposure, *self.exposures)), float(np.clip(gain, *self.gains)))
+        exposure, gain = (
+            settings.exposure_ms or self.now.exposure_ms,
+            settings.gain or self.now.gain,
+        )
+        self.now = CameraSettings(
+            float(np.clip(exposure, *self.exposures)), float(np.clip(gain, *self.gains))
+        )
         self.applied.append(self.now)
         return self.settings()
 
@@ -105,7 +117,9 @@ def test_a_part_dark_and_shiny_gets_two_exposures():
     assert found.share > 0.999 and found.share_before < 0.51
     # at 1 ms the bright half is saturated, the dark half has a modulation of one grey level
     before = found.state_before
-    assert (before[:, 60:] == STATES.index("saturated")).all() and (before[:, :60] == STATES.index("dark")).mean() > 0.9
+    assert (before[:, 60:] == STATES.index("saturated")).all() and (
+        before[:, :60] == STATES.index("dark")
+    ).mean() > 0.9
     assert not missing_facts(found.text(), f"{short:g}", f"{long:g} ms", "100.0 %")
 
 
@@ -159,7 +173,9 @@ def test_a_camera_of_few_exposures_and_one_without():
     _, rig = make(halves(20.0, 6000.0), exposures=(0.5, 2.0))
     found = suggest(rig)
     assert all(0.5 <= exposure <= 2.0 for exposure in found.exposures_ms)
-    assert found.share == pytest.approx(0.5, abs=0.02), "what is saturated at the shortest exposure is said"
+    assert found.share == pytest.approx(0.5, abs=0.02), (
+        "what is saturated at the shortest exposure is said"
+    )
     _, rig = make(20.0, reports=False)
     with raises(DeviceError, "the bench", "exposure"):
         suggest(rig)

@@ -1,4 +1,5 @@
-"""A turn: planned, resumed where it was left, named where it fails, and closed to a watertight mesh by one command."""
+"""A turn: planned, resumed where it was left, named where it fails, and closed to a watertight mesh
+by one command."""
 
 import json
 from collections.abc import Callable
@@ -15,7 +16,15 @@ from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, 
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.turn import align_turn, capture_turn, missing_steps, next_turn, plan_turn, recorded_steps, turn
+from slviewer.pipeline.turn import (
+    align_turn,
+    capture_turn,
+    missing_steps,
+    next_turn,
+    plan_turn,
+    recorded_steps,
+    turn,
+)
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.refusal import Refused
 from slviewer.session.capture import TurnStep
@@ -39,10 +48,18 @@ def calibrated(folder: Path, scale: float = SCALE) -> Path:
 
 @pytest.mark.computes
 @pytest.mark.slow
-def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, run: Callable[..., Any]) -> None:
-    session, rig, out = calibrated(tmp_path / "session"), tmp_path / "rig.toml", tmp_path / "stone.ply"
+def test_one_command_makes_a_watertight_mesh_of_a_turned_object(
+    tmp_path: Path, run: Callable[..., Any]
+) -> None:
+    session, rig, out = (
+        calibrated(tmp_path / "session"),
+        tmp_path / "rig.toml",
+        tmp_path / "stone.ply",
+    )
     rig.write_text(to_toml(RIG))
-    status, text, error = run("turn", session, "--rig", rig, "--mesh", out, "--json", tmp_path / "turn.json")
+    status, text, error = run(
+        "turn", session, "--rig", rig, "--mesh", out, "--json", tmp_path / "turn.json"
+    )
     assert status == 0, error
     assert not missing_facts(text, "12 scans", "watertight") and "features" not in error
     record = json.loads((tmp_path / "turn.json").read_text())
@@ -65,13 +82,17 @@ def test_one_command_makes_a_watertight_mesh_of_a_turned_object(tmp_path: Path, 
 def distances(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """mm (n,) from points (n, 3) to a surface."""
     core, scene = open3d().core, open3d().t.geometry.RaycastingScene()
-    scene.add_triangles(core.Tensor(mesh.vertices.astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32)))
+    scene.add_triangles(
+        core.Tensor(mesh.vertices.astype(np.float32)), core.Tensor(mesh.faces.astype(np.uint32))
+    )
     return scene.compute_distance(core.Tensor(points.astype(np.float32))).numpy()
 
 
 def test_a_plan_is_a_full_turn_or_a_range() -> None:
     full = plan_turn("turn1", 12)
-    assert [step.deg for step in full] == [30.0 * k for k in range(12)] and full[4].name == "turn1_05"
+    assert [step.deg for step in full] == [30.0 * k for k in range(12)] and full[
+        4
+    ].name == "turn1_05"
     assert [step.deg for step in plan_turn("a", 4, -90.0)] == [0.0, -30.0, -60.0, -90.0]
     assert plan_turn("a", 3, -360.0)[-1].deg == -240.0
     for steps, range_deg in ((1, 360.0), (300, 360.0), (12, 0.0), (12, 361.0), (12, float("nan"))):
@@ -90,16 +111,28 @@ class Turned:
         self.rig, self.faults = breakable(self.bench.rig)
 
     def set_up(self, choice: Choice, board: object) -> RigSetup:
-        return RigSetup(self.rig)  # without its world, where the board stays in view: it is quick to render
+        return RigSetup(
+            self.rig
+        )  # without its world, where the board stays in view: it is quick to render
 
-    def __call__(self, progress: Callable[[float, str], None] = lambda share, doing: None, **options: Any) -> Any:
+    def __call__(
+        self, progress: Callable[[float, str], None] = lambda share, doing: None, **options: Any
+    ) -> Any:
         return turn(
-            self.folder, TINY, merge=False, set_up=self.set_up, progress=progress, warn=self.warnings.append, **options
+            self.folder,
+            TINY,
+            merge=False,
+            set_up=self.set_up,
+            progress=progress,
+            warn=self.warnings.append,
+            **options,
         )
 
     def angles(self) -> dict[str, float]:
         with Session.open(self.folder) as store:
-            return {c.name: c.turn_step.deg for c in store.captures("scan") if c.turn_step is not None}
+            return {
+                c.name: c.turn_step.deg for c in store.captures("scan") if c.turn_step is not None
+            }
 
 
 @pytest.fixture
@@ -130,7 +163,9 @@ def test_a_fault_names_its_step_and_the_turn_goes_on_from_there(turned: Turned) 
     # a scan that was deleted is a missing step
     with Session.open(turned.folder, write=True) as store:
         store.trash_capture("turn1_02")
-        assert [step.name for step in missing_steps(store, "turn1")] == ["turn1_02"] and next_turn(store) == "turn3"
+        assert [step.name for step in missing_steps(store, "turn1")] == ["turn1_02"] and next_turn(
+            store
+        ) == "turn3"
 
 
 @pytest.mark.computes
@@ -144,7 +179,10 @@ def test_a_cancelled_turn_keeps_what_was_captured(turned: Turned) -> None:
 
     with raises(Cancelled):
         turned(cancel, steps=4)
-    assert list(turned.angles()) == ["turn1_01", "turn1_02"] and "step 2 of 4: turning to 90 degrees" in seen
+    assert (
+        list(turned.angles()) == ["turn1_01", "turn1_02"]
+        and "step 2 of 4: turning to 90 degrees" in seen
+    )
     turned(resume=True)
     assert turned.angles() == FOUR
 
@@ -170,9 +208,12 @@ class Counting:
 
 
 @pytest.mark.parametrize(
-    ("counts", "targets", "warned"), [(107.0, [137.0, 167.0], 0), (77.0, [137.0, 167.0], 0), (0.0, [30.0, 60.0], 1)]
+    ("counts", "targets", "warned"),
+    [(107.0, [137.0, 167.0], 0), (77.0, [137.0, 167.0], 0), (0.0, [30.0, 60.0], 1)],
 )
-def test_a_resumed_turn_goes_on_at_the_angle_where_it_stopped(counts: float, targets: list[float], warned: int) -> None:
+def test_a_resumed_turn_goes_on_at_the_angle_where_it_stopped(
+    counts: float, targets: list[float], warned: int
+) -> None:
     """It began where the table counted 47 degrees; the last scan is that at 60 degrees."""
     table, warnings, steps = Counting(counts), list[str](), plan_turn("turn1", 5, 120.0)
     recorded = [TurnStep(s.turn, s.step, s.steps, s.step_deg, 47.0 + s.deg) for s in steps[:3]]
@@ -181,7 +222,9 @@ def test_a_resumed_turn_goes_on_at_the_angle_where_it_stopped(counts: float, tar
     saved: list[TurnStep] = []
     capture_turn(rig, steps[3:], lambda step, _: saved.append(step), recorded, warn=warnings.append)
     assert table.turned_to == targets and len(warnings) == warned
-    assert [step.deg for step in saved] == [90.0, 120.0] and [step.position_deg for step in saved] == targets
+    assert [step.deg for step in saved] == [90.0, 120.0] and [
+        step.position_deg for step in saved
+    ] == targets
 
 
 def test_angles_that_do_not_fit_the_scans_are_not_insisted_on() -> None:
@@ -192,7 +235,9 @@ def test_angles_that_do_not_fit_the_scans_are_not_insisted_on() -> None:
             raise Refused("overlap", "they do not overlap")
         return start
 
-    assert align_turn(attempt, warnings.append) == "features" and "they do not overlap" in warnings[0]
+    assert (
+        align_turn(attempt, warnings.append) == "features" and "they do not overlap" in warnings[0]
+    )
 
 
 @pytest.mark.computes

@@ -1,4 +1,5 @@
-"""The white balance of textures: a white reference becomes neutral, and what is no reference is refused."""
+"""The white balance of textures: a white reference becomes neutral, and what is no reference is
+refused."""
 
 from pathlib import Path
 
@@ -40,7 +41,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def mean_colour(path: Path) -> np.ndarray:
     """The mean colour of a texture, without what no scan saw."""
-    image = np.asarray(trimesh.load(path, force="mesh").visual.material.baseColorTexture)[..., :3].astype(float)
+    image = np.asarray(trimesh.load(path, force="mesh").visual.material.baseColorTexture)[
+        ..., :3
+    ].astype(float)
     return np.asarray(image[image.max(axis=2) > 20].mean(axis=0))
 
 
@@ -57,7 +60,9 @@ def test_the_texture_of_a_white_balanced_part_is_neutral(session: Path, tmp_path
 def test_gains_undo_the_cast_and_keep_overexposed_pixels_neutral(session: Path) -> None:
     with Session.open(session) as store:
         gains = measure_white(store, "card")
-        assert gains * COLOUR == pytest.approx(ColouredCamera.BLUE, abs=0.01) and gains.max() == pytest.approx(1.0)
+        assert gains * COLOUR == pytest.approx(
+            ColouredCamera.BLUE, abs=0.01
+        ) and gains.max() == pytest.approx(1.0)
         shown = balance(np.full((1, 1, 3), 255, np.uint8), gains)
         assert len(np.unique(shown)) == 1
         for reference, fact in (("grey", "colours"), ("board", "target poses")):

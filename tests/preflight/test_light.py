@@ -1,4 +1,5 @@
-"""The remedies of a wrong exposure and of what no check can see are sentences that can be acted on."""
+"""The remedies of a wrong exposure and of what no check can see are sentences that can be acted
+on."""
 
 import numpy as np
 import pytest
@@ -20,7 +21,10 @@ from slviewer.preflight.screen import check_pixels
     ],
 )
 def test_the_remedy_of_an_exposure(
-    monkeypatch: pytest.MonkeyPatch, level: float, exposure_ms: float | None, remedy: tuple[str, ...]
+    monkeypatch: pytest.MonkeyPatch,
+    level: float,
+    exposure_ms: float | None,
+    remedy: tuple[str, ...],
 ) -> None:
     bench = RigUnderTest(preset_rig(scale=0.1), lambda doing: None)
     monkeypatch.setattr(bench.rig.camera, "settings", lambda: CameraSettings(exposure_ms))

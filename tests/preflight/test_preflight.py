@@ -78,10 +78,16 @@ def test_a_sound_rig_is_left_in_peace(seed, looked, compiled):
     said: list[str] = []
     done: list[float] = []
     before = process_time()
-    found = looked(simulated_rig(world(seed=seed)), say=said.append, progress=lambda share, doing: done.append(share))
+    found = looked(
+        simulated_rig(world(seed=seed)),
+        say=said.append,
+        progress=lambda share, doing: done.append(share),
+    )
     assert wrong_with(found) == set() and found.verdict == "good"
     assert found.settle_ms == 0 and found.exposure_ms is None
-    assert found.seconds > 0 and process_time() - before < 10  # of the processor, whatever else it does
+    assert (
+        found.seconds > 0 and process_time() - before < 10
+    )  # of the processor, whatever else it does
     assert len(said) == len(found.checks) == 10 and done == sorted(done) and done[-1] == 1.0
     assert all(check.sentence.endswith(".") for check in found.checks)
     assert found.to_dict()["checks"][0]["name"] == "screen"
@@ -153,7 +159,9 @@ def test_another_screen_is_named(looked, lying):
     assert found.check("gamma").verdict == "unknown"
 
 
-@pytest.mark.parametrize(("exposure_ms", "verdict"), [(2.0, "bad"), (0.3, "warning"), (0.08, "bad")])
+@pytest.mark.parametrize(
+    ("exposure_ms", "verdict"), [(2.0, "bad"), (0.3, "warning"), (0.08, "bad")]
+)
 def test_a_wrong_exposure_is_named_with_a_better_one(exposure_ms, verdict, time):
     rig = simulated_rig(world())
     with rig.opened():
@@ -195,7 +203,9 @@ def test_a_lamp_switched_on_meanwhile_is_named(looked, time):
         wrong.room = 12.0
 
     found = looked(rig, say=switch)
-    assert "ambient" in wrong_with(found) and not missing_facts(found.check("ambient").sentence, "brighter")
+    assert "ambient" in wrong_with(found) and not missing_facts(
+        found.check("ambient").sentence, "brighter"
+    )
     assert "motion" not in wrong_with(found)
 
 
@@ -246,7 +256,12 @@ class TwelveBits:
     """The simulated camera with 12 bits in 16, which cannot tell its exposure."""
 
     def __init__(self, camera) -> None:
-        self._camera, self.name, self.size, self.dtype = camera, camera.name, camera.size, np.dtype(np.uint16)
+        self._camera, self.name, self.size, self.dtype = (
+            camera,
+            camera.name,
+            camera.size,
+            np.dtype(np.uint16),
+        )
         self.open, self.close = camera.open, camera.close
         self.settings = partial(CameraSettings)
 
@@ -263,4 +278,6 @@ def test_a_camera_of_twelve_bits_that_says_nothing_of_its_exposure(looked):
     rig = simulated_rig(world())
     found = looked(Rig("twelve", TwelveBits(rig.camera), rig.projector))
     assert wrong_with(found) == set() and found.exposure_ms is None
-    assert found.check("exposure").figures["bright_share_of_full_scale"] == pytest.approx(0.83, abs=0.03)
+    assert found.check("exposure").figures["bright_share_of_full_scale"] == pytest.approx(
+        0.83, abs=0.03
+    )

@@ -50,12 +50,25 @@ def gained(stack: np.ndarray, gain: float | np.ndarray, offset: float = 0.0) -> 
 
 
 @pytest.mark.parametrize(
-    "sequence_of", [p18, *(pytest.param(each, marks=pytest.mark.slow) for each in (complementary, gray))]
+    "sequence_of",
+    [p18, *(pytest.param(each, marks=pytest.mark.slow) for each in (complementary, gray))],
 )
 def test_a_sound_capture_is_good(tmp_path: Path, sequence_of: Callable) -> None:
     found = checked(tmp_path / "session", *frames_of(sequence_of))
-    assert found.verdict == "good", [vars(check) for check in found.checks if check.verdict != "good"]
-    names = {"description", "order", "repeats", "exposure", "flicker", "ambient", "gamma", "noise", "decoding"}
+    assert found.verdict == "good", [
+        vars(check) for check in found.checks if check.verdict != "good"
+    ]
+    names = {
+        "description",
+        "order",
+        "repeats",
+        "exposure",
+        "flicker",
+        "ambient",
+        "gamma",
+        "noise",
+        "decoding",
+    }
     assert {check.name for check in found.checks} == names
     decoded = found.check("decoding").figures
     assert all(0.9 < decoded[axis]["decoded_share"] <= 1 for axis in ("x", "y"))
@@ -87,7 +100,9 @@ def test_saturation_is_checked(tmp_path: Path) -> None:
 def test_darkness_is_checked(tmp_path: Path) -> None:
     sequence, stack = frames_of()
     exposure = checked(tmp_path / "session", sequence, gained(stack, 0.1)).check("exposure")
-    assert exposure.verdict == "bad" and 0.05 < exposure.figures["bright_share_of_full_scale"] < 0.12
+    assert (
+        exposure.verdict == "bad" and 0.05 < exposure.figures["bright_share_of_full_scale"] < 0.12
+    )
 
 
 @pytest.mark.slow
@@ -102,7 +117,9 @@ def test_noise_is_checked(tmp_path: Path) -> None:
 def test_drifting_light_is_checked(tmp_path: Path) -> None:
     sequence, stack = frames_of(p18)
     gains = 1 - 0.2 * np.random.default_rng(0).random(len(stack))
-    flicker = checked(tmp_path / "session", sequence, gained(stack, gains[:, None, None])).check("flicker")
+    flicker = checked(tmp_path / "session", sequence, gained(stack, gains[:, None, None])).check(
+        "flicker"
+    )
     assert flicker.verdict == "warning" and flicker.remedy
 
 
@@ -115,14 +132,18 @@ def test_gamma_is_checked(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_description_that_contradicts_the_frames_is_bad(tmp_path: Path) -> None:
     sequence, stack = frames_of(gray)
-    smaller = PatternSequence((sequence.projector[0] // 2, sequence.projector[1] // 2), sequence.frames)
+    smaller = PatternSequence(
+        (sequence.projector[0] // 2, sequence.projector[1] // 2), sequence.frames
+    )
     description = checked(tmp_path / "session", smaller, stack).check("description")
     assert description.verdict == "bad" and description.remedy
 
 
 def listed(text: str) -> list[dict[str, str]]:
     """The verdict and the name of each check that a text lists, a line each."""
-    return [dict(zip(("verdict", "name"), line.split(), strict=False)) for line in text.splitlines()]
+    return [
+        dict(zip(("verdict", "name"), line.split(), strict=False)) for line in text.splitlines()
+    ]
 
 
 @pytest.mark.slow
@@ -134,11 +155,19 @@ def test_the_command_writes_json_and_ends_with_1_for_a_bad_capture(
         store.save_capture("good", "scan", sequence, stack, source="a test")
         store.save_capture("bright", "scan", sequence, gained(stack, 3), source="a test")
     out = tmp_path / "found.json"
-    assert main(["preflight", "--capture", str(tmp_path / "session"), "good", "--json", str(out)]) == 0
+    assert (
+        main(["preflight", "--capture", str(tmp_path / "session"), "good", "--json", str(out)]) == 0
+    )
     assert json.loads(out.read_text())["verdict"] == "good"
     assert {"verdict": "good", "name": "order:"} in listed(capsys.readouterr().out)
-    assert main(["preflight", "--capture", str(tmp_path / "session"), "bright", "--json", str(out)]) == 1
+    assert (
+        main(["preflight", "--capture", str(tmp_path / "session"), "bright", "--json", str(out)])
+        == 1
+    )
     assert json.loads(out.read_text())["verdict"] == "bad"
     said = capsys.readouterr()
     assert {"verdict": "bad", "name": "exposure:"} in listed(said.out) and said.err
-    assert main(["preflight", "--capture", str(tmp_path / "session"), "good", "--rig", "simulated"]) == 2
+    assert (
+        main(["preflight", "--capture", str(tmp_path / "session"), "good", "--rig", "simulated"])
+        == 2
+    )

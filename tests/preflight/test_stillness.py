@@ -22,7 +22,9 @@ def check(scene: np.ndarray, last: np.ndarray | None = None, noise: float = 0.8)
     bench.white, bench.illuminated = grab(scene), np.ones(scene.shape, bool)
     white = np.stack([grab(scene) for _ in range(6)])
     times = np.arange(6.0)
-    return check_motion(bench, Burst(white, 0 * white, times, times), grab(scene if last is None else last))
+    return check_motion(
+        bench, Burst(white, 0 * white, times, times), grab(scene if last is None else last)
+    )
 
 
 EVEN = np.full((120, 160), 180.0)

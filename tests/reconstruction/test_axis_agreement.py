@@ -1,4 +1,5 @@
-"""What the second axis of a capture says of the calibration: nothing, a raised sigma, or why they do not belong."""
+"""What the second axis of a capture says of the calibration: nothing, a raised sigma, or why they
+do not belong."""
 
 import re
 from dataclasses import replace
@@ -23,10 +24,17 @@ CALIBRATED = (500.0, 700.0)
 
 
 def rig() -> StereoRig:
-    """A baseline of 180 mm mostly along x, axes crossing at 600 mm; rows half as high as columns are wide."""
-    camera = Lens(np.array([[356.0, 0, 81], [0, 357.0, 59], [0, 0, 1]]), np.array([-0.08, 0.03, 4e-4, -3e-4, 0]), SIZE)
+    """A baseline of 180 mm mostly along x, axes crossing at 600 mm; rows half as high as columns
+    are wide."""
+    camera = Lens(
+        np.array([[356.0, 0, 81], [0, 357.0, 59], [0, 0, 1]]),
+        np.array([-0.08, 0.03, 4e-4, -3e-4, 0]),
+        SIZE,
+    )
     projector = Lens(
-        np.array([[1400.0, 0, 460], [0, 2800.0, 560], [0, 0, 1]]), np.array([-0.06, 0.02, 3e-4, 5e-4, 0]), PROJECTOR
+        np.array([[1400.0, 0, 460], [0, 2800.0, 560], [0, 0, 1]]),
+        np.array([-0.06, 0.02, 3e-4, 5e-4, 0]),
+        PROJECTOR,
     )
     R = cv2.Rodrigues(np.array([0.01, 0.29, -0.005]))[0]
     return StereoRig(camera, projector, R, -R @ np.array([180.0, 5.0, 8.0]))
@@ -37,7 +45,9 @@ def coordinates(true: StereoRig, depth: float = 600.0) -> np.ndarray:
     rays = true.camera.rays()
     z = depth / (1 + 0.3 * rays[..., 0] - 0.2 * rays[..., 1])
     found = true.project(np.dstack([rays * z[..., None], z]))
-    found = np.where(((found >= 0) & (found <= np.array(PROJECTOR) - 1)).all(-1)[..., None], found, np.nan)
+    found = np.where(
+        ((found >= 0) & (found <= np.array(PROJECTOR) - 1)).all(-1)[..., None], found, np.nan
+    )
     return np.asarray(found + np.random.default_rng(1).normal(0, SIGMA_PX, found.shape))
 
 
@@ -68,11 +78,15 @@ def test_the_misfit_of_a_sound_capture_is_its_noise() -> None:
     true, found = rig(), coordinates(rig())
     v, u = np.nonzero(np.isfinite(found[..., 0]))
     pixels = np.column_stack([u, v]).astype(float)
-    agreement = measure_axis_agreement(by(true), pixels, found[v, u], np.full((len(u), 2), SIGMA_PX))
+    agreement = measure_axis_agreement(
+        by(true), pixels, found[v, u], np.full((len(u), 2), SIGMA_PX)
+    )
     assert agreement is not None
     assert agreement.misfit_px == pytest.approx(SIGMA_PX, rel=0.05)
     assert agreement.ratio == pytest.approx(1.0, abs=0.05)
-    assert agreement.in_front == 1.0 and np.median(agreement.depths_mm) == pytest.approx(600, abs=15)
+    assert agreement.in_front == 1.0 and np.median(agreement.depths_mm) == pytest.approx(
+        600, abs=15
+    )
     check = check_phases("scan", phases(found), by(true), CALIBRATED)
     assert (check.sigma_factor, check.warnings) == (1.0, ())
 
@@ -106,7 +120,10 @@ def test_an_inverted_transform_and_exchanged_matrices_are_named() -> None:
     with raises(InputError, "R and T"):
         check_phases("scan", found, by(inverted))
     exchanged = StereoRig(
-        Lens(true.projector.K, true.projector.D, SIZE), Lens(true.camera.K, true.camera.D, PROJECTOR), true.R, true.t
+        Lens(true.projector.K, true.projector.D, SIZE),
+        Lens(true.camera.K, true.camera.D, PROJECTOR),
+        true.R,
+        true.t,
     )
     with raises(InputError, "camera and projector"):
         check_phases("scan", found, by(exchanged))
@@ -135,7 +152,9 @@ def test_one_axis_is_judged_by_what_the_projector_could_light_and_by_depth() -> 
         assert check_phases("scan", phases(found, axis), by(true), CALIBRATED).warnings == ()
     with raises(InputError, "scan", "100 %"):
         check_phases("scan", phases((found + 0.5) / 2 - 0.5, "y"), by(true), CALIBRATED)
-    (warning,) = check_phases("scan", phases((found + 0.5) / 3 - 0.5, "x"), by(true), CALIBRATED).warnings
+    (warning,) = check_phases(
+        "scan", phases((found + 0.5) / 3 - 0.5, "x"), by(true), CALIBRATED
+    ).warnings
     assert not missing_facts(warning, "350 mm", "980 mm")
 
 

@@ -1,4 +1,5 @@
-"""One pass over the frames against the definitions: NumPy's decoding, and each model's own points."""
+"""One pass over the frames against the definitions: NumPy's decoding, and each model's own
+points."""
 
 from dataclasses import replace
 
@@ -26,7 +27,9 @@ SEQUENCES = {
     "3 steps and complementary code": complementary(PROJECTOR, 3, 18.0),
     "three frequencies of 4 steps": multifrequency(PROJECTOR, 4),
     "heterodyne, 7 steps": multifrequency((400, 400), 7, (18.0, 21.0, 25.0)),
-    "offset and falling phase": replace(complementary(PROJECTOR, 4, 18.0), phase_offset_rad=1.9, phase_sign=-1),
+    "offset and falling phase": replace(
+        complementary(PROJECTOR, 4, 18.0), phase_offset_rad=1.9, phase_sign=-1
+    ),
 }
 
 
@@ -41,7 +44,11 @@ def frames_of(sequence, dtype=np.uint8, seed=0):
     frames = np.empty((len(sequence.frames), HEIGHT, WIDTH))
     for i in range(len(frames)):
         along, levels = profile(sequence, i)
-        seen = np.zeros_like(coordinate) if along == "y" else np.interp(coordinate, np.arange(len(levels)), levels)
+        seen = (
+            np.zeros_like(coordinate)
+            if along == "y"
+            else np.interp(coordinate, np.arange(len(levels)), levels)
+        )
         frames[i] = 15 + gain * seen / 255 + rng.normal(0, 1.5, coordinate.shape)
     full, depth = (255, 1) if dtype == np.uint8 else (4095, 16)
     return np.clip(np.rint(frames * depth), 0, full).astype(dtype)
@@ -51,7 +58,9 @@ def pixelwise(period_px=18.0):
     rng = np.random.default_rng(1)
     shape = HEIGHT, WIDTH
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    c = np.stack([400 + 0.02 * u, np.full(shape, 1.4), np.full(shape, -9e-4), (u - 75) / 300, (v - 30) / 300])
+    c = np.stack(
+        [400 + 0.02 * u, np.full(shape, 1.4), np.full(shape, -9e-4), (u - 75) / 300, (v - 30) / 300]
+    )
     c[:, rng.random(shape) < 0.01] = np.nan
     low, high = np.full(shape, 22, np.float32), np.full(shape, 38, np.float32)
     ones = np.ones(shape, np.float32)
@@ -60,17 +69,22 @@ def pixelwise(period_px=18.0):
 
 
 def splined():
-    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose illuminated."""
+    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose
+    illuminated."""
     rng = np.random.default_rng(2)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     shape, step = (HEIGHT, WIDTH), 6
     c = np.stack([560 + 0.02 * u, np.full(shape, 0.5), np.full(shape, -4e-4)]).astype(np.float32)
-    grid = rng.normal(0, 0.1, ((HEIGHT - 1) // step + 2, (WIDTH - 1) // step + 2, 17)).astype(np.float32)
+    grid = rng.normal(0, 0.1, ((HEIGHT - 1) // step + 2, (WIDTH - 1) // step + 2, 17)).astype(
+        np.float32
+    )
     held = grid.copy()
     held[2, 3:5] = np.nan
     model = object.__new__(SplinedModel)
     rays = np.stack([(u - 75) / 300, (v - 30) / 300])
-    vars(model).update(rays=rays, _compiled={"x": CompiledAxis(c, 155.5, grid, held, step, 500.0, 600.0)})
+    vars(model).update(
+        rays=rays, _compiled={"x": CompiledAxis(c, 155.5, grid, held, step, 500.0, 600.0)}
+    )
     return model
 
 
@@ -144,11 +158,14 @@ def test_arrays_and_light_are_used_again():
 
 
 def test_light_of_fewer_bits_than_the_frames_is_measured_anew(monkeypatch):
-    """The kernel is replaced by what it reports, the largest grey levels: for uint16 it takes long to compile."""
+    """The kernel is replaced by what it reports, the largest grey levels: for uint16 it takes long
+    to compile."""
     sequence, whites = SEQUENCES["three frequencies of 4 steps"], []
     frames = frames_of(sequence, np.uint16)
 
-    def sweep_rows(first, last, stack, shifts, ladder, rules, scale, depths, maps, texture, indices, peaks):
+    def sweep_rows(
+        first, last, stack, shifts, ladder, rules, scale, depths, maps, texture, indices, peaks
+    ):
         whites.append(scale.white)
         peaks[first // kernels.ROWS : -(-last // kernels.ROWS)] = stack.max()
 

@@ -1,4 +1,5 @@
-"""The one pass for CUDA devices against the definitions: in numba's simulator, and on a device where there is one."""
+"""The one pass for CUDA devices against the definitions: in numba's simulator, and on a device
+where there is one."""
 
 import importlib.util
 import json
@@ -51,28 +52,49 @@ CASES = {  # sequence, model, dtype
 
 
 def pixelwise():
-    c = np.stack([400 + 0.02 * U, np.full(U.shape, 1.4), np.full(U.shape, -9e-4), (U - 10) / 300, (V - 7) / 300])
+    c = np.stack(
+        [
+            400 + 0.02 * U,
+            np.full(U.shape, 1.4),
+            np.full(U.shape, -9e-4),
+            (U - 10) / 300,
+            (V - 7) / 300,
+        ]
+    )
     c[:, 5, 5] = np.nan
-    low, high, ones = np.full(U.shape, 22, np.float32), np.full(U.shape, 38, np.float32), np.ones(U.shape, np.float32)
+    low, high, ones = (
+        np.full(U.shape, 22, np.float32),
+        np.full(U.shape, 38, np.float32),
+        np.ones(U.shape, np.float32),
+    )
     fit = PixelFit(c, np.stack([ones] * 3), np.full(U.shape, 20, np.uint16), low, high, ones)
     return PixelwiseModel({"x": fit}, {"x": 18.0}, {}, "x")
 
 
 def splined():
-    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose illuminated."""
-    c = np.stack([560 + 0.02 * U, np.full(U.shape, 0.5), np.full(U.shape, -4e-4)]).astype(np.float32)
+    """A made-up compiled form: what a joint adjustment would leave, with cells that no pose
+    illuminated."""
+    c = np.stack([560 + 0.02 * U, np.full(U.shape, 0.5), np.full(U.shape, -4e-4)]).astype(
+        np.float32
+    )
     grid = np.random.default_rng(2).normal(0, 0.1, (4, 5, 17)).astype(np.float32)
     held = grid.copy()
     held[2, 3, :5] = np.nan
     model = object.__new__(SplinedModel)
     rays = np.stack([(U - 10) / 300, (V - 7) / 300])
-    vars(model).update(rays=rays, _compiled={"x": CompiledAxis(c, 155.5, grid, held, 6, 500.0, 600.0)})
+    vars(model).update(
+        rays=rays, _compiled={"x": CompiledAxis(c, 155.5, grid, held, 6, 500.0, 600.0)}
+    )
     return model
 
 
 def stereo():
-    camera = Lens([[320, 0, 9.5], [0, 320, 6.5], [0, 0, 1]], [-0.1, 0.05, 1e-3, -1e-3, 0], (WIDTH, HEIGHT))
-    projector = Lens([[1900, 0, 455], [0, 1950, 570], [0, 0, 1]], [-0.05, 0.02, 5e-4, 8e-4, 0.01], PROJECTOR)
+    camera = Lens(
+        [[320, 0, 9.5], [0, 320, 6.5], [0, 0, 1]], [-0.1, 0.05, 1e-3, -1e-3, 0], (WIDTH, HEIGHT)
+    )
+    projector = Lens(
+        [[1900, 0, 455], [0, 1950, 570], [0, 0, 1]], [-0.05, 0.02, 5e-4, 8e-4, 0.01], PROJECTOR
+    )
     R = np.array([[np.cos(0.3), 0, -np.sin(0.3)], [0, 1, 0], [np.sin(0.3), 0, np.cos(0.3)]])
     return StereoModel.from_rig(StereoRig(camera, projector, R, [60.0, 2.0, 30.0]))
 
@@ -95,7 +117,11 @@ def frames_of(sequence, dtype, model):
     frames = np.empty((len(sequence.frames), HEIGHT, WIDTH))
     for i in range(len(frames)):
         along, levels = profile(sequence, i)
-        seen = np.zeros(U.shape) if along == "y" else np.interp(coordinate, np.arange(len(levels)), levels)
+        seen = (
+            np.zeros(U.shape)
+            if along == "y"
+            else np.interp(coordinate, np.arange(len(levels)), levels)
+        )
         frames[i] = 15 + gain * seen / 255 + rng.normal(0, 1.5, U.shape)
     full, depth = (255, 1) if dtype == "uint8" else (4095, 16)
     return np.clip(np.rint(frames * depth), 0, full).astype(dtype)
@@ -108,7 +134,8 @@ def made(case):
 
 
 def scans_to(folder):
-    """What a device makes of all cases, saved; and then what happens when it fails in the middle."""
+    """What a device makes of all cases, saved; and then what happens when it fails in the
+    middle."""
     said = []
     folder, handler = Path(folder), logging.Handler()
     handler.emit = lambda record: said.append(record.getMessage())
@@ -119,7 +146,9 @@ def scans_to(folder):
         one = one_pass(sequence, model, "x")
         assert isinstance(one, CudaPass) and has_pass(model)
         scan = one.run(frames)
-        if case.startswith("heterodyne"):  # light of a camera of fewer bits is found out, and arrays are used again
+        if case.startswith(
+            "heterodyne"
+        ):  # light of a camera of fewer bits is found out, and arrays are used again
             before = scan.points.copy()
             again = one.run(frames, replace(scan.light, white=1023.0), scan)
             assert again.light.white == 4095 and again.points is scan.points
@@ -154,7 +183,9 @@ def scans(request, tmp_path_factory):
         f"import {here.stem} as it; it.scans_to({str(folder)!r})"
     )
     command = [sys.executable, "-W", "ignore", "-c", code]
-    run = subprocess.run(command, cwd=ROOT, env={**os.environ, **there}, capture_output=True, text=True)
+    run = subprocess.run(
+        command, cwd=ROOT, env={**os.environ, **there}, capture_output=True, text=True
+    )
     assert run.returncode == 0, run.stderr
     return folder
 
@@ -211,10 +242,14 @@ def test_a_device_that_fails_is_told_once_and_the_processor_goes_on(scans):
 
 def test_without_a_device_all_is_the_processors(monkeypatch, caplog):
     monkeypatch.setattr(cuda_device, "_cached_name", [])
-    broken = SimpleNamespace(cuInit=lambda flags: 803)  # as if the kernel's module were another version's
+    broken = SimpleNamespace(
+        cuInit=lambda flags: 803
+    )  # as if the kernel's module were another version's
     monkeypatch.setattr(cuda_device.ctypes, "CDLL", lambda name: broken)
     real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "numba_cuda" or real(name))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: name == "numba_cuda" or real(name)
+    )
     assert type(one_pass(SEQUENCES["p18"], pixelwise(), "x")) is OnePass
     assert type(one_pass(SEQUENCES["p18"], splined(), "x")) is OnePass
     assert has_pass(splined()) and not has_pass(stereo()) and not has_pass(None)
@@ -251,11 +286,17 @@ def test_a_stereo_pass_refuses_what_it_cannot_do():
 @pytest.mark.parametrize("cc", [pytest.param((7, 5), marks=pytest.mark.slow), (9, 0)])
 @pytest.mark.parametrize(
     "model",
-    ["stereo", pytest.param("pixelwise", marks=pytest.mark.slow), pytest.param("splined", marks=pytest.mark.slow)],
+    [
+        "stereo",
+        pytest.param("pixelwise", marks=pytest.mark.slow),
+        pytest.param("splined", marks=pytest.mark.slow),
+    ],
 )
 def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
     """As far as PTX, which needs no device."""
-    pytest.importorskip("numba_cuda", reason="kernels are compiled by numba-cuda: pip install 'slviewer[cuda]'")
+    pytest.importorskip(
+        "numba_cuda", reason="kernels are compiled by numba-cuda: pip install 'slviewer[cuda]'"
+    )
     from numba import cuda
     from numba.core import types
 
@@ -280,8 +321,22 @@ def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
 
     kernel = sweep.sweep_kernel(job, len(job.frames), measure, True)
     light = types.UniTuple(types.float32, 6)
-    assert compiled(kernel, whole, light, *tables, single, words, single, points, single, whole, types.int32[::1])
-    list_moves, move, list_masked, mask = spike_kernels(spike_rules(job.layout), (HEIGHT, WIDTH), measure)
+    assert compiled(
+        kernel,
+        whole,
+        light,
+        *tables,
+        single,
+        words,
+        single,
+        points,
+        single,
+        whole,
+        types.int32[::1],
+    )
+    list_moves, move, list_masked, mask = spike_kernels(
+        spike_rules(job.layout), (HEIGHT, WIDTH), measure
+    )
     assert compiled(list_moves, maps, words) and compiled(list_masked, maps, words)
     assert compiled(move, words, *tables, single, points, single)
     assert compiled(mask, words, single, words, points, single)

@@ -13,7 +13,9 @@ from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 SHAPE = (30, 40)
 
 
-def plane_grid(shape: tuple[int, int] = SHAPE, slope: tuple[float, float] = (0.3, -0.2)) -> np.ndarray:
+def plane_grid(
+    shape: tuple[int, int] = SHAPE, slope: tuple[float, float] = (0.3, -0.2)
+) -> np.ndarray:
     """A tilted plane 600 mm away, seen by a pinhole of 0.4 mm a pixel there."""
     v, u = np.mgrid[: shape[0], : shape[1]]
     uc, vc = (u - shape[1] / 2) / 1500, (v - shape[0] / 2) / 1500
@@ -80,7 +82,9 @@ def test_sigma_is_compared_on_the_same_pixels() -> None:
     both["y"].offset[:20] = np.nan
     assert reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "x"
     both["x"].offset[5:] = np.nan
-    assert reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "y"  # nothing in common, and y measures more
+    assert (
+        reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "y"
+    )  # nothing in common, and y measures more
 
 
 def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:
@@ -142,8 +146,13 @@ def test_normals_of_a_plane() -> None:
     # float32 depths at 600 mm step by 6e-5 mm, pixels by 0.4 mm
     assert np.abs(found - truth).max() < 1e-3
     assert (np.einsum("hwc,hwc->hw", found, points) < 0).all()
-    noisy = points + points * np.random.default_rng(0).normal(0, 0.04 / 600, (60, 80, 1)).astype(np.float32)
-    tilt = {reach: np.degrees(np.arccos(np.clip(normals(noisy, reach) @ truth, -1, 1))).mean() for reach in (1, 2)}
+    noisy = points + points * np.random.default_rng(0).normal(0, 0.04 / 600, (60, 80, 1)).astype(
+        np.float32
+    )
+    tilt = {
+        reach: np.degrees(np.arccos(np.clip(normals(noisy, reach) @ truth, -1, 1))).mean()
+        for reach in (1, 2)
+    }
     assert 0.3 < tilt[2] < 1.5
     assert tilt[1] > 2 * tilt[2]
 

@@ -16,7 +16,12 @@ from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
-from slviewer.registration.markers import MeasuredMarkers, fit_marker_pose, marker_notes, measure_markers
+from slviewer.registration.markers import (
+    MeasuredMarkers,
+    fit_marker_pose,
+    marker_notes,
+    measure_markers,
+)
 from slviewer.registration.multiway import Starts, register_all
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose
@@ -67,7 +72,10 @@ def largest_error(clouds: dict[str, Cloud], T: np.ndarray, true: np.ndarray) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "behind_mm", "reason"),
-    [(marked_sphere, 60.0, "sphere"), pytest.param(marked_cylinder, 0.0, "cylinder", marks=pytest.mark.slow)],
+    [
+        (marked_sphere, 60.0, "sphere"),
+        pytest.param(marked_cylinder, 0.0, "cylinder", marks=pytest.mark.slow),
+    ],
 )
 def test_markers_register_shapes_that_hold_no_pose(
     make: Callable[[Pose], MarkedScene], behind_mm: float, reason: str
@@ -92,7 +100,9 @@ def test_a_plane_and_its_corners(plates, on_plates) -> None:
     alignment = register_all(plates, "a", Starts(markers=on_plates))
     true = true_motion(pose(0), pose(1))
     assert 0.0005 < largest_error(plates, alignment.T_reference_scan["b"], true) < 0.05
-    gap = move_points(true, on_plates["b"].corners.reshape(-1, 3)) - on_plates["a"].corners.reshape(-1, 3)
+    gap = move_points(true, on_plates["b"].corners.reshape(-1, 3)) - on_plates["a"].corners.reshape(
+        -1, 3
+    )
     sigma = np.hypot(on_plates["a"].sigma_mm, on_plates["b"].sigma_mm).ravel()
     assert 0.2 < np.sqrt(np.mean(gap**2)) / np.sqrt(np.mean(sigma**2)) < 1.3, "what is predicted"
 
@@ -107,7 +117,11 @@ def test_scans_that_do_not_overlap_are_joined_by_markers_alone(plates, on_plates
         points[:, slice(middle, None) if name == "a" else slice(None, middle)] = np.nan
         halves[name] = replace(cloud, points=points)
     alignment = register_all(halves, "a", Starts(markers=on_plates))
-    assert 0.0005 < largest_error(plates, alignment.T_reference_scan["b"], true_motion(pose(0), pose(1))) < 0.1
+    assert (
+        0.0005
+        < largest_error(plates, alignment.T_reference_scan["b"], true_motion(pose(0), pose(1)))
+        < 0.1
+    )
 
 
 @pytest.mark.slow
@@ -118,7 +132,10 @@ def test_a_marker_that_was_moved_is_named_and_one_of_two_is_undecidable(on_plate
     moved = fit_marker_pose(replace(b, corners=corners), a)
     assert moved is not None and moved.moved == (2,) and moved.ids == (0, 1, 3, 4, 5)
     assert np.allclose(moved.T, true_motion(pose(0), pose(1)), atol=0.1)
-    few = [replace(m, ids=m.ids[:2], corners=c[:2], sigma_mm=m.sigma_mm[:2]) for m, c in ((a, a.corners), (b, corners))]
+    few = [
+        replace(m, ids=m.ids[:2], corners=c[:2], sigma_mm=m.sigma_mm[:2])
+        for m, c in ((a, a.corners), (b, corners))
+    ]
     few[1].corners[1] += 5.0
     with pytest.raises(Refused):
         fit_marker_pose(few[1], few[0])
@@ -142,7 +159,10 @@ def test_a_number_that_is_seen_twice_is_left_out_and_reported() -> None:
 
 @pytest.mark.slow
 def test_one_marker_alone_does_not_join_scans_without_overlap(plates, on_plates) -> None:
-    one = {n: replace(m, ids=m.ids[:1], corners=m.corners[:1], sigma_mm=m.sigma_mm[:1]) for n, m in on_plates.items()}
+    one = {
+        n: replace(m, ids=m.ids[:1], corners=m.corners[:1], sigma_mm=m.sigma_mm[:1])
+        for n, m in on_plates.items()
+    }
     halves = {}
     for name, cloud in plates.items():
         points = cloud.points.copy()
@@ -152,13 +172,18 @@ def test_one_marker_alone_does_not_join_scans_without_overlap(plates, on_plates)
         register_all(halves, "a", Starts(markers=one))
 
 
-@pytest.mark.parametrize(("notation", "count"), [("markers:0-23:20", 24), ("markers:100-102:40", 3), ("mat:16", None)])
+@pytest.mark.parametrize(
+    ("notation", "count"), [("markers:0-23:20", 24), ("markers:100-102:40", 3), ("mat:16", None)]
+)
 def test_sheets_are_read_back(notation: str, count: int | None) -> None:
     drawing = draw_marker_sheet(notation)
     scale = 8.0
     page = np.full((int(drawing.height * scale), int(drawing.width * scale)), 255, np.uint8)
     for x, y, w, h in drawing.rectangles:
-        a, b = (np.array((x, y)) * scale).round().astype(int), (np.array((x + w, y + h)) * scale).round().astype(int)
+        a, b = (
+            (np.array((x, y)) * scale).round().astype(int),
+            (np.array((x + w, y + h)) * scale).round().astype(int),
+        )
         page[a[1] : b[1], a[0] : b[0]] = 0
     seen = detect_markers(cv2.GaussianBlur(page, (0, 0), 1.0))
     assert not seen.repeated and seen.ids.tolist() == sorted(seen.ids)
@@ -168,7 +193,8 @@ def test_sheets_are_read_back(notation: str, count: int | None) -> None:
 
 
 @pytest.mark.parametrize(
-    "notation", ["markers:5-2:20", "markers:0-600:20", "markers:0-99:50", "mat:100", "mat:x", "markers:"]
+    "notation",
+    ["markers:5-2:20", "markers:0-600:20", "markers:0-99:50", "mat:100", "mat:x", "markers:"],
 )
 def test_sheets_that_are_impossible_are_refused(notation: str) -> None:
     with pytest.raises(InputError):

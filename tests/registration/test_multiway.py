@@ -1,4 +1,5 @@
-"""Many scans come together in one frame; loops close, and a pair that contradicts the others is found."""
+"""Many scans come together in one frame; loops close, and a pair that contradicts the others is
+found."""
 
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ DEPTHS = {"object_r1": -120.0, "object_r2": 0.0, "object_r3": 120.0}
 
 
 def pose(name: str) -> np.ndarray:
-    """Where the object stands in the reference's frame: its scan is nearer or further, and turned."""
+    """Where the object stands in the reference's frame: its scan is nearer or further, and
+    turned."""
     T = motion(12.0 if name == "object_r1" else 9.0, 4.0, seed=len(name) + int(DEPTHS[name]) % 7)
     T[:3, 3] -= T[:3, :3] @ [0.0, 0.0, DEPTHS[name]]
     return T if name != "object_r2" else np.eye(4)
@@ -40,7 +42,9 @@ def off(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     """mm at the object's centre, and degrees."""
     D = T @ np.linalg.inv(true)
     shift = np.linalg.norm(D[:3, :3] @ CENTRE + D[:3, 3] - CENTRE)
-    return float(shift), float(np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())))
+    return float(shift), float(
+        np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec()))
+    )
 
 
 def test_three_depths_come_into_one_frame(clouds: dict[str, Cloud]) -> None:
@@ -51,7 +55,9 @@ def test_three_depths_come_into_one_frame(clouds: dict[str, Cloud]) -> None:
         shift, turn = off(pair.T_reference_scan, pose(name))
         assert shift < 0.02 and turn < 0.01
         assert 0.8 * NOISE < pair.rms_mm < 2.0 * NOISE
-        assert pair.overlap > 0.6 and pair.start == "features" and pair.gate_mm <= 2.0  # two pixels of this camera
+        assert (
+            pair.overlap > 0.6 and pair.start == "features" and pair.gate_mm <= 2.0
+        )  # two pixels of this camera
         assert 0.0002 < pair.uncertainty.shift_mm < 0.02
     assert len(found.pairs) == 3 and len(found.loops) == 1 and not found.dropped
     assert found.loops[0].after.shift_mm < found.loops[0].before.shift_mm < 0.05
@@ -81,7 +87,10 @@ def test_edges_are_not_trusted(clouds: dict[str, Cloud]) -> None:
 
 @pytest.mark.slow
 def test_a_scan_that_does_not_belong_is_named() -> None:
-    scans = {"a": Scan(view(bumpy(2), (-75, 45), 2)), "stranger": Scan(view(bumpy(58), (-45, 75), 1))}
+    scans = {
+        "a": Scan(view(bumpy(2), (-75, 45), 2)),
+        "stranger": Scan(view(bumpy(58), (-45, 75), 1)),
+    }
     with raises(Refused, "stranger"):
         register_all(scans, "a")
 
@@ -121,7 +130,11 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
         T = TABLE.rotation(step * k)
         normals = directions @ T[:3, :3].T  # nearly: enough to say what the camera sees
         points = (knob(directions) + TABLE.point) @ T[:3, :3].T + T[:3, 3]
-        points += rng.normal(0, NOISE, (len(points), 1)) * points / np.linalg.norm(points, axis=1, keepdims=True)
+        points += (
+            rng.normal(0, NOISE, (len(points), 1))
+            * points
+            / np.linalg.norm(points, axis=1, keepdims=True)
+        )
         seen = np.sum(normals * points, axis=1) < -0.35 * np.linalg.norm(points, axis=1)
         scans[f"turn_{k + 1:02d}"] = Scan(points[seen])
     return scans
@@ -130,7 +143,9 @@ def turned_scans(count: int, step: float) -> dict[str, Scan]:
 @pytest.fixture(scope="module")
 def turn() -> MultiwayAlignment:
     scans = turned_scans(6, 60.0)
-    return register_all(scans, "turn_03", Starts(table_deg=dict(zip(scans, 60.0 * np.arange(6), strict=True))))
+    return register_all(
+        scans, "turn_03", Starts(table_deg=dict(zip(scans, 60.0 * np.arange(6), strict=True)))
+    )
 
 
 @pytest.mark.slow
@@ -143,9 +158,13 @@ def test_a_turn_closes(turn: MultiwayAlignment) -> None:
     assert turn.loops[0].before.shift_mm < 0.1
     assert max(loop.after.shift_mm for loop in turn.loops) < 0.05
     assert len(turn.pairs) >= 6 and not turn.dropped
-    # the third scan and its neighbours are one pair apart, the sixth is three: it is the least sure, and told so
+    # the third scan and its neighbours are one pair apart, the sixth is three: it is the least
+    # sure, and told so
     sure = {name: pair.uncertainty.shift_mm for name, pair in turn.on_reference().items()}
-    assert 0.005 < sure["turn_02"] < sure["turn_06"] < 0.05 and max(sure, key=lambda name: sure[name]) == "turn_06"
+    assert (
+        0.005 < sure["turn_02"] < sure["turn_06"] < 0.05
+        and max(sure, key=lambda name: sure[name]) == "turn_06"
+    )
     assert {pair.start for pair in turn.pairs.values()} <= {"turntable", "features", "initial"}
 
 
@@ -153,7 +172,9 @@ def test_the_axis_is_found_from_two_steps_and_a_wrong_angle_is_told() -> None:
     steps = [TABLE.rotation(-40.0)] * 2
     axis = fit_turntable_axis(steps, 40.0)
     np.testing.assert_allclose(axis.rotation(25.0), TABLE.rotation(25.0), atol=1e-9)
-    np.testing.assert_allclose(fit_turntable_axis(steps, -40.0).rotation(-25.0), TABLE.rotation(25.0), atol=1e-9)
+    np.testing.assert_allclose(
+        fit_turntable_axis(steps, -40.0).rotation(-25.0), TABLE.rotation(25.0), atol=1e-9
+    )
     with raises(InputError, "40.0 degrees", 30):
         fit_turntable_axis(steps, 30.0)
     for angle in (0.0, 180.0):

@@ -10,7 +10,9 @@ pytestmark = pytest.mark.process
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False
+    )
 
 
 def test_open3d_imports_in_a_fresh_process_without_dash() -> None:
@@ -41,7 +43,8 @@ def test_a_break_while_open3d_is_imported_waits_for_its_end() -> None:
     done = run(
         "import os, signal, sys, threading, time\n"
         "from slviewer.registration.open3d_loader import open3d\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs ignore it
+        # a shell's background jobs ignore it
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def interrupt():\n"  # once the import has begun
         "    while 'open3d' not in sys.modules:\n        time.sleep(0.001)\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"

@@ -1,4 +1,5 @@
-"""Registration finds a known motion to hundredths of a millimetre, and refuses what it cannot know."""
+"""Registration finds a known motion to hundredths of a millimetre, and refuses what it cannot
+know."""
 
 import re
 
@@ -15,16 +16,22 @@ from slviewer.registration.refusal import Refused
 pytestmark = pytest.mark.computes
 
 
-@pytest.mark.parametrize(("deg", "mm"), [pytest.param(1.0, 2.0, marks=pytest.mark.slow), (60.0, 150.0)])
+@pytest.mark.parametrize(
+    ("deg", "mm"), [pytest.param(1.0, 2.0, marks=pytest.mark.slow), (60.0, 150.0)]
+)
 def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     T = motion(deg, mm)
     result = register(view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2))
     shift, turn = error(result, T)
     assert shift < 0.03
     assert turn < 0.02
-    assert 0.9 * NOISE < result.rms_mm < 1.6 * NOISE  # both scans' noise, sqrt(2) times one's, on tilted surfaces
+    assert (
+        0.9 * NOISE < result.rms_mm < 1.6 * NOISE
+    )  # both scans' noise, sqrt(2) times one's, on tilted surfaces
     assert result.inlier_rmse_mm > 3 * result.rms_mm  # the spacing of the points is in it
-    assert 0.68 < result.overlap < 0.78  # 90 of 120 mm, less the points beyond the gate across steep slopes
+    assert (
+        0.68 < result.overlap < 0.78
+    )  # 90 of 120 mm, less the points beyond the gate across steep slopes
     assert result.agreement > 0.98
 
 
@@ -38,7 +45,9 @@ def registered() -> Registration:
 
 @pytest.mark.slow
 def test_the_same_scans_give_the_same_pose(registered: Registration) -> None:
-    np.testing.assert_allclose(register(*SCANS).T_reference_scan, registered.T_reference_scan, atol=1e-7)
+    np.testing.assert_allclose(
+        register(*SCANS).T_reference_scan, registered.T_reference_scan, atol=1e-7
+    )
 
 
 @pytest.mark.slow
@@ -71,10 +80,15 @@ def test_gates_follow_the_size_of_the_object(scale: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("relief", "other"), [pytest.param(12.0, 52, marks=pytest.mark.slow), (3.0, 58)])
+@pytest.mark.parametrize(
+    ("relief", "other"), [pytest.param(12.0, 52, marks=pytest.mark.slow), (3.0, 58)]
+)
 def test_unrelated_shapes_are_refused(other: int, relief: float) -> None:
     with pytest.raises(SlviewerError):
-        register(view(bumpy(other, relief), (-45, 75), 1, points=10_000), view(bumpy(2, relief), (-75, 45), 2))
+        register(
+            view(bumpy(other, relief), (-45, 75), 1, points=10_000),
+            view(bumpy(2, relief), (-75, 45), 2),
+        )
 
 
 def test_points_that_are_all_one_are_refused() -> None:
@@ -109,7 +123,9 @@ def moulding(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         (moulding, "slides", ("slides",)),
     ],
 )
-def test_a_shape_that_slides_or_turns_is_refused_by_its_name(shape: Height, reason: str, free: tuple[str, ...]) -> None:
+def test_a_shape_that_slides_or_turns_is_refused_by_its_name(
+    shape: Height, reason: str, free: tuple[str, ...]
+) -> None:
     with raises(Refused, *free) as refusal:
         register(view(shape, (-45, 75), 1, motion(5, 10)), view(shape, (-75, 45), 2))
     assert refusal.value.reason == reason
@@ -126,7 +142,10 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
     scan, reference = view(twice, (-70, 70), 1, T), view(twice, (-75, 75), 2)
     with raises(Refused, "RMS") as refusal:
         register(scan, reference)
-    assert refusal.value.reason == "ambiguous" and len(re.findall(r"[\d.]+ (?:mm|%)", str(refusal.value))) >= 3
+    assert (
+        refusal.value.reason == "ambiguous"
+        and len(re.findall(r"[\d.]+ (?:mm|%)", str(refusal.value))) >= 3
+    )
     corners = CENTRE + np.array([[50.0, 50.0, 0.0], [-50.0, 40.0, 0.0], [40.0, -50.0, 0.0]])
     picks = (corners - T[:3, 3]) @ T[:3, :3] + np.random.default_rng(0).normal(0, 2.0, (3, 3))
     start, apart = fit_picked_start(picks, corners)
@@ -166,7 +185,9 @@ def test_the_predicted_uncertainty_is_the_true_one() -> None:
         told.append((found.uncertainty.shift_mm, found.uncertainty.turn_deg))
     predicted = np.sqrt(np.mean(np.square(told), axis=0))
     true = np.sqrt(np.mean(np.square([shifts, turns]), axis=1))
-    assert (predicted > 0.5 * true).all() and (predicted < 3.0 * true).all()  # few, and not as dense as a camera's
+    assert (predicted > 0.5 * true).all() and (
+        predicted < 3.0 * true
+    ).all()  # few, and not as dense as a camera's
 
 
 def test_a_pose_handed_in_replaces_the_search() -> None:

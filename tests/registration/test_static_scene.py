@@ -1,4 +1,5 @@
-"""An object on a turntable before a wall that stands still: its motion is measured, and the wall is kept out of it."""
+"""An object on a turntable before a wall that stands still: its motion is measured, and the wall is
+kept out of it."""
 
 import re
 from functools import cache
@@ -14,7 +15,11 @@ from slviewer.errors import InputError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import register_all
 from slviewer.registration.scan import away_from_edges
-from slviewer.registration.static_scene import measure_contradiction, register_object, sample_surface
+from slviewer.registration.static_scene import (
+    measure_contradiction,
+    register_object,
+    sample_surface,
+)
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.scenes import Surface
 from slviewer.simulation.turning import AXIS, AXIS_POINT, turning
@@ -39,7 +44,12 @@ def seen(scene: MeshScene, seed: int, wall: bool) -> Cloud:
     behind = WALL_MM + 12.0 * (rays()[..., 0] > 0.05) + 30.0 * rays()[..., 0]
     rng = np.random.default_rng(seed)
     z = np.where(np.isfinite(z), z, behind if wall else np.nan) + rng.normal(0, NOISE, z.shape)
-    return Cloud((rays() * z[..., None]).astype(np.float32), "x", "stereo", np.full(z.shape, NOISE, np.float32))
+    return Cloud(
+        (rays() * z[..., None]).astype(np.float32),
+        "x",
+        "stereo",
+        np.full(z.shape, NOISE, np.float32),
+    )
 
 
 def turned(deg: float) -> np.ndarray:
@@ -54,15 +64,22 @@ def error(T: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     """mm at the object, degrees."""
     D = T @ np.linalg.inv(true)
     shift = np.linalg.norm(D[:3, :3] @ AXIS_POINT + D[:3, 3] - AXIS_POINT)
-    return float(shift), float(np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec())))
+    return float(shift), float(
+        np.degrees(np.linalg.norm(Rotation.from_matrix(D[:3, :3]).as_rotvec()))
+    )
 
 
 @cache
 def scans(deg: float, wall: bool) -> tuple[dict[str, Cloud], dict[str, np.ndarray]]:
-    """Two scans, the object turned by so many degrees between them; and where the wall is seen in each."""
+    """Two scans, the object turned by so many degrees between them; and where the wall is seen in
+    each."""
     first = turning()["turn_01"]
     pose, T = first.pose, turned(deg)
-    second = MeshScene(first.vertices, first.triangles, type(pose)(T[:3, :3] @ pose.R, T[:3, :3] @ pose.t + T[:3, 3]))
+    second = MeshScene(
+        first.vertices,
+        first.triangles,
+        type(pose)(T[:3, :3] @ pose.R, T[:3, :3] @ pose.t + T[:3, 3]),
+    )
     clouds = {"a": seen(first, 1, wall), "b": seen(second, 2, wall)}
     return clouds, {name: cloud.points[..., 2] > 700 for name, cloud in clouds.items()}
 
@@ -79,7 +96,9 @@ def test_a_wall_behind_a_turned_object_is_recognised_and_does_not_move_it(deg: f
     for name, mask in found.static.items():
         wall_there = wall[name] & clouds[name].mask
         assert (mask & wall_there).sum() > 0.95 * wall_there.sum()
-        assert (mask & ~wall_there).sum() < 0.04 * (clouds[name].mask & ~wall_there).sum()  # its rim
+        assert (mask & ~wall_there).sum() < 0.04 * (
+            clouds[name].mask & ~wall_there
+        ).sum()  # its rim
         assert not (found.clouds[name].mask & mask).any()
     assert 0 <= found.contradictions["b", "a"].share < 0.02
 
@@ -89,7 +108,10 @@ def test_an_object_alone_has_nothing_that_stands_still() -> None:
     found = register_object(clouds, "a")
     assert not any(mask.any() for mask in found.static.values())
     assert found.clouds["a"] is clouds["a"]
-    assert found.contradictions["b", "a"].share < 0.01 and found.contradictions["b", "a"].compared > 1000
+    assert (
+        found.contradictions["b", "a"].share < 0.01
+        and found.contradictions["b", "a"].compared > 1000
+    )
 
 
 def test_a_scan_that_is_all_holes_says_where_its_points_are_lost() -> None:
@@ -118,7 +140,9 @@ def test_contradictions_are_counted_where_one_scan_sees_through_the_others_point
     share = float(wall["b"].sum() / clouds["b"].mask.sum())
     T = np.linalg.inv(turned(2.0))
     moved = measure_contradiction(views["b"], views["a"], T, 1.0).share
-    assert 0.2 * share < moved < 0.8 * share  # half of the turned wall lies before itself, the other half behind
+    assert (
+        0.2 * share < moved < 0.8 * share
+    )  # half of the turned wall lies before itself, the other half behind
     still = measure_contradiction(views["b"], views["a"], np.eye(4), 1.0).share
     assert 0.001 < still < 0.5 * (1 - share)
 
@@ -132,7 +156,9 @@ def test_real_shells_turn_while_their_background_stands_still(real_data: Path) -
             pytest.skip(f"{file} is not among the real captures")
         clouds[name] = organised_ply(file, calibration)
     found = register_object(clouds, "scan_0020")
-    turn = np.degrees(Rotation.from_matrix(found.alignment.T_reference_scan["scan_0021"][:3, :3]).magnitude())
+    turn = np.degrees(
+        Rotation.from_matrix(found.alignment.T_reference_scan["scan_0021"][:3, :3]).magnitude()
+    )
     assert turn == pytest.approx(1.37, abs=0.03)
     for name, cloud in clouds.items():
         share = found.static[name].sum() / cloud.mask.sum()
@@ -145,7 +171,9 @@ def test_real_shells_turn_while_their_background_stands_still(real_data: Path) -
 def organised_ply(file: Path, calibration: Path, step: int = 3) -> Cloud:
     """The authors' cloud on the grid of every third pixel of their camera."""
     data = file.read_bytes()
-    vertices = np.frombuffer(data[data.index(b"end_header\n") + 11 :], dtype=[("p", "<f4", 3), ("c", "u1", 3)])
+    vertices = np.frombuffer(
+        data[data.index(b"end_header\n") + 11 :], dtype=[("p", "<f4", 3), ("c", "u1", 3)]
+    )
     points = vertices["p"].astype(np.float64) * (1, -1, -1)
     storage = cv2.FileStorage(str(calibration), cv2.FILE_STORAGE_READ)
     K, distortion = storage.getNode("cam_K").mat(), storage.getNode("cam_kc").mat()

@@ -1,4 +1,5 @@
-"""Made-up results that look like real ones: bent planes, noisy spheres, a hilly object seen from three places."""
+"""Made-up results that look like real ones: bent planes, noisy spheres, a hilly object seen from
+three places."""
 
 import numpy as np
 
@@ -25,7 +26,18 @@ from slviewer.report.data import (
 from slviewer.report.maps import verification_maps
 
 MODELS = ("stereo", "pixelwise")
-INCIDENCE = ((100, 0), (91.2, 8.8), (0, 100), (0, 100), (0, 47.6), (0, 0.7), (0, 0), (0, 0), (2.1, 97.9), (0, 87))
+INCIDENCE = (
+    (100, 0),
+    (91.2, 8.8),
+    (0, 100),
+    (0, 100),
+    (0, 47.6),
+    (0, 0.7),
+    (0, 0),
+    (0, 0),
+    (2.1, 97.9),
+    (0, 87),
+)
 LETTER = {
     "stereo": (0.188, 0.237, 0.144, 0.127, 0.172, 0.205, 0.270, 0.214, 0.138, 0.146),
     "pixelwise": (0.068, 0.066, 0.070, 0.056, 0.091, 0.104, 0.163, 0.118, 0.053, 0.076),
@@ -51,12 +63,16 @@ def error_map(width: int, rms: float, noise: float, seed: int, round_: bool = Fa
     bend = np.sin(a * u + b * v) + 0.7 * np.cos(b * u - c * v) + 0.5 * u * v
     bend *= np.sqrt(max(rms**2 - noise**2, 0.0)) / bend.std()
     errors = (bend + noise * rng.standard_normal(u.shape)).astype(np.float32)
-    outside = u**2 + v**2 > 0.3 if round_ else (np.abs(u + 0.1 * v) > 0.75) | (np.abs(v - 0.08 * u) > 0.6)
+    outside = (
+        u**2 + v**2 > 0.3 if round_ else (np.abs(u + 0.1 * v) > 0.75) | (np.abs(v - 0.08 * u) > 0.6)
+    )
     errors[outside] = np.nan
     return errors
 
 
-def error_maps(title: str, width: int, rms: dict[str, float], seed: int, round_: bool = False) -> ErrorMaps:
+def error_maps(
+    title: str, width: int, rms: dict[str, float], seed: int, round_: bool = False
+) -> ErrorMaps:
     maps = {m: error_map(width, r, 0.036, seed + i, round_) for i, (m, r) in enumerate(rms.items())}
     return ErrorMaps(title, maps, rms, 0.036)
 
@@ -66,7 +82,10 @@ def cloud(width: int, shift: float) -> np.ndarray:
     u, v = grid(width)
     u, v = u * 1.35 * shift / 600, v * 1.35 * shift / 600
     radius, angle = np.hypot(u, v), np.arctan2(v, u)
-    groove = 9 * np.cos(5 * np.log(radius + 0.04) - angle) * np.exp(-radius) + 2.2 * np.cos(26 * angle) * radius
+    groove = (
+        9 * np.cos(5 * np.log(radius + 0.04) - angle) * np.exp(-radius)
+        + 2.2 * np.cos(26 * angle) * radius
+    )
     z = shift - 75 * np.sqrt(np.clip(0.85 - radius**2, 0, None)) - groove
     rng = np.random.default_rng(int(shift))
     z = (z + 0.05 * rng.standard_normal(z.shape)).astype(np.float32)
@@ -113,7 +132,9 @@ def outlines() -> dict[str, np.ndarray]:
                 [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
             )
         else:
-            corners = corners @ np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+            corners = corners @ np.array(
+                [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
+            )
         out[f"plane_{i + 1:02d}"] = corners + np.array([10, -5, middle])
     return out
 
@@ -124,14 +145,37 @@ def plane_rows() -> list[PlaneRow]:
         share = {"R1": float(r1), "R2": float(r2), "R3": 100.0 - r1 - r2}
         rms = {m: OURS[m][i] for m in MODELS}
         letter = {m: LETTER[m][i] for m in MODELS}
-        rows.append(PlaneRow(f"plane_{i + 1:02d}", share, rms, dict.fromkeys(MODELS, 0.036), share, letter))
+        rows.append(
+            PlaneRow(f"plane_{i + 1:02d}", share, rms, dict.fromkeys(MODELS, 0.036), share, letter)
+        )
     return rows
 
 
 def sphere_rows() -> list[SphereRow]:
-    radii = ((97.94, 98.11), (98.1, 98.05), (98.2, 98.04), (98.25, 98.02), (98.31, 97.9), (98.39, 97.8))
-    rms = ((0.109, 0.08), (0.096, 0.074), (0.086, 0.062), (0.076, 0.056), (0.092, 0.076), (0.085, 0.085))
-    letter = ((98.44, 98.01), (98.28, 98.0), (98.27, 98.08), (98.2, 98.06), (98.25, 98.15), (98.1, 98.06))
+    radii = (
+        (97.94, 98.11),
+        (98.1, 98.05),
+        (98.2, 98.04),
+        (98.25, 98.02),
+        (98.31, 97.9),
+        (98.39, 97.8),
+    )
+    rms = (
+        (0.109, 0.08),
+        (0.096, 0.074),
+        (0.086, 0.062),
+        (0.076, 0.056),
+        (0.092, 0.076),
+        (0.085, 0.085),
+    )
+    letter = (
+        (98.44, 98.01),
+        (98.28, 98.0),
+        (98.27, 98.08),
+        (98.2, 98.06),
+        (98.25, 98.15),
+        (98.1, 98.06),
+    )
     return [
         SphereRow(
             f"sphere_{i + 1}",
@@ -150,7 +194,10 @@ def sphere_rows() -> list[SphereRow]:
 def reproduction_data(width: int = 1600) -> ReproductionData:
     clouds = [cloud(width, shift) for shift in (450, 590, 740)]
     merged = np.concatenate(
-        [c.reshape(-1, 3) + np.array([0, 0, 590 - s], np.float32) for c, s in zip(clouds, (450, 590, 740), strict=True)]
+        [
+            c.reshape(-1, 3) + np.array([0, 0, 590 - s], np.float32)
+            for c, s in zip(clouds, (450, 590, 740), strict=True)
+        ]
     )
     source = np.repeat(np.arange(3, dtype=np.uint8), [c.size // 3 for c in clouds])
     known = np.isfinite(merged[:, 2])
@@ -180,12 +227,22 @@ def reproduction_data(width: int = 1600) -> ReproductionData:
         ],
         pixel_curve=pixel_curve(),
         rms_maps_mm=rms_maps(width),
-        plane_maps=[error_maps(f"plane_{i:02d}", width, {m: OURS[m][i - 1] for m in MODELS}, i) for i in (1, 3, 8)],
-        sphere_maps=[error_maps(row.name, width, dict(row.rms_mm), 20 + i, True) for i, row in enumerate(spheres)],
+        plane_maps=[
+            error_maps(f"plane_{i:02d}", width, {m: OURS[m][i - 1] for m in MODELS}, i)
+            for i in (1, 3, 8)
+        ],
+        sphere_maps=[
+            error_maps(row.name, width, dict(row.rms_mm), 20 + i, True)
+            for i, row in enumerate(spheres)
+        ],
         plane_outlines=outlines(),
         clouds=[CloudView(f"object_r{i + 1}", c, note=f"R{i + 1}") for i, c in enumerate(clouds)],
         merged=CloudView(
-            "merged", merged[known], facing[known], source[known], ("object_r1", "object_r2", "object_r3")
+            "merged",
+            merged[known],
+            facing[known],
+            source[known],
+            ("object_r1", "object_r2", "object_r3"),
         ),
         letter_points={"R1": 1642179, "R2": 1476327, "R3": 1034094},
     )
@@ -207,7 +264,10 @@ def session_data(width: int = 1600) -> SessionData:
         noise[0][3] = np.nan
         residuals[name] = PoseResiduals(pixels, noise[0], pixels * [0.5, 0.8], noise[1])
     captures = [
-        CaptureRow(n, "calibration", "used", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0}) for n in names
+        CaptureRow(
+            n, "calibration", "used", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0}
+        )
+        for n in names
     ]
     captures += [
         CaptureRow(
@@ -218,7 +278,8 @@ def session_data(width: int = 1600) -> SessionData:
             (912, 1140),
             52,
             {"x": 18.0, "y": 18.0},
-            "12 of 336 circles found: lower the exposure, or move the board so that all of it is in view",
+            "12 of 336 circles found: lower the exposure, or move the board so that all of it is in"
+            " view",
         ),
         CaptureRow(
             "pose_17",
@@ -230,7 +291,9 @@ def session_data(width: int = 1600) -> SessionData:
             {"x": 18.0, "y": 18.0},
             "the board slipped",
         ),
-        CaptureRow("vase <b>blue</b>", "scan", "scan", (width, height), (912, 1140), 26, {"x": 18.0}),
+        CaptureRow(
+            "vase <b>blue</b>", "scan", "scan", (width, height), (912, 1140), 26, {"x": 18.0}
+        ),
     ]
     K = np.array([[3510.2, 0, 801.3], [0, 3509.8, 598.2], [0, 0, 1]])
     D = np.array([-0.0812, 0.113, 0.0003, -0.0002, -0.04])
@@ -250,9 +313,16 @@ def session_data(width: int = 1600) -> SessionData:
         }
         planes[row.name] = Verification(shape="plane", models=fits, incidence=dict(row.incidence))
         drawn = error_maps(row.name, width, dict(row.rms_mm), i).maps
-        maps.append(verification_maps(row.name, planes[row.name], {f"error_{m}": array for m, array in drawn.items()}))
+        maps.append(
+            verification_maps(
+                row.name, planes[row.name], {f"error_{m}": array for m, array in drawn.items()}
+            )
+        )
     rig = StereoRig(
-        Lens(K, D, (width, height)), Lens(K * [[0.4], [0.8], [1]], -D, (912, 1140)), R, np.array([-178.2, 0.4, 21.3])
+        Lens(K, D, (width, height)),
+        Lens(K * [[0.4], [0.8], [1]], -D, (912, 1140)),
+        R,
+        np.array([-178.2, 0.4, 21.3]),
     )
     stereo = StereoModel(
         rig,
@@ -272,5 +342,7 @@ def session_data(width: int = 1600) -> SessionData:
         calibration=CalibrationFigures(stereo, residuals),
         pixel_fits=[PixelFitView("x", rms_maps(width), np.full((height, width), 17, np.uint16))],
         records=[RecordsView(Verification, planes, maps)],
-        warnings=["the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"],
+        warnings=[
+            "the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"
+        ],
     )

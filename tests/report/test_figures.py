@@ -1,4 +1,5 @@
-"""The figures: pictures of the right size, one scale where figures are compared, nothing invented where data lack."""
+"""The figures: pictures of the right size, one scale where figures are compared, nothing invented
+where data lack."""
 
 import io
 import threading
@@ -36,7 +37,9 @@ def opened(figure: Figure) -> np.ndarray:
 def test_colours_stay_true_where_they_mean_something() -> None:
     drawing = new_figure(300, 200)
     axes = drawing.subplots()
-    axes.imshow(np.random.default_rng(0).uniform(size=(200, 200, 3)))  # thousands of colours that compete
+    axes.imshow(
+        np.random.default_rng(0).uniform(size=(200, 200, 3))
+    )  # thousands of colours that compete
     drawing.text(0.1, 0.9, "■", fontsize=30, color=MODELS["stereo"])
     image = opened(finish_figure(drawing, "c", "a")).reshape(-1, 3)
     assert (image == 255).all(axis=1).mean() > 0.1
@@ -47,7 +50,8 @@ def test_colours_stay_true_where_they_mean_something() -> None:
 def test_figures_can_be_drawn_by_several_threads() -> None:
     done: list[Figure] = []
     threads = [
-        threading.Thread(target=lambda: done.append(pose_bars({"a": (0.1, 0.2)}, {"camera": 0.1}))) for _ in range(2)
+        threading.Thread(target=lambda: done.append(pose_bars({"a": (0.1, 0.2)}, {"camera": 0.1})))
+        for _ in range(2)
     ]
     for thread in threads:
         thread.start()
@@ -72,7 +76,9 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 @pytest.mark.parametrize("width", [FULL, 528])
 def test_error_maps_share_one_scale_centred_on_zero(drawn: list[Any], width: int) -> None:
     small, large = error_map(200, 0.05, 0.02, 1), error_map(200, 0.5, 0.02, 2)
-    figure = maps.draw_error_maps("pose 3", {"stereo": large, "pixelwise": small}, RMS, 0.036, width=width)
+    figure = maps.draw_error_maps(
+        "pose 3", {"stereo": large, "pixelwise": small}, RMS, 0.036, width=width
+    )
     assert opened(figure).shape[1] == DENSITY * width
     images = [image for axes in drawn[0].axes for image in axes.get_images()]
     limits = {image.get_clim() for image in images}
@@ -96,7 +102,9 @@ def test_maps_are_cropped_to_the_data_and_grey_where_there_is_none(drawn: list[A
 
 def test_one_limit_for_many_figures() -> None:
     a, b = error_map(200, 0.05, 0.02, 1), error_map(200, 0.5, 0.02, 2)
-    assert maps.error_limit([a, b]) == maps.error_limit([b]) or maps.error_limit([a, b]) < maps.error_limit([b])
+    assert maps.error_limit([a, b]) == maps.error_limit([b]) or maps.error_limit(
+        [a, b]
+    ) < maps.error_limit([b])
     assert maps.error_limit([np.full((4, 4), np.nan)]) == 1.0
 
 
@@ -110,7 +118,9 @@ def test_nothing_measured_is_drawn_as_nothing() -> None:
 
 
 def test_scales_end_at_round_values() -> None:
-    assert [round_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx([0.015, 0.4, 8, 1, 1])
+    assert [round_up(v) for v in (0.011, 0.4, 7, 0.95, float("nan"))] == pytest.approx(
+        [0.015, 0.4, 8, 1, 1]
+    )
 
 
 @pytest.mark.slow
@@ -119,7 +129,11 @@ def test_the_pixels_curve_and_its_residuals() -> None:
     opened(figure)
     assert missing_facts(figure.caption, "(500, 500)", "24 target poses", "30 µm") == []
     nothing = np.full(3, np.nan)
-    opened(pixel_curves(PixelCurve((1, 2), "x", nothing, nothing, nothing, nothing, np.ones(5), np.ones(3))))
+    opened(
+        pixel_curves(
+            PixelCurve((1, 2), "x", nothing, nothing, nothing, nothing, np.ones(5), np.ones(3))
+        )
+    )
 
 
 @pytest.mark.slow

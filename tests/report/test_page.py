@@ -17,14 +17,30 @@ EVIL = "<script>alert('x')</script> \"quoted\" & <img src=y onerror=z>"
 
 
 def table(caption: str = "table") -> Table:
-    columns = [Column("pose", align="left"), Column("RMS", "mm", "stereo"), Column("RMS", "mm", "pixelwise")]
-    return Table(columns, [["1", "0.2", Cell("0.1", "better")]], caption, ["a note"], [["mean", "0.2", "0.1"]])
+    columns = [
+        Column("pose", align="left"),
+        Column("RMS", "mm", "stereo"),
+        Column("RMS", "mm", "pixelwise"),
+    ]
+    return Table(
+        columns,
+        [["1", "0.2", Cell("0.1", "better")]],
+        caption,
+        ["a note"],
+        [["mean", "0.2", "0.1"]],
+    )
 
 
 def write(path: Path, text: str = "words") -> str:
     figure = Figure(PIXELS, f"caption {text}", f"alt {text}", 300)
     items = [figure, table(text), PageNotice(text), PageNotice(text, "good")]
-    write_page(path, text, text, [(text, text, text), Headline("1 mm", "size")], [Section(text, [text, text], items)])
+    write_page(
+        path,
+        text,
+        text,
+        [(text, text, text), Headline("1 mm", "size")],
+        [Section(text, [text, text], items)],
+    )
     return path.read_text(encoding="utf-8")
 
 
@@ -46,7 +62,9 @@ def test_texts_are_shown_and_never_run(tmp_path: Path) -> None:
 
 def test_anchors_lead_to_their_sections(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
-    write_page(path, "t", "s", [], [Section("Two words", ""), Section("Two words", ""), Section("?", "")])
+    write_page(
+        path, "t", "s", [], [Section("Two words", ""), Section("Two words", ""), Section("?", "")]
+    )
     page = path.read_text(encoding="utf-8")
     targets = re.findall(r'href="#([^"]+)"', page)
     assert len(set(targets)) == 3

@@ -1,4 +1,5 @@
-"""Whole reports from made-up results: what wins shows, what loses shows as plainly, and the Letter stands beside it."""
+"""Whole reports from made-up results: what wins shows, what loses shows as plainly, and the Letter
+stands beside it."""
 
 import dataclasses
 import re
@@ -26,7 +27,14 @@ from slviewer.report.reproduction import (
     reproduction_title,
 )
 from slviewer.report.session import session_headlines, session_sections, session_title
-from slviewer.report.tables import better_worse, compare_errors, format_number, plane_table, spacing_table, sphere_table
+from slviewer.report.tables import (
+    better_worse,
+    compare_errors,
+    format_number,
+    plane_table,
+    spacing_table,
+    sphere_table,
+)
 
 pytestmark = pytest.mark.computes
 
@@ -38,14 +46,20 @@ def texts(section: Section) -> str:
     for item in section.items:
         if isinstance(item, Table):
             cells = [c for row in (*item.rows, *item.footer) for c in row]
-            words += [item.caption, *item.notes, *(str(c.value if isinstance(c, Cell) else c) for c in cells)]
+            words += [
+                item.caption,
+                *item.notes,
+                *(str(c.value if isinstance(c, Cell) else c) for c in cells),
+            ]
         else:
             words.append(item.text if isinstance(item, PageNotice) else item.caption)
     return "\n".join(words)
 
 
 def by_title(table: Table, row: int) -> dict[tuple[str, str], str | Cell]:
-    return {(c.group, c.title): cell for c, cell in zip(table.columns, table.rows[row], strict=True)}
+    return {
+        (c.group, c.title): cell for c, cell in zip(table.columns, table.rows[row], strict=True)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +69,18 @@ def reproduction() -> list[Section]:
 
 @pytest.fixture(scope="module")
 def tables() -> list[Section]:
-    """The reproduction's sections without figures of maps and planes, which take most of the time."""
-    data = dataclasses.replace(reproduction_data(WIDTH), plane_maps=[], sphere_maps=[], plane_outlines={})
+    """The reproduction's sections without figures of maps and planes, which take most of the
+    time."""
+    data = dataclasses.replace(
+        reproduction_data(WIDTH), plane_maps=[], sphere_maps=[], plane_outlines={}
+    )
     return reproduction_sections(dataclasses.replace(data, pixel_curve=None))
 
 
 @pytest.mark.slow
-def test_the_reproduction_is_one_self_contained_file(tmp_path: Path, reproduction: list[Section]) -> None:
+def test_the_reproduction_is_one_self_contained_file(
+    tmp_path: Path, reproduction: list[Section]
+) -> None:
     data = reproduction_data(WIDTH)
     path = tmp_path / "report.html"
     write_page(path, *reproduction_title(data), reproduction_headlines(data), reproduction)
@@ -76,10 +95,21 @@ def test_the_reproduction_is_one_self_contained_file(tmp_path: Path, reproductio
 @pytest.mark.slow
 def test_every_experiment_shows_its_figures(reproduction: list[Section]) -> None:
     figures = [sum(isinstance(item, Figure) for item in section.items) for section in reproduction]
-    # curves and RMS maps; bars, three poses and the planes in space; six spheres; three clouds and the merged one
+    # curves and RMS maps; bars, three poses and the planes in space; six spheres; three clouds and
+    # the merged one
     assert figures == [2, 5, 6, 2]
-    alts = " ".join(item.alt for section in reproduction for item in section.items if isinstance(item, Figure))
-    for word in ("pixel (500, 500)", "plane_01", "plane_03", "plane_08", "sphere_6", "object_r3", "merged"):
+    alts = " ".join(
+        item.alt for section in reproduction for item in section.items if isinstance(item, Figure)
+    )
+    for word in (
+        "pixel (500, 500)",
+        "plane_01",
+        "plane_03",
+        "plane_08",
+        "sphere_6",
+        "object_r3",
+        "merged",
+    ):
         assert word in alts
 
 
@@ -93,12 +123,19 @@ def test_the_letters_own_figures_stand_beside_ours(tables: list[Section]) -> Non
 @pytest.mark.slow
 def test_where_pixelwise_loses_it_is_said(tables: list[Section]) -> None:
     planes = tables[1]
-    assert any(isinstance(i, PageNotice) and i.kind == "warning" and "plane_01" in i.text for i in planes.items)
+    assert any(
+        isinstance(i, PageNotice) and i.kind == "warning" and "plane_01" in i.text
+        for i in planes.items
+    )
     table = next(i for i in planes.items if isinstance(i, Table))
     first, third = by_title(table, 0), by_title(table, 2)
-    assert first["pixelwise", "RMS"] == Cell("0.219", "worse") and first["stereo", "RMS"] == Cell("0.134", "better")
+    assert first["pixelwise", "RMS"] == Cell("0.219", "worse") and first["stereo", "RMS"] == Cell(
+        "0.134", "better"
+    )
     assert first["pixelwise", "against stereo"] == Cell("1.63 × worse", "worse")
-    assert third["pixelwise", "RMS"] == Cell("0.076", "better") and third["stereo", "RMS"] == "0.198"
+    assert (
+        third["pixelwise", "RMS"] == Cell("0.076", "better") and third["stereo", "RMS"] == "0.198"
+    )
     assert third["pixelwise", "floor"] == Cell("0.036", "muted")
     assert by_title(table, 7)["pixelwise", "against stereo"] == Cell("equal")
 
@@ -115,7 +152,9 @@ def test_headlines_name_both_and_mark_the_loser() -> None:
     data = reproduction_data(WIDTH)
     assert [h.mark for h in reproduction_headlines(data)] == ["better"] * 4
     assert "0.270 → 0.174 mm" in reproduction_headlines(data)[0].value
-    worse = dataclasses.replace(data, spacings=[SpacingRow("a", 100.0, {"stereo": 100.1, "pixelwise": 100.4})])
+    worse = dataclasses.replace(
+        data, spacings=[SpacingRow("a", 100.0, {"stereo": 100.1, "pixelwise": 100.4})]
+    )
     assert reproduction_headlines(worse)[3].mark == "worse"
 
 
@@ -156,15 +195,22 @@ def test_verdicts() -> None:
     assert compare_errors(0.1, 0.25) == Cell("2.50 × better", "better")
     assert compare_errors(-0.25, 0.1) == Cell("2.50 × worse", "worse")
     assert compare_errors(0.100, 0.101) == Cell("equal") and better_worse(0.100, 0.101) == ""
-    assert format_number(-0.5, signed=True) == "−0.500" and format_number(0.5, 1, signed=True) == "+0.5"
+    assert (
+        format_number(-0.5, signed=True) == "−0.500"
+        and format_number(0.5, 1, signed=True) == "+0.5"
+    )
 
 
 def test_spheres_are_judged_by_their_radius_and_spacing() -> None:
     table = sphere_table(sphere_rows(), "t")
     row = by_title(table, 0)
-    assert row["stereo", "error"] == "−0.090" and row["pixelwise", "error"] == Cell("+0.080", "better")
+    assert row["stereo", "error"] == "−0.090" and row["pixelwise", "error"] == Cell(
+        "+0.080", "better"
+    )
     assert missing_facts(table.notes[0], "radius", "98.03 mm") == []
-    spacing = by_title(spacing_table([SpacingRow("a to b", 150.0, {"stereo": 150.5, "pixelwise": 149.9})], "t"), 0)
+    spacing = by_title(
+        spacing_table([SpacingRow("a to b", 150.0, {"stereo": 150.5, "pixelwise": 149.9})], "t"), 0
+    )
     assert spacing["pixelwise", "error"] == Cell("−0.100", "better")
     assert spacing["pixelwise", "against stereo"] == Cell("5.00 × better", "better")
 
@@ -177,7 +223,15 @@ def test_a_sessions_report(tmp_path: Path) -> None:
         "Warnings", "Reprojection", "Parameters", "Pixel-wise model", "Verification", "Captures"
     ]  # fmt: skip
     words = "\n".join(texts(section) for section in sections)
-    facts = ("12 of 336 circles", "the board slipped", "pose_03", "pose_04", "20 %", "pose_14", "179.47 mm")
+    facts = (
+        "12 of 336 circles",
+        "the board slipped",
+        "pose_03",
+        "pose_04",
+        "20 %",
+        "pose_14",
+        "179.47 mm",
+    )
     assert missing_facts(words, *facts) == []
     path = tmp_path / "report.html"
     write_page(path, *session_title(data), session_headlines(data), sections)
@@ -198,7 +252,9 @@ def test_a_calibration_made_elsewhere() -> None:
     data = session_data(WIDTH)
     assert data.calibration is not None
     bare = CalibrationFigures(StereoModel.from_rig(data.calibration.stereo.rig))
-    sections = session_sections(dataclasses.replace(data, calibration=bare, records=(), pixel_fits=()))
+    sections = session_sections(
+        dataclasses.replace(data, calibration=bare, records=(), pixel_fits=())
+    )
     assert missing_facts(texts(sections[1]), "elsewhere") == []
 
 
@@ -206,13 +262,21 @@ def test_a_calibration_made_elsewhere() -> None:
 def test_how_good_a_calibration_is() -> None:
     verdict = Verdict.of(
         [
-            Finding("empty-corner", "doubtful", "no pose reached the upper left corner", "fill it in two more poses"),
+            Finding(
+                "empty-corner",
+                "doubtful",
+                "no pose reached the upper left corner",
+                "fill it in two more poses",
+            ),
             Finding("outlier", "note", "pose_07 is left out", ""),
         ]
     )
     held = {"stereo": 0.2, "splined": 0.02}
     compared = CrossValidation(
-        {m: {"pose_01": HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0)} for m, mm in held.items()},
+        {
+            m: {"pose_01": HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0)}
+            for m, mm in held.items()
+        },
         (("pose_01",),),
         {},
     )
@@ -225,14 +289,34 @@ def test_how_good_a_calibration_is() -> None:
         "left_out": {"pose_09": "contradicts the other poses"},
     }
     sides = {"within_95_mm": (-0.034, -0.026), "within_997_mm": (-0.036, -0.024)}
-    figure = {"property": "sphere spacing", "error_mm": -0.03, "U_mm": 0.004, "position": "left", **sides}
+    figure = {
+        "property": "sphere spacing",
+        "error_mm": -0.03,
+        "U_mm": 0.004,
+        "position": "left",
+        **sides,
+    }
     found = {
         "artefact": {"name": "bar <1>", "certificate": "lab 7"},
         "model": "splined",
         "positions": [
-            {"position": "left", "capture": "a", "figures": [figure], "rms_mm": [0.1], "floor_mm": [0.1], "points": 9},
+            {
+                "position": "left",
+                "capture": "a",
+                "figures": [figure],
+                "rms_mm": [0.1],
+                "floor_mm": [0.1],
+                "points": 9,
+            },
         ],
-        "judgements": [{"property": "sphere spacing", "worst": figure, "limit_mm": 0.05, "decision": "undecided"}],
+        "judgements": [
+            {
+                "property": "sphere spacing",
+                "worst": figure,
+                "limit_mm": 0.05,
+                "decision": "undecided",
+            }
+        ],
         "scale": {"ppm": -300.0, "u_ppm": 20.0, "length_mm": 100.0, "positions": 2},
         "decision": "undecided",
         "lacks": ["2 of 7 positions were measured"],
@@ -263,16 +347,24 @@ def test_how_good_a_calibration_is() -> None:
     balls = {
         name: Verification(
             shape="sphere",
-            models={m: ModelFit(9, 0, 0.1, centre_mm=(x, 0.0, 500.0)) for m, x in (("stereo", a), ("splined", b))},
+            models={
+                m: ModelFit(9, 0, 0.1, centre_mm=(x, 0.0, 500.0))
+                for m, x in (("stereo", a), ("splined", b))
+            },
         )
         for name, a, b in (("a", 0.0, 0.0), ("b", 60.6, 60.5))
     }
     data = dataclasses.replace(
         session_data(WIDTH),
         verdict=verdict,
-        models=ModelsView("stereo", "splined", compared, splined, {"splined": "scale corrected by +300 ppm"}),
+        models=ModelsView(
+            "stereo", "splined", compared, splined, {"splined": "scale corrected by +300 ppm"}
+        ),
         records=[
-            RecordsView(AcceptanceTest, {"1": read_record(AcceptanceTest, {"accepted": found, "time": "2026-11-21"})}),
+            RecordsView(
+                AcceptanceTest,
+                {"1": read_record(AcceptanceTest, {"accepted": found, "time": "2026-11-21"})},
+            ),
             RecordsView(Drift, {"1": drift}),
             RecordsView(Verification, balls),
         ],

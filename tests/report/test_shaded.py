@@ -16,8 +16,12 @@ def sheet(z: float, half: float, n: int = 120) -> np.ndarray:
     return np.stack([x, y, np.full_like(x, z)], axis=-1).reshape(-1, 3).astype(np.float32)
 
 
-def drawn(points: np.ndarray, colours: np.ndarray, normal: tuple[float, float, float] = (0, 0, -1)) -> np.ndarray:
-    return render_points(points, np.broadcast_to(normal, points.shape), colours, SIZE, np.eye(3)).astype(int)
+def drawn(
+    points: np.ndarray, colours: np.ndarray, normal: tuple[float, float, float] = (0, 0, -1)
+) -> np.ndarray:
+    return render_points(
+        points, np.broadcast_to(normal, points.shape), colours, SIZE, np.eye(3)
+    ).astype(int)
 
 
 def test_nearer_points_hide_farther_ones() -> None:
@@ -51,7 +55,9 @@ def test_the_viewer_steps_aside_and_up() -> None:
     R = view_rotation(24, 18)
     assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1)
     nearer = R @ [0.0, 0.0, -1.0]
-    assert nearer[0] > 0 and nearer[1] > 0  # what sticks out moves right and down: seen from the left and above
+    assert (
+        nearer[0] > 0 and nearer[1] > 0
+    )  # what sticks out moves right and down: seen from the left and above
 
 
 def test_a_mosaic_shows_one_scan_in_each_square_and_leaves_no_hole() -> None:

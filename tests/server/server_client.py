@@ -41,7 +41,9 @@ class Client:
         self.thread.start()
         before = set(server.viser.get_clients())
         self.send("ViewerCameraMessage", **CAMERA)
-        assert until(lambda: set(server.viser.get_clients()) - before), "the camera message made no client of it"
+        assert until(lambda: set(server.viser.get_clients()) - before), (
+            "the camera message made no client of it"
+        )
         (self.number,) = set(server.viser.get_clients()) - before
 
     def _listen(self) -> None:
@@ -49,7 +51,9 @@ class Client:
             for raw in self.socket:
                 assert isinstance(raw, bytes)
                 size = int.from_bytes(raw[8:16], "little")
-                inner = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size], int.from_bytes(raw[:8], "little"))
+                inner = zstandard.ZstdDecompressor().decompress(
+                    raw[16 : 16 + size], int.from_bytes(raw[:8], "little")
+                )
                 self.received.extend(msgspec.msgpack.decode(inner)["messages"])
 
     def send(self, kind: str, **fields: Any) -> None:
@@ -67,7 +71,11 @@ class Client:
 
     def told(self, handle: Any) -> list:
         """The values of an input that the server sent since the client connected."""
-        updates = [m for m in self.received if m["type"] == "GuiUpdateMessage" and m["uuid"] == handle._impl.uuid]
+        updates = [
+            m
+            for m in self.received
+            if m["type"] == "GuiUpdateMessage" and m["uuid"] == handle._impl.uuid
+        ]
         return [m["updates"]["value"] for m in updates]
 
 
@@ -106,7 +114,9 @@ class Browser:
         """The bytes of a request, to be sent by hand."""
         return f"GET {self.path}{path} HTTP/1.1\r\nHost: {self.host}\r\nCookie: {self.cookie}\r\n\r\n".encode()
 
-    def open(self, path: str = "", origin: str | None = "own", host: str | None = None) -> ClientConnection:
+    def open(
+        self, path: str = "", origin: str | None = "own", host: str | None = None
+    ) -> ClientConnection:
         """A WebSocket; raises InvalidStatus where the server refuses it."""
         headers = [("Cookie", self.cookie)] if self.cookie else []
         if origin is not None:

@@ -16,7 +16,14 @@ from server_client import Browser
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import SlviewerError, UsageError
-from slviewer.server.access import ONE_TIME_SECONDS, ROLES, WRONG_TOKENS, WRONG_TOKENS_SECONDS, Access, Refusal
+from slviewer.server.access import (
+    ONE_TIME_SECONDS,
+    ROLES,
+    WRONG_TOKENS,
+    WRONG_TOKENS_SECONDS,
+    Access,
+    Refusal,
+)
 from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.credentials import load_tokens
 from slviewer.server.secure import Serving, serve
@@ -32,9 +39,21 @@ def test_a_link_is_exchanged_for_a_cookie_of_its_own_path(server, stranger, role
     assert origin == server.origin and "?" not in server.link(role)
     answer = stranger.log_in(token)
     cookie, grant = answer.headers["Set-Cookie"], server.access.grants[role]
-    assert f"slviewer_{server.port}_{role}=" in cookie and f"Path=/{role}-" in cookie and "Secure" not in cookie
-    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and "no-store" in answer.headers["Cache-Control"]
-    assert token not in cookie and token not in str(answer.headers) and token.encode() not in answer.content
+    assert (
+        f"slviewer_{server.port}_{role}=" in cookie
+        and f"Path=/{role}-" in cookie
+        and "Secure" not in cookie
+    )
+    assert (
+        "HttpOnly" in cookie
+        and "SameSite=Strict" in cookie
+        and "no-store" in answer.headers["Cache-Control"]
+    )
+    assert (
+        token not in cookie
+        and token not in str(answer.headers)
+        and token.encode() not in answer.content
+    )
     assert stranger.path == f"{grant.path}/"
     if role not in ("project", "camera"):
         assert b"<title>Viser</title>" in stranger.get().content
@@ -50,11 +69,18 @@ def test_one_browser_holds_the_cookies_of_all_roles(browser, server):
         page.goto(server.link(role))
         page.wait_for_url(f"**/{role}-*/")
         assert server.access.grants[role].token not in page.content() + page.title()
-    assert until(lambda: {server.role(client) for client in server.viser.get_clients()} == {"operate", "watch"})
+    assert until(
+        lambda: (
+            {server.role(client) for client in server.viser.get_clients()} == {"operate", "watch"}
+        )
+    )
     assert operating.url == f"{server.origin}{server.access.grants['operate'].path}/"
     operating.reload()
-    operating.bring_to_front()  # a page that is hidden may not draw, and what has not drawn is no client
-    assert until(lambda: "operate" in {server.role(client) for client in server.viser.get_clients()})
+    # a page that is hidden may not draw, and what has not drawn is no client
+    operating.bring_to_front()
+    assert until(
+        lambda: "operate" in {server.role(client) for client in server.viser.get_clients()}
+    )
     grants = [server.access.grants[role] for role in ("operate", "watch")]
     assert {cookie["path"] for cookie in context.cookies()} == {grant.path for grant in grants}
     sent = [r.url.partition("#")[0] + r.headers.get("referer", "") for r in requests]
@@ -152,7 +178,11 @@ def test_wrong_tokens_are_limited_and_lock_out_no_random_one():
 def test_new_links_end_all_that_the_old_ones_opened(operator_server):
     server = operator_server
     browsers = {role: Browser(server, role) for role in ("operate", "watch")}
-    asking, other, watching = browsers["operate"].client(), browsers["operate"].client(), browsers["watch"].client()
+    asking, other, watching = (
+        browsers["operate"].client(),
+        browsers["operate"].client(),
+        browsers["watch"].client(),
+    )
     old = {role: grant.token for role, grant in server.access.grants.items()}
     server.renew_links(asking.number, leaving_s=1.0)
     for client in (other, watching):
@@ -165,7 +195,10 @@ def test_new_links_end_all_that_the_old_ones_opened(operator_server):
     assert not asking.thread.is_alive()  # whether or not it went on to its new page
     for role, browser in browsers.items():
         assert browser.get().status == 403 and browser.log_in(old[role]).status == 403
-        assert browser.log_in(server.access.grants[role].token).status == 200 and browser.get().status == 200
+        assert (
+            browser.log_in(server.access.grants[role].token).status == 200
+            and browser.get().status == 200
+        )
     assert Browser(server, None).log_in(once).status == 200
 
 
@@ -179,7 +212,9 @@ def operator_server(tmp_path):
 def test_tokens_stay_in_a_file_that_nobody_else_reads(operator_server, tmp_path):
     file = tmp_path / "tokens.toml"
     assert file.stat().st_mode & 0o777 == 0o600
-    assert load_tokens(file) == {role: grant.token for role, grant in operator_server.access.grants.items()}
+    assert load_tokens(file) == {
+        role: grant.token for role, grant in operator_server.access.grants.items()
+    }
     operator_server.renew_links(0)
     assert load_tokens(file)["operate"] == operator_server.access.grants["operate"].token
     assert file.stat().st_mode & 0o777 == 0o600
@@ -189,7 +224,16 @@ def test_tokens_stay_in_a_file_that_nobody_else_reads(operator_server, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "content", ["", "operate = 5", "other = 'x'", "operate", "a = [" + "[" * 3000, "\xff", "operate = 'short'"]
+    "content",
+    [
+        "",
+        "operate = 5",
+        "other = 'x'",
+        "operate",
+        "a = [" + "[" * 3000,
+        "\xff",
+        "operate = 'short'",
+    ],
 )
 def test_a_file_of_no_tokens_is_refused(tmp_path, content):
     file = tmp_path / "tokens.toml"
@@ -216,7 +260,9 @@ def test_secrets_are_read_from_regular_files_alone(tmp_path, kind):
 
 def test_health_is_answered_without_a_link_and_discloses_nothing(server, stranger):
     answer = stranger.get("/healthz")
-    assert (answer.status, answer.content) == (204, b"") and not {"Set-Cookie", "Server"} & set(answer.headers)
+    assert (answer.status, answer.content) == (204, b"") and not {"Set-Cookie", "Server"} & set(
+        answer.headers
+    )
     assert stranger.get("/healthz", Origin=EVIL).status == 403
     assert stranger.get("/healthz?x").status == 400 and stranger.get("/healthz/x").status == 403
 
@@ -241,7 +287,9 @@ def test_every_route_of_every_role(server, stranger, role, tmp_path):
 
     (tmp_path / "a.txt").write_text("a")
     offered = server.downloads.offer(tmp_path / "a.txt", within=tmp_path).partition("/")[2]
-    server.device_pages.update({device: DevicePage(b"page", handle) for device in ("project", "camera")})
+    server.device_pages.update(
+        {device: DevicePage(b"page", handle) for device in ("project", "camera")}
+    )
     mine = Browser(server, role)
     for route, statuses in ROUTES.items():
         path = route.format(offered=offered)
@@ -294,7 +342,8 @@ def test_the_refusal_says_what_to_do(stranger):
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:{port}", "127.0.0.1:1", "127.0.0.1", "localhost.evil:{port}"]
+    "host",
+    ["evil.example", "evil.example:{port}", "127.0.0.1:1", "127.0.0.1", "localhost.evil:{port}"],
 )
 def test_a_rebound_host_name_is_refused(operator, host):
     name = host.format(port=operator.server.port)
@@ -315,7 +364,9 @@ def test_two_hosts_are_none(operator):
         assert b"421" in raw.recv(100)
 
 
-@pytest.mark.parametrize("origin", [EVIL, "null", None, "http://127.0.0.1:1", "http://localhost:{port}.evil", ""])
+@pytest.mark.parametrize(
+    "origin", [EVIL, "null", None, "http://127.0.0.1:1", "http://localhost:{port}.evil", ""]
+)
 def test_another_pages_websocket_is_refused_even_with_the_cookie(operator, origin):
     with pytest.raises(InvalidStatus) as refused:
         operator.open(origin=origin)
@@ -325,14 +376,29 @@ def test_another_pages_websocket_is_refused_even_with_the_cookie(operator, origi
 def test_another_pages_request_is_refused_even_with_the_cookie(operator):
     assert operator.get("", Origin=EVIL).status == 403
     # another port of this machine is the same site, so that the strict cookie is sent along
-    assert operator.get("", Sec_Fetch_Site="same-site", Sec_Fetch_Mode="no-cors", Sec_Fetch_Dest="script").status == 403
     assert (
-        operator.get("", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate", Sec_Fetch_Dest="iframe").status == 403
+        operator.get(
+            "", Sec_Fetch_Site="same-site", Sec_Fetch_Mode="no-cors", Sec_Fetch_Dest="script"
+        ).status
+        == 403
     )
-    assert operator.get("", Sec_Fetch_Site="same-origin", Sec_Fetch_Mode="cors", Sec_Fetch_Dest="empty").status == 200
+    assert (
+        operator.get(
+            "", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate", Sec_Fetch_Dest="iframe"
+        ).status
+        == 403
+    )
+    assert (
+        operator.get(
+            "", Sec_Fetch_Site="same-origin", Sec_Fetch_Mode="cors", Sec_Fetch_Dest="empty"
+        ).status
+        == 200
+    )
 
 
-@pytest.mark.parametrize("query", ["websocket=ws://evil", "playbackPath=http://evil/x.viser", "token={token}", "x", ""])
+@pytest.mark.parametrize(
+    "query", ["websocket=ws://evil", "playbackPath=http://evil/x.viser", "token={token}", "x", ""]
+)
 def test_addresses_take_no_parameters(operator, query):
     token = operator.server.access.grants["operate"].token
     for path in ("", "/", "/login"):
@@ -343,7 +409,9 @@ def test_addresses_take_no_parameters(operator, query):
             operator.open(f"?{query}")
 
 
-@pytest.mark.parametrize("path", ["//evil.example/", "/\\evil.example/", "/a//b", "/a/../b", "http://evil.example/"])
+@pytest.mark.parametrize(
+    "path", ["//evil.example/", "/\\evil.example/", "/a//b", "/a/../b", "http://evil.example/"]
+)
 def test_no_address_leads_elsewhere(stranger, path):
     answer = stranger.get(path)
     assert answer.status == 404 and "Location" not in answer.headers
@@ -359,8 +427,12 @@ def test_nothing_but_the_page_is_read_from_visers_folder(operator):
 def test_every_answer_keeps_out_of_other_pages_and_of_caches(operator, stranger):
     for answer in (operator.get(""), stranger.get("/"), operator.get("none"), operator.get("?x=1")):
         headers = answer.headers
-        assert headers["X-Frame-Options"] == "DENY" and headers["X-Content-Type-Options"] == "nosniff"
-        assert headers["Referrer-Policy"] == "no-referrer" and headers["Cache-Control"] == "no-store"
+        assert (
+            headers["X-Frame-Options"] == "DENY" and headers["X-Content-Type-Options"] == "nosniff"
+        )
+        assert (
+            headers["Referrer-Policy"] == "no-referrer" and headers["Cache-Control"] == "no-store"
+        )
         policy = headers["Content-Security-Policy"]
         assert "frame-ancestors 'none'" in policy and "default-src 'none'" in policy
         assert "unsafe-inline" not in policy.partition("script-src")[2].partition(";")[0]
@@ -368,7 +440,11 @@ def test_every_answer_keeps_out_of_other_pages_and_of_caches(operator, stranger)
 
 def test_other_methods_and_half_requests_end_without_noise(operator, caplog):
     with caplog.at_level(logging.INFO):
-        for text in (b"POST / HTTP/1.1\r\nContent-Length: 3\r\n\r\nabc", b"GET /\r\n\r\n", b"\x16\x03\x01\x02\x00"):
+        for text in (
+            b"POST / HTTP/1.1\r\nContent-Length: 3\r\n\r\nabc",
+            b"GET /\r\n\r\n",
+            b"\x16\x03\x01\x02\x00",
+        ):
             with socket.create_connection(("127.0.0.1", operator.server.port)) as raw:
                 raw.sendall(text)
                 raw.shutdown(socket.SHUT_WR)
@@ -410,7 +486,9 @@ def test_a_taken_port_is_an_error_at_once(server):
     assert time.monotonic() - start < HANG_S
 
 
-@pytest.mark.parametrize("host", ["203.0.113.7", "no.such.host.invalid", "", "::1::2", "127.0.0.1:8080"])
+@pytest.mark.parametrize(
+    "host", ["203.0.113.7", "no.such.host.invalid", "", "::1::2", "127.0.0.1:8080"]
+)
 def test_an_unusable_address_is_an_error_at_once(host):
     start = time.monotonic()
     with pytest.raises(SlviewerError):
@@ -447,11 +525,17 @@ def test_it_serves_this_machine_alone_unless_told(server):
 def test_tokens_are_long_and_differ():
     grants = Access(1).grants.values()
     assert all(len(grant.token) >= 32 for grant in grants)
-    assert len({one for grant in grants for one in (grant.token, grant.value, grant.path)}) == 3 * len(ROLES)
+    assert len(
+        {one for grant in grants for one in (grant.token, grant.value, grant.path)}
+    ) == 3 * len(ROLES)
     for token in ("", "\udce9", "x" * 300):
         with pytest.raises(Refusal):
             Access(1).exchange(token, "127.0.0.1")
-    for tokens in ({"operate": "short"}, {"operate": "T" * 20, "watch": "T" * 20}, {"watch": "T" * 20 + "; Path=/"}):
+    for tokens in (
+        {"operate": "short"},
+        {"operate": "T" * 20, "watch": "T" * 20},
+        {"watch": "T" * 20 + "; Path=/"},
+    ):
         with pytest.raises(UsageError):
             Access(1, tokens)
 
@@ -468,7 +552,11 @@ def test_on_a_network_it_answers_to_its_address_its_name_and_those_given():
             return False
 
     assert answers("192.0.2.5:8080", "192.0.2.5") and answers("[2001:db8::1]:8080", "2001:db8::1")
-    assert answers("192.0.2.5:8080", "::ffff:192.0.2.5") and answers("SCANNER.lab:8080", "192.0.2.5")
-    assert answers("scan.example:443", "192.0.2.5") and answers(f"{socket.gethostname()}:8080", "192.0.2.5")
+    assert answers("192.0.2.5:8080", "::ffff:192.0.2.5") and answers(
+        "SCANNER.lab:8080", "192.0.2.5"
+    )
+    assert answers("scan.example:443", "192.0.2.5") and answers(
+        f"{socket.gethostname()}:8080", "192.0.2.5"
+    )
     assert not answers("192.0.2.6:8080", "192.0.2.5") and not answers("localhost:8080", "192.0.2.5")
     assert not answers("scanner.lab.evil:8080", "192.0.2.5")

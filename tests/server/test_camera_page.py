@@ -31,7 +31,8 @@ BLACK, RANGE = 16, 219
 
 
 class Film:
-    """A video file of one picture, which the browser plays as its camera; the picture may be replaced while it runs."""
+    """A video file of one picture, which the browser plays as its camera; the picture may be
+    replaced while it runs."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -94,7 +95,9 @@ def phone(browser: Browser, film: Film) -> Iterator[Browser]:
 
 @pytest.fixture
 def channel(server: SafeServer) -> Iterator[CameraChannel]:
-    pages = PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0))  # a film does not change by itself
+    pages = PageChannels(
+        camera=CameraChannel(HANG_S, settling_ms=0.0)
+    )  # a film does not change by itself
     serve_device_pages(server, pages)
     yield pages.camera
     server.device_pages.clear()
@@ -131,10 +134,16 @@ def test_pictures_are_those_after_the_request(phone, film, opens, channel):
         film.show(grey)
         camera.grab(out)
         off.append(out.astype(int) - grey)
-    assert np.abs(off).max() <= 2 and 0.1 < np.std(off) < 1.0, "the luminance of a video has 219 levels"
+    assert np.abs(off).max() <= 2 and 0.1 < np.std(off) < 1.0, (
+        "the luminance of a video has 219 levels"
+    )
     colour = camera.grab_colour()
-    assert colour.shape == (*SIZE[::-1], 3) and np.abs(colour.astype(int) - grey[..., None]).max() <= 3
-    assert any("exposure" in note for note in camera.notes), "this camera reports no exposure that could be locked"
+    assert (
+        colour.shape == (*SIZE[::-1], 3) and np.abs(colour.astype(int) - grey[..., None]).max() <= 3
+    )
+    assert any("exposure" in note for note in camera.notes), (
+        "this camera reports no exposure that could be locked"
+    )
     assert camera.apply(CameraSettings(5.0)) == CameraSettings()
     camera.close()
     expect(page.get_by_role("heading", name="Ready")).to_be_visible()
@@ -156,7 +165,9 @@ def test_a_page_that_is_closed_is_missed(phone, opens, channel):
         return bool(errors)
 
     assert until(fails)
-    assert not missing_facts(errors[0], "connection", "lost") or not missing_facts(errors[0], "hidden")
+    assert not missing_facts(errors[0], "connection", "lost") or not missing_facts(
+        errors[0], "hidden"
+    )
 
 
 def test_a_browser_without_permission_says_so(browser, opens, channel):
@@ -181,23 +192,43 @@ def test_a_scan_by_a_phone_measures_the_plane(phone, film, opens, channel, tmp_p
     rms_mm = {}
     for name, rig in rigs.items():
         made = RigSetup(rig)
-        capture(tmp_path / "session", name, {}, role="scan", patterns="gray", set_up=lambda *_, made=made: made)
-        found = reconstruct(tmp_path / "session", name, out=tmp_path / "cloud.ply", grid=tmp_path / "grid.npy")
+        capture(
+            tmp_path / "session",
+            name,
+            {},
+            role="scan",
+            patterns="gray",
+            set_up=lambda *_, made=made: made,
+        )
+        found = reconstruct(
+            tmp_path / "session", name, out=tmp_path / "cloud.ply", grid=tmp_path / "grid.npy"
+        )
         off = (np.load(tmp_path / "grid.npy") - origin) @ normal
         rms_mm[name] = 1.4826 * np.nanmedian(np.abs(off))
-        assert found.only.points > 0.8 * world.renderer(False).truth().mask.sum() and abs(np.nanmedian(off)) < 0.05
+        assert (
+            found.only.points > 0.8 * world.renderer(False).truth().mask.sum()
+            and abs(np.nanmedian(off)) < 0.05
+        )
     assert 0.3 < rms_mm["simulated"] < 0.8, "mm, of 4 steps at a quarter of the resolution"
     assert 0.97 < rms_mm["phone"] / rms_mm["simulated"] < 1.2, rms_mm
 
 
 def test_the_page_works_encrypted_by_the_certificate_made_here(phone, film, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    server, pages = serve(Serving(port=0, tls=True)), PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0))
+    server, pages = (
+        serve(Serving(port=0, tls=True)),
+        PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0)),
+    )
     serve_device_pages(server, pages)
-    context = phone.new_context(ignore_https_errors=True)  # as a person who has compared the fingerprint
+    context = phone.new_context(
+        ignore_https_errors=True
+    )  # as a person who has compared the fingerprint
     try:
         context.new_page().goto(server.link("camera"))
-        assert server.link("camera").startswith("https:") and pages.camera.wait_ready(HANG_S).size == SIZE
+        assert (
+            server.link("camera").startswith("https:")
+            and pages.camera.wait_ready(HANG_S).size == SIZE
+        )
         camera, out = BrowserCamera(page=pages.camera), np.empty(SIZE[::-1], np.uint8)
         camera.open()
         film.show(np.full(SIZE[::-1], 200, np.uint8))

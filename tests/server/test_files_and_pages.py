@@ -35,9 +35,15 @@ def test_an_offered_file_arrives_whole(operator, watcher, stranger, tmp_path):
         assert answer.status == 200 and answer.content == content
         assert int(answer.headers["Content-Length"]) == len(content)
         disposition = answer.headers["Content-Disposition"]
-        assert disposition.startswith("attachment; ") and "filename*=UTF-8''scan%20_%C3%A9_.ply" in disposition
+        assert (
+            disposition.startswith("attachment; ")
+            and "filename*=UTF-8''scan%20_%C3%A9_.ply" in disposition
+        )
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
-    assert stranger.get(address).status == 403 and Browser(operator.server, "project").get(address).status == 404
+    assert (
+        stranger.get(address).status == 403
+        and Browser(operator.server, "project").get(address).status == 404
+    )
     downloads.clear()
     assert operator.get(address).status == 404
 
@@ -45,7 +51,9 @@ def test_an_offered_file_arrives_whole(operator, watcher, stranger, tmp_path):
 def test_an_empty_file_is_a_file(operator, tmp_path):
     (tmp_path / "empty.csv").touch()
     answer = operator.get(operator.server.downloads.offer(tmp_path / "empty.csv", within=tmp_path))
-    assert answer.status == 200 and answer.content == b"" and answer.headers["Content-Length"] == "0"
+    assert (
+        answer.status == 200 and answer.content == b"" and answer.headers["Content-Length"] == "0"
+    )
 
 
 def test_no_file_outside_the_folder_is_offered(operator, tmp_path):
@@ -79,7 +87,9 @@ def test_a_file_that_becomes_a_link_is_no_longer_sent(operator, tmp_path):
     operator.server.downloads.clear()
 
 
-@pytest.mark.parametrize("path", ["download", "download/", "download/x", "download/../secret", "download/x/y"])
+@pytest.mark.parametrize(
+    "path", ["download", "download/", "download/x", "download/../secret", "download/x/y"]
+)
 def test_addresses_that_were_not_offered_are_nothing(operator, path):
     assert operator.get(path).status == 404
 
@@ -90,14 +100,17 @@ LARGE = 512 * CHUNK
 
 @pytest.fixture
 def serving(tmp_path) -> Iterator:
-    """Starts a server of a large file, and returns the operator's browser and the file's address."""
+    """Starts a server of a large file, and returns the operator's browser and the file's
+    address."""
     servers = []
 
     def start(**options: object) -> tuple[Browser, str]:
         with (tmp_path / "large.bin").open("wb") as file:
             file.truncate(LARGE)
         servers.append(serve(Serving(port=0), **options))
-        return Browser(servers[-1], "operate"), servers[-1].downloads.offer(tmp_path / "large.bin", within=tmp_path)
+        return Browser(servers[-1], "operate"), servers[-1].downloads.offer(
+            tmp_path / "large.bin", within=tmp_path
+        )
 
     yield start
     for server in servers:
@@ -105,7 +118,9 @@ def serving(tmp_path) -> Iterator:
 
 
 def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(serving):
-    operator, address = serving(stall_s=10 * HANG_S)  # whoever waited for the slow reader would wait for too long
+    operator, address = serving(
+        stall_s=10 * HANG_S
+    )  # whoever waited for the slow reader would wait for too long
     with socket.create_connection(("127.0.0.1", operator.server.port), timeout=HANG_S) as slow:
         slow.sendall(operator.raw_request(address))
         assert slow.recv(100).startswith(b"HTTP/1.1 200")
@@ -128,7 +143,9 @@ def test_a_reader_who_takes_nothing_is_let_go(serving):
         assert received < LARGE
 
 
-def test_the_projector_page_has_a_link_of_its_own(server, operator, watcher, projector_page, stranger):
+def test_the_projector_page_has_a_link_of_its_own(
+    server, operator, watcher, projector_page, stranger
+):
     async def echo(connection) -> None:
         async for message in connection:
             await connection.send(f"{connection.role}: {message}")
@@ -184,13 +201,18 @@ def test_typed_text_stays_text(text):
     safe = escape(text)
     assert not set(safe) & set("<>\"'`*_[](){}|!\\\n/:.~=@")
     shown = html.unescape(safe)
-    assert not re.search(r"(?i)https?:|www\.|\w@", shown), "viser's Markdown would make a link of it"
+    assert not re.search(r"(?i)https?:|www\.|\w@", shown), (
+        "viser's Markdown would make a link of it"
+    )
     typed = "".join(c for c in text if c.isprintable() or c.isspace())
     assert shown.replace("\u2060", "").split() == typed.split()
 
 
 def test_ordinary_names_stay_readable():
-    assert escape("Würfel 3") == "Würfel 3" and html.unescape(escape("a_b-1.ply (2)")) == "a_b-1.ply (2)"
+    assert (
+        escape("Würfel 3") == "Würfel 3"
+        and html.unescape(escape("a_b-1.ply (2)")) == "a_b-1.ply (2)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -216,7 +238,11 @@ def test_uploaded_names_are_plain_file_names(name, safe):
 
 def test_long_names_are_cut_and_keep_their_suffix():
     name = safe_file_name("漢" * 300 + ".ply")
-    assert name.endswith(".ply") and len(name.encode()) <= 200 and len(safe_file_name("a." + "b" * 500)) <= 120
+    assert (
+        name.endswith(".ply")
+        and len(name.encode()) <= 200
+        and len(safe_file_name("a." + "b" * 500)) <= 120
+    )
 
 
 def test_the_server_stops_and_its_port_is_free_again(serving):

@@ -1,4 +1,5 @@
-"""What a client may change: every message that viser would obey and ours must not is sent to a live server."""
+"""What a client may change: every message that viser would obey and ours must not is sent to a live
+server."""
 
 import dataclasses
 import math
@@ -46,7 +47,11 @@ CASES = {
         [0, 10, 7],
         [-1, 11, 2.5, math.nan, math.inf, "3", None, True, [3]],
     ),
-    "number": (lambda g: g.add_number("x", 1.0, min=0.0, max=2.0), [0, 1.5], [-0.1, 2.1, math.nan, "1", 2**60, {}]),
+    "number": (
+        lambda g: g.add_number("x", 1.0, min=0.0, max=2.0),
+        [0, 1.5],
+        [-0.1, 2.1, math.nan, "1", 2**60, {}],
+    ),
     "free number": (lambda g: g.add_number("x", 1), [-5, 2**40], [0.5, 2**60, -math.inf]),
     "text": (
         lambda g: g.add_text("x", "a"),
@@ -61,7 +66,18 @@ CASES = {
     "vector3": (
         lambda g: g.add_vector3("x", (1.0, 2.0, 3.0), min=(0.0, 0.0, 0.0)),
         [[0, 0.5, 7], [1.0, 2.0, 4.0]],
-        [[1, 2], [1, 2, 3, 4], [1, -1, 2], [1, math.nan, 2], ["1", 2, 3], [1, True, 2], [[1], 2, 3], 5, None, "123"],
+        [
+            [1, 2],
+            [1, 2, 3, 4],
+            [1, -1, 2],
+            [1, math.nan, 2],
+            ["1", 2, 3],
+            [1, True, 2],
+            [[1], 2, 3],
+            5,
+            None,
+            "123",
+        ],
     ),
     "rgb": (lambda g: g.add_rgb("x", (1, 2, 3)), [], [[0, 255, 7], "red"]),
     "range": (lambda g: g.add_multi_slider("x", 0, 9, 1, (2, 5)), [], [[0, 9], [5, 2]]),
@@ -92,7 +108,14 @@ def test_only_the_value_can_be_set(operator, gui):
     button = gui.add_button("Delete", disabled=True)
     client = operator.client()
     uuid = slider._impl.uuid
-    for updates in ({"max": 99}, {"disabled": False}, {"value": 6, "max": 99}, {"props": 1}, {"update_cb": []}, {}):
+    for updates in (
+        {"max": 99},
+        {"disabled": False},
+        {"value": 6, "max": 99},
+        {"props": 1},
+        {"update_cb": []},
+        {},
+    ):
         client.send("GuiUpdateMessage", uuid=uuid, updates=updates)
     client.send("GuiUpdateMessage", uuid=button._impl.uuid, updates={"disabled": False})
     client.send("GuiUpdateMessage", uuid="no such thing", updates={"value": 1})
@@ -113,7 +136,13 @@ def test_what_is_disabled_or_hidden_stays_as_it_is(operator, gui):
         in_panel = gui.add_button("c")
     with gui.add_modal("modal") as modal:
         in_modal = gui.add_button("d")
-    buttons = [gui.add_button("e", disabled=True), gui.add_button("f", visible=False), in_folder, in_tab, in_panel]
+    buttons = [
+        gui.add_button("e", disabled=True),
+        gui.add_button("f", visible=False),
+        in_folder,
+        in_tab,
+        in_panel,
+    ]
     slider = gui.add_slider("gain", 0, 10, 1, 5, disabled=True)
     for button in (*buttons, in_modal):
         button.on_click(lambda event: clicks.append(event.target.label))
@@ -143,21 +172,39 @@ def test_a_watcher_sees_all_and_changes_nothing(server, operator, watcher, gui):
     button, upload = gui.add_button("Capture"), gui.add_upload_button("Open")
     command = gui.add_command("Capture")
     gizmo = server.viser.scene.add_transform_controls("/board")
-    for register in (slider.on_update, button.on_click, upload.on_upload, command.on_trigger, gizmo.on_update):
+    for register in (
+        slider.on_update,
+        button.on_click,
+        upload.on_upload,
+        command.on_trigger,
+        gizmo.on_update,
+    ):
         register(lambda event: calls.append(event))
     server.viser.scene.on_click()(lambda event: calls.append(event))
     client = watcher.client()
     assert server.role(client.number) == "watch"
-    assert until(lambda: {"GuiSliderMessage", "TransformControlsMessage"} <= {m["type"] for m in client.received})
+    assert until(
+        lambda: (
+            {"GuiSliderMessage", "TransformControlsMessage"} <= {m["type"] for m in client.received}
+        )
+    )
     client.set(slider, 7)
     client.set(button, True)
     client.send("CommandTriggerMessage", uuid=command._impl.uuid)
-    client.send("TransformControlsUpdateMessage", name="/board", wxyz=[1, 0, 0, 0], position=[1, 1, 1], owner="")
+    client.send(
+        "TransformControlsUpdateMessage",
+        name="/board",
+        wxyz=[1, 0, 0, 0],
+        position=[1, 1, 1],
+        owner="",
+    )
     client.send("ScenePointerMessage", **POINTER)
     client.send("FileTransferStartUpload", **announced(upload, 0, 0))
     client.send("GuiFormDirtyMessage", uuid="x")
     client.send("ViewerCameraMessage", **{**CAMERA, "position": [7, 7, 7]})
-    assert until(lambda: server.viser.get_clients()[client.number].camera.position.tolist() == [7, 7, 7])
+    assert until(
+        lambda: server.viser.get_clients()[client.number].camera.position.tolist() == [7, 7, 7]
+    )
     assert slider.value == 5 and calls == [] and gizmo.position.tolist() == [0, 0, 0]
     assert until(lambda: client.told(slider) == [5])
     both = operator.client()
@@ -193,7 +240,9 @@ def test_commands_answer_only_where_they_are_and_forms_never(operator, gui):
 
 def test_the_scene_answers_only_where_someone_listens(server, operator):
     scene, calls = server.viser.scene, []
-    heard, deaf, hidden = (scene.add_transform_controls(name) for name in ("/heard", "/deaf", "/hidden"))
+    heard, deaf, hidden = (
+        scene.add_transform_controls(name) for name in ("/heard", "/deaf", "/hidden")
+    )
     ball, plain = scene.add_icosphere("/ball", 1.0), scene.add_icosphere("/plain", 1.0)
     for one in (heard, hidden):
         one.on_update(lambda event: calls.append((event.target.name, event.phase)))
@@ -207,7 +256,9 @@ def test_the_scene_answers_only_where_someone_listens(server, operator):
     for owner in ("1", "999", "x"):
         client.send("TransformControlsUpdateMessage", name="/heard", **pose, owner=owner)
     for wxyz in ([0, 0, 0, 0], [math.nan, 0, 0, 1], [1, 0, 0], "abcd"):
-        client.send("TransformControlsUpdateMessage", name="/heard", wxyz=wxyz, position=[9, 9, 9], owner="")
+        client.send(
+            "TransformControlsUpdateMessage", name="/heard", wxyz=wxyz, position=[9, 9, 9], owner=""
+        )
     for name in ("/ball", "/plain", "/none"):
         node = {"name": name, "instance_index": None, "screen_pos": [0.1, 0.1], "owner": ""}
         client.send("SceneNodeClickMessage", **node, **click)
@@ -215,7 +266,9 @@ def test_the_scene_answers_only_where_someone_listens(server, operator):
     settle(client)
     assert until(lambda: set(calls) == {("/heard", "update"), "ball"} and len(calls) == 2), calls
     assert heard.position.tolist() == [1, 2, 3]
-    assert deaf.position.tolist() == hidden.position.tolist() == plain.position.tolist() == [0, 0, 0]
+    assert (
+        deaf.position.tolist() == hidden.position.tolist() == plain.position.tolist() == [0, 0, 0]
+    )
 
     scene.on_click()(lambda event: calls.append("scene"))
     client.send("ScenePointerMessage", **{**POINTER, "event_type": "rect-select"})
@@ -250,7 +303,9 @@ def test_no_client_opens_a_tunnel(server, operator, gui):
     gui.configure_theme(dark_mode=True)
 
     def themes() -> list[dict]:
-        return [message for message in client.received if message["type"] == "ThemeConfigurationMessage"]
+        return [
+            message for message in client.received if message["type"] == "ThemeConfigurationMessage"
+        ]
 
     assert until(lambda: themes() and themes()[-1]["dark_mode"])
     assert not any(theme["show_share_button"] for theme in themes())
@@ -282,18 +337,27 @@ def test_garbage_hurts_nobody(server, operator, gui, capsys):
     client.socket.send(b"\x91" * 100_000)
     client.send("GuiUpdateMessage", uuid=["a"], updates={"value": 1})
     client.send("GuiUpdateMessage", uuid=slider._impl.uuid, updates=[1])
-    client.send("GuiUpdateMessage", uuid=slider._impl.uuid, updates={"value": 1}, excluded_self_client=3)
+    client.send(
+        "GuiUpdateMessage", uuid=slider._impl.uuid, updates={"value": 1}, excluded_self_client=3
+    )
     client.send("ViewerCameraMessage", **{**CAMERA, "position": [math.nan, 0, 0]})
     client.send("ViewerCameraMessage", **{**CAMERA, "image_width": -5})
     client.send("ViewerCameraMessage", **{**CAMERA, "fov": "wide"})
     settle(client)
-    assert slider.value == 5 and server.viser.get_clients()[client.number].camera.image_width == 1280
+    assert (
+        slider.value == 5 and server.viser.get_clients()[client.number].camera.image_width == 1280
+    )
     assert "Traceback" not in capsys.readouterr().err
 
 
 ALLOWED = {
     "operate": {
-        *("ViewerCameraMessage", "GuiUpdateMessage", "CommandTriggerMessage", "LocalStorageGetItemResponseMessage"),
+        *(
+            "ViewerCameraMessage",
+            "GuiUpdateMessage",
+            "CommandTriggerMessage",
+            "LocalStorageGetItemResponseMessage",
+        ),
         *("FileTransferStartUpload", "FileTransferPart", "TransformControlsUpdateMessage"),
         *("TransformControlsDragStartMessage", "TransformControlsDragEndMessage"),
         *("SceneNodeClickMessage", "ScenePointerMessage"),
@@ -302,7 +366,8 @@ ALLOWED = {
     "project": set(),
     "camera": set(),
 }
-"""The messages that are considered at all; whether one passes depends on what the page offers at the moment."""
+"""The messages that are considered at all; whether one passes depends on what the page offers at
+the moment."""
 VALUES = {str: "/x", int: 1, float: 1.0, bool: True, bytes: b"x"}
 
 
@@ -328,11 +393,15 @@ def test_every_message_of_the_protocol_for_every_role(server, operator, role, mo
     connection = viser_internals.ViserClient(server.viser, client.number).connection
     gate = ViserGate(server.viser, connection, role, UploadBudget(1000))
     considered = set()
-    monkeypatch.setattr(gate, "_check_message", partial(note_considered, gate._check_message, considered))
+    monkeypatch.setattr(
+        gate, "_check_message", partial(note_considered, gate._check_message, considered)
+    )
     monkeypatch.setattr(gate, "_send_refusal", lambda *_: None)
     passed = set()
     kinds = every_message()
-    assert len(kinds) > 100 and all(name in {kind.__name__ for kind in kinds} for name in ALLOWED["operate"])
+    assert len(kinds) > 100 and all(
+        name in {kind.__name__ for kind in kinds} for name in ALLOWED["operate"]
+    )
     for kind in kinds:
         raw = msgspec.msgpack.encode({"type": kind.__name__, **example(kind)})
         if gate(raw) is not None:
@@ -356,7 +425,9 @@ def note_considered(check, considered: set, message, raw):
     return passed
 
 
-def test_what_an_operator_types_into_a_private_input_reaches_no_watcher(server, operator, watcher, gui):
+def test_what_an_operator_types_into_a_private_input_reaches_no_watcher(
+    server, operator, watcher, gui
+):
     secret = "rtsp://admin:hunter2@camera/stream"
     address = gui.add_text("Camera ID", "")
     viser_internals.make_private(address)

@@ -12,7 +12,13 @@ from server_client import Browser
 
 from slviewer.server import limits
 from slviewer.server.connection import REQUEST_BYTES
-from slviewer.server.limits import CONNECTIONS, STRANGERS_PER_ADDRESS, Listener, OncePerSecond, address_group
+from slviewer.server.limits import (
+    CONNECTIONS,
+    STRANGERS_PER_ADDRESS,
+    Listener,
+    OncePerSecond,
+    address_group,
+)
 from slviewer.server.secure import Serving, serve
 
 
@@ -24,7 +30,11 @@ def crowd(server):
         def open_connections(count: int, said: bytes = b"") -> list[socket.socket]:
             opened = []
             for _ in range(count):
-                opened.append(ended.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S)))
+                opened.append(
+                    ended.enter_context(
+                        socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S)
+                    )
+                )
                 with contextlib.suppress(OSError):
                     opened[-1].sendall(said)
             return opened
@@ -79,9 +89,13 @@ def test_each_role_has_so_many_connections():
 def test_the_busiest_address_makes_room(monkeypatch):
     closed = []
     with Listener(socket.AF_INET, socket.SOCK_STREAM, strangers=4) as listener:
-        for number, address in enumerate(["192.0.2.1", "192.0.2.1", "192.0.2.1", "192.0.2.2", "192.0.2.3"]):
+        for number, address in enumerate(
+            ["192.0.2.1", "192.0.2.1", "192.0.2.1", "192.0.2.2", "192.0.2.3"]
+        ):
             one = limits._Accepted(socket.AF_INET, socket.SOCK_STREAM)
-            monkeypatch.setattr(one, "shutdown", lambda how, number=number: closed.append(number), raising=False)
+            monkeypatch.setattr(
+                one, "shutdown", lambda how, number=number: closed.append(number), raising=False
+            )
             listener.count(one, (address, number))
         assert closed == [0]
 
@@ -101,7 +115,11 @@ def test_accepting_pauses_so_that_others_are_served():
 
 
 def test_addresses_of_one_subscriber_are_one():
-    assert address_group("2001:db8::1") == address_group("2001:db8::ffff:2") != address_group("2001:db8:0:1::1")
+    assert (
+        address_group("2001:db8::1")
+        == address_group("2001:db8::ffff:2")
+        != address_group("2001:db8:0:1::1")
+    )
     assert address_group("192.0.2.1") != address_group("192.0.2.2")
     assert address_group("fe80::1%eth0") == address_group("fe80::2%eth0")
 
@@ -112,7 +130,9 @@ def test_a_fault_is_logged_once_a_second():
 
     def passes(text: str, error: type[Exception] | None = None) -> bool:
         info = (error, error(), None) if error else None
-        return records.filter(logging.LogRecord("slviewer.server", logging.ERROR, "", 0, text, (1,), info))
+        return records.filter(
+            logging.LogRecord("slviewer.server", logging.ERROR, "", 0, text, (1,), info)
+        )
 
     assert [passes("failed %s") for _ in range(50)] == [True] + [False] * 49
     assert passes("another") and passes("failed %s", OSError) and not passes("failed %s", OSError)
@@ -130,7 +150,10 @@ def test_descriptors_are_given_back(server, operator):
 
     def knock() -> None:
         for _ in range(100):
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S):
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S),
+            ):
                 pass
 
     threads = [threading.Thread(target=knock) for _ in range(4)]

@@ -1,4 +1,5 @@
-"""Batches that wait together in a busy page are handed over as one, in their order, and none is lost."""
+"""Batches that wait together in a busy page are handed over as one, in their order, and none is
+lost."""
 
 import threading
 from collections.abc import Iterator
@@ -64,14 +65,20 @@ def isolated_address() -> Iterator[str]:
     server.server_close()
 
 
-def test_batches_that_wait_are_one_and_keep_their_order(browser: Browser, isolated_address: str) -> None:
+def test_batches_that_wait_are_one_and_keep_their_order(
+    browser: Browser, isolated_address: str
+) -> None:
     context = browser.new_context()
     page = context.new_page()
     page.goto(isolated_address)
     page.add_script_tag(content=PAGE_SCRIPT.decode())
     found = page.evaluate(WORKER)
     context.close()
-    whole = [each for batch in found["arrived"] for each in (batch if isinstance(batch, list) else [batch])]
+    whole = [
+        each
+        for batch in found["arrived"]
+        for each in (batch if isinstance(batch, list) else [batch])
+    ]
     assert whole == [*range(14), "closed", *range(16, 40)]
     assert 3 <= len(found["arrived"]) < 10  # of 20 that were sent
     assert found["failed"]  # the error was told, and what came after it was still handed over

@@ -1,4 +1,5 @@
-"""The projector page in a real browser: pixels, words, and everything that may happen to a page in the middle."""
+"""The projector page in a real browser: pixels, words, and everything that may happen to a page in
+the middle."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -83,18 +84,22 @@ def usual(browser: Browser, server: SafeServer) -> Iterator[Window]:
 
 @pytest.fixture
 def opens(browser: Browser, server: SafeServer, usual: Window) -> Iterator[Opens]:
-    """Opens a projector page, whose screen is its window unless another one is given; only the first usual one is in a
-    browser that other tests use.
+    """Opens a projector page, whose screen is its window unless another one is given; only the
+    first usual one is in a browser that other tests use.
     """
     contexts, errors = [], []
 
-    def opened(size: tuple[int, int] = SIZE, ratio: float = 1.0, screen: tuple[int, int] | None = None) -> Page:
+    def opened(
+        size: tuple[int, int] = SIZE, ratio: float = 1.0, screen: tuple[int, int] | None = None
+    ) -> Page:
         if (size, ratio, screen) == (SIZE, 1.0, None) and not usual.is_used:
             return usual.open(server)
         width, height = (math.ceil(side / ratio) for side in size)
         whole = {"width": screen[0], "height": screen[1]} if screen else None
         viewport = {"width": width, "height": height}
-        contexts.append(browser.new_context(viewport=viewport, screen=whole, device_scale_factor=ratio))
+        contexts.append(
+            browser.new_context(viewport=viewport, screen=whole, device_scale_factor=ratio)
+        )
         return follow_link(contexts[-1], server, errors)
 
     yield opened
@@ -157,18 +162,15 @@ def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, 
     page = opens()
     ready(channel, projector)
     # what the canvas holds at each animation frame: the sum of a pattern is its fingerprint
-    page.evaluate(
-        """window.held = []; (function look() {
+    page.evaluate("""window.held = []; (function look() {
             const { data } = context.getImageData(0, 0, 360, 270);
             let sum = 0;
             for (let i = 0; i < data.length; i += 4) sum = (sum * 31 + data[i]) % 1000003;
             if (held.at(-1) !== sum) held.push(sum);
             requestAnimationFrame(look);
-        })()"""
-    )
+        })()""")
     # animation frames that begin between the request and its answer
-    page.evaluate(
-        """window.waited = []; let drawn = 0, requested = 0;
+    page.evaluate("""window.waited = []; let drawn = 0, requested = 0;
         (function count() { drawn += 1; requestAnimationFrame(count); })();
         link.socket.addEventListener("message", () => { requested = drawn; }, { capture: true });
         const send = link.socket.send.bind(link.socket);
@@ -176,8 +178,7 @@ def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, 
             if (JSON.parse(text).op === "done") waited.push(drawn - requested);
             send(text);
         };
-        null"""
-    )
+        null""")
     order = np.random.default_rng(3).permutation(len(SEQUENCE.frames))[:12]
     for index in order:
         projector.show(int(index))
@@ -190,7 +191,9 @@ def test_frames_appear_in_the_order_in_which_they_are_asked_for(opens, channel, 
         return total
 
     assert held[-len(order) :] == [fingerprint(int(index)) for index in order]
-    assert len(waited) == len(order) and set(waited) == {2}, "the second begins once the picture is on its way"
+    assert len(waited) == len(order) and set(waited) == {2}, (
+        "the second begins once the picture is on its way"
+    )
 
 
 def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
@@ -199,7 +202,9 @@ def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
     assert channel.wait_ready(HANG_S).state == "ready"
     projector = browser_projector(None, channel)
     assert projector.size == size
-    sequence = PatternSequence(size, tuple(Frame("phase", axis, k, 25, 18.0) for axis in ("x", "y") for k in range(25)))
+    sequence = PatternSequence(
+        size, tuple(Frame("phase", axis, k, 25, 18.0) for axis in ("x", "y") for k in range(25))
+    )
     projector.open()
     with pytest.raises(DeviceError):
         projector.show(0)
@@ -208,7 +213,9 @@ def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
     real, page.send = page.send, lambda message: (sent.append(message), real(message))
     projector.load(sequence)
     (message,) = sent
-    assert 25 * sum(size) < len(message) < 25 * sum(size) + 1000, "one row or column of each pattern, and no picture"
+    assert 25 * sum(size) < len(message) < 25 * sum(size) + 1000, (
+        "one row or column of each pattern, and no picture"
+    )
     sent.clear()
     projector.load(sequence)
     assert sent == []
@@ -261,15 +268,20 @@ def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel
     assert left < 6000 <= since_click
     page.evaluate("settlesAt += 1e6")  # the browser's notice stays until it is looked at here
     grown = {"width": SIZE[0], "height": SIZE[1], "screenWidth": SIZE[0], "screenHeight": SIZE[1]}
-    session = page.context.new_cdp_session(page)  # without a display the window does not grow by itself
-    session.send("Emulation.setDeviceMetricsOverride", {**grown, "deviceScaleFactor": 1, "mobile": False})
+    session = page.context.new_cdp_session(
+        page
+    )  # without a display the window does not grow by itself
+    session.send(
+        "Emulation.setDeviceMetricsOverride", {**grown, "deviceScaleFactor": 1, "mobile": False}
+    )
     assert until(lambda: state_has(channel, "notice", "wait"))
     settle(page)
     ready(channel, projector)
     assert page.evaluate("document.fullscreenElement !== null")
     projector.show(0)
     session.send(
-        "Emulation.setDeviceMetricsOverride", {**grown, "height": 200, "deviceScaleFactor": 1, "mobile": False}
+        "Emulation.setDeviceMetricsOverride",
+        {**grown, "height": 200, "deviceScaleFactor": 1, "mobile": False},
     )
     page.evaluate("document.exitFullscreen()")
     assert until(lambda: state_has(channel, "fill", "screen", "F11"))
@@ -291,7 +303,9 @@ def test_the_marker_tells_the_screen_and_its_sides(opens, channel, projector):
         return float(np.argmin(turned[0, :, 1] > 127))
 
     picture = seen(page)
-    corners = [square(turned) for turned in (picture, picture[:, ::-1], picture[::-1, ::-1], picture[::-1])]
+    corners = [
+        square(turned) for turned in (picture, picture[:, ::-1], picture[::-1, ::-1], picture[::-1])
+    ]
     assert np.allclose(corners, [4 * side, 3 * side, 2 * side, side], atol=1)
     expect(page.locator("main")).to_contain_text("360 x 270")
     projector.show_level(0)
@@ -307,10 +321,14 @@ def test_a_reload_ends_the_capture_and_the_next_one_is_whole(opens, channel, pro
     projector.show(3)
     page.reload()
     assert channel.wait_ready(HANG_S).state == "ready"
-    assert until(lambda: shows(page, np.full(SIZE[::-1], 200, np.uint8))), "the light comes back by itself"
+    assert until(lambda: shows(page, np.full(SIZE[::-1], 200, np.uint8))), (
+        "the light comes back by itself"
+    )
     with pytest.raises(DeviceError) as lost:
         projector.show(4)
-    assert not missing_facts(str(lost.value), "reloaded") or not missing_facts(str(lost.value), "closed")
+    assert not missing_facts(str(lost.value), "reloaded") or not missing_facts(
+        str(lost.value), "closed"
+    )
     with raises(DeviceError, "load"):
         projector.show(5)
     projector.load(SEQUENCE)
@@ -356,7 +374,9 @@ def test_a_page_that_is_closed_in_the_middle_is_missed_at_once(opens, channel, p
     with pytest.raises(DeviceError) as lost:
         projector.show(1)
     # hidden is the last thing that some browsers say
-    assert not missing_facts(str(lost.value), "closed") or not missing_facts(str(lost.value), "hidden")
+    assert not missing_facts(str(lost.value), "closed") or not missing_facts(
+        str(lost.value), "hidden"
+    )
     assert until(lambda: channel.page_state().state == "waiting")
     with raises(DeviceError, "no projector page", "link"):
         projector.load(SEQUENCE)
@@ -369,11 +389,9 @@ def test_a_page_that_hangs_is_given_up(opens, channel, projector):
     page = opens()
     ready(channel, projector)
     # its answers are kept back until it has been given up
-    page.evaluate(
-        """window.late = [];
+    page.evaluate("""window.late = [];
         link.socket.send = (text) => late.push(text);
-        null"""
-    )
+        null""")
     channel.page().answer_s = 0.5
     with raises(DeviceError, "0.5 s"):
         projector.show(1)
@@ -382,7 +400,9 @@ def test_a_page_that_hangs_is_given_up(opens, channel, projector):
     page.evaluate("delete link.socket.send; for (const text of late) link.socket.send(text)")
     projector.load(SEQUENCE)
     projector.show(1)
-    assert shows(page, render_pattern(SEQUENCE, 1)), "an answer that came too late is not taken for the next one's"
+    assert shows(page, render_pattern(SEQUENCE, 1)), (
+        "an answer that came too late is not taken for the next one's"
+    )
 
 
 def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, channel, projector):
@@ -403,10 +423,8 @@ def test_a_window_that_changes_and_changes_back_still_ends_the_capture(opens, ch
 def test_a_hidden_page_is_no_projector(opens, channel, projector):
     page = opens()
     ready(channel, projector)
-    page.evaluate(
-        """Object.defineProperty(document, "visibilityState", { value: "hidden" });
-        document.dispatchEvent(new Event("visibilitychange"))"""
-    )
+    page.evaluate("""Object.defineProperty(document, "visibilityState", { value: "hidden" });
+        document.dispatchEvent(new Event("visibilitychange"))""")
     assert until(lambda: channel.page_state().state == "refused")
     with raises(DeviceError, "hidden", "front"):
         projector.show(1)
@@ -434,7 +452,9 @@ def test_a_second_window_takes_over_only_when_it_is_asked_to(opens, channel, pro
     assert shows(second, render_pattern(SEQUENCE, 3))
 
 
-def test_the_operator_is_led_to_the_page_with_its_rights_alone(browser, server, channel, projector_page):
+def test_the_operator_is_led_to_the_page_with_its_rights_alone(
+    browser, server, channel, projector_page
+):
     context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
     page = context.new_page()
     page.goto(server.link())

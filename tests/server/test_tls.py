@@ -24,7 +24,9 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> TlsCertificate:
 
 
 @pytest.fixture
-def served(certificate: TlsCertificate, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
+def served(
+    certificate: TlsCertificate, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+):
     """A server with this certificate: as the user's own, else as the one that slviewer made."""
     own = getattr(request, "param", False)
     monkeypatch.setattr(credentials, "_config_folder", lambda: certificate.chain.parent)
@@ -34,9 +36,13 @@ def served(certificate: TlsCertificate, request: pytest.FixtureRequest, monkeypa
     server.stop()
 
 
-def ask(server: SafeServer, certificate: TlsCertificate, path: str, **headers: str) -> http.client.HTTPResponse:
+def ask(
+    server: SafeServer, certificate: TlsCertificate, path: str, **headers: str
+) -> http.client.HTTPResponse:
     context = ssl.create_default_context(cafile=str(certificate.chain))
-    connection = http.client.HTTPSConnection("127.0.0.1", server.port, timeout=HANG_S, context=context)
+    connection = http.client.HTTPSConnection(
+        "127.0.0.1", server.port, timeout=HANG_S, context=context
+    )
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     answer.read()
@@ -49,16 +55,28 @@ def test_the_cookie_is_for_encrypted_connections_alone(served, certificate, requ
     token = served.link().partition("#")[2]
     assert served.link().startswith(f"https://127.0.0.1:{served.port}/#")
     for name in ("127.0.0.1", "scanner.lab"):
-        answer = ask(served, certificate, "/login", Authorization=f"Bearer {token}", Host=f"{name}:{served.port}")
+        answer = ask(
+            served,
+            certificate,
+            "/login",
+            Authorization=f"Bearer {token}",
+            Host=f"{name}:{served.port}",
+        )
         assert answer.status == 200 and "; Secure" in answer.headers["Set-Cookie"]
     own = request.node.callspec.params["served"]
-    assert ("Strict-Transport-Security" in answer.headers) == own, "a self-made one would lock its host out later"
+    assert ("Strict-Transport-Security" in answer.headers) == own, (
+        "a self-made one would lock its host out later"
+    )
 
 
 def test_a_proxy_that_encrypts_has_secure_cookies_too(server, stranger):
     grant = server.access.grants["operate"]
-    assert "; Secure" in stranger.log_in(grant.token, X_Forwarded_Proto="https").headers["Set-Cookie"]
-    assert "Secure" not in stranger.log_in(grant.token, X_Forwarded_Proto="http").headers["Set-Cookie"]
+    assert (
+        "; Secure" in stranger.log_in(grant.token, X_Forwarded_Proto="https").headers["Set-Cookie"]
+    )
+    assert (
+        "Secure" not in stranger.log_in(grant.token, X_Forwarded_Proto="http").headers["Set-Cookie"]
+    )
 
 
 def test_the_pages_work_encrypted(browser: Browser, served: SafeServer) -> None:
@@ -68,13 +86,18 @@ def test_the_pages_work_encrypted(browser: Browser, served: SafeServer) -> None:
     page.wait_for_url("https://**/operate-*/")
     assert until(served.viser.get_clients)
     (client,) = served.viser.get_clients()
-    assert served.role(client) == "operate" and all(cookie["secure"] for cookie in context.cookies())
+    assert served.role(client) == "operate" and all(
+        cookie["secure"] for cookie in context.cookies()
+    )
     assert served.origin_of(client) == served.origin
     context.close()
 
 
 def test_whoever_begins_no_handshake_keeps_nobody_out(served, certificate):
-    crowd = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(3 * STRANGERS_PER_ADDRESS)]
+    crowd = [
+        socket.create_connection(("127.0.0.1", served.port))
+        for _ in range(3 * STRANGERS_PER_ADDRESS)
+    ]
     assert ask(served, certificate, "/").status == 200
     for one in crowd:
         one.close()

@@ -8,7 +8,9 @@ from server_client import Browser, announced, part, settle
 @pytest.fixture
 def button(gui):
     button = gui.add_upload_button("Open")
-    button.on_upload(lambda event: files.append((event.target.value.name, event.target.value.content)))
+    button.on_upload(
+        lambda event: files.append((event.target.value.name, event.target.value.content))
+    )
     files: list = []
     button.__dict__["files"] = files
     return button
@@ -20,7 +22,10 @@ def under_way(browser: Browser) -> int:
 
 def test_a_file_arrives_under_a_harmless_name(operator, button):
     client, content = operator.client(), bytes(range(256)) * 32
-    client.send("FileTransferStartUpload", **announced(button, 8192, 2, "../../.ssh/authorized keys\x00.pub"))
+    client.send(
+        "FileTransferStartUpload",
+        **announced(button, 8192, 2, "../../.ssh/authorized keys\x00.pub"),
+    )
     client.send("FileTransferPart", **part(button, 0, content[:5000]))
     client.send("FileTransferPart", **part(button, 1, content[5000:]))
     assert until(lambda: button.files == [("authorized keys.pub", content)])
@@ -53,7 +58,9 @@ def test_several_at_once_share_the_limit(operator, button):
     assert under_way(operator) == 1
 
 
-@pytest.mark.parametrize(("size", "parts"), [(-1, 0), (10, 0), (0, 1), (10, 10_000_000), (5000, 3), (2**62, 1)])
+@pytest.mark.parametrize(
+    ("size", "parts"), [(-1, 0), (10, 0), (0, 1), (10, 10_000_000), (5000, 3), (2**62, 1)]
+)
 def test_announcements_that_cannot_be_are_refused(operator, button, size, parts):
     client = operator.client()
     client.send("FileTransferStartUpload", **announced(button, size, parts))
@@ -63,7 +70,12 @@ def test_announcements_that_cannot_be_are_refused(operator, button, size, parts)
 
 def test_parts_that_were_not_announced_end_the_upload(operator, button):
     client = operator.client()
-    for bad in ([(0, b"x" * 8193)], [(5, b"x")], [(0, b"x" * 10), (0, b"x" * 10)], [(0, b"x"), (1, b"x")]):
+    for bad in (
+        [(0, b"x" * 8193)],
+        [(5, b"x")],
+        [(0, b"x" * 10), (0, b"x" * 10)],
+        [(0, b"x"), (1, b"x")],
+    ):
         client.send("FileTransferStartUpload", **announced(button, 8192, 2))
         for index, content in bad:
             client.send("FileTransferPart", **part(button, index, content))

@@ -1,4 +1,5 @@
-"""Who has drawn what: one that answers is ready again, one that stalls is asked nothing more and holds nobody up."""
+"""Who has drawn what: one that answers is ready again, one that stalls is asked nothing more and
+holds nobody up."""
 
 import threading
 
@@ -12,8 +13,15 @@ from slviewer.server.viewers import STALLED_S, Viewers
 
 def answer(client: Client) -> None:
     """Say, as viser's page does, that all that came was drawn."""
-    asked = next(m for m in reversed(client.received) if m["type"] == "LocalStorageGetItemRequestMessage")
-    client.send("LocalStorageGetItemResponseMessage", value=None, error=None, request_uuid=asked["request_uuid"])
+    asked = next(
+        m for m in reversed(client.received) if m["type"] == "LocalStorageGetItemRequestMessage"
+    )
+    client.send(
+        "LocalStorageGetItemResponseMessage",
+        value=None,
+        error=None,
+        request_uuid=asked["request_uuid"],
+    )
 
 
 def asked(client: Client) -> int:
@@ -37,7 +45,9 @@ def test_each_is_ready_once_it_has_drawn_what_it_was_sent(
         viewers.sent(client)
     assert ready() == set()
     assert until(lambda: asked(quick) == asked(slow) == 1)
-    assert quick.received[-2]["type"] == "LabelMessage" or "Label" in str(quick.received[:-1])  # drawn before it asks
+    assert quick.received[-2]["type"] == "LabelMessage" or "Label" in str(
+        quick.received[:-1]
+    )  # drawn before it asks
     clock.sleep(0.25)
     answer(quick)
     assert until(lambda: ready() == {quick.number}) and heard.wait(HANG_S)
@@ -45,7 +55,9 @@ def test_each_is_ready_once_it_has_drawn_what_it_was_sent(
     clock.sleep(0.5)
     assert viewers.slowest_s() == pytest.approx(0.75), "the slow one has not answered yet"
     clock.sleep(STALLED_S)
-    assert viewers.slowest_s() == pytest.approx(0.25), "one that stalls sets the pace for itself alone"
+    assert viewers.slowest_s() == pytest.approx(0.25), (
+        "one that stalls sets the pace for itself alone"
+    )
     answer(quick)  # an answer to nothing is let in by nobody
     slow.send("LocalStorageGetItemResponseMessage", value=None, error=None, request_uuid="another")
     quick.flush()

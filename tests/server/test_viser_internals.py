@@ -1,4 +1,5 @@
-"""The inside of viser is as it was when the guard was written: what fails here must be read again before it serves."""
+"""The inside of viser is as it was when the guard was written: what fails here must be read again
+before it serves."""
 
 import hashlib
 import inspect
@@ -58,7 +59,10 @@ def test_what_the_guard_relies_on_is_unchanged(source):
 
 def test_the_page_is_the_one_whose_scripts_are_allowed():
     page = viser_internals.CLIENT_PAGE.read_bytes()
-    assert hashlib.sha256(page).hexdigest() == "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
+    assert (
+        hashlib.sha256(page).hexdigest()
+        == "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
+    )
     (loader,) = re.findall(rb'<script data-p="[^"]*"[^>]*>(.*)</script>', page, re.S)
     assert script_hash(loader) == viser_internals.VISER_SCRIPTS[0]
 
@@ -66,7 +70,9 @@ def test_the_page_is_the_one_whose_scripts_are_allowed():
 def test_a_client_sends_nothing_that_was_not_thought_of(server, operator):
     operator.client()
     (client,) = server.viser.get_clients().values()
-    handled = set(server.viser._websock_server._incoming_handlers) | set(client._websock_connection._incoming_handlers)
+    handled = set(server.viser._websock_server._incoming_handlers) | set(
+        client._websock_connection._incoming_handlers
+    )
     unused = {
         _messages.GuiButtonHoldMessage,
         _messages.GuiFormSubmitMessage,
@@ -81,7 +87,13 @@ def test_every_input_is_known_to_the_check_of_values():
     inputs = {kind for kind in vars(_gui_handles).values() if inspect.isclass(kind)}
     concrete = {kind.__name__ for kind in inputs if issubclass(kind, _gui_handles._GuiInputHandle)}
     assert concrete - {"_GuiInputHandle", "GuiInputHandle"} == {
-        *("GuiButtonHandle", "GuiButtonGroupHandle", "GuiCheckboxHandle", "GuiDropdownHandle", "GuiMultiSliderHandle"),
+        *(
+            "GuiButtonHandle",
+            "GuiButtonGroupHandle",
+            "GuiCheckboxHandle",
+            "GuiDropdownHandle",
+            "GuiMultiSliderHandle",
+        ),
         *(
             "GuiNumberHandle",
             "GuiProgressBarHandle",
@@ -100,6 +112,8 @@ def test_websockets_has_what_the_connection_uses():
         *("self", "process_request", "process_response", "server_header")
     ]
     assert list(inspect.signature(connection.recv).parameters) == ["self", "decode"]
-    assert inspect.iscoroutinefunction(connection.drain) and inspect.iscoroutinefunction(connection.recv)
+    assert inspect.iscoroutinefunction(connection.drain) and inspect.iscoroutinefunction(
+        connection.recv
+    )
     source = inspect.getsource(connection)
     assert "self.request_rcvd" in source and "process_request(self, self.request)" in source

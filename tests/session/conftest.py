@@ -20,7 +20,9 @@ def sequence():
 @pytest.fixture
 def noise():
     def make(seed, n=4, dtype=np.uint8):
-        return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, (n, 30, 40), dtype, endpoint=True)
+        return np.random.default_rng(seed).integers(
+            0, np.iinfo(dtype).max, (n, 30, 40), dtype, endpoint=True
+        )
 
     return make
 

@@ -36,7 +36,11 @@ def test_images_and_tomls_are_unpacked_and_the_rest_is_named(tmp_path: Path) -> 
     assert archive.unpacked_size(data) == 3
     source, warnings = unpack(data, tmp_path / "out")
     assert source == tmp_path / "out" / "set"  # the folder that alone holds everything
-    found = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*") if path.is_file())
+    found = sorted(
+        str(path.relative_to(tmp_path / "out"))
+        for path in (tmp_path / "out").rglob("*")
+        if path.is_file()
+    )
     assert found == ["set/frames.toml", "set/scan_1/a.png", "set/scan_2/a.png"]
     assert len(warnings) == 1 and missing_facts(warnings[0], "notes.txt", "run.sh") == []
 
@@ -54,7 +58,9 @@ def link(name: str) -> zipfile.ZipInfo:
     return info
 
 
-@pytest.mark.parametrize("name", ["../a.png", "b/../../a.png", "/etc/a.png", "C:/a.png", "..\\a.png"])
+@pytest.mark.parametrize(
+    "name", ["../a.png", "b/../../a.png", "/etc/a.png", "C:/a.png", "..\\a.png"]
+)
 def test_names_that_lead_outside_are_refused(tmp_path: Path, name: str) -> None:
     info = zipfile.ZipInfo("x")
     info.filename = name

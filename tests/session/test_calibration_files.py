@@ -54,10 +54,14 @@ def test_what_is_written_is_read_back(tmp_path, suffix):
     entries["T"] = entries["T"].ravel()
     path = tmp_path / f"calibration{suffix}"
     for _ in range(2):  # the second replaces the first
-        write_calibration(path, {**entries, "rms_px": 0.25, "camera_size": (1600, 1200), "program": "slviewer"})
+        write_calibration(
+            path, {**entries, "rms_px": 0.25, "camera_size": (1600, 1200), "program": "slviewer"}
+        )
     read = opencv_calibration.read_matrices(read_storage(path))
     for key, value in entries.items():
-        np.testing.assert_allclose(read[key], value.reshape(read[key].shape), rtol=1e-14, atol=1e-14)
+        np.testing.assert_allclose(
+            read[key], value.reshape(read[key].shape), rtol=1e-14, atol=1e-14
+        )
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
@@ -93,14 +97,18 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path):
 )
 @pytest.mark.filterwarnings("error")  # which NumPy would print beside the message
 def test_what_cannot_be_used_is_named(change, facts):
-    entries = {key: value for key, value in {**rig(), **change}.items() if not isinstance(value, str)}
+    entries = {
+        key: value for key, value in {**rig(), **change}.items() if not isinstance(value, str)
+    }
     with raises(InputError, "a.yml", *facts):
         opencv_calibration.read_matrices(Storage("a.yml", entries), KEYS)
 
 
 @pytest.mark.process
 def test_entries_of_a_file_that_cannot_be_used_are_named(tmp_path):
-    storage = read_storage(write(tmp_path / "a.yml", {**rig(), "M1": rig()["M1"] * np.nan, "M2": "words"}))
+    storage = read_storage(
+        write(tmp_path / "a.yml", {**rig(), "M1": rig()["M1"] * np.nan, "M2": "words"})
+    )
     with raises(InputError, "a.yml", "M1", "finite"):
         opencv_calibration.read_matrices(storage, KEYS)
     with raises(InputError, "a.yml", "M2", "matrix"):
@@ -114,7 +122,9 @@ def test_other_shapes_that_mean_the_same(tmp_path):
         "trans": rig()["trans"].T,
         "rot": rig()["rot"].round(6),
     }
-    read = opencv_calibration.read_matrices(read_storage(write(tmp_path / "a.yml", {**rig(), **changed})), KEYS)
+    read = opencv_calibration.read_matrices(
+        read_storage(write(tmp_path / "a.yml", {**rig(), **changed})), KEYS
+    )
     np.testing.assert_array_equal(read["D_camera"], rig()["D1"].ravel())
     np.testing.assert_array_equal(read["T"], rig()["trans"].ravel())
     np.testing.assert_allclose(read["R"], rig()["rot"], atol=2e-6)
@@ -152,7 +162,8 @@ def test_a_file_or_keys_that_are_missing(tmp_path):
 def test_a_real_file_in_two_parts(real_data):
     with raises(InputError, "intrinsic.yml", "R, T", "M1, D1, M2, D2"):
         opencv_calibration.read_matrices(
-            read_storage(real_data / "slmaster_david" / "intrinsic.yml"), ("M1", "D1", "M2", "D2", "R", "T")
+            read_storage(real_data / "slmaster_david" / "intrinsic.yml"),
+            ("M1", "D1", "M2", "D2", "R", "T"),
         )
 
 
@@ -165,7 +176,10 @@ def test_a_real_file_in_two_parts(real_data):
         (".xml", "<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000),
         (
             ".yml",
-            "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 2000000000\n   cols: 2000000000\n   dt: d\n   data: [1]\n",
+            (
+                "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 2000000000\n   cols: 2000000000\n  "
+                " dt: d\n   data: [1]\n"
+            ),
         ),
     ],
 )
@@ -181,4 +195,6 @@ def test_other_entries_of_a_file_do_not_matter(tmp_path):
     others = {"points": np.zeros((300, 200)), "M0": np.full((3, 3), np.nan), "note": "M1"}
     storage = read_storage(write(tmp_path / "a.yml", {**others, **rig()}))
     assert storage.entries["points"] is None and list(storage.entries) == [*others, *rig()]
-    np.testing.assert_array_equal(opencv_calibration.read_matrices(storage, KEYS)["K_camera"], rig()["M1"])
+    np.testing.assert_array_equal(
+        opencv_calibration.read_matrices(storage, KEYS)["K_camera"], rig()["M1"]
+    )

@@ -47,24 +47,36 @@ for line in sys.stdin:
         save_until_killed(*map(int, line.split()))
     print(os.WTERMSIG(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Starts one writer a line of its input, height of the frames and number of the change to the disk in which it dies."""
+"""Starts one writer a line of its input, height of the frames and number of the change to the disk
+in which it dies."""
 
 
 @pytest.mark.slow
 @pytest.mark.process
 @pytest.mark.parametrize(
-    ("seed", "kills"), [pytest.param(0, 2, id="few"), pytest.param(1, 10, id="many", marks=pytest.mark.slow)]
+    ("seed", "kills"),
+    [pytest.param(0, 2, id="few"), pytest.param(1, 10, id="many", marks=pytest.mark.slow)],
 )
-def test_a_writer_killed_at_any_moment_leaves_whole_captures(tmp_path, sequence, frames, seed, kills):
+def test_a_writer_killed_at_any_moment_leaves_whole_captures(
+    tmp_path, sequence, frames, seed, kills
+):
     folder = tmp_path / "session"
     with Session.create(folder) as session:
         session.save_capture("before", "scan", sequence, frames, source="")
     rng = np.random.default_rng(seed)
     caught_in_the_act = 0
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path]),
+    }
     command = [sys.executable, "-c", WRITER, str(folder)]
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1, env=environment
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+        env=environment,
     ) as writers:
         for height in (8, 480, 1600):
             for _ in range(kills):
@@ -90,7 +102,9 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("renames", range(6))
-def test_a_replacement_cut_short_anywhere_leaves_the_old_or_the_new(session, sequence, frames, monkeypatch, renames):
+def test_a_replacement_cut_short_anywhere_leaves_the_old_or_the_new(
+    session, sequence, frames, monkeypatch, renames
+):
     new = frames[::-1].copy()
     session.save_capture("a", "scan", sequence, frames, source="old")
     done = 0
@@ -115,7 +129,9 @@ def test_a_replacement_cut_short_anywhere_leaves_the_old_or_the_new(session, seq
     for write in (False, True):  # a reader recovers too, where nobody writes
         with Session.open(session.folder, write=write) as reopened:
             capture = reopened.load_capture("a")
-            np.testing.assert_array_equal(capture.frames, frames if capture.meta["source"] == "old" else new)
+            np.testing.assert_array_equal(
+                capture.frames, frames if capture.meta["source"] == "old" else new
+            )
             assert not atomic.list_leftovers(session.folder)
     if capture.meta["source"] == "new":
         assert len(list((session.folder / "trash").iterdir())) == 1
@@ -124,7 +140,9 @@ def test_a_replacement_cut_short_anywhere_leaves_the_old_or_the_new(session, seq
 def test_a_reader_leaves_a_working_writer_alone(session, sequence, frames, monkeypatch):
     waits = []
     acquire = WriterLock.acquire
-    monkeypatch.setattr(WriterLock, "acquire", lambda lock, patience_s: waits.append(patience_s) or acquire(lock, 0))
+    monkeypatch.setattr(
+        WriterLock, "acquire", lambda lock, patience_s: waits.append(patience_s) or acquire(lock, 0)
+    )
     with atomic.staged_folder(session.folder / "captures" / "a", 1) as staged:
         assert Session.open(session.folder).capture_names() == []
         assert staged.is_dir()
@@ -146,7 +164,9 @@ def test_a_save_that_the_disk_has_no_room_for_is_refused(session, sequence, fram
 
 @pytest.mark.parametrize("written", [0, 2, 4, 5])
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EIO])
-def test_a_disk_that_fills_up_in_the_middle(session, sequence, frames, noise, monkeypatch, written, code):
+def test_a_disk_that_fills_up_in_the_middle(
+    session, sequence, frames, noise, monkeypatch, written, code
+):
     session.save_capture("a", "scan", sequence, frames, source="")
     whole = atomic.write_bytes
     count = 0

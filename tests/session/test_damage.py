@@ -35,12 +35,17 @@ def damage_file(path: Path, damage: str) -> None:
 
 
 def save_as_older(session: Session, frames: np.ndarray) -> None:
-    """Replace the stacks of all captures, of these frames, by the ones that older versions wrote: no checksums."""
+    """Replace the stacks of all captures, of these frames, by the ones that older versions wrote:
+    no checksums."""
     for capture in session.captures():
         stack = capture.folder / "frames.zarr"
         shutil.rmtree(stack)
         plain = zarr.create_array(
-            stack, shape=frames.shape, dtype=frames.dtype, chunks=(1, *frames.shape[1:]), compressors=None
+            stack,
+            shape=frames.shape,
+            dtype=frames.dtype,
+            chunks=(1, *frames.shape[1:]),
+            compressors=None,
         )
         plain[...] = frames
 
@@ -56,19 +61,27 @@ def test_a_damaged_frame_is_named_and_never_used(session, sequence, frames, dama
 
 
 def test_a_damaged_frame_of_several_exposures_is_named(session, sequence, noise):
-    capture = session.save_capture("a", "scan", sequence, noise(1, 8), source="", exposures_ms=(2.0, 8.0))
+    capture = session.save_capture(
+        "a", "scan", sequence, noise(1, 8), source="", exposures_ms=(2.0, 8.0)
+    )
     damage_file(capture.folder / "frames.zarr" / "c.5.0.0", "zeros inside")
     with raises(DamagedError, "a", "frame 6 of 8", "c.5.0.0"):
         _ = capture.frames
 
 
-@pytest.mark.parametrize("damage", ["a zeroed frame", "zeros inside", "one bit", "cut short", "missing"])
-def test_older_stacks_are_compared_with_their_hash_once(session, sequence, frames, damage, monkeypatch):
+@pytest.mark.parametrize(
+    "damage", ["a zeroed frame", "zeros inside", "one bit", "cut short", "missing"]
+)
+def test_older_stacks_are_compared_with_their_hash_once(
+    session, sequence, frames, damage, monkeypatch
+):
     capture = session.save_capture("a", "scan", sequence, frames, source="")
     save_as_older(session, frames)
     verified = []
     whole = type(capture).verify
-    monkeypatch.setattr(type(capture), "verify", lambda self: (verified.append(self.name), whole(self)))
+    monkeypatch.setattr(
+        type(capture), "verify", lambda self: (verified.append(self.name), whole(self))
+    )
     for _ in range(3):
         np.testing.assert_array_equal(session.load_capture("a").frames, frames)
     assert verified == ["a"]
@@ -125,7 +138,11 @@ def test_a_damaged_pose_is_refused_and_the_others_are_read(session, sequence, fr
         session.save_capture(name, "calibration", sequence, frames, source="")
     damage_file(session.folder / "captures/pose_2/frames.zarr/c.1.0.0", "zeros inside")
     monkeypatch.setattr(poses, "decode_capture", lambda capture, stack: {})
-    monkeypatch.setattr(poses, "read_stored_pose", lambda store, capture, *_: poses.Judged(capture.name, None, "sound"))
+    monkeypatch.setattr(
+        poses,
+        "read_stored_pose",
+        lambda store, capture, *_: poses.Judged(capture.name, None, "sound"),
+    )
     monkeypatch.setattr(poses, "load_judged", lambda store, name, *_: None)
     judged = list(poses.read_stored_poses(session, session.capture_names(), None, None))
     assert [pose.name for pose in judged] == ["pose_1", "pose_2", "pose_3"]
@@ -135,9 +152,12 @@ def test_a_damaged_pose_is_refused_and_the_others_are_read(session, sequence, fr
 
 @pytest.fixture
 def untidy(session, sequence, frames):
-    """A session with two sound captures beside a stray folder, a copy, and two damaged descriptions."""
+    """A session with two sound captures beside a stray folder, a copy, and two damaged
+    descriptions."""
     for name in ("a", "b", "pose_1", "pose_2"):
-        session.save_capture(name, "calibration" if "pose" in name else "scan", sequence, frames, source="")
+        session.save_capture(
+            name, "calibration" if "pose" in name else "scan", sequence, frames, source=""
+        )
     captures = session.folder / "captures"
     shutil.copytree(captures / "pose_1", captures / "pose_1 (copy)")
     (captures / "stray").mkdir()
@@ -149,7 +169,11 @@ def untidy(session, sequence, frames):
 def test_what_is_sound_opens_and_what_is_not_is_named(untidy):
     session = Session.open(untidy.folder)
     sound, faults = session.read_captures()
-    assert [capture.name for capture in sound] == ["a", "pose_1"] == [c.name for c in session.captures()]
+    assert (
+        [capture.name for capture in sound]
+        == ["a", "pose_1"]
+        == [c.name for c in session.captures()]
+    )
     assert session.capture_names("calibration") == ["pose_1"]
     assert set(faults) == {"b", "pose_1 (copy)", "pose_2", "stray"}
     for name, fault in faults.items():
@@ -190,7 +214,9 @@ def test_check_reads_everything_and_lists_what_is_damaged(session, sequence, fra
         inspect(session.folder, check=True)
     lines = str(damage.value).splitlines()[1:]
     named = ["captures/c/capture.json", "decisions.json", "b: frame 4 of 4", "clouds/a", "clouds/b"]
-    assert len(lines) == len(named) and all(name in line for name, line in zip(named, lines, strict=True))
+    assert len(lines) == len(named) and all(
+        name in line for name, line in zip(named, lines, strict=True)
+    )
 
 
 def test_check_finds_damage_of_older_sessions(session, sequence, frames):

@@ -14,7 +14,8 @@ EXPOSURES = (2.0, 8.0, 32.0)
 
 @pytest.fixture(params=[np.uint8, np.uint16])
 def stacks(request):
-    """(3, 4, 30, 40): from dark on the left to clipped on the right, later on in the shorter exposures."""
+    """(3, 4, 30, 40): from dark on the left to clipped on the right, later on in the shorter
+    exposures."""
     rng = np.random.default_rng(5)
     top = np.iinfo(request.param).max
     light = np.geomspace(0.01, 1.5, 40) * rng.uniform(0.5, 1, (4, 30, 40)) * top
@@ -23,7 +24,9 @@ def stacks(request):
 
 def save(session, sequence, stacks, name="a", exposures=EXPOSURES, **more):
     frames = stacks.reshape(-1, *stacks.shape[2:])
-    return session.save_capture(name, "scan", sequence, frames, source="", exposures_ms=exposures, **more)
+    return session.save_capture(
+        name, "scan", sequence, frames, source="", exposures_ms=exposures, **more
+    )
 
 
 def test_every_frame_is_kept_and_the_merge_is_read(session, sequence, stacks):
@@ -43,7 +46,10 @@ def test_every_frame_is_kept_and_the_merge_is_read(session, sequence, stacks):
 
 
 def test_exposures_are_part_of_the_content(session, sequence, stacks):
-    hashes = {save(session, sequence, stacks, name, e).hash for name, e in (("a", EXPOSURES), ("b", (2.0, 8.0, 33.0)))}
+    hashes = {
+        save(session, sequence, stacks, name, e).hash
+        for name, e in (("a", EXPOSURES), ("b", (2.0, 8.0, 33.0)))
+    }
     assert len(hashes) == 2
 
 

@@ -96,7 +96,9 @@ def test_grey_stored_as_colour_has_no_colours(tmp_path):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_one_channel_of_colour_frames_is_taken(tmp_path, dtype):
-    blue, green, red = (np.random.default_rng(seed).integers(0, 200, (3, 4)).astype(dtype) for seed in range(3))
+    blue, green, red = (
+        np.random.default_rng(seed).integers(0, 200, (3, 4)).astype(dtype) for seed in range(3)
+    )
     red[0, 0] = white = 255 if dtype == np.uint8 else 1023
     bgr = np.dstack([blue, green, red])
     (tmp_path / "a.png").write_bytes(encoded(".png", bgr))
@@ -106,5 +108,7 @@ def test_one_channel_of_colour_frames_is_taken(tmp_path, dtype):
         np.testing.assert_array_equal(images.texture, bgr[..., ::-1])
         assert images.in_colour and images.stack.dtype == dtype
     luma = read_frames([tmp_path / "a.png"], None, "luma").stack[0].astype(float)
-    np.testing.assert_allclose(luma.flat[1:], (0.114 * blue + 0.587 * green + 0.299 * red).flat[1:], atol=1)
+    np.testing.assert_allclose(
+        luma.flat[1:], (0.114 * blue + 0.587 * green + 0.299 * red).flat[1:], atol=1
+    )
     assert luma[0, 0] == white  # one channel is saturated

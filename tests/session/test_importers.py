@@ -25,8 +25,14 @@ def write(path: Path, pixels: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def write_p18(pose: Path, folders="VH", numbers=range(26), name="P18_F{:02d}.PNG", dtype=np.uint8) -> list[np.ndarray]:
-    return [write(pose / d / name.format(n), image(100 * i + n, dtype)) for i, d in enumerate(folders) for n in numbers]
+def write_p18(
+    pose: Path, folders="VH", numbers=range(26), name="P18_F{:02d}.PNG", dtype=np.uint8
+) -> list[np.ndarray]:
+    return [
+        write(pose / d / name.format(n), image(100 * i + n, dtype))
+        for i, d in enumerate(folders)
+        for n in numbers
+    ]
 
 
 def write_procam(capture: Path, count=42) -> list[np.ndarray]:
@@ -40,7 +46,10 @@ def test_p18_takes_v_then_h_with_the_texture_once(tmp_path):
     written = {name: write_p18(tmp_path / name) for name in ("pose_10", "pose_2")}
     found = p18.LAYOUT.read(tmp_path, prefix="planes")
     captures = list(found)
-    assert [capture.name for capture in captures] == ["planes_pose_2", "planes_pose_10"] and not found.warnings
+    assert [capture.name for capture in captures] == [
+        "planes_pose_2",
+        "planes_pose_10",
+    ] and not found.warnings
     assert len(found) == 2
     for capture in captures:
         sequence, whole = capture.sequence, written[capture.name.removeprefix("planes_")]
@@ -49,13 +58,19 @@ def test_p18_takes_v_then_h_with_the_texture_once(tmp_path):
         preset = presets.p18((912, 1140))
         assert sequence.frames == preset.frames[:-1]  # the preset shows its white once an axis
         np.testing.assert_array_equal(capture.frames, np.stack([*whole[:26], *whole[26:51]]))
-        assert capture.texture is None and capture.source.endswith(capture.name.removeprefix("planes_"))
+        assert capture.texture is None and capture.source.endswith(
+            capture.name.removeprefix("planes_")
+        )
 
 
 def test_p18_of_one_pose_one_axis_other_capitals_and_depth(tmp_path):
     write_p18(tmp_path / "scan", "h", name="p18_f{:02d}.tif", dtype=np.uint16)
     (capture,) = p18.LAYOUT.read(tmp_path / "scan", projector=(800, 600))
-    assert capture.name == "scan" and capture.sequence.axes == ("y",) and capture.sequence.projector == (800, 600)
+    assert (
+        capture.name == "scan"
+        and capture.sequence.axes == ("y",)
+        and capture.sequence.projector == (800, 600)
+    )
     assert capture.frames.shape == (26, 12, 16) and capture.frames.dtype == np.uint16
 
 
@@ -69,7 +84,9 @@ def test_p18_texture_at_f26_or_nowhere_or_twice(tmp_path):
     write(tmp_path / "pose_3/V/P18_F26.PNG", np.full((12, 16), 9, np.uint8))
     found = p18.LAYOUT.read(tmp_path)
     _, bare, double = found
-    assert [frame.kind for frame in bare.sequence.frames].count("texture") == 0 and len(bare.frames) == 50
+    assert [frame.kind for frame in bare.sequence.frames].count("texture") == 0 and len(
+        bare.frames
+    ) == 50
     assert (double.frames[25] == 9).all()
     assert missing_facts(found.warnings[0], "pose_2", "texture") == [] and len(found.warnings) == 2
     assert missing_facts(found.warnings[1], "pose_3/V", "F25", "F26") == []
@@ -268,13 +285,25 @@ def test_frames_are_what_the_toml_says(tmp_path):
         (lambda t: 'order = "time"\n' + t, ("order", "'time'", '"name"')),
         (lambda t: 'order = "name"\n' + t, ("[[frame]] 1", 'order = "name"')),
         (lambda t: t.replace("step = 1", "step = 1\nexposure_ms = 4"), ("3 of 4", "exposure_ms")),
-        (lambda t: t + '\n[[frames]]\nkind = "white"\nfiles = "w.png"', ("[[frame]]", "[[frames]]")),
+        (
+            lambda t: t + '\n[[frames]]\nkind = "white"\nfiles = "w.png"',
+            ("[[frame]]", "[[frames]]"),
+        ),
         (lambda t: t.replace('"c.png"', '"../c.png"'), ("[[frame]] 3", '"../c.png"')),
         (lambda t: t.replace("projector =", "projectr ="), ("'projectr'", "projector")),
-        (lambda t: t.replace('kind = "white"', 'kind = "blue"'), ("[[frame]] 4", "white.png", "'blue'")),
-        (lambda t: t.replace('kind = "white"', 'kind = ["white"]'), ("[[frame]] 4", "white.png", "kind", "['white']")),
+        (
+            lambda t: t.replace('kind = "white"', 'kind = "blue"'),
+            ("[[frame]] 4", "white.png", "'blue'"),
+        ),
+        (
+            lambda t: t.replace('kind = "white"', 'kind = ["white"]'),
+            ("[[frame]] 4", "white.png", "kind", "['white']"),
+        ),
         (lambda t: t.replace("step = 1", "stp = 1"), ("[[frame]] 2", "sub/b.png", "'stp'")),
-        (lambda t: t.replace("step = 1", 'step = "one"'), ("[[frame]] 2", "sub/b.png", "phase", "number")),
+        (
+            lambda t: t.replace("step = 1", 'step = "one"'),
+            ("[[frame]] 2", "sub/b.png", "phase", "number"),
+        ),
         (lambda t: t.replace("step = 1", "step = 0"), ("phase step 1 of 3",)),
         (lambda t: t.replace('file = "c.png"', ""), ("[[frame]] 3", "file")),
         (lambda t: t.replace("c.png", "d.png"), ("capture", "d.png")),
@@ -293,7 +322,9 @@ def test_frames_toml_faults_are_named(tmp_path, edit, facts):
 
 def test_frames_projector_given_beside_the_toml(tmp_path):
     toml = write_frames(tmp_path, edit=lambda text: text.replace('projector = "96x64"', ""))
-    assert frames_layout.LAYOUT.read(tmp_path, toml, projector=(96, 64)).recordings[0].sequence.projector == (96, 64)
+    assert frames_layout.LAYOUT.read(tmp_path, toml, projector=(96, 64)).recordings[
+        0
+    ].sequence.projector == (96, 64)
     assert frames_layout.LAYOUT.read(tmp_path, toml).recordings[0].sequence.projector_size is None
     toml = write_frames(tmp_path)
     frames_layout.LAYOUT.read(tmp_path, toml, projector=(96, 64))
@@ -322,7 +353,9 @@ files = "t*_[0?_*].png"
 kind = "white"
 files = ["white.png"]
 """
-GROUP_FILES = [f"fringe_{n}.png" for n in range(6, 12)] + [f"t{9 + n}.{n}_[0{n % 2}_{n}].png" for n in range(4)]
+GROUP_FILES = [f"fringe_{n}.png" for n in range(6, 12)] + [
+    f"t{9 + n}.{n}_[0{n % 2}_{n}].png" for n in range(4)
+]
 
 
 def write_groups(folder: Path, names: list[str], toml: str) -> Path:
@@ -355,7 +388,9 @@ def test_groups_take_their_files_by_pattern_in_natural_order(tmp_path):
 
 def test_groups_in_order_of_the_names(tmp_path):
     ordered = "\n".join(
-        line for line in GROUPS.format(top='order = "name"').splitlines() if not line.startswith("files")
+        line
+        for line in GROUPS.format(top='order = "name"').splitlines()
+        if not line.startswith("files")
     )
     toml = write_groups(tmp_path, [f"{n}.bmp" for n in range(11)], ordered)
     (capture,) = frames_layout.LAYOUT.read(tmp_path, toml)
@@ -370,12 +405,21 @@ def test_groups_in_order_of_the_names(tmp_path):
     [
         ("bits = 3", ["gray 0", "gray 1", "gray 2"]),
         ("bits = 2\ncomplementary = true", ["gray 0", "gray 1", "complementary 0"]),
-        ("bits = 2\nmsb_first = false\ncomplementary = true", ["complementary 0", "gray 1", "gray 0"]),
-        ("bits = 2\nmsb_first = false\ninverse = true", ["gray 1", "inverse 1", "gray 0", "inverse 0"]),
+        (
+            "bits = 2\nmsb_first = false\ncomplementary = true",
+            ["complementary 0", "gray 1", "gray 0"],
+        ),
+        (
+            "bits = 2\nmsb_first = false\ninverse = true",
+            ["gray 1", "inverse 1", "gray 0", "inverse 0"],
+        ),
     ],
 )
 def test_gray_groups(tmp_path, text, kinds):
-    toml = 'order = "name"\n[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 3\nperiod_px = 16\n[[frames]]\n'
+    toml = (
+        'order = "name"\n[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 3\nperiod_px ='
+        " 16\n[[frames]]\n"
+    )
     path = write_groups(tmp_path, [], f'{toml}kind = "gray"\naxis = "x"\n{text}')
     frames = frames_layout.read_description(path).sequence.frames
     assert [f"{frame.kind} {frame.bit}" for frame in frames[3:]] == kinds
@@ -389,21 +433,27 @@ def test_gray_groups(tmp_path, text, kinds):
         ("steps = 3", "steps = 2", ("[[frames]] 1", "phase x", "steps")),
         ("16.0]", '"16"]', ("[[frames]] 1", "str", "period_px")),
         ("inverse = true", "inverse = 1", ("[[frames]] 2", "bool", "inverse")),
-        ('files = ["white.png"]', 'files = ["a.png", "b.png"]', ("[[frames]] 3", "2 files", "1 images")),
+        (
+            'files = ["white.png"]',
+            'files = ["a.png", "b.png"]',
+            ("[[frames]] 3", "2 files", "1 images"),
+        ),
         ('kind = "white"', 'kind = "flat"', ("[[frames]] 3", "'flat'", "kind")),
         ('files = "fringe_*.png"', "", ("[[frames]] 1", "phase x", "file")),
         ('files = ["white.png"]', 'files = "fringe_6.*"', ("fringe_6.png", "two patterns")),
     ],
 )
 def test_faults_in_groups_are_named(tmp_path, old, new, facts):
-    toml = write_groups(tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top="").replace(old, new))
+    toml = write_groups(
+        tmp_path, [*GROUP_FILES, "white.png"], GROUPS.format(top="").replace(old, new)
+    )
     with raises(InputError, *facts):
         frames_layout.LAYOUT.read(tmp_path, toml)
 
 
 def test_brackets_of_exposures_become_one_capture(tmp_path):
     text = 'projector = "96x64"\n' + "".join(
-        f'[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 3\nperiod_px = 96\n'
+        '[[frames]]\nkind = "phase"\naxis = "x"\nsteps = 3\nperiod_px = 96\n'
         f'exposure_ms = {exposure}\nfiles = "{exposure}ms/*.png"\n'
         for exposure in (20, 5)
     )
@@ -412,7 +462,9 @@ def test_brackets_of_exposures_become_one_capture(tmp_path):
     assert capture.exposures_ms == (20.0, 5.0) and len(capture.sequence.frames) == 3
     np.testing.assert_array_equal(capture.frames, [image(seed) for seed in range(6)])
     longest = capture.frames[:3].max(0) < 255
-    np.testing.assert_array_equal(capture.merged_frames(), np.where(longest, capture.frames[:3], capture.frames[3:]))
+    np.testing.assert_array_equal(
+        capture.merged_frames(), np.where(longest, capture.frames[:3], capture.frames[3:])
+    )
     (tmp_path / "sequence.toml").write_text(text.replace("steps = 3", "steps = 4", 1))
     with raises(InputError, 20, "5 ms"):
         frames_layout.LAYOUT.read(tmp_path, tmp_path / "sequence.toml")
@@ -443,7 +495,9 @@ def test_frames_of_a_real_scene(real_data, tmp_path):
     toml.write_text(DAVID)
     (capture,) = frames_layout.LAYOUT.read(real_data / "slmaster_david" / "L", toml)
     assert capture.name == "L" and capture.frames.shape == (10, 1536, 2048)
-    assert capture.sequence.projector_size is None and capture.sequence.frames[9] == Frame("complementary", "x")
+    assert capture.sequence.projector_size is None and capture.sequence.frames[9] == Frame(
+        "complementary", "x"
+    )
     a, b, c, d = capture.frames[:4, ::8, ::8].astype(float)
     modulation = np.hypot(a - c, b - d) / 2
     assert 0.6 < (modulation > 6).mean() < 0.8  # INFO.md: 70 % of the pixels

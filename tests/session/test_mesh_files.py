@@ -1,4 +1,5 @@
-"""What is written for other programs is read back by other programs: as it was, and in its true size."""
+"""What is written for other programs is read back by other programs: as it was, and in its true
+size."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -53,12 +54,18 @@ def test_trimesh_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
     near(unit * found.extents, SIZE, 1e-5)
     if suffix == "stl":
         near(found.triangles, MESH.vertices[MESH.faces])
-        near(found.face_normals, trimesh.Trimesh(MESH.vertices, MESH.faces, process=False).face_normals, 1e-4)
+        near(
+            found.face_normals,
+            trimesh.Trimesh(MESH.vertices, MESH.faces, process=False).face_normals,
+            1e-4,
+        )
         return
     turned = [1, -1, -1] if suffix == "glb" else [1, 1, 1]  # y up, z towards the viewer
     near(unit * found.vertices, MESH.vertices * turned)
     assert np.array_equal(found.faces, MESH.faces)
-    if suffix == "glb":  # beside a material, trimesh keeps the colours as an attribute of the scene's mesh
+    if (
+        suffix == "glb"
+    ):  # beside a material, trimesh keeps the colours as an attribute of the scene's mesh
         ((_, found),) = trimesh.load(path, process=False).geometry.items()
         painted = found.visual.vertex_attributes["color"]
     else:
@@ -75,7 +82,9 @@ def test_trimesh_reads_3mf_in_millimetres(tmp_path: Path) -> None:
     assert scene.units == "millimeter"
     assert len(scene.to_mesh().faces) == len(MESH.faces)
     near(scene.extents, SIZE, 1e-5)
-    assert estimated_bytes("3mf", len(MESH.vertices), len(MESH.faces)) == pytest.approx(size, rel=0.5)
+    assert estimated_bytes("3mf", len(MESH.vertices), len(MESH.faces)) == pytest.approx(
+        size, rel=0.5
+    )
     with raises(InputError, "cloud.3mf", "triangles", ".ply"):
         write_shape(tmp_path / "cloud.3mf", POINTS)
 
@@ -89,7 +98,8 @@ def test_pye57_reads_points_in_metres_and_their_colours(tmp_path: Path) -> None:
     file.close()
     near(1000 * np.stack([found[f"cartesian{each}"] for each in "XYZ"], axis=1), POINTS.points)
     assert np.array_equal(
-        np.stack([found[f"color{each}"] for each in ("Red", "Green", "Blue")], axis=1), POINTS.colours
+        np.stack([found[f"color{each}"] for each in ("Red", "Green", "Blue")], axis=1),
+        POINTS.colours,
     )
     assert estimated_bytes("e57", len(POINTS.points)) == pytest.approx(size, rel=0.05)
     assert [each.name for each in tmp_path.iterdir()] == ["cloud.e57"]
@@ -120,7 +130,11 @@ def test_open3d_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
     if suffix == "stl":
         near(corners, MESH.vertices[MESH.faces])
     else:
-        near(np.asarray(found.vertex_colors)[np.asarray(found.triangles)] * 255, MESH.colours[MESH.faces], 0.02)  # type: ignore[index]
+        near(
+            np.asarray(found.vertex_colors)[np.asarray(found.triangles)] * 255,
+            MESH.colours[MESH.faces],
+            0.02,
+        )  # type: ignore[index]
 
 
 @pytest.mark.parametrize("suffix", POINT_FORMATS[:3])

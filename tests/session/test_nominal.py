@@ -1,4 +1,5 @@
-"""Nominal models from files: read where they are sound, refused in words where they are not, never rescaled unasked."""
+"""Nominal models from files: read where they are sound, refused in words where they are not, never
+rescaled unasked."""
 
 import errno
 import os
@@ -30,7 +31,9 @@ def test_every_format_gives_the_same_closed_mesh(tmp_path: Path) -> None:
         BALL.export(tmp_path / name, **options)
         found = read_nominal(tmp_path / name)
         assert found.closed and not found.notes and found.units is None
-        assert len(found.mesh.faces) == len(BALL.faces) and len(found.mesh.vertices) == len(BALL.vertices)
+        assert len(found.mesh.faces) == len(BALL.faces) and len(found.mesh.vertices) == len(
+            BALL.vertices
+        )
         assert found.size_mm == pytest.approx([80, 80, 80], abs=1e-3)
         assert missing_facts(found.text(), name, "320 triangles", "closed") == []
 
@@ -38,7 +41,9 @@ def test_every_format_gives_the_same_closed_mesh(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.process
 def test_step_and_3mf_state_their_units(tmp_path: Path) -> None:
-    plate = read_nominal(PLATE)  # 60 x 40 x 8 mm with a bore of radius 12, and a pin of radius 5 and height 6
+    plate = read_nominal(
+        PLATE
+    )  # 60 x 40 x 8 mm with a bore of radius 12, and a pin of radius 5 and height 6
     assert plate.closed and plate.units == "mm" and len(plate.notes) == 1
     assert missing_facts(plate.notes[0], "0.005 mm") == []
     assert plate.size_mm == pytest.approx([60, 40, 14], abs=1e-5)
@@ -51,7 +56,9 @@ def test_step_and_3mf_state_their_units(tmp_path: Path) -> None:
     model = tmp_path / "ball.3mf"
     BALL.export(model)
     ball = read_nominal(model, "inch")
-    assert ball.units == "mm" and ball.closed and ball.size_mm == pytest.approx([80, 80, 80], abs=1e-3)
+    assert (
+        ball.units == "mm" and ball.closed and ball.size_mm == pytest.approx([80, 80, 80], abs=1e-3)
+    )
     with zipfile.ZipFile(model) as archive, zipfile.ZipFile(tmp_path / "inch.3mf", "w") as other:
         for name in archive.namelist():
             other.writestr(name, archive.read(name).replace(b'unit="millimeter"', b'unit="inch"'))
@@ -86,7 +93,9 @@ def test_damaged_cad_models_are_refused(tmp_path: Path, suffix: str, damage: str
         read_nominal(path)
 
 
-def test_triangles_are_turned_outwards_and_empty_ones_left_out_and_it_is_said(tmp_path: Path) -> None:
+def test_triangles_are_turned_outwards_and_empty_ones_left_out_and_it_is_said(
+    tmp_path: Path,
+) -> None:
     mixed = BALL.copy()
     mixed.faces[::3] = mixed.faces[::3, ::-1]
     mixed.export(tmp_path / "mixed.ply")
@@ -95,13 +104,17 @@ def test_triangles_are_turned_outwards_and_empty_ones_left_out_and_it_is_said(tm
     inside.export(tmp_path / "inside.stl")
     for name, facts in (("mixed.ply", ("turned",)), ("inside.stl", ("inwards", "turned"))):
         found = read_nominal(tmp_path / name)
-        assert found.closed and len(found.notes) == 1 and missing_facts(found.notes[0], *facts) == []
+        assert (
+            found.closed and len(found.notes) == 1 and missing_facts(found.notes[0], *facts) == []
+        )
         a, b, c = (found.mesh.vertices[found.mesh.faces[:, k]] for k in range(3))
         assert (np.sum(np.cross(b - a, c - a) * (a + b + c), axis=1) > 0).all()
     faces = np.concatenate([BALL.faces, [[0, 0, 1], [2, 3, 3]]])
     trimesh.Trimesh(BALL.vertices, faces, process=False).export(tmp_path / "flat.ply")
     found = read_nominal(tmp_path / "flat.ply")
-    assert len(found.mesh.faces) == 320 and missing_facts(found.notes[0], "2 of 322 triangles") == []
+    assert (
+        len(found.mesh.faces) == 320 and missing_facts(found.notes[0], "2 of 322 triangles") == []
+    )
     trimesh.Trimesh(BALL.vertices, BALL.faces[:200], process=False).export(tmp_path / "open.ply")
     assert not read_nominal(tmp_path / "open.ply").closed
     assert missing_facts(read_nominal(tmp_path / "open.ply").notes[0], "open") == []
@@ -127,8 +140,9 @@ def hostile(folder: Path) -> dict[str, tuple[bytes, str]]:
     stl, ply = (folder / "s.stl").read_bytes(), (folder / "p.ply").read_bytes()
     body = ply.index(b"end_header\n") + 11
     ascii_header = (
-        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-        b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty"
+        b" float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0"
+        b" 0\n0 1 0\n"
     )
     return {
         "short.stl": (stl[:-100], "320 triangles"),
@@ -195,7 +209,9 @@ def test_size_and_triangles_are_limited_before_anything_is_loaded(tmp_path: Path
         (0.001, ("--units mm", "138,564 mm", "1,040 times smaller")),
     ],
 )
-def test_other_units_are_asked_for_with_both_sizes(tmp_path: Path, factor: float, facts: tuple[str, ...]) -> None:
+def test_other_units_are_asked_for_with_both_sizes(
+    tmp_path: Path, factor: float, facts: tuple[str, ...]
+) -> None:
     scan = BALL.vertices.astype(np.float64)
     small = BALL.copy()
     small.apply_scale(1 / factor)
@@ -203,7 +219,9 @@ def test_other_units_are_asked_for_with_both_sizes(tmp_path: Path, factor: float
     with raises(InputError, "b.stl", *facts):
         check_size(read_nominal(tmp_path / "b.stl"), scan)
     check_size(read_nominal(tmp_path / "b.stl", "mm"), scan)  # the operator has said so
-    assert read_nominal(tmp_path / "b.stl").size_mm.max() == pytest.approx(80 / factor, rel=1e-3)  # as it was
+    assert read_nominal(tmp_path / "b.stl").size_mm.max() == pytest.approx(
+        80 / factor, rel=1e-3
+    )  # as it was
 
 
 def test_units_that_are_given_are_taken(tmp_path: Path) -> None:
@@ -213,4 +231,6 @@ def test_units_that_are_given_are_taken(tmp_path: Path) -> None:
     found = read_nominal(tmp_path / "b.stl", "inch")
     assert found.size_mm == pytest.approx([80, 80, 80], rel=1e-3)
     check_size(found, BALL.vertices)
-    check_size(read_nominal(tmp_path / "b.stl"), BALL.vertices / 25.4 * 3)  # three times larger: a part of it, or more
+    check_size(
+        read_nominal(tmp_path / "b.stl"), BALL.vertices / 25.4 * 3
+    )  # three times larger: a part of it, or more

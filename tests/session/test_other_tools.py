@@ -1,4 +1,5 @@
-"""The patterns of other tools, made here by their own formulae: a camera that sees them decodes its own pixels."""
+"""The patterns of other tools, made here by their own formulae: a camera that sees them decodes its
+own pixels."""
 
 from pathlib import Path
 
@@ -27,7 +28,9 @@ def write(path: Path, pattern: np.ndarray) -> None:
 
 def cosines(steps: int, pitch: float, at: np.ndarray) -> list[np.ndarray]:
     """SLStudio's pstools::computePhaseVector."""
-    return [0.5 * (1 + np.cos(2 * np.pi * at / pitch - 2 * np.pi * k / steps)) for k in range(steps)]
+    return [
+        0.5 * (1 + np.cos(2 * np.pi * at / pitch - 2 * np.pi * k / steps)) for k in range(steps)
+    ]
 
 
 def bit_of(at: np.ndarray, place: int) -> np.ndarray:
@@ -45,7 +48,9 @@ def decoded_error(capture: NewCapture, axis: str) -> np.ndarray:
 def slstudio_frames(codec: str) -> list[np.ndarray]:
     """Both axes, or the columns alone for the codecs of one axis."""
     if codec == "gray":
-        bits = [bit_of(U, 9 - p) for p in range(10)] + [bit_of(V, 6 - p) for p in range(6)]  # of 10 and of 7
+        bits = [bit_of(U, 9 - p) for p in range(10)] + [
+            bit_of(V, 6 - p) for p in range(6)
+        ]  # of 10 and of 7
         return [np.ones(U.shape), np.zeros(U.shape), *bits]
     frames: list[np.ndarray] = []
     for at, extent in ((U, COLUMNS), (V, ROWS)):
@@ -115,7 +120,9 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
         opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
     found = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
-    other = (2000, ROWS) if shadow else (COLUMNS, 60)  # as many images as another projector without, or with them
+    other = (
+        (2000, ROWS) if shadow else (COLUMNS, 60)
+    )  # as many images as another projector without, or with them
     with pytest.raises(InputError):
         opencv_graycode.LAYOUT.read(tmp_path, projector=other, files="pattern_cam1_*")
     with raises(InputError, f"{len(patterns)} images", "4000x120", 40):
@@ -166,5 +173,7 @@ def test_sltk_captures_of_a_real_rig(real_data):
     assert [recording.name for recording in found.recordings] == ["scan_0020", "scan_0021"]
     sequence, files = found.recordings[0].sequence, found.recordings[0].files
     assert len(files) == 44 and [frame.axis for frame in sequence.frames] == ["x"] * 22 + ["y"] * 22
-    assert [frame.bit for frame in sequence.frames[:4]] == [0, 0, 1, 1] and sequence.frames[43].kind == "inverse"
+    assert [frame.bit for frame in sequence.frames[:4]] == [0, 0, 1, 1] and sequence.frames[
+        43
+    ].kind == "inverse"
     assert layouts.detect_layout(real_data / "kamino_procam_jpg90") == "procam-calibration"

@@ -72,11 +72,19 @@ def test_open3d_reads_it(tmp_path: Path) -> None:
 def test_what_is_not_known_is_no_nan_in_the_file(tmp_path: Path) -> None:
     normals, sigma = NORMALS.copy(), SIGMA.copy()
     normals[:3], sigma[5] = np.nan, np.nan
-    write_ply(tmp_path / "a.ply", POINTS, normals=normals, scalars={"sigma_noise": sigma}, notes=["é\nof a scan"])
+    write_ply(
+        tmp_path / "a.ply",
+        POINTS,
+        normals=normals,
+        scalars={"sigma_noise": sigma},
+        notes=["é\nof a scan"],
+    )
     ply = read_ply(tmp_path / "a.ply")
     assert ply.normals is not None and np.isnan(ply.normals[:3]).all()
     assert np.array_equal(ply.normals[3:], NORMALS[3:])
-    assert np.isnan(ply.scalars["sigma_noise"][5]) and np.array_equal(ply.scalars["sigma_noise"][6:], SIGMA[6:])
+    assert np.isnan(ply.scalars["sigma_noise"][5]) and np.array_equal(
+        ply.scalars["sigma_noise"][6:], SIGMA[6:]
+    )
     assert b"comment ? of a scan\n" in (tmp_path / "a.ply").read_bytes()
 
 
@@ -96,13 +104,17 @@ def test_what_is_not_known_is_no_nan_in_the_file(tmp_path: Path) -> None:
         ({"faces": [[0, 1]]}, ("(1, 2)", "(m, 3)")),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path: Path, arguments: dict, facts: tuple[str, ...]) -> None:
+def test_what_does_not_fit_is_refused(
+    tmp_path: Path, arguments: dict, facts: tuple[str, ...]
+) -> None:
     with raises(InputError, *facts):
         write_ply(tmp_path / "a.ply", **{"points": POINTS, **arguments})
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failed_write_keeps_the_older_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_keeps_the_older_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.ply"
     write_ply(path, POINTS)
     before = path.read_bytes()
@@ -133,6 +145,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(InputError):
         read_ply(path)
-    path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty short q\nend_header\n")
+    path.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty short q\nend_header\n"
+    )
     with raises(InputError, "a.ply", "q"):
         read_ply(path)

@@ -1,4 +1,5 @@
-"""Laws of every reader of files: any bytes and any values give a typed value or one of our errors, nothing else."""
+"""Laws of every reader of files: any bytes and any values give a typed value or one of our errors,
+nothing else."""
 
 import functools
 import html
@@ -52,8 +53,11 @@ FEW, MANY = 8, 80
 """Examples of each law: by default, and in the slow tier."""
 
 
-def law(few: int = FEW, many: int = MANY, **drawn: st.SearchStrategy[Any]) -> Callable[[Callable[..., None]], Any]:
-    """Decorate a test of drawn values: it is run on few examples, and a slow test of its name and `_often` on many."""
+def law(
+    few: int = FEW, many: int = MANY, **drawn: st.SearchStrategy[Any]
+) -> Callable[[Callable[..., None]], Any]:
+    """Decorate a test of drawn values: it is run on few examples, and a slow test of its name and
+    `_often` on many."""
 
     def decorate(check: Callable[..., None]) -> Any:
         """Return the test of few examples, and define the other one."""
@@ -65,7 +69,11 @@ def law(few: int = FEW, many: int = MANY, **drawn: st.SearchStrategy[Any]) -> Ca
 
 
 _TEXTS = st.text(max_size=8) | st.sampled_from(["\x1b[2J", "\u202e", "~nobody", "../x", "9" * 500])
-_NUMBERS = st.floats() | st.integers() | st.sampled_from([10**30, 2**63, -1, 1e308, float("nan"), float("inf")])
+_NUMBERS = (
+    st.floats()
+    | st.integers()
+    | st.sampled_from([10**30, 2**63, -1, 1e308, float("nan"), float("inf")])
+)
 _VALUES = st.recursive(
     st.none() | st.booleans() | _NUMBERS | _TEXTS,
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(_TEXTS, inner, max_size=4),
@@ -74,7 +82,8 @@ _VALUES = st.recursive(
 
 
 def _read(read: Callable[[], Any]) -> Any:
-    """Return what a reader returns; None where it raises one of our errors, whose message a terminal can show."""
+    """Return what a reader returns; None where it raises one of our errors, whose message a
+    terminal can show."""
     try:
         return read()
     except SlviewerError as error:
@@ -85,7 +94,8 @@ def _read(read: Callable[[], Any]) -> Any:
 
 @st.composite
 def _damaged(draw: st.DrawFn, sound: Any) -> Any:
-    """Draw plain values like ``sound`` ones, with one of them, at any depth, replaced or missing."""
+    """Draw plain values like ``sound`` ones, with one of them, at any depth, replaced or
+    missing."""
     if not isinstance(sound, dict | list) or not sound or draw(st.integers(0, 9)) == 0:
         return draw(_VALUES)
     key = draw(st.sampled_from(sorted(sound) if isinstance(sound, dict) else range(len(sound))))
@@ -101,7 +111,11 @@ def _damaged_bytes(sound: bytes) -> st.SearchStrategy[bytes]:
     """Return a strategy of any bytes, and of ``sound`` ones cut short or with some replaced."""
     cut = st.integers(0, len(sound)).map(lambda n: sound[:n])
     patch = st.tuples(st.integers(0, len(sound)), st.binary(max_size=6))
-    return st.binary(max_size=200) | cut | patch.map(lambda p: sound[: p[0]] + p[1] + sound[p[0] + len(p[1]) :])
+    return (
+        st.binary(max_size=200)
+        | cut
+        | patch.map(lambda p: sound[: p[0]] + p[1] + sound[p[0] + len(p[1]) :])
+    )
 
 
 @pytest.fixture
@@ -111,15 +125,28 @@ def full(session: Session) -> Session:
     session.save_capture("scan", "scan", sequence, np.zeros((4, 6, 8), np.uint8), source="test")
     session.decide("excluded", {"scan": "dark"})
     session.decide("levels", [0, 255])
-    meta = {"kind": "point", "name": "a", "source": "scan", "model": "stereo", "time": "", "data": {"scale": 1.0}}
-    session.save_result("measurements/m1", {**meta, "of": [], "inputs": session.input_hashes("scan")}, {"K": np.eye(3)})
+    meta = {
+        "kind": "point",
+        "name": "a",
+        "source": "scan",
+        "model": "stereo",
+        "time": "",
+        "data": {"scale": 1.0},
+    }
+    session.save_result(
+        "measurements/m1",
+        {**meta, "of": [], "inputs": session.input_hashes("scan")},
+        {"K": np.eye(3)},
+    )
     return session
 
 
 def _use_capture(store: Session) -> None:
     """Use every entry of a capture."""
     capture = store.load_capture("scan")
-    assert capture.frames.shape == (4, capture.size[1], capture.size[0]) and isinstance(capture.exposures_ms, tuple)
+    assert capture.frames.shape == (4, capture.size[1], capture.size[0]) and isinstance(
+        capture.exposures_ms, tuple
+    )
 
 
 def _use_decisions(store: Session) -> None:
@@ -131,7 +158,9 @@ def _use_decisions(store: Session) -> None:
 def _use_result(store: Session) -> None:
     """Use a result's meta and arrays, and its state."""
     meta, arrays = store.load_result("measurements/m1")
-    assert isinstance(meta["name"], str) and all(isinstance(array, np.ndarray) for array in arrays.values())
+    assert isinstance(meta["name"], str) and all(
+        isinstance(array, np.ndarray) for array in arrays.values()
+    )
     assert store.state_of("measurements/m1") in ("fresh", "stale")
 
 
@@ -142,16 +171,25 @@ _RECORDS: dict[str, Callable[[Session], object]] = {
     "results/measurements/m1/meta.json": _use_result,
     "session.json": lambda store: Session.open(store.folder).close(),
 }
-_LISTED = {"changes": [["results/measurements/m1", None, "trash/m1"], ["results/a", "results/.a.tmp-1-ab", None]]}
+_LISTED = {
+    "changes": [
+        ["results/measurements/m1", None, "trash/m1"],
+        ["results/a", "results/.a.tmp-1-ab", None],
+    ]
+}
 
 
 @law(data=st.data())
 @pytest.mark.parametrize("name", _RECORDS)
-def test_a_damaged_record_is_refused_or_typed(full: Session, name: str, data: st.DataObject) -> None:
+def test_a_damaged_record_is_refused_or_typed(
+    full: Session, name: str, data: st.DataObject
+) -> None:
     path = full.folder / name
     sound = path.read_bytes()
     _RECORDS[name](full)
-    damage = _damaged(json.loads(sound)).map(lambda values: json.dumps(values).encode()) | _damaged_bytes(sound)
+    damage = _damaged(json.loads(sound)).map(
+        lambda values: json.dumps(values).encode()
+    ) | _damaged_bytes(sound)
     path.write_bytes(data.draw(damage))
     try:
         _read(lambda: _RECORDS[name](full))
@@ -170,13 +208,17 @@ def test_a_damaged_array_is_refused_or_read(full: Session, data: st.DataObject) 
 
 
 @law(data=st.data())
-def test_a_damaged_list_of_changes_is_finished_or_discarded(tmp_path: Path, data: st.DataObject) -> None:
+def test_a_damaged_list_of_changes_is_finished_or_discarded(
+    tmp_path: Path, data: st.DataObject
+) -> None:
     """And nothing beside the session changes."""
     folder = Path(tempfile.mkdtemp(dir=tmp_path)) / "session"
     Session.create(folder).close()
     (folder.parent / "results").mkdir()
     sound = json.dumps(_LISTED).encode()
-    damage = _damaged(_LISTED).map(lambda values: json.dumps(values).encode()) | _damaged_bytes(sound)
+    damage = _damaged(_LISTED).map(lambda values: json.dumps(values).encode()) | _damaged_bytes(
+        sound
+    )
     (folder / ".together.new-1-ab").write_bytes(data.draw(damage))
     Session.open(folder, write=True).close()
     assert not list(folder.glob(".together*")) and len(list(folder.parent.iterdir())) == 2
@@ -198,11 +240,34 @@ def _asset(name: str) -> dict[str, Any]:
     return read_toml(asset(kind) / file)
 
 
-_FRAMES = [frame.to_dict() | {"file": f"{i}.png"} for i, frame in enumerate(phase_steps("x", 3, 96.0))]
-_SPHERE = {"name": "ball", "kind": "sphere", "region": {"kind": "ball", "centre": [0.0, 0.0, 500.0], "size": [150.0]}}
-_SIZE = {"name": "d", "kind": "diameter", "features": ["ball"], "nominal": 250.0, "lower": 249.0, "upper": 251.0}
-_PLAN = {"version": 1, "name": "plan", "alignment": {"kind": "none"}, "feature": [_SPHERE], "characteristic": [_SIZE]}
-_BOX = {"centre_mm": [0.0, 0.0, 600.0], "size_mm": [9.0, 9.0, 9.0], "rotation_deg": [0.0, 10.0, 0.0]}
+_FRAMES = [
+    frame.to_dict() | {"file": f"{i}.png"} for i, frame in enumerate(phase_steps("x", 3, 96.0))
+]
+_SPHERE = {
+    "name": "ball",
+    "kind": "sphere",
+    "region": {"kind": "ball", "centre": [0.0, 0.0, 500.0], "size": [150.0]},
+}
+_SIZE = {
+    "name": "d",
+    "kind": "diameter",
+    "features": ["ball"],
+    "nominal": 250.0,
+    "lower": 249.0,
+    "upper": 251.0,
+}
+_PLAN = {
+    "version": 1,
+    "name": "plan",
+    "alignment": {"kind": "none"},
+    "feature": [_SPHERE],
+    "characteristic": [_SIZE],
+}
+_BOX = {
+    "centre_mm": [0.0, 0.0, 600.0],
+    "size_mm": [9.0, 9.0, 9.0],
+    "rotation_deg": [0.0, 10.0, 0.0],
+}
 _TABLES: dict[str, tuple[dict[str, Any], Callable[[Path], object]]] = {
     "frames": ({"projector": "96x64", "phase_sign": 1, "frame": _FRAMES}, read_description),
     "artefact": (_asset("artefacts/sphere_196.toml"), read_artefact),
@@ -216,7 +281,9 @@ _TABLES: dict[str, tuple[dict[str, Any], Callable[[Path], object]]] = {
 
 @law(data=st.data())
 @pytest.mark.parametrize("name", _TABLES)
-def test_a_damaged_table_is_refused_or_typed(tmp_path: Path, name: str, data: st.DataObject) -> None:
+def test_a_damaged_table_is_refused_or_typed(
+    tmp_path: Path, name: str, data: st.DataObject
+) -> None:
     sound, read = _TABLES[name]
     path = tmp_path / "table.toml"
     path.touch(0o600)
@@ -234,23 +301,40 @@ def _to_toml(values: Any) -> bytes:
         """Return a value that TOML can hold."""
         if isinstance(value, dict):
             return {key: known(each) for key, each in value.items() if each is not None}
-        return [known(each) for each in value if each is not None] if isinstance(value, list) else value
+        return (
+            [known(each) for each in value if each is not None]
+            if isinstance(value, list)
+            else value
+        )
 
-    table = known(values) if isinstance(values, dict) else {"a": known(values if values is not None else "")}
-    return "".join(f"{format_value(key)} = {format_value(value)}\n" for key, value in table.items()).encode()
+    table = (
+        known(values)
+        if isinstance(values, dict)
+        else {"a": known(values if values is not None else "")}
+    )
+    return "".join(
+        f"{format_value(key)} = {format_value(value)}\n" for key, value in table.items()
+    ).encode()
 
 
 @law(data=st.data())
 @pytest.mark.parametrize("kind", ["ply", "stl", "obj", "png", "tif", "nominal.ply"])
-def test_a_damaged_file_of_points_or_pixels_is_refused_or_read(tmp_path: Path, kind: str, data: st.DataObject) -> None:
+def test_a_damaged_file_of_points_or_pixels_is_refused_or_read(
+    tmp_path: Path, kind: str, data: st.DataObject
+) -> None:
     path = tmp_path / f"file.{kind}"
     points = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]], np.float32)
     faces = np.array([[0, 1, 2], [0, 1, 3]])
     read: Callable[[Path], Any]
     if kind in ("png", "tif"):
-        sound, read = cv2.imencode(f".{kind}", np.arange(48, dtype=np.uint8).reshape(6, 8))[1].tobytes(), read_image
+        sound, read = (
+            cv2.imencode(f".{kind}", np.arange(48, dtype=np.uint8).reshape(6, 8))[1].tobytes(),
+            read_image,
+        )
     elif kind == "stl":
-        facets = np.zeros(2, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]))
+        facets = np.zeros(
+            2, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        )
         facets["corners"] = points[faces]
         sound, read = bytes(80) + (2).to_bytes(4, "little") + facets.tobytes(), read_nominal
     elif kind == "obj":
@@ -265,7 +349,13 @@ def test_a_damaged_file_of_points_or_pixels_is_refused_or_read(tmp_path: Path, k
 
 
 _CERTIFIED = {
-    **{"schema": 1, "session": "s", "software": {}, "results": {}, "figures": {"verify/a": {"rms_mm": 1.0}}},
+    **{
+        "schema": 1,
+        "session": "s",
+        "software": {},
+        "results": {},
+        "figures": {"verify/a": {"rms_mm": 1.0}},
+    },
     "captures": {"a": {"role": "scan", "hash": "0", "frames": ["0"]}},
 }
 
@@ -285,7 +375,8 @@ def test_a_damaged_certificate_is_refused_or_typed(tmp_path: Path, data: st.Data
 
 @functools.cache
 def _make_sound_file(kind: str) -> bytes:
-    """Return a sound file of this kind; cached, because a 3MF file holds random UUIDs and varies in size."""
+    """Return a sound file of this kind; cached, because a 3MF file holds random UUIDs and varies in
+    size."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"file.{kind}")
         if kind in ("yml", "json"):
@@ -300,7 +391,8 @@ def _make_sound_file(kind: str) -> bytes:
 @law(few=2, many=5, data=st.data())
 @pytest.mark.process
 @pytest.mark.parametrize(
-    "kind", ["yml", "json", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("step", "3mf"))]
+    "kind",
+    ["yml", "json", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("step", "3mf"))],
 )
 def test_a_damaged_file_that_another_process_parses_is_refused_or_read(
     tmp_path: Path, kind: str, data: st.DataObject

@@ -18,8 +18,28 @@ from slviewer.session.nominal import read_nominal
 from slviewer.session.reading import MAX_TOML_BYTES, expand_user, read_file, read_json, read_toml
 from slviewer.session.results import read_meta
 
-FAR_TOO_DEEP = ("[" * 100_000, '{"a":' * 100_000, '{"a": ' + "[" * 50 + "]" * 50 + "}", '{"a": 1' + "0" * 5000 + "}")
-FOREIGN = (None, True, -1, 1e308, float("inf"), 10**30, "x", "", [], {}, [[]], [None], {"a": {}}, [1.5] * 3)
+FAR_TOO_DEEP = (
+    "[" * 100_000,
+    '{"a":' * 100_000,
+    '{"a": ' + "[" * 50 + "]" * 50 + "}",
+    '{"a": 1' + "0" * 5000 + "}",
+)
+FOREIGN = (
+    None,
+    True,
+    -1,
+    1e308,
+    float("inf"),
+    10**30,
+    "x",
+    "",
+    [],
+    {},
+    [[]],
+    [None],
+    {"a": {}},
+    [1.5] * 3,
+)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder", "circle", "sparse", "missing"])
@@ -79,7 +99,11 @@ def test_an_entry_of_another_type_is_damage(session, key, value):
         meta, arrays = session.load_result("calibration/stereo")
     except SlviewerError:
         return
-    assert isinstance(meta["model"], dict) and isinstance(meta["inputs"], dict) and isinstance(meta["hash"], str)
+    assert (
+        isinstance(meta["model"], dict)
+        and isinstance(meta["inputs"], dict)
+        and isinstance(meta["hash"], str)
+    )
     assert set(arrays) <= {"K"}
 
 
@@ -100,7 +124,9 @@ def test_inputs_that_form_a_circle_or_many_paths_are_examined_once(session, monk
         session.save_result(f"{name}b", {"inputs": inputs}, {})
         session.save_result(name, {"inputs": session.input_hashes(f"{name}b") | inputs}, {})
     examined: Counter[Path] = Counter()
-    monkeypatch.setattr(store, "read_meta", lambda folder: examined.update([folder]) or read_meta(folder))
+    monkeypatch.setattr(
+        store, "read_meta", lambda folder: examined.update([folder]) or read_meta(folder)
+    )
     assert session.state_of(names[-1]) in ("fresh", "stale")
     assert max(examined.values()) <= 2  # not once for each path
     path = session.folder / "results/made/n0/meta.json"
@@ -119,7 +145,9 @@ def test_an_array_that_is_not_what_its_header_announces_is_damage(session, shape
         session.load_result("made/one")
 
 
-@pytest.mark.parametrize("key", ["excluded", "names", "model", "levels", "exposures", "rig", "measurement names"])
+@pytest.mark.parametrize(
+    "key", ["excluded", "names", "model", "levels", "exposures", "rig", "measurement names"]
+)
 @pytest.mark.parametrize("value", [3, "x", ["x"], {"x": 3}, [float("inf")]])
 def test_decisions_are_of_their_types(session, key, value):
     (session.folder / "decisions.json").write_text(json.dumps({key: value}))
@@ -141,7 +169,9 @@ def test_a_frame_has_numbers_in_range(key, value):
     assert len(sequence.frames) == 1
 
 
-@pytest.mark.parametrize("value", [float("inf"), [1e400, 2], "9" * 5000 + "x1", [[1], [2]], 10**9, "1000000x1000000"])
+@pytest.mark.parametrize(
+    "value", [float("inf"), [1e400, 2], "9" * 5000 + "x1", [[1], [2]], 10**9, "1000000x1000000"]
+)
 def test_a_size_is_two_numbers_in_range(value):
     with pytest.raises(InputError):
         parse_size(value)
@@ -151,8 +181,13 @@ def test_a_model_of_repeated_facets_is_welded(tmp_path):
     one = np.array([0, 0, 1, 0, 0, 0, 9, 0, 0, 0, 9, 0], "<f4").tobytes() + b"\0\0"
     (tmp_path / "same.stl").write_bytes(bytes(80) + (20_000).to_bytes(4, "little") + one * 20_000)
     assert len(read_nominal(tmp_path / "same.stl").mesh.faces) == 1
-    facet = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
-    (tmp_path / "parts.stl").write_bytes(b"".join(b"solid s%d\n" % i + facet + b"endsolid\n" for i in range(3000)))
+    facet = (
+        b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1"
+        b" 0\nendloop\nendfacet\n"
+    )
+    (tmp_path / "parts.stl").write_bytes(
+        b"".join(b"solid s%d\n" % i + facet + b"endsolid\n" for i in range(3000))
+    )
     assert len(read_nominal(tmp_path / "parts.stl").mesh.faces) == 1
     groups = b"".join(b"g g%d\nf 1 2 3\n" % i for i in range(3000))
     (tmp_path / "groups.obj").write_bytes(b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + groups)

@@ -1,4 +1,5 @@
-"""Captures, results and decisions: what goes in comes out, and what contradicts itself is refused."""
+"""Captures, results and decisions: what goes in comes out, and what contradicts itself is
+refused."""
 
 import json
 import os
@@ -26,7 +27,13 @@ def test_a_capture_comes_back_as_it_was(session, sequence, noise, dtype):
     frames[1] = 0  # Zarr leaves out chunks that are all fill value
     colours = np.random.default_rng(3).integers(0, np.iinfo(dtype).max, (30, 40, 3), dtype)
     saved = session.save_capture(
-        "pose_1", "calibration", sequence, frames, source="camera 1", texture=colours, settings={"exposure_ms": 8}
+        "pose_1",
+        "calibration",
+        sequence,
+        frames,
+        source="camera 1",
+        texture=colours,
+        settings={"exposure_ms": 8},
     )
     loaded = Session.open(session.folder).load_capture("pose_1")
     assert loaded == saved
@@ -51,7 +58,11 @@ def test_a_stack_with_folders_for_each_frame_is_read_too(session, sequence, fram
     stack = saved.folder / "frames.zarr"
     shutil.rmtree(stack)
     older = zarr.create_array(
-        stack, shape=frames.shape, dtype=frames.dtype, chunks=(1, *frames.shape[1:]), compressors=None
+        stack,
+        shape=frames.shape,
+        dtype=frames.dtype,
+        chunks=(1, *frames.shape[1:]),
+        compressors=None,
     )
     older[...] = frames
     assert (stack / "c" / "0" / "0" / "0").is_file()
@@ -60,7 +71,9 @@ def test_a_stack_with_folders_for_each_frame_is_read_too(session, sequence, fram
 
 def test_names_are_counted_and_safe(session, sequence, frames):
     for name in ("pose_10", "pose_2", "flat"):
-        session.save_capture(name, "calibration" if "pose" in name else "scan", sequence, frames, source="")
+        session.save_capture(
+            name, "calibration" if "pose" in name else "scan", sequence, frames, source=""
+        )
     assert session.capture_names() == ["flat", "pose_2", "pose_10"]
     assert [capture.name for capture in session.captures("calibration")] == ["pose_2", "pose_10"]
     for name in ("", "a/b", "../a", ".hidden", "a b", "-a", "a.", "é", "a\n", "x" * 200):
@@ -78,7 +91,12 @@ def test_names_are_counted_and_safe(session, sequence, frames):
         ("scan", lambda frames: frames.astype(np.float32), None, ("float32", "uint8", "uint16")),
         ("scan", lambda frames: frames[:, :0], None, ("(n, h, w)", "(4, 0, 40)")),
         ("pose", lambda frames: frames, None, ("'pose'", "'calibration'", "'scan'")),
-        ("scan", lambda frames: frames, np.zeros((30, 40), np.uint8), ("texture", "(30, 40, 3)", "(30, 40)")),
+        (
+            "scan",
+            lambda frames: frames,
+            np.zeros((30, 40), np.uint8),
+            ("texture", "(30, 40, 3)", "(30, 40)"),
+        ),
     ],
 )
 def test_frames_that_do_not_fit_are_refused(session, sequence, frames, role, bad, texture, facts):
@@ -87,7 +105,9 @@ def test_frames_that_do_not_fit_are_refused(session, sequence, frames, role, bad
     assert session.capture_names() == [] and not list((session.folder / "captures").iterdir())
 
 
-def test_a_taken_name_is_refused_and_the_replaced_capture_is_in_the_trash(session, sequence, frames):
+def test_a_taken_name_is_refused_and_the_replaced_capture_is_in_the_trash(
+    session, sequence, frames
+):
     first = session.save_capture("a", "scan", sequence, frames, source="")
     with raises(InputError, "'a'", "--force"):
         session.save_capture("a", "scan", sequence, frames[::-1], source="")
@@ -129,7 +149,9 @@ def test_captures_are_saved_all_or_none(session, sequence, frames, noise):
     np.testing.assert_array_equal(saved[2].frames, noise(2))
     assert saved[2].meta["settings"] == {"i": 2} and saved[2].meta["board"] == "circles:21x16:9"
     with pytest.raises(InputError):
-        session.save_captures([NewCapture("new", sequence, frames, None, ""), *source(False)], "calibration")
+        session.save_captures(
+            [NewCapture("new", sequence, frames, None, ""), *source(False)], "calibration"
+        )
     with pytest.raises(InputError):
         session.save_captures([NewCapture("new", sequence, frames, None, "")] * 2, "calibration")
     assert session.capture_names() == ["pose_0", "pose_1", "pose_2"]
@@ -140,7 +162,11 @@ def test_captures_are_saved_all_or_none(session, sequence, frames, noise):
 )
 def test_damage_is_an_error_and_never_a_black_frame(session, sequence, frames, damage):
     folder = session.save_capture("a", "scan", sequence, frames, source="").folder
-    chunk, array, meta = folder / "frames.zarr/c.2.0.0", folder / "frames.zarr/zarr.json", folder / "capture.json"
+    chunk, array, meta = (
+        folder / "frames.zarr/c.2.0.0",
+        folder / "frames.zarr/zarr.json",
+        folder / "capture.json",
+    )
     if damage == "missing chunk":
         chunk.unlink()
     elif damage == "short chunk":
@@ -174,7 +200,11 @@ def test_results_come_back_and_replace_each_other(session):
         "fortran": np.asfortranarray(np.arange(6).reshape(2, 3)),
     }
     for version in (1, 2):
-        session.save_result("calibration/pixelwise", {"version": version, "rms": np.float32(0.5), "inputs": {}}, arrays)
+        session.save_result(
+            "calibration/pixelwise",
+            {"version": version, "rms": np.float32(0.5), "inputs": {}},
+            arrays,
+        )
     meta, loaded = session.load_result("calibration/pixelwise")
     assert meta["version"] == 2 and meta["rms"] == 0.5
     assert loaded.keys() == arrays.keys()
@@ -183,7 +213,9 @@ def test_results_come_back_and_replace_each_other(session):
         np.testing.assert_array_equal(loaded[name], array)
     assert list(session.load_result("calibration/pixelwise", only=["mask"])[1]) == ["mask"]
     assert session.result_names() == ["calibration/pixelwise"]
-    assert [path.name for path in (session.folder / "results/calibration").iterdir()] == ["pixelwise"]
+    assert [path.name for path in (session.folder / "results/calibration").iterdir()] == [
+        "pixelwise"
+    ]
     with pytest.raises(InputError):
         session.load_result("calibration/pixelwise", only=["y"])
     with raises(InputError, "'calibration/stereo'", "calibration/pixelwise"):
@@ -208,8 +240,12 @@ def test_a_damaged_array_is_an_error(session):
 def test_a_result_is_stale_when_any_of_its_inputs_is(session, sequence, frames):
     session.save_capture("pose_1", "calibration", sequence, frames, source="")
     session.save_capture("scan_1", "scan", sequence, frames, source="")
-    session.save_result("calibration/stereo", {"inputs": session.input_hashes("pose_1")}, {"K": np.eye(3)})
-    session.save_result("clouds/scan_1", {"inputs": session.input_hashes("scan_1", "calibration/stereo")}, {})
+    session.save_result(
+        "calibration/stereo", {"inputs": session.input_hashes("pose_1")}, {"K": np.eye(3)}
+    )
+    session.save_result(
+        "clouds/scan_1", {"inputs": session.input_hashes("scan_1", "calibration/stereo")}, {}
+    )
     session.save_result("made/elsewhere", {}, {})
     results = ("calibration/stereo", "clouds/scan_1", "made/elsewhere")
     assert [session.state_of(name) for name in results] == ["fresh"] * 3
@@ -218,7 +254,9 @@ def test_a_result_is_stale_when_any_of_its_inputs_is(session, sequence, frames):
     assert [session.state_of(name) for name in results] == ["fresh"] * 3  # the same frames again
     session.save_capture("pose_1", "calibration", sequence, frames[::-1], source="", force=True)
     assert [session.state_of(name) for name in results] == ["stale", "stale", "fresh"]
-    session.save_result("calibration/stereo", {"inputs": session.input_hashes("pose_1")}, {"K": np.eye(3)})
+    session.save_result(
+        "calibration/stereo", {"inputs": session.input_hashes("pose_1")}, {"K": np.eye(3)}
+    )
     assert [session.state_of(name) for name in results] == ["fresh", "stale", "fresh"]
     session.trash_capture("pose_1")
     assert session.state_of("calibration/stereo") == "stale"
@@ -286,8 +324,13 @@ try:
 except SessionError as error:
     print(error)
 """
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.startswith("4\n") and missing_facts(said, f"process {os.getpid()}", socket.gethostname()) == []
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+    assert (
+        said.startswith("4\n")
+        and missing_facts(said, f"process {os.getpid()}", socket.gethostname()) == []
+    )
     reader = Session.open(session.folder)
     for change in (
         lambda: reader.save_capture("b", "scan", sequence, frames, source=""),
@@ -337,14 +380,21 @@ def test_sessions_from_elsewhere(tmp_path):
 def test_a_sequence_with_every_kind_survives(session, sequence, noise):
     mixed = replace(
         sequence,
-        frames=(*sequence.frames, Frame("gray", "x", bit=0, bits=1), Frame("complementary", "x"), Frame("texture")),
+        frames=(
+            *sequence.frames,
+            Frame("gray", "x", bit=0, bits=1),
+            Frame("complementary", "x"),
+            Frame("texture"),
+        ),
         gray_origin_px=1.25,
     )
     session.save_capture("a", "scan", mixed, noise(1, 7), source="")
     assert session.load_capture("a").sequence == mixed
 
 
-def test_a_session_of_the_first_schema_is_read_and_raised_when_it_is_saved_in(session, sequence, frames):
+def test_a_session_of_the_first_schema_is_read_and_raised_when_it_is_saved_in(
+    session, sequence, frames
+):
     path = session.folder / "session.json"
     described = json.loads(path.read_text())
     assert described["schema"] == 2

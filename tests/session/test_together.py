@@ -21,7 +21,8 @@ class Killed(BaseException):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Iterator[str]:
-    """A session whose results say "old"; the new calibration has three of the four. The disk syncs at once."""
+    """A session whose results say "old"; the new calibration has three of the four. The disk syncs
+    at once."""
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
     folder = tmp_path / "session"
     with Session.create(folder) as session:
@@ -31,7 +32,8 @@ def folder(tmp_path, monkeypatch) -> Iterator[str]:
 
 
 def save_new(session: Session) -> None:
-    """Replace the three results by new ones, of which one depends on another, and move the fourth to the trash."""
+    """Replace the three results by new ones, of which one depends on another, and move the fourth
+    to the trash."""
     with session.together():
         session.trash_result("calibration/splined")
         for name in NAMES:
@@ -42,7 +44,8 @@ def save_new(session: Session) -> None:
 
 
 def age(folder) -> str:
-    """The age of all results, which must be one, and of which none may be missing, half there or stale."""
+    """The age of all results, which must be one, and of which none may be missing, half there or
+    stale."""
     with Session.open(folder, write=True) as session:
         assert not atomic.list_leftovers(folder)
         (age,) = {session.load_result(name)[0]["age"] for name in NAMES}
@@ -52,7 +55,8 @@ def age(folder) -> str:
 
 
 def inject(monkeypatch, at: int, fault: BaseException) -> Callable[[], int]:
-    """Let the ``at``-th call that changes or syncs the disk raise a fault; returns the count of the calls."""
+    """Let the ``at``-th call that changes or syncs the disk raise a fault; returns the count of the
+    calls."""
     calls = 0
     for name in ("rename", "replace", "fsync", "unlink", "mkdir"):
         real = getattr(os, name)
@@ -60,7 +64,9 @@ def inject(monkeypatch, at: int, fault: BaseException) -> Callable[[], int]:
         def wrapped(*args, real=real, **options):
             nonlocal calls
             calls += 1
-            if calls == at or (isinstance(fault, Killed) and calls > at):  # nothing runs after a kill
+            if calls == at or (
+                isinstance(fault, Killed) and calls > at
+            ):  # nothing runs after a kill
                 raise fault
             return real(*args, **options)
 
@@ -116,7 +122,8 @@ def test_a_result_that_is_trashed_and_saved_again_is_in_the_trash_once(folder):
 
 
 @pytest.mark.parametrize(
-    "listed", ['{"changes": [["../x", null, "trash/x"]]}', '{"changes": [["/tmp/x", null, null]]}', "{"]
+    "listed",
+    ['{"changes": [["../x", null, "trash/x"]]}', '{"changes": [["/tmp/x", null, null]]}', "{"],
 )
 def test_a_listing_that_names_other_folders_is_ignored(folder, listed):
     (folder.parent / "x").mkdir()
@@ -125,7 +132,9 @@ def test_a_listing_that_names_other_folders_is_ignored(folder, listed):
     assert (folder.parent / "x").is_dir() and not list(folder.glob(".together*"))
 
 
-@pytest.mark.parametrize("change", [["captures/x", "captures/y", None], ["captures/x", None, "trash/x"]])
+@pytest.mark.parametrize(
+    "change", [["captures/x", "captures/y", None], ["captures/x", None, "trash/x"]]
+)
 def test_a_listing_that_leads_outside_by_a_link_is_ignored(folder, change):
     """A session from somebody else may come with both."""
     for name in ("x", "y"):
@@ -134,4 +143,9 @@ def test_a_listing_that_leads_outside_by_a_link_is_ignored(folder, change):
     (folder / "captures").symlink_to(folder.parent / "home")
     (folder / ".together.new-1-ab").write_text(json.dumps({"changes": [change]}))
     assert age(folder) == "old"
-    assert sorted(path.name for path in (folder.parent / "home").rglob("*")) == ["inside", "inside", "x", "y"]
+    assert sorted(path.name for path in (folder.parent / "home").rglob("*")) == [
+        "inside",
+        "inside",
+        "x",
+        "y",
+    ]

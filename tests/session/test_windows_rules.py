@@ -1,4 +1,5 @@
-"""The rules of Windows, imposed on every system: no synced folders, no open files replaced, no names of devices."""
+"""The rules of Windows, imposed on every system: no synced folders, no open files replaced, no
+names of devices."""
 
 import builtins
 import io
@@ -22,13 +23,16 @@ from slviewer.session.store import Session
 
 @pytest.fixture
 def windows(monkeypatch):
-    """Refuse what Windows refuses: to open folders, and to move or remove what is open in this process."""
+    """Refuse what Windows refuses: to open folders, and to move or remove what is open in this
+    process."""
     if not Path("/proc/self/fd").is_dir():
         pytest.skip("open files cannot be listed here")
     real_open = os.open
 
     def open_file(path, flags, *rest, **options):
-        if not isinstance(path, int) and os.path.isdir(path) and not options:  # not shutil.rmtree's, of other systems
+        if (
+            not isinstance(path, int) and os.path.isdir(path) and not options
+        ):  # not shutil.rmtree's, of other systems
             raise PermissionError(13, "Permission denied", str(path))
         return real_open(path, flags, *rest, **options)
 
@@ -51,11 +55,17 @@ def windows(monkeypatch):
 def require_closed(path) -> None:
     """Raise PermissionError where a file at or below a path is open or mapped into memory."""
     top = os.path.realpath(path)
-    held = {os.readlink(link) for link in map(str, Path("/proc/self/fd").iterdir()) if os.path.islink(link)}
+    held = {
+        os.readlink(link)
+        for link in map(str, Path("/proc/self/fd").iterdir())
+        if os.path.islink(link)
+    }
     maps = Path("/proc/self/maps").read_text().splitlines()
     held |= {line.split(maxsplit=5)[5] for line in maps if "/" in line}
     if any(name == top or name.startswith(top + os.sep) for name in held):
-        raise PermissionError(13, "The process cannot access the file because it is used", str(path))
+        raise PermissionError(
+            13, "The process cannot access the file because it is used", str(path)
+        )
 
 
 def test_the_simulation_refuses_to_move_what_is_open(windows, tmp_path) -> None:
@@ -66,7 +76,9 @@ def test_the_simulation_refuses_to_move_what_is_open(windows, tmp_path) -> None:
     os.rename(folder, tmp_path / "b")
 
 
-def test_a_session_is_saved_and_replaced_by_the_rules_of_windows(windows, tmp_path, sequence, frames, noise) -> None:
+def test_a_session_is_saved_and_replaced_by_the_rules_of_windows(
+    windows, tmp_path, sequence, frames, noise
+) -> None:
     with Session.create(tmp_path / "session") as session:
         session.save_capture("part", "scan", sequence, frames, source="test")
         assert (session.load_capture("part").stack() == frames).all()
@@ -79,17 +91,23 @@ def test_a_session_is_saved_and_replaced_by_the_rules_of_windows(windows, tmp_pa
         assert session.capture_names() == []
 
 
-def test_a_file_that_another_program_has_open_for_a_moment_is_waited_for(windows, monkeypatch, tmp_path) -> None:
+def test_a_file_that_another_program_has_open_for_a_moment_is_waited_for(
+    windows, monkeypatch, tmp_path
+) -> None:
     path = tmp_path / "table.csv"
     replace_file(path, b"old")
     with open(path, "rb") as held:
         pauses = []
-        monkeypatch.setattr(time, "sleep", lambda seconds: pauses.append(seconds) or len(pauses) < 3 or held.close())
+        monkeypatch.setattr(
+            time, "sleep", lambda seconds: pauses.append(seconds) or len(pauses) < 3 or held.close()
+        )
         replace_file(path, b"new", patience_s=60.0)
     assert path.read_bytes() == b"new" and len(pauses) == 3
     with open(path, "rb"), raises(SessionError, "table.csv"):
         replace_file(path, b"never", patience_s=0.0)
-    assert path.read_bytes() == b"new" and [each.name for each in tmp_path.iterdir()] == ["table.csv"]
+    assert path.read_bytes() == b"new" and [each.name for each in tmp_path.iterdir()] == [
+        "table.csv"
+    ]
 
 
 @pytest.mark.parametrize("name", ["con", "NUL", "aux.txt", "Com1", "lpt9.a.b"])
@@ -110,8 +128,16 @@ def test_names_that_differ_in_case_alone_are_refused(session, sequence, frames) 
     session.save_rig("bench", "settle_ms = 1")
     both = [NewCapture(name, sequence, frames, None, "test", {}) for name in ("a", "A")]
     for save, *names in (
-        (lambda: session.save_capture("part", "scan", sequence, frames, source="test"), "'part'", "'Part'"),
-        (lambda: session.save_capture("PART", "scan", sequence, frames, source="", force=True), "'PART'", "'Part'"),
+        (
+            lambda: session.save_capture("part", "scan", sequence, frames, source="test"),
+            "'part'",
+            "'Part'",
+        ),
+        (
+            lambda: session.save_capture("PART", "scan", sequence, frames, source="", force=True),
+            "'PART'",
+            "'Part'",
+        ),
         (lambda: session.save_rig("Bench", ""), "'Bench'", "'bench'"),
         (lambda: session.save_captures(both, "scan"), "'a'", "'A'"),
     ):
@@ -132,8 +158,20 @@ def test_a_session_s_path_leaves_room_for_its_files(tmp_path) -> None:
 @pytest.mark.process
 def test_files_are_opened_with_an_encoding() -> None:
     """By default Windows reads and writes text in a code page of its own."""
-    command = [sys.executable, "-m", "ruff", "check", "--preview", "--select", "PLW1514", "slviewer", "docs"]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "ruff",
+        "check",
+        "--preview",
+        "--select",
+        "PLW1514",
+        "slviewer",
+        "docs",
+    ]
+    done = subprocess.run(
+        command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout
 
 

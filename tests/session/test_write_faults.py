@@ -1,4 +1,5 @@
-"""Wherever the program is killed while it writes, or the disk refuses: nothing saved is lost, and work goes on."""
+"""Wherever the program is killed while it writes, or the disk refuses: nothing saved is lost, and
+work goes on."""
 
 import shutil
 import threading
@@ -27,7 +28,8 @@ from slviewer.session.store import Session
 
 @contextmanager
 def faulty(disk: Disk) -> Iterator[None]:
-    """Context manager: everything that changes files is counted by the disk; locks of the dead are released after."""
+    """Context manager: everything that changes files is counted by the disk; locks of the dead are
+    released after."""
     locks: list[WriterLock] = []
 
     class Lock(WriterLock):
@@ -45,14 +47,20 @@ def faulty(disk: Disk) -> Iterator[None]:
 
 
 def points(calls: list[str], most: int) -> list[int]:
-    """Numbers of the calls to fail at: all that rename, remove or make, and some that write and sync."""
-    moves = [i for i, name in enumerate(calls) if name in ("rename", "replace", "mkdir", "unlink", "rmdir")]
+    """Numbers of the calls to fail at: all that rename, remove or make, and some that write and
+    sync."""
+    moves = [
+        i
+        for i, name in enumerate(calls)
+        if name in ("rename", "replace", "mkdir", "unlink", "rmdir")
+    ]
     others = np.linspace(0, len(calls) - 1, most).astype(int).tolist()
     return sorted({*moves[:: max(1, len(moves) // most)], *moves[-3:], *others})
 
 
 def whole_captures(folder: Path) -> dict[str, str]:
-    """{name: source} of the session's captures, all of which must be what was saved; nothing else may be there."""
+    """{name: source} of the session's captures, all of which must be what was saved; nothing else
+    may be there."""
     with Session.open(folder, write=True) as session:
         assert not atomic.list_leftovers(folder)
         captures, faults = session.read_captures()
@@ -67,16 +75,24 @@ def whole_captures(folder: Path) -> dict[str, str]:
 @pytest.fixture
 def new(sequence, noise):
     """Makes captures to save, by their seeds."""
-    return lambda *seeds, source="": [NewCapture(f"pose_{i}", sequence, noise(i), None, source) for i in seeds]
+    return lambda *seeds, source="": [
+        NewCapture(f"pose_{i}", sequence, noise(i), None, source) for i in seeds
+    ]
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(name, marks=[] if name in ("kill", "disk full") else pytest.mark.slow) for name in FAULTS]
+    "fault",
+    [
+        pytest.param(name, marks=[] if name in ("kill", "disk full") else pytest.mark.slow)
+        for name in FAULTS
+    ],
 )
 def test_several_captures_are_saved_whatever_happens(tmp_path, new, fault):
     def attempt(folder: Path, disk: Disk) -> None:
         with faulty(disk), opened_or_made(folder) as session:
-            session.save_captures(new(*(i for i in (1, 2, 3) if f"pose_{i}" not in session.capture_names())), "scan")
+            session.save_captures(
+                new(*(i for i in (1, 2, 3) if f"pose_{i}" not in session.capture_names())), "scan"
+            )
             session.save_result("clouds/pose_1", {}, {"a": np.arange(5)})
             session.exclude("pose_1", "why")
 
@@ -93,7 +109,9 @@ def test_several_captures_are_saved_whatever_happens(tmp_path, new, fault):
             there = whole_captures(folder)
             counts.add(len(there))
             complete = [name for name in disk.calls[:at] if name == "rename"]
-            assert FAULTS[fault] != KILL or len(there) >= min(3, len(complete)), "a complete capture was removed"
+            assert FAULTS[fault] != KILL or len(there) >= min(3, len(complete)), (
+                "a complete capture was removed"
+            )
         attempt(folder, Disk(None))
         assert set(whole_captures(folder)) == {"pose_1", "pose_2", "pose_3"}
         with Session.open(folder) as session:
@@ -102,7 +120,11 @@ def test_several_captures_are_saved_whatever_happens(tmp_path, new, fault):
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(name, marks=[] if name in ("kill", "disk full") else pytest.mark.slow) for name in FAULTS]
+    "fault",
+    [
+        pytest.param(name, marks=[] if name in ("kill", "disk full") else pytest.mark.slow)
+        for name in FAULTS
+    ],
 )
 def test_a_replacement_is_the_old_or_the_new(tmp_path, sequence, new, fault):
     def attempt(folder: Path, disk: Disk) -> None:
@@ -123,7 +145,11 @@ def test_a_replacement_is_the_old_or_the_new(tmp_path, sequence, new, fault):
         with suppress(Killed, SessionError):
             attempt(folder, Disk(at, FAULTS[fault]))
         there = whole_captures(folder)
-        assert set(there) == {"pose_1", "pose_2"} and there["pose_2"] == "old" and there["pose_1"] in ("old", "new")
+        assert (
+            set(there) == {"pose_1", "pose_2"}
+            and there["pose_2"] == "old"
+            and there["pose_1"] in ("old", "new")
+        )
         with Session.open(folder) as session:
             meta, arrays = session.load_result("clouds/pose_1")
             assert len(arrays["a"]) == {"old": 5, "new": 9}[meta["made"]]
@@ -140,7 +166,9 @@ def test_an_import_that_was_interrupted_continues(tmp_path, fault):
     for number in range(3):
         (folder := source / f"capture_{number}").mkdir(parents=True)
         for i in range(len(sequence.frames)):
-            image = np.clip(render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, (40, 60)), 0, 255).round()
+            image = np.clip(
+                render_pattern(sequence, i) * 0.5 + 40 + rng.normal(0, 1, (40, 60)), 0, 255
+            ).round()
             cv2.imwrite(str(folder / f"graycode_{i:02d}.png"), image.astype(np.uint8))
 
     def attempt(folder: Path, disk: Disk) -> list[str]:
@@ -158,7 +186,9 @@ def test_an_import_that_was_interrupted_continues(tmp_path, fault):
             raise SessionError("nothing failed")
         there = whole_captures(folder) if (folder / "session.json").exists() else {}
         skipped = attempt(folder, Disk(None))
-        assert len(skipped) == bool(there) and all(missing_facts(each, *there) == [] for each in skipped)
+        assert len(skipped) == bool(there) and all(
+            missing_facts(each, *there) == [] for each in skipped
+        )
         repeated.add(len(there))
         assert len(whole_captures(folder)) == 3 and not (folder / "trash").exists()
         assert missing_facts(inspect(folder, check=True), "3 captures") == []
@@ -178,12 +208,17 @@ def test_a_session_that_another_writer_works_in_is_never_removed(tmp_path, seque
     with pytest.raises(SessionError), opened_or_made(tmp_path / "made"):
         raise SessionError("a failure")
     assert list((tmp_path / "made").iterdir()) == []
-    with pytest.raises(SessionError), opened_or_made(folder) as session:  # made by another: never removed
+    with (
+        pytest.raises(SessionError),
+        opened_or_made(folder) as session,
+    ):  # made by another: never removed
         raise SessionError("a failure")
     assert (folder / "session.json").exists()
 
 
-def test_a_failed_creation_never_costs_a_second_writer_its_work(tmp_path, sequence, frames, monkeypatch):
+def test_a_failed_creation_never_costs_a_second_writer_its_work(
+    tmp_path, sequence, frames, monkeypatch
+):
     """The second writer begins at every change to the disk that the first one makes."""
 
     class PatientLock(WriterLock):
@@ -195,7 +230,11 @@ def test_a_failed_creation_never_costs_a_second_writer_its_work(tmp_path, sequen
 
         def __init__(self, begin: int | None) -> None:
             super().__init__(None)
-            self.started, self._begin, self._thread = threading.Event(), begin, threading.get_ident()
+            self.started, self._begin, self._thread = (
+                threading.Event(),
+                begin,
+                threading.get_ident(),
+            )
 
         def call(self, name: str, *paths: object) -> None:
             if threading.get_ident() == self._thread:

@@ -1,4 +1,5 @@
-"""Light that surfaces throw on themselves: form factors of known shapes, linearity, and what it does to decoding."""
+"""Light that surfaces throw on themselves: form factors of known shapes, linearity, and what it
+does to decoding."""
 
 from functools import cache
 
@@ -26,7 +27,10 @@ def coordinate_errors(sequence_of, angle_deg=90.0, bounces=2):
     """Return errors (n,) px and predicted sigmas (n,) px of the valid pixels of a groove."""
     renderer = Renderer(RIG, groove(POSE, angle_deg, indirect=Indirect(bounces)))
     sequence = one_axis(sequence_of(RIG.projector.size), "x")
-    phase, truth = decode(sequence, renderer.capture(sequence, 1), "x", mask_indirect=False), renderer.truth()
+    phase, truth = (
+        decode(sequence, renderer.capture(sequence, 1), "x", mask_indirect=False),
+        renderer.truth(),
+    )
     valid = phase.mask & truth.mask
     assert valid.sum() > 0.9 * truth.mask.sum()
     return (phase.coordinate - truth.projector[..., 0])[valid], phase.sigma_px[valid]
@@ -34,7 +38,8 @@ def coordinate_errors(sequence_of, angle_deg=90.0, bounces=2):
 
 @pytest.mark.slow
 def test_a_wall_of_a_groove_receives_what_the_formula_of_two_strips_says():
-    """In the middle of a long wall: (1 + (cos a - s) / sqrt(1 + s^2 - 2 s cos a)) / 2 at s widths from the fold."""
+    """In the middle of a long wall: (1 + (cos a - s) / sqrt(1 + s^2 - 2 s cos a)) / 2 at s widths
+    from the fold."""
     scene = groove(Pose(np.eye(3), np.array([0, 0, 640.0])), 70, length_mm=900)
     middle = np.flatnonzero(np.abs(scene.vertices[:, 1]) < 1e-6)
     factors = scene.form_factors(middle).sum(axis=1)
@@ -99,13 +104,19 @@ def test_without_bounces_both_measure_to_the_noise():
         assert np.abs(errors).max() < 1
 
 
-@pytest.mark.parametrize("wrong", [{"bounces": 3}, {"gloss": 1.5}, {"scattered": -1.0}, {"reach_mm": 0.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"bounces": 3}, {"gloss": 1.5}, {"scattered": -1.0}, {"reach_mm": 0.0}]
+)
 def test_impossible_light_is_refused(wrong):
     with pytest.raises(InputError):
         Indirect(**wrong)
 
 
 def test_impossible_shapes_are_refused():
-    for make in (lambda: groove(POSE, 5), lambda: bowl(POSE, opening_deg=120), lambda: groove(POSE, albedo=1.0)):
+    for make in (
+        lambda: groove(POSE, 5),
+        lambda: bowl(POSE, opening_deg=120),
+        lambda: groove(POSE, albedo=1.0),
+    ):
         with pytest.raises(InputError):
             make()

@@ -1,4 +1,5 @@
-"""The faults of the hostile rig do what they say: sizes of gains, bytes of a codec, places of frames, geometry."""
+"""The faults of the hostile rig do what they say: sizes of gains, bytes of a codec, places of
+frames, geometry."""
 
 import numpy as np
 import pytest
@@ -8,7 +9,13 @@ from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.simulation import hostile_frames as faults
 from slviewer.simulation.boards import Pose, blank_board
-from slviewer.simulation.hostile import FAULTS, SEVERITIES, expose_frames, hostile_light, render_light
+from slviewer.simulation.hostile import (
+    FAULTS,
+    SEVERITIES,
+    expose_frames,
+    hostile_light,
+    render_light,
+)
 from slviewer.simulation.hostile_frames import Shot
 from slviewer.simulation.hostile_scenes import MirrorTable, put_on_table, with_hand
 from slviewer.simulation.renderer import Renderer
@@ -22,7 +29,11 @@ SEQUENCE = PatternSequence(
     tuple(
         frame
         for axis in ("x", "y")
-        for frame in (*phase_steps(axis, 8, 16.0), *gray_bits(axis, 7), Frame("complementary", axis))
+        for frame in (
+            *phase_steps(axis, 8, 16.0),
+            *gray_bits(axis, 7),
+            Frame("complementary", axis),
+        )
     ),
 )
 RIG = letter(0.1, local_distortion_px=0.0)
@@ -33,14 +44,21 @@ RNG = np.random.default_rng(3)
 
 def shot(**change):
     return Shot(
-        **{"number": 0, "sequence": SEQUENCE, "rng": np.random.default_rng(5), "room_light": RENDERER.room_light()}
+        **{
+            "number": 0,
+            "sequence": SEQUENCE,
+            "rng": np.random.default_rng(5),
+            "room_light": RENDERER.room_light(),
+        }
         | change
     )
 
 
 def test_drift_has_the_rms_that_it_says():
     gains = faults.drifting_gains(32, 0.1, RNG)
-    assert np.std(gains) == pytest.approx(0.1, rel=0.02) and np.mean(gains) == pytest.approx(1, abs=0.02)
+    assert np.std(gains) == pytest.approx(0.1, rel=0.02) and np.mean(gains) == pytest.approx(
+        1, abs=0.02
+    )
     scaled = faults.scale_frames(LIGHT, gains)
     assert np.allclose(scaled.sum((1, 2)) / LIGHT.sum((1, 2)), gains, rtol=1e-5)
 
@@ -55,7 +73,9 @@ def test_flicker_is_bands_of_rows_that_differ_from_frame_to_frame():
     even = np.full_like(LIGHT, 90.0)
     ratio = faults.add_flicker(even, 0.05, shot()) / even
     assert np.allclose(ratio, ratio[:, :, :1], atol=1e-5)
-    assert ratio.max() == pytest.approx(1.05, abs=2e-3) and ratio.min() == pytest.approx(0.95, abs=2e-3)
+    assert ratio.max() == pytest.approx(1.05, abs=2e-3) and ratio.min() == pytest.approx(
+        0.95, abs=2e-3
+    )
     assert np.std(ratio[:, 60, 0]) > 0.02
 
 
@@ -84,8 +104,20 @@ def test_frames_change_places():
     assert faults.drop_frame(frames, 4)[:, 0, 0].tolist() == [*range(4), *range(5, 32), 31]
     assert faults.repeat_frames(frames, 1, shot())[1:4, 0, 0].tolist() == [1, 1, 3]
     assert faults.swap_neighbours(frames, 1, shot())[:4, 0, 0].tolist() == [0, 2, 1, 3]
-    assert faults.exchange_axis_frames(frames, 0, shot())[:, 0, 0].tolist() == [*range(16, 32), *range(16)]
-    assert faults.reverse_bits(frames, 0, shot())[8:16, 0, 0].tolist() == [14, 13, 12, 11, 10, 9, 8, 15]
+    assert faults.exchange_axis_frames(frames, 0, shot())[:, 0, 0].tolist() == [
+        *range(16, 32),
+        *range(16),
+    ]
+    assert faults.reverse_bits(frames, 0, shot())[8:16, 0, 0].tolist() == [
+        14,
+        13,
+        12,
+        11,
+        10,
+        9,
+        8,
+        15,
+    ]
     assert faults.reorder_steps(frames, 0, shot())[:8, 0, 0].tolist() == [2, 3, 4, 5, 6, 7, 0, 1]
     assert faults.reorder_steps(frames, 1, shot())[:8, 0, 0].tolist() == [0, 7, 6, 5, 4, 3, 2, 1]
 
@@ -94,9 +126,9 @@ def test_hot_pixels_are_as_many_as_said_and_stay_where_they_are():
     frames = np.full((3, 200, 200), 100, np.uint8)
     spoilt = faults.add_hot_pixels(frames, 0.02, shot())
     assert np.array_equal(spoilt[0], spoilt[2])
-    assert np.mean(spoilt == 255) == pytest.approx(0.01, rel=0.2) and np.mean(spoilt == 0) == pytest.approx(
-        0.01, rel=0.2
-    )
+    assert np.mean(spoilt == 255) == pytest.approx(0.01, rel=0.2) and np.mean(
+        spoilt == 0
+    ) == pytest.approx(0.01, rel=0.2)
 
 
 def test_a_dim_projector_has_the_amplitude_that_it_says():
@@ -106,7 +138,12 @@ def test_a_dim_projector_has_the_amplitude_that_it_says():
 
 
 def test_noise_is_that_of_the_rig_where_nothing_is_wrong():
-    frames = np.stack([expose_frames(RIG, LIGHT[:1], SEQUENCE, RENDERER.room_light(), seed=k)[0] for k in range(24)])
+    frames = np.stack(
+        [
+            expose_frames(RIG, LIGHT[:1], SEQUENCE, RENDERER.room_light(), seed=k)[0]
+            for k in range(24)
+        ]
+    )
     inner = RENDERER.truth().mask & (LIGHT[0] > 50)
     variance = frames.astype(float).var(0, ddof=1)[inner].mean()
     expected = RIG.sensor.read_variance + RIG.sensor.shot_variance * LIGHT[0][inner].mean() + 1 / 12
@@ -129,7 +166,10 @@ def test_the_mirror_shows_the_plane_below_itself_and_lights_it_again():
     assert isinstance(table, MirrorTable)
     rays = RIG.camera.rays()
     mirrored = np.isfinite(table.trace(rays).points[..., 2]) & ~table.is_direct(rays)
-    assert mirrored.any() and np.nonzero(mirrored)[0].min() > np.nonzero(table.is_direct(rays))[0].max() - 3
+    assert (
+        mirrored.any()
+        and np.nonzero(mirrored)[0].min() > np.nonzero(table.is_direct(rays))[0].max() - 3
+    )
     # What the mirror shows are points of the plate itself.
     assert np.allclose(table.trace(rays).points[mirrored][:, 2], 600.0, atol=1e-6)
     light, _ = render_light(RIG, table, SEQUENCE)
@@ -140,7 +180,11 @@ def test_the_mirror_shows_the_plane_below_itself_and_lights_it_again():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if k % 3 == 0 else pytest.mark.slow) for k, name in enumerate(FAULTS)]
+    "name",
+    [
+        pytest.param(name, marks=[] if k % 3 == 0 else pytest.mark.slow)
+        for k, name in enumerate(FAULTS)
+    ],
 )
 def test_every_fault_disturbs_the_capture_more_the_more_severe_it_is(name):
     fault, number = FAULTS[name], 3
@@ -150,9 +194,18 @@ def test_every_fault_disturbs_the_capture_more_the_more_severe_it_is(name):
         light, renderer = LIGHT, RENDERER
         if fault.is_optical:
             light, renderer = hostile_light(fault, severity, RIG, PLANE, SEQUENCE, number)
-        frames = expose_frames(renderer.rig, light, SEQUENCE, renderer.room_light(), number, fault, severity)
+        frames = expose_frames(
+            renderer.rig, light, SEQUENCE, renderer.room_light(), number, fault, severity
+        )
         assert frames.shape == clean.shape and frames.dtype == np.uint8
         changes.append(np.abs(frames - clean).mean())
     assert min(changes) > 0
-    variants = {"exchanged-axes", "reversed-axis", "reversed-bits", "step-order", "duplicate-frame", "swapped-frames"}
+    variants = {
+        "exchanged-axes",
+        "reversed-axis",
+        "reversed-bits",
+        "step-order",
+        "duplicate-frame",
+        "swapped-frames",
+    }
     assert name in variants or changes[0] < changes[2]

@@ -49,7 +49,9 @@ def test_spheres_and_objects_lie_in_their_ranges():
         assert shares(scene)[i] > 99
     one, two, three = (scene.pose.R for scene in objects().values())
     for R in (one, two):
-        assert 1 < np.degrees(np.arccos((np.trace(R.T @ three) - 1) / 2)) < 10  # something for ICP to do
+        assert (
+            1 < np.degrees(np.arccos((np.trace(R.T @ three) - 1) / 2)) < 10
+        )  # something for ICP to do
 
 
 @pytest.mark.parametrize("seed", [0, 7])
@@ -65,7 +67,9 @@ def test_target_poses_are_in_view_lit_and_spread(seed):
         assert points[:, 2].min() > 470 and points[:, 2].max() < 730
         assert 5 < np.degrees(np.arccos(pose.R[2, 2])) < 30
         corners = rig.camera.project(pose.to_camera(BOARD.outline()))
-        seen += cv2.fillConvexPoly(np.zeros(seen.shape, np.uint8), np.rint(corners).astype(np.int32), 1)
+        seen += cv2.fillConvexPoly(
+            np.zeros(seen.shape, np.uint8), np.rint(corners).astype(np.int32), 1
+        )
     assert (seen >= 4).mean() > 0.85 and (seen >= 2).mean() > 0.93
     depths = [pose.to_camera(BOARD.points.mean(0))[2] for pose in poses]
     assert min(depths) < 530 and max(depths) > 670
@@ -73,7 +77,10 @@ def test_target_poses_are_in_view_lit_and_spread(seed):
 
 def test_poses_do_not_depend_on_the_scale():
     small, large = target_poses(letter(0.25), BOARD, 4), target_poses(letter(1.0), BOARD, 4)
-    assert all(np.array_equal(a.R, b.R) and np.array_equal(a.t, b.t) for a, b in zip(small, large, strict=True))
+    assert all(
+        np.array_equal(a.R, b.R) and np.array_equal(a.t, b.t)
+        for a, b in zip(small, large, strict=True)
+    )
 
 
 def test_a_board_too_large_is_refused():
@@ -85,7 +92,9 @@ def test_the_plan_names_every_capture_and_its_truth_can_be_saved():
     rig = letter(0.25)
     plan = letter_plan(rig, poses=3)
     assert list(plan)[:3] == ["pose_01", "pose_02", "pose_03"]
-    assert [sum(name.startswith(word) for name in plan) for word in ("plane_", "sphere_", "object_r")] == [10, 6, 3]
+    assert [
+        sum(name.startswith(word) for name in plan) for word in ("plane_", "sphere_", "object_r")
+    ] == [10, 6, 3]
     json.dumps(rig_record(rig))
     for scene in plan.values():
         json.dumps(scene_record(scene))
@@ -97,7 +106,9 @@ def test_the_plan_names_every_capture_and_its_truth_can_be_saved():
 
 def test_the_shipped_object_is_what_its_script_makes():
     assets = Path(__file__).parents[2] / "assets"
-    spec = importlib.util.spec_from_file_location("make_demo_object", assets / "make_demo_object.py")
+    spec = importlib.util.spec_from_file_location(
+        "make_demo_object", assets / "make_demo_object.py"
+    )
     assert spec and spec.loader
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)

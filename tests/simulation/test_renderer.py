@@ -29,7 +29,9 @@ PHASE_X = PatternSequence(PROJECTOR, tuple(phase_steps("x", 18, 18.0)))
 
 def predicted_sigma(rig, A, B, steps=18):
     """rad, from the sensor's specification: sigma_phi = sqrt(2/n) sigma_I / B."""
-    variance = rig.sensor.read_variance + rig.sensor.shot_variance * (A - rig.sensor.dark_level) + 1 / 12
+    variance = (
+        rig.sensor.read_variance + rig.sensor.shot_variance * (A - rig.sensor.dark_level) + 1 / 12
+    )
     return np.sqrt(2 / steps * variance) / B
 
 
@@ -42,10 +44,14 @@ def shift(stack):
 
 def test_frames_decode_to_the_true_coordinates_but_for_the_specified_noise():
     rig = letter(0.25)
-    renderer = Renderer(rig, blank_board(Pose(rotation(np.array([0.2, 0.3, 0])), np.array([0, 0, 600.0]))))
+    renderer = Renderer(
+        rig, blank_board(Pose(rotation(np.array([0.2, 0.3, 0])), np.array([0, 0, 600.0])))
+    )
     truth, sequence = renderer.truth(), p18(PROJECTOR)
     stack = renderer.capture(sequence, seed=4)
-    inner = truth.mask.copy()  # pixels mixed with the dark beside the plate are noisier than specified
+    inner = (
+        truth.mask.copy()
+    )  # pixels mixed with the dark beside the plate are noisier than specified
     for axis in (0, 1):
         for step in (-1, 1):
             inner &= np.roll(truth.mask, step, axis)
@@ -73,17 +79,25 @@ def test_the_plane_floor_at_580_mm():
 def test_noise_has_the_specified_variance():
     rig = letter(0.25)
     white = PatternSequence(PROJECTOR, tuple(Frame("white") for _ in range(60)))
-    board = printed_board(Board.parse("circles:21x16:9"), Pose(np.eye(3), np.array([-90.0, -67.5, 620.0])))
+    board = printed_board(
+        Board.parse("circles:21x16:9"), Pose(np.eye(3), np.array([-90.0, -67.5, 620.0]))
+    )
     stack = Renderer(rig, board).capture(white).astype(float)
     level, variance = stack.mean(0), stack.var(0, ddof=1)
     for low, high in ((15, 40), (130, 170), (170, 215)):
         chosen = (level > low) & (level < high)
-        expected = rig.sensor.read_variance + rig.sensor.shot_variance * (level[chosen].mean() - 3) + 1 / 12
+        expected = (
+            rig.sensor.read_variance
+            + rig.sensor.shot_variance * (level[chosen].mean() - 3)
+            + 1 / 12
+        )
         assert chosen.sum() > 500
         assert variance[chosen].mean() == pytest.approx(expected, rel=0.03)
     noise = (stack - level)[:, 100:200, 150:250]
     assert abs((noise[1:] * noise[:-1]).mean()) < 0.02 * noise.var()  # from frame to frame
-    assert abs((noise[:, :, 1:] * noise[:, :, :-1]).mean()) < 0.02 * noise.var()  # from pixel to pixel
+    assert (
+        abs((noise[:, :, 1:] * noise[:, :, :-1]).mean()) < 0.02 * noise.var()
+    )  # from pixel to pixel
 
 
 def test_the_seed_alone_decides_the_frames():
@@ -110,13 +124,17 @@ def test_circles_are_seen_where_they_are():
     detection = detect(board, image)
     error = detection.pixels - rig.camera.project(pose.to_camera(scene.features))[detection.ids]
     assert len(detection.ids) == 336
-    assert np.abs(error.mean(0)).max() < 0.05  # shading and perspective shift a blob by hundredths of a pixel
+    assert (
+        np.abs(error.mean(0)).max() < 0.05
+    )  # shading and perspective shift a blob by hundredths of a pixel
     assert 0.001 < np.sqrt(np.mean(error**2)) < 0.06
 
 
 @pytest.mark.parametrize("depth", [430.0, pytest.param(600.0, marks=pytest.mark.slow), 810.0])
 def test_the_operator_s_exposure_neither_saturates_nor_starves(depth):
-    renderer = Renderer(letter(0.25), blank_board(Pose(np.eye(3), np.array([0, 0, depth])), (600, 400)))
+    renderer = Renderer(
+        letter(0.25), blank_board(Pose(np.eye(3), np.array([0, 0, depth])), (600, 400))
+    )
     assert renderer.truth().mask.all()  # the projector's field covers the camera's
     frame = renderer.capture(PatternSequence(PROJECTOR, (Frame("white"), Frame("black"))))
     assert np.quantile(frame[0], 0.99) > 200 and frame[0].max() < 245
@@ -128,23 +146,34 @@ def test_defocus_takes_modulation_and_leaves_phase():
     modulation = {}
     for blur in (rig.light.defocus_px_mm, 3 * rig.light.defocus_px_mm):
         soft = replace(rig, light=replace(rig.light, defocus_px_mm=blur))
-        renderer = Renderer(soft, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 450.0])), (400, 300)))
+        renderer = Renderer(
+            soft, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 450.0])), (400, 300))
+        )
         phase, _, B = shift(renderer.capture(PHASE_X))
         error = np.angle(np.exp(1j * (phase - 2 * np.pi * renderer.truth().projector[..., 0] / 18)))
         assert abs(error.mean()) < 2e-4
         modulation[blur] = np.median(B)
     sharp, soft_B = modulation.values()
-    sigma = [np.hypot(0.5, f * 1500 * abs(1 / 483 - 1 / 600)) for f in (1, 3)]  # the projector is 33 mm further away
-    assert soft_B / sharp == pytest.approx(np.exp(-2 * (np.pi / 18) ** 2 * (sigma[1] ** 2 - sigma[0] ** 2)), rel=0.03)
+    sigma = [
+        np.hypot(0.5, f * 1500 * abs(1 / 483 - 1 / 600)) for f in (1, 3)
+    ]  # the projector is 33 mm further away
+    assert soft_B / sharp == pytest.approx(
+        np.exp(-2 * (np.pi / 18) ** 2 * (sigma[1] ** 2 - sigma[0] ** 2)), rel=0.03
+    )
 
 
 @pytest.mark.slow
 def test_gamma_bends_the_fringes_and_flicker_shakes_them():
     scene = blank_board(FACING, (400, 300))
-    straight, bent = (shift(Renderer(letter(0.25, gamma=g), scene).capture(PHASE_X))[1].mean() for g in (1.0, 2.2))
+    straight, bent = (
+        shift(Renderer(letter(0.25, gamma=g), scene).capture(PHASE_X))[1].mean() for g in (1.0, 2.2)
+    )
     assert bent < 0.85 * straight
     white = PatternSequence(PROJECTOR, tuple(Frame("white") for _ in range(30)))
-    steady, shaking = (Renderer(letter(0.25, flicker=f), scene).capture(white).mean((1, 2)).std() for f in (0, 0.01))
+    steady, shaking = (
+        Renderer(letter(0.25, flicker=f), scene).capture(white).mean((1, 2)).std()
+        for f in (0, 0.01)
+    )
     assert steady < 0.05 and 0.8 < shaking < 3
 
 
@@ -164,6 +193,8 @@ def test_what_cannot_be_rendered_is_refused():
         Renderer(rig, sphere((5000.0, 0.0, 600.0))).capture(PHASE_X)
     with raises(InputError, "(3, 4)", "uint8"):
         white = (None, np.full(912, 255, np.uint8))
-        Renderer(rig, blank_board(FACING)).frame(white, np.zeros(2, np.uint32), np.zeros((3, 4), np.uint8))
+        Renderer(rig, blank_board(FACING)).frame(
+            white, np.zeros(2, np.uint32), np.zeros((3, 4), np.uint8)
+        )
     with raises(InputError, "scale 0"):
         letter(0.0)

@@ -37,7 +37,9 @@ def test_without_waves_it_is_opencv_s_model():
     points = np.random.default_rng(0).uniform([-130, -100, 450], [130, 100, 800], (200, 3))
     (fx, fy), (cx, cy) = lens.focal_px, lens.centre_px
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(lens.brown))[0].reshape(-1, 2)
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(lens.brown))[
+        0
+    ].reshape(-1, 2)
     assert np.abs(lens.project(points) - expected).max() < 1e-9
 
 

@@ -1,4 +1,5 @@
-"""A simulated board with its mark is numbered from the same circle at any turn; without it, from the one that is up."""
+"""A simulated board with its mark is numbered from the same circle at any turn; without it, from
+the one that is up."""
 
 import numpy as np
 import pytest

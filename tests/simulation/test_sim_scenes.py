@@ -46,9 +46,13 @@ def test_printed_circles_cover_their_share_of_the_plate():
     pose = Pose(np.eye(3), np.array([-90.0, -67.5, 620.0]))
     scene = printed_board(board, pose, BoardShape(misplaced_mm=0.02), margin_mm=9)
     surface = scene.trace(RIG.camera.rays())
-    per_pixel = np.prod(620 / np.array(RIG.camera.focal_px) / 0.25)  # mm^2, but for the lens's distortion
+    per_pixel = np.prod(
+        620 / np.array(RIG.camera.focal_px) / 0.25
+    )  # mm^2, but for the lens's distortion
     local = surface.points[..., :2] - pose.t[:2]
-    inner = ((local > -6) & (local < [186, 141])).all(-1)  # without the plate's rim, dark in part for its own reason
+    inner = ((local > -6) & (local < [186, 141])).all(
+        -1
+    )  # without the plate's rim, dark in part for its own reason
     dark = (scene.white - surface.albedo[inner]).sum() / (scene.white - scene.dark)
     assert dark * per_pixel == pytest.approx(336 * np.pi * 2.25**2, rel=0.02)
     assert np.allclose(scene.misplacement.std(), 0.02, rtol=0.1)
@@ -100,7 +104,11 @@ def test_a_plate_throws_its_shadow_where_geometry_says():
     square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     near, far = square * 15 + [0, 0, 540], square * 300 + [0, 0, 600]
     faces = np.array([[0, 2, 1], [0, 3, 2]])
-    scene = MeshScene(np.concatenate([near, far]), np.concatenate([faces, faces + 4]), Pose(np.eye(3), np.zeros(3)))
+    scene = MeshScene(
+        np.concatenate([near, far]),
+        np.concatenate([faces, faces + 4]),
+        Pose(np.eye(3), np.zeros(3)),
+    )
     truth = Renderer(RIG, scene).truth()
     back = np.abs(truth.points[..., 2] - 600) < 1e-6
     front = np.abs(truth.points[..., 2] - 540) < 1e-6
@@ -109,7 +117,12 @@ def test_a_plate_throws_its_shadow_where_geometry_says():
     crossing = truth.points + way * ((540 - truth.points[..., 2]) / way[..., 2])[..., None]
     margin = np.abs(crossing[..., :2]).max(-1) - 15
     assert (~truth.mask[back & (margin < -0.1)]).all() and (back & (margin < -0.1)).sum() > 1000
-    illuminated = back & (margin > 0.1) & (truth.projector > 0).all(-1) & (truth.projector < [911, 1139]).all(-1)
+    illuminated = (
+        back
+        & (margin > 0.1)
+        & (truth.projector > 0).all(-1)
+        & (truth.projector < [911, 1139]).all(-1)
+    )
     assert truth.mask[illuminated].all()
 
 
@@ -129,6 +142,7 @@ def test_the_demo_object_is_closed_and_its_truth_lies_on_it():
     cloud = open3d.core.Tensor(chosen.astype(np.float32))
     caster = open3d.t.geometry.RaycastingScene()
     caster.add_triangles(
-        open3d.core.Tensor(scene.vertices.astype(np.float32)), open3d.core.Tensor(scene.triangles.astype(np.uint32))
+        open3d.core.Tensor(scene.vertices.astype(np.float32)),
+        open3d.core.Tensor(scene.triangles.astype(np.uint32)),
     )
     assert caster.compute_distance(cloud).numpy().max() < 1e-3

@@ -27,7 +27,9 @@ def test_the_table_turns_it_about_one_axis_before_the_rig() -> None:
     first, second, last = (scenes[name].pose for name in ("turn_01", "turn_02", "turn_12"))
     for before, after in ((first, second), (last, first)):
         R = after.R @ before.R.T
-        np.testing.assert_allclose(np.degrees(Rotation.from_matrix(R).as_rotvec()), 30.0 * AXIS, atol=1e-9)
+        np.testing.assert_allclose(
+            np.degrees(Rotation.from_matrix(R).as_rotvec()), 30.0 * AXIS, atol=1e-9
+        )
         np.testing.assert_allclose(R @ (before.t - AXIS_POINT) + AXIS_POINT, after.t, atol=1e-9)
     truth = Renderer(letter(0.08), scenes["turn_05"]).truth()
     seen = np.isfinite(truth.points[..., 2])

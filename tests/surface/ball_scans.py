@@ -26,12 +26,19 @@ def looking_from(side: tuple[float, float, float], away: float) -> np.ndarray:
     return T
 
 
-def ball(away: float, sigma: float, seed: int, size: tuple[int, int] = (76, 57), grey: float = 200.0) -> Cloud:
-    """What a camera with a slight barrel distortion sees of the ball; noise along z, texture by the angle of sight."""
+def ball(
+    away: float, sigma: float, seed: int, size: tuple[int, int] = (76, 57), grey: float = 200.0
+) -> Cloud:
+    """What a camera with a slight barrel distortion sees of the ball; noise along z, texture by the
+    angle of sight."""
     w, h = size
     v, u = np.mgrid[:h, :w].astype(float)
     x, y = (u - w / 2) / (3.0 * w), (v - h / 2) / (3.0 * w)
-    rays = np.stack([x, y, np.ones_like(x)], axis=2) * (1 + 0.3 * (x**2 + y**2))[..., None] ** [1, 1, 0]
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) * (1 + 0.3 * (x**2 + y**2))[..., None] ** [
+        1,
+        1,
+        0,
+    ]
     squared = (rays**2).sum(axis=2)
     b = away / squared
     with np.errstate(invalid="ignore"):
@@ -54,7 +61,9 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def around(sigma: float = 0.04, without: tuple[str, ...] = ()) -> tuple[dict[str, Cloud], dict[str, np.ndarray]]:
+def around(
+    sigma: float = 0.04, without: tuple[str, ...] = ()
+) -> tuple[dict[str, Cloud], dict[str, np.ndarray]]:
     """Scans from the six sides, and their poses."""
     scans = {name: ball(300.0, sigma, i) for i, name in enumerate(SIDES) if name not in without}
     return scans, {name: looking_from(SIDES[name], 300.0) for name in scans}

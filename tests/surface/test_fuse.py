@@ -18,7 +18,10 @@ DEPTHS = {"near": (240.0, 0.02), "middle": (320.0, 0.04), "far": (400.0, 0.06)}
 
 
 def depths(**changed: float) -> tuple[dict, dict]:
-    scans = {name: ball(away, changed.get(name, sigma), i) for i, (name, (away, sigma)) in enumerate(DEPTHS.items())}
+    scans = {
+        name: ball(away, changed.get(name, sigma), i)
+        for i, (name, (away, sigma)) in enumerate(DEPTHS.items())
+    }
     return scans, {name: looking_from(SIDE, away) for name, (away, _) in DEPTHS.items()}
 
 
@@ -59,9 +62,13 @@ def test_the_error_of_a_pose_is_part_of_sigma_where_it_moves_the_surface(fused: 
     assert before is not None and after is not None and uncertain.surface.normals is not None
     near = uncertain.source == uncertain.names.index("near")
     added = np.sqrt(after.astype(np.float64) ** 2 - before.astype(np.float64) ** 2)
-    np.testing.assert_allclose(added[near], 0.1 * np.abs(uncertain.surface.normals[near, 2]), atol=1e-3)
+    np.testing.assert_allclose(
+        added[near], 0.1 * np.abs(uncertain.surface.normals[near, 2]), atol=1e-3
+    )
     assert near.mean() > 0.5 and np.array_equal(after[~near], before[~near])
-    turned = fuse(*depths(), poses={"near": (np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))})  # about the ball's middle
+    turned = fuse(
+        *depths(), poses={"near": (np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))}
+    )  # about the ball's middle
     assert turned.surface.sigma_mm is not None
     assert np.abs(turned.surface.sigma_mm - before).max() < 0.05 * np.median(before)
 
@@ -74,20 +81,28 @@ def test_a_bad_scan_weighs_little() -> None:
     biased = fuse({**scans, "far": replace(scans["far"], sigma_z=sigma)}, {**poses, "far": shifted})
     seen = biased.seen_by == 3
     assert abs(off(biased.surface.points)[seen].mean()) < 0.01
-    equal = fuse({**scans, "far": replace(scans["far"], sigma_z=sigma / 20)}, {**poses, "far": shifted})
+    equal = fuse(
+        {**scans, "far": replace(scans["far"], sigma_z=sigma / 20)}, {**poses, "far": shifted}
+    )
     assert abs(off(equal.surface.points)[equal.seen_by == 3].mean()) > 0.03
 
 
 def test_a_calibrations_own_error_is_not_averaged_away() -> None:
     scans, poses = depths()
-    lasting = {name: replace(scan, sigma_calibration=np.full(scan.sigma_z.shape, 0.05)) for name, scan in scans.items()}
+    lasting = {
+        name: replace(scan, sigma_calibration=np.full(scan.sigma_z.shape, 0.05))
+        for name, scan in scans.items()
+    }
     sigma = fuse(lasting, poses).surface.sigma_mm
     assert sigma is not None and 0.035 < np.median(sigma) < 0.055
 
 
 def test_noise_that_is_not_known_is_taken_from_the_scan() -> None:
     scans, poses = depths()
-    unknown = {name: replace(scan, sigma_z=np.full(scan.sigma_z.shape, np.nan)) for name, scan in scans.items()}
+    unknown = {
+        name: replace(scan, sigma_z=np.full(scan.sigma_z.shape, np.nan))
+        for name, scan in scans.items()
+    }
     found = fuse(unknown, poses)
     sigma, seen = found.surface.sigma_mm, found.seen_by == 3
     assert sigma is not None
@@ -120,7 +135,9 @@ def test_small_clusters_far_from_everything_else_are_removed_and_counted() -> No
 
 def test_colours_show_no_seam() -> None:
     poses = {"a": looking_from((0.4, 0, -1), 300.0), "b": looking_from((-0.4, 0, -1), 300.0)}
-    found = fuse({"a": ball(300.0, 0.03, 1, grey=120.0), "b": ball(300.0, 0.03, 2, grey=180.0)}, poses)
+    found = fuse(
+        {"a": ball(300.0, 0.03, 1, grey=120.0), "b": ball(300.0, 0.03, 2, grey=180.0)}, poses
+    )
     grey = found.surface.colours
     assert grey is not None and np.ptp(np.percentile(grey, [1, 99])) < 4
     assert abs(grey.mean() - np.sqrt(120 * 180)) < 3
@@ -139,10 +156,15 @@ def test_refusals() -> None:
     with raises(InputError, "far"):
         fuse(scans, {name: T for name, T in poses.items() if name != "far"})
     with pytest.raises(InputError):
-        moved = replace(scans["far"], points=scans["far"].points + [0, 0, -200] + 3 * np.sin(scans["far"].points))
+        moved = replace(
+            scans["far"],
+            points=scans["far"].points + [0, 0, -200] + 3 * np.sin(scans["far"].points),
+        )
         fuse({"far": moved}, poses)
     with raises(InputError, "far", 0):
-        fuse({"far": replace(scans["far"], points=np.full_like(scans["far"].points, np.nan))}, poses)
+        fuse(
+            {"far": replace(scans["far"], points=np.full_like(scans["far"].points, np.nan))}, poses
+        )
     with raises(InputError, 1, 255):
         fuse({}, {})
 

@@ -19,8 +19,11 @@ from slviewer.surface.selection import (
 CAMERA = ViewCamera(np.zeros(3), np.eye(3), np.radians(40.0), 4 / 3)
 
 
-def on_table(noise: float = 0.05, size: tuple[int, int] = (120, 90)) -> tuple[np.ndarray, np.ndarray]:
-    """Points (h, w, 3) mm of a block 20 mm high on a tilted table, with a floor 30 mm deeper; which are the block."""
+def on_table(
+    noise: float = 0.05, size: tuple[int, int] = (120, 90)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (h, w, 3) mm of a block 20 mm high on a tilted table, with a floor 30 mm deeper; which
+    are the block."""
     w, h = size
     v, u = np.mgrid[:h, :w].astype(float)
     rays = np.stack([(u - w / 2) / (2 * w), (v - h / 2) / (2 * w), np.ones_like(u)], axis=-1)
@@ -62,7 +65,11 @@ def test_a_region_around_points_holds_them_and_not_much_more() -> None:
 def test_a_region_without_points_is_refused_with_numbers() -> None:
     points = ball(300.0, 0.05, 1).points
     with raises(
-        InputError, "scan_1", f"{np.isfinite(points[..., 2]).sum()} points", "z", f"{np.nanmin(points[..., 2]):.0f}"
+        InputError,
+        "scan_1",
+        f"{np.isfinite(points[..., 2]).sum()} points",
+        "z",
+        f"{np.nanmin(points[..., 2]):.0f}",
     ):
         crop_mask("scan_1", points, RegionOfInterest.between([-10, -10, 900], [10, 10, 950]))
     for wrong in ((0.0, 1.0, 1.0), (np.nan, 1.0, 1.0), (-1.0, 1.0, 1.0), (1e9, 1.0, 1.0)):
@@ -96,7 +103,9 @@ def test_an_outline_selects_what_any_view_shows_inside() -> None:
 
 def test_views_that_moved_are_told_apart() -> None:
     assert CAMERA.is_near(ViewCamera(np.full(3, 1e-4), np.eye(3), CAMERA.fov_rad, CAMERA.aspect))
-    assert not CAMERA.is_near(ViewCamera(np.array([1.0, 0, 0]), np.eye(3), CAMERA.fov_rad, CAMERA.aspect))
+    assert not CAMERA.is_near(
+        ViewCamera(np.array([1.0, 0, 0]), np.eye(3), CAMERA.fov_rad, CAMERA.aspect)
+    )
 
 
 def test_the_connected_part_ends_at_jumps() -> None:
@@ -130,7 +139,10 @@ def test_the_support_and_what_is_below_it_are_selected() -> None:
 def test_edits_are_undone_and_redone_without_limit() -> None:
     points, block = on_table()
     history = EditHistory()
-    masks = [select_polygon(block.shape, np.array([[k, 10], [k + 1, 10], [k + 1, 60], [k, 60]])) for k in range(60)]
+    masks = [
+        select_polygon(block.shape, np.array([[k, 10], [k + 1, 10], [k + 1, 60], [k, 60]]))
+        for k in range(60)
+    ]
     for mask in masks:
         history = history.add(make_edit(points, mask, "rectangle"))
     removed = np.isfinite(points[..., 2]) & ~history.keep_mask(points)
@@ -150,7 +162,9 @@ def test_edits_survive_another_calibration() -> None:
     plane = detect_support(points, 0.05)
     history = EditHistory().add(make_edit(points, plane.select_below(points), "support", plane))
     history = history.add(
-        make_edit(points, select_connected(np.where(block[..., None], points, np.nan), (50, 40)), "part")
+        make_edit(
+            points, select_connected(np.where(block[..., None], points, np.nan), (50, 40)), "part"
+        )
     )
     assert not history.keep_mask(points).any()
     other = points * np.float32(1.0003)
@@ -174,6 +188,11 @@ def test_masks_are_packed_without_loss_and_bounded_when_read() -> None:
     packed = pack_mask(block)
     assert packed.size < block.size / 50
     assert np.array_equal(unpack_mask(packed, (120, 90)), block)
-    for wrong, size in ((packed[:-6], (120, 90)), (packed, (121, 91)), (packed, (64, 64)), (packed, (0, 5))):
+    for wrong, size in (
+        (packed[:-6], (120, 90)),
+        (packed, (121, 91)),
+        (packed, (64, 64)),
+        (packed, (0, 5)),
+    ):
         with pytest.raises(InputError):
             unpack_mask(wrong, size)

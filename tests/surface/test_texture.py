@@ -1,4 +1,5 @@
-"""Textures: what the scans show comes to its place, without shading, gains, seams or what is hidden."""
+"""Textures: what the scans show comes to its place, without shading, gains, seams or what is
+hidden."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,13 +26,19 @@ AWAY = 300.0
 
 def albedo(points: np.ndarray) -> np.ndarray:
     """Reflectance of places on the ball: waves 15 mm long, and one half darker."""
-    return 0.5 + 0.2 * np.sin(points[..., 0] / 2.4) * np.cos(points[..., 1] / 2.4) + 0.15 * np.sign(points[..., 2])
+    return (
+        0.5
+        + 0.2 * np.sin(points[..., 0] / 2.4) * np.cos(points[..., 1] / 2.4)
+        + 0.15 * np.sign(points[..., 2])
+    )
 
 
 def painted(name: str, gain: float) -> Cloud:
     """A scan of the painted ball, lit from beside the camera."""
     cloud = ball(AWAY, 0.02, 1, size=(200, 150))
-    places = move_points(looking_from(SIDES[name], AWAY), cloud.points.reshape(-1, 3)).reshape(cloud.points.shape)
+    places = move_points(looking_from(SIDES[name], AWAY), cloud.points.reshape(-1, 3)).reshape(
+        cloud.points.shape
+    )
     normals = (cloud.points - [0, 0, AWAY]) / RADIUS
     to_light = LIGHT - cloud.points
     distance = np.linalg.norm(to_light, axis=-1)
@@ -51,7 +58,8 @@ def textured() -> TexturedMesh:
 
 
 def made_up() -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """A sphere with coordinates uv (n, 2) and an image (512, 512, 3) of chance, to be written and read back."""
+    """A sphere with coordinates uv (n, 2) and an image (512, 512, 3) of chance, to be written and
+    read back."""
     sphere, chance = trimesh.creation.icosphere(3, RADIUS), np.random.default_rng(4)
     image = chance.integers(0, 256, (512, 512, 3)).astype(np.uint8)
     return Mesh(sphere.vertices, sphere.faces), chance.random((len(sphere.vertices), 2)), image
@@ -61,12 +69,17 @@ def shown(textured: TexturedMesh) -> np.ndarray:
     """The image's red at each vertex."""
     size = len(textured.image)
     column, row = textured.uv[:, 0] * size - 0.5, (1 - textured.uv[:, 1]) * size - 0.5
-    at = np.clip(np.round(row), 0, size - 1).astype(int), np.clip(np.round(column), 0, size - 1).astype(int)
+    at = (
+        np.clip(np.round(row), 0, size - 1).astype(int),
+        np.clip(np.round(column), 0, size - 1).astype(int),
+    )
     return textured.image[at][:, 0].astype(float)
 
 
 @pytest.mark.slow
-def test_the_texture_is_the_reflectance_without_shading_and_exposures(textured: TexturedMesh) -> None:
+def test_the_texture_is_the_reflectance_without_shading_and_exposures(
+    textured: TexturedMesh,
+) -> None:
     red, truth = shown(textured), albedo(textured.mesh.vertices)
     away_from_step = np.abs(textured.mesh.vertices[:, 2]) > 3
     factor = np.sum(red * truth) / np.sum(truth**2)
@@ -86,7 +99,9 @@ def test_trimesh_and_open3d_read_mesh_and_image(tmp_path: Path, suffix: str) -> 
     assert size == sum(each.stat().st_size for each in tmp_path.iterdir())
     found = trimesh.load(path, force="mesh", process=False, maintain_order=True)
     assert len(found.faces) == len(mesh.faces)
-    assert found.extents.max() * (1000 if suffix == "glb" else 1) == pytest.approx(2 * RADIUS, rel=1e-3)
+    assert found.extents.max() * (1000 if suffix == "glb" else 1) == pytest.approx(
+        2 * RADIUS, rel=1e-3
+    )
     assert np.allclose(found.visual.uv, uv, atol=1e-5)
     material = found.visual.material
     image = np.asarray(material.baseColorTexture if suffix == "glb" else material.image)

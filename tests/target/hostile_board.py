@@ -1,4 +1,5 @@
-"""Boards in scenes that are not made for them: clutter around the sheet, glare, a second board, thermal contrast."""
+"""Boards in scenes that are not made for them: clutter around the sheet, glare, a second board,
+thermal contrast."""
 
 from dataclasses import dataclass, replace
 
@@ -15,8 +16,10 @@ Disc = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Scene(View):
-    """A board with ``discs`` in its plane, on the sheet and beside it; ``glare`` spots (u, v, radius px, grey levels);
-    ``texture`` grey levels of a cloudy background; ``second`` the same board once more, smaller, seen so."""
+    """A board with ``discs`` in its plane, on the sheet and beside it; ``glare`` spots (u, v,
+    radius px, grey levels); ``texture`` grey levels of a cloudy background; ``second`` the same
+    board once more, smaller, seen so.
+    """
 
     discs: tuple[Disc, ...] = ()
     glare: tuple[tuple[float, float, float, float], ...] = ()
@@ -64,8 +67,11 @@ def sheet_mask(view: View, board: Board) -> np.ndarray:
     return mask.astype(bool)
 
 
-def blobs_around(board: Board, seed: int, count: int, sheet: float = 0.6, like: float = 0.25) -> tuple[Disc, ...]:
-    """Dark discs about as large as the board's circles, scattered beyond the edge of a sheet ``sheet`` pitches wide."""
+def blobs_around(
+    board: Board, seed: int, count: int, sheet: float = 0.6, like: float = 0.25
+) -> tuple[Disc, ...]:
+    """Dark discs about as large as the board's circles, scattered beyond the edge of a sheet
+    ``sheet`` pitches wide."""
     rng = np.random.default_rng(seed)
     low, high = (f(board.points[:, :2], axis=0) / board.pitch_mm for f in (np.min, np.max))
     near = neighbour_distance_mm(board) / board.pitch_mm
@@ -80,10 +86,13 @@ def blobs_around(board: Board, seed: int, count: int, sheet: float = 0.6, like: 
 
 
 def lattice_around(board: Board, seed: int, share: float, jitter: float = 0.0) -> tuple[Disc, ...]:
-    """Dark discs where one more row of circles would be, ``share`` of it, each up to ``jitter`` pitches off."""
+    """Dark discs where one more row of circles would be, ``share`` of it, each up to ``jitter``
+    pitches off."""
     rng = np.random.default_rng(seed)
     points = board.points[:, :2] / board.pitch_mm
     row = points[points[:, 1] == 0] - (0, 2 if board.kind == "acircles" else 1)
     radius = 0.25 * neighbour_distance_mm(board) / board.pitch_mm
-    chosen = row[: max(1, round(share * len(row)))] + rng.uniform(-jitter, jitter, (max(1, round(share * len(row))), 2))
+    chosen = row[: max(1, round(share * len(row)))] + rng.uniform(
+        -jitter, jitter, (max(1, round(share * len(row))), 2)
+    )
     return tuple((float(x), float(y), float(radius), 0.08) for x, y in chosen)

@@ -1,4 +1,5 @@
-"""A small renderer of boards with known feature positions: supersampled, in perspective, shaded, blurred and noisy."""
+"""A small renderer of boards with known feature positions: supersampled, in perspective, shaded,
+blurred and noisy."""
 
 from dataclasses import dataclass
 
@@ -13,10 +14,10 @@ from slviewer.target.mark import mark_geometry
 class View:
     """How a board is seen.
 
-    ``fill`` is the width or height of the board over the image's; ``tilt`` deg about an axis at ``axis`` deg in the
-    image; ``roll`` deg clockwise in the image; ``shift`` px; ``marked`` a dot beside the first circle; ``k1`` radial
-    distortion in normalised coordinates; ``shade`` the ratio of brightest to darkest light; ``hide`` a rectangle of the
-    board in mm that shows paper.
+    ``fill`` is the width or height of the board over the image's; ``tilt`` deg about an axis at
+    ``axis`` deg in the image; ``roll`` deg clockwise in the image; ``shift`` px; ``marked`` a dot
+    beside the first circle; ``k1`` radial distortion in normalised coordinates; ``shade`` the ratio
+    of brightest to darkest light; ``hide`` a rectangle of the board in mm that shows paper.
     """
 
     size: tuple[int, int] = (640, 480)
@@ -53,11 +54,17 @@ class View:
         depth = focal * max(spread[0] / width, spread[1] / height) / self.fill
         T = np.array([0.0, 0.0, depth]) - R @ np.array([*middle, 0.0])
         K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-        return np.array([[1, 0, self.shift[0]], [0, 1, self.shift[1]], [0, 0, 1.0]]) @ K @ np.c_[R[:, :2], T]
+        return (
+            np.array([[1, 0, self.shift[0]], [0, 1, self.shift[1]], [0, 0, 1.0]])
+            @ K
+            @ np.c_[R[:, :2], T]
+        )
 
     def project(self, board: Board, points: np.ndarray) -> np.ndarray:
         """(n, 2) px of board points (n, 2) mm, distortion included."""
-        ideal = cv2.perspectiveTransform(np.asarray(points, float)[None, :, :2], self.homography(board))[0]
+        ideal = cv2.perspectiveTransform(
+            np.asarray(points, float)[None, :, :2], self.homography(board)
+        )[0]
         seen = ideal.copy()
         for _ in range(30):
             seen -= self._undistort(seen) - ideal
@@ -70,7 +77,8 @@ class View:
         return pixels + offset * self.k1 * radius2
 
     def gain(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Light at a pixel: a slope across the image times vignetting, 1 at its brightest, 1 / shade at its darkest."""
+        """Light at a pixel: a slope across the image times vignetting, 1 at its brightest, 1 /
+        shade at its darkest."""
         width, height = self.size
         along = (u / width + 0.4 * v / height) / 1.4
         away = ((u - width / 2) ** 2 + (v - height / 2) ** 2) / (width**2 + height**2) * 4
@@ -84,13 +92,18 @@ class View:
         width, height = self.size
         s = self.supersample
         inverse = np.linalg.inv(self.homography(board))
-        # a sheared grid of samples: an edge along a pixel row meets s² different heights rather than s
+        # a sheared grid of samples: an edge along a pixel row meets s² different heights rather
+        # than s
         b, a = np.meshgrid(np.arange(s), np.arange(s), indexing="ij")
         fine_u, fine_v = ((a + (b + 0.5) / s) / s - 0.5, (b + (a + 0.5) / s) / s - 0.5)
         image = np.empty((height, width))
         for v0 in range(0, height, 32):
             rows = np.arange(v0, min(v0 + 32, height))
-            u = np.arange(width)[None, None, :, None] + fine_u[None, :, None, :] + np.zeros((len(rows), 1, 1, 1))
+            u = (
+                np.arange(width)[None, None, :, None]
+                + fine_u[None, :, None, :]
+                + np.zeros((len(rows), 1, 1, 1))
+            )
             v = rows[:, None, None, None] + fine_v[None, :, None, :] + np.zeros((1, 1, width, 1))
             if self.k1:
                 u, v = np.moveaxis(self._undistort(np.stack([u, v], -1)), -1, 0)
@@ -101,7 +114,9 @@ class View:
         image = self.paper * image * self.gain(u, v)
         if self.blur:
             image = cv2.GaussianBlur(image, (0, 0), self.blur)
-        image += np.random.default_rng(seed).normal(0, self.noise, image.shape) if self.noise else 0.0
+        image += (
+            np.random.default_rng(seed).normal(0, self.noise, image.shape) if self.noise else 0.0
+        )
         return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
     def albedo(self, board: Board, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -110,7 +125,9 @@ class View:
         if self.marked and mark is not None:
             dark |= (x - mark.x) ** 2 + (y - mark.y) ** 2 < mark.radius**2
         if self.hide is not None:
-            dark &= ~((x > self.hide[0]) & (y > self.hide[1]) & (x < self.hide[2]) & (y < self.hide[3]))
+            dark &= ~(
+                (x > self.hide[0]) & (y > self.hide[1]) & (x < self.hide[2]) & (y < self.hide[3])
+            )
         margin = self.sheet * board.pitch_mm
         low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin
         on_sheet = (x > low[0]) & (y > low[1]) & (x < high[0]) & (y < high[1])
@@ -122,12 +139,17 @@ def dark_parts(board: Board, x: np.ndarray, y: np.ndarray, diameter: float) -> n
     """Bool: where a board is printed; ``diameter`` of circles over their distance."""
     p = board.pitch_mm
     if board.kind == "circles":
-        j, i = (np.clip(np.round(c / p), 0, n - 1) for c, n in ((x, board.columns), (y, board.rows)))
+        j, i = (
+            np.clip(np.round(c / p), 0, n - 1) for c, n in ((x, board.columns), (y, board.rows))
+        )
         return (x - j * p) ** 2 + (y - i * p) ** 2 < (diameter * p / 2) ** 2
     if board.kind == "acircles":
         dark = np.zeros(x.shape, bool)
         for first in (0, 1):
-            i = np.clip(2 * np.round((y / p - first) / 2), 0, 2 * ((board.rows - 1 - first) // 2)) + first
+            i = (
+                np.clip(2 * np.round((y / p - first) / 2), 0, 2 * ((board.rows - 1 - first) // 2))
+                + first
+            )
             j = np.clip(np.round((x / p - first) / 2), 0, board.columns - 1)
             dark |= (x - (2 * j + first) * p) ** 2 + (y - i * p) ** 2 < (diameter * p / 2**0.5) ** 2
         return dark
@@ -146,5 +168,7 @@ def dark_parts(board: Board, x: np.ndarray, y: np.ndarray, diameter: float) -> n
 
 def _marker_sheet(board: Board) -> np.ndarray:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    charuco = cv2.aruco.CharucoBoard((board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary)
+    charuco = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.pitch_mm, board.marker_mm, dictionary
+    )
     return charuco.generateImage((112 * board.columns, 112 * board.rows), marginSize=0)

@@ -55,10 +55,14 @@ def test_odd_lengths_keep_every_digit() -> None:
         ("charuco:20x20:30:20:DICT_4X4_50", ("200 markers", "DICT_4X4_50", 50)),
     ],
 )
-def test_bad_notation_is_refused_with_the_fault_and_an_example(notation: str, facts: tuple[object, ...]) -> None:
+def test_bad_notation_is_refused_with_the_fault_and_an_example(
+    notation: str, facts: tuple[object, ...]
+) -> None:
     with raises(InputError, *facts) as error:
         Board.parse(notation)
-    assert "DICT_4X4_50 has 50" in str(error.value) or any(kind in str(error.value) for kind in ("circles", "ch"))
+    assert "DICT_4X4_50 has 50" in str(error.value) or any(
+        kind in str(error.value) for kind in ("circles", "ch")
+    )
 
 
 def test_points_run_row_by_row_from_the_origin() -> None:

@@ -1,4 +1,5 @@
-"""Grids of circles in rendered images: where their centres are, how they are numbered, and what is refused."""
+"""Grids of circles in rendered images: where their centres are, how they are numbered, and what is
+refused."""
 
 from dataclasses import replace
 
@@ -21,7 +22,8 @@ SMALL = View(size=(400, 300), supersample=4)
 
 
 def discs(board: Board, view: View) -> np.ndarray:
-    """(n, 2) px: centroids of the circles' images, which perspective moves away from the images of their centres."""
+    """(n, 2) px: centroids of the circles' images, which perspective moves away from the images of
+    their centres."""
     radius = view.diameter * board.pitch_mm / 2 * (2**0.5 if board.kind == "acircles" else 1)
     r = radius * np.sqrt((np.arange(16) + 0.5) / 16)
     a = np.arange(32) / 32 * 2 * np.pi
@@ -52,7 +54,11 @@ def test_centroids_are_exact_to_a_hundredth_of_a_pixel_under_uneven_light(tilt: 
     [
         ("circles:9x7:20", replace(SMALL, noise=3, shade=3, tilt=20), 0.04),
         ("circles:9x7:20", replace(SMALL, inverted=True, shade=3, noise=1, tilt=25), 0.04),
-        ("circles:9x7:20", replace(SMALL, k1=0.4, tilt=20), 0.15),  # distortion moves centroids as well
+        (
+            "circles:9x7:20",
+            replace(SMALL, k1=0.4, tilt=20),
+            0.15,
+        ),  # distortion moves centroids as well
         ("acircles:4x11:20", replace(SMALL, tilt=25, shade=3, noise=1), 0.03),
         *often(
             ("circles:9x7:20", replace(SMALL, blur=2.5, tilt=20), 0.03),
@@ -91,12 +97,18 @@ def test_the_circles_radius_is_measured(notation: str, view: View, radius: float
 def test_other_image_types_give_the_same() -> None:
     image = replace(SMALL, tilt=20).render(BOARD)
     pixels = detect(BOARD, image).pixels
-    np.testing.assert_allclose(detect(BOARD, image.astype(np.uint16) * 16).pixels, pixels, atol=1e-3)
-    np.testing.assert_allclose(detect(BOARD, np.repeat(image[..., None], 3, axis=2)).pixels, pixels, atol=1e-3)
+    np.testing.assert_allclose(
+        detect(BOARD, image.astype(np.uint16) * 16).pixels, pixels, atol=1e-3
+    )
+    np.testing.assert_allclose(
+        detect(BOARD, np.repeat(image[..., None], 3, axis=2)).pixels, pixels, atol=1e-3
+    )
     np.testing.assert_allclose(detect(BOARD, image // 5).pixels, pixels, atol=0.05)
 
 
-@pytest.mark.parametrize("image", [np.zeros((300, 400)), np.zeros((300, 400, 4), np.uint8), np.zeros((4, 4), np.uint8)])
+@pytest.mark.parametrize(
+    "image", [np.zeros((300, 400)), np.zeros((300, 400, 4), np.uint8), np.zeros((4, 4), np.uint8)]
+)
 def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
     with raises(InputError, "uint8", "uint16"):
         detect(BOARD, image)
@@ -122,10 +134,16 @@ def test_a_symmetric_board_starts_where_the_rule_says(notation: str, roll: float
 
 @pytest.mark.parametrize(
     ("notation", "roll"),
-    crossed(["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20", "acircles:4x9:20"], [180, 70, 250, 130, 0, 330]),
+    crossed(
+        ["circles:9x7:20", "acircles:5x8:20", "circles:6x6:20", "acircles:4x9:20"],
+        [180, 70, 250, 130, 0, 330],
+    ),
 )
 def test_a_marked_board_starts_at_its_mark(notation: str, roll: float) -> None:
-    board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.6, shade=2, noise=1, marked=True)
+    board, view = (
+        Board.parse(notation),
+        replace(SMALL, roll=roll, tilt=20, fill=0.6, shade=2, noise=1, marked=True),
+    )
     detection = detect(board, view.render(board))
     assert detection.marked
     assert rms(detection.pixels - view.truth(board)) < 0.15
@@ -176,10 +194,14 @@ def test_an_odd_asymmetric_board_is_numbered_by_its_own_pattern(roll: float) -> 
         ("circles:9x7:20", (-30, -30, 190, 10)),  # the first row
         ("circles:9x7:20", (70, 50, 90, 70)),  # one circle in the middle
         ("acircles:4x11:20", (-30, -30, 190, 10)),
-        *often(("circles:9x7:20", (150, -30, 190, 190)), ("acircles:4x11:20", (-30, -30, 190, 30))),  # the last column
+        *often(
+            ("circles:9x7:20", (150, -30, 190, 190)), ("acircles:4x11:20", (-30, -30, 190, 30))
+        ),  # the last column
     ],
 )
-def test_hidden_circles_are_counted_not_guessed(notation: str, hide: tuple[float, float, float, float]) -> None:
+def test_hidden_circles_are_counted_not_guessed(
+    notation: str, hide: tuple[float, float, float, float]
+) -> None:
     board = Board.parse(notation)
     x, y = board.points[:, :2].T
     left = np.count_nonzero(~((x > hide[0]) & (y > hide[1]) & (x < hide[2]) & (y < hide[3])))
@@ -222,13 +244,17 @@ def test_a_smaller_grid_than_stated_is_refused() -> None:
 def test_a_transposed_notation_is_the_same_board_turned() -> None:
     image = replace(SMALL, tilt=15).render(BOARD)
     turned = detect(Board.parse("circles:7x9:20"), image).pixels.reshape(9, 7, 2)
-    np.testing.assert_allclose(np.rot90(detect(BOARD, image).pixels.reshape(7, 9, 2)), turned, atol=1e-6)
+    np.testing.assert_allclose(
+        np.rot90(detect(BOARD, image).pixels.reshape(7, 9, 2)), turned, atol=1e-6
+    )
 
 
 def test_squares_are_not_taken_for_circles() -> None:
     chessboard = Board.parse("chessboard:9x7:20")
     with raises(DetectionError, "squares"):
-        detect(Board.parse("acircles:5x8:20"), replace(SMALL, blur=0.5, fill=0.5).render(chessboard))
+        detect(
+            Board.parse("acircles:5x8:20"), replace(SMALL, blur=0.5, fill=0.5).render(chessboard)
+        )
 
 
 def test_overexposure_is_named() -> None:
@@ -252,6 +278,8 @@ def test_board_mask_covers_half_a_pitch_beyond_the_circles() -> None:
     view = replace(SMALL, tilt=30, axis=20)
     mask = board_mask(BOARD, detect(BOARD, view.render(BOARD)), (300, 400))
     expected = np.zeros((300, 400), np.uint8)
-    cv2.fillConvexPoly(expected, np.int32(np.round(view.project(BOARD, BOARD.outline()) * 16)), 1, shift=4)
+    cv2.fillConvexPoly(
+        expected, np.int32(np.round(view.project(BOARD, BOARD.outline()) * 16)), 1, shift=4
+    )
     assert mask.shape == (300, 400) and mask.dtype == bool
     assert np.count_nonzero(mask != expected.astype(bool)) < 0.002 * np.count_nonzero(mask)

@@ -34,11 +34,17 @@ def rms(difference: np.ndarray) -> float:
             ("chessboard:9x7:20", View(size=(480, 360), shade=4, tilt=45, axis=70, noise=2), 0.03),
             ("chessboard:9x7:20", replace(SMALL, shade=10, tilt=20), 0.04),
             ("chessboard:9x7:20", replace(SMALL, k1=0.4, tilt=20), 0.05),
-            ("charuco:8x6:20", View(size=(480, 360), fill=0.6, shade=4, tilt=20, axis=70, noise=1), 0.02),
+            (
+                "charuco:8x6:20",
+                View(size=(480, 360), fill=0.6, shade=4, tilt=20, axis=70, noise=1),
+                0.02,
+            ),
         ),
     ],
 )
-def test_corners_are_exact_to_hundredths_of_a_pixel(notation: str, view: View, limit: float) -> None:
+def test_corners_are_exact_to_hundredths_of_a_pixel(
+    notation: str, view: View, limit: float
+) -> None:
     board = Board.parse(notation)
     detection = detect(board, view.render(board))
     np.testing.assert_array_equal(detection.ids, np.arange(len(board.points)))
@@ -47,7 +53,10 @@ def test_corners_are_exact_to_hundredths_of_a_pixel(notation: str, view: View, l
 
 @pytest.mark.parametrize(
     ("notation", "roll"),
-    crossed(["chessboard:8x7:20", "chessboard:7x8:20", "charuco:7x5:20", "charuco:6x6:20"], [180, 90, 150, 270, 0]),
+    crossed(
+        ["chessboard:8x7:20", "chessboard:7x8:20", "charuco:7x5:20", "charuco:6x6:20"],
+        [180, 90, 150, 270, 0],
+    ),
 )
 def test_a_board_with_marks_of_its_own_keeps_its_numbers(notation: str, roll: float) -> None:
     board, view = Board.parse(notation), replace(SMALL, roll=roll, tilt=20, fill=0.7)

@@ -1,4 +1,5 @@
-"""Boards of circles among clutter: detected in place and in order, or refused for the right reason."""
+"""Boards of circles among clutter: detected in place and in order, or refused for the right
+reason."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -34,8 +35,14 @@ def hostile_scenes(board: Board, seed: int) -> Iterator[tuple[str, Scene]]:
     )
     blobs = blobs_around(board, seed, 40)
     warm = tuple((x, y, radius, 0.9) for x, y, radius, _ in blobs)
-    between = [(x + 0.5, y + 0.5, 0.08, 0.1) for x in range(board.columns - 1) for y in range(board.rows - 1)]
-    glare = tuple((float(rng.uniform(0, 400)), float(rng.uniform(0, 300)), 35.0, 90.0) for _ in range(3))
+    between = [
+        (x + 0.5, y + 0.5, 0.08, 0.1)
+        for x in range(board.columns - 1)
+        for y in range(board.rows - 1)
+    ]
+    glare = tuple(
+        (float(rng.uniform(0, 400)), float(rng.uniform(0, 300)), 35.0, 90.0) for _ in range(3)
+    )
     yield "many blobs", replace(base, discs=blobs_around(board, seed, 120))
     yield "blobs in a row", replace(base, discs=lattice_around(board, seed, 1.0, 0.25))
     yield "thermal", replace(base, inverted=True, blur=1.6, noise=4, contrast=0.4, discs=warm)
@@ -68,7 +75,9 @@ def test_a_board_among_clutter_is_detected_in_order(board: Board) -> None:
             continue
         detected += 1
         off = distance(detection.pixels, scene.truth(board), board is SYMMETRIC)
-        assert off.max() < 0.6, name  # centroids are not images of centres: a tenth of a pixel under a steep slant
+        assert off.max() < 0.6, (
+            name
+        )  # centroids are not images of centres: a tenth of a pixel under a steep slant
         assert not detection.marked, name
         errors.append(float(np.sqrt((off**2).mean())))
     assert detected >= len(scenes) - 1
@@ -78,7 +87,9 @@ def test_a_board_among_clutter_is_detected_in_order(board: Board) -> None:
 def corners_of(board: Board, away: float, radius: float) -> tuple[Disc, ...]:
     """Discs on the diagonals of the grid's four corners, as screws and holes of boards are."""
     high = board.points[:, :2].max(0) / board.pitch_mm
-    return tuple((x, y, radius, 0.08) for x in (-away, high[0] + away) for y in (-away, high[1] + away))
+    return tuple(
+        (x, y, radius, 0.08) for x in (-away, high[0] + away) for y in (-away, high[1] + away)
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +118,8 @@ def test_warm_spots_beyond_the_edge_of_a_thermal_board_are_no_mark() -> None:
     rng, detected = np.random.default_rng(4), 0
     for k in range(12):
         spots = tuple(
-            (-0.625 + a, -0.625 + b, float(rng.uniform(0.1, 0.3)), 1.0) for a, b in rng.uniform(-0.3, 0.3, (3, 2))
+            (-0.625 + a, -0.625 + b, float(rng.uniform(0.1, 0.3)), 1.0)
+            for a, b in rng.uniform(-0.3, 0.3, (3, 2))
         )
         view = replace(SCENE, inverted=True, blur=1.5, noise=3, roll=180, sheet=0.4, discs=spots)
         try:
@@ -116,7 +128,9 @@ def test_warm_spots_beyond_the_edge_of_a_thermal_board_are_no_mark() -> None:
             continue
         detected += 1
         assert not detection.marked
-        assert distance(detection.pixels, view.truth(SYMMETRIC)[::-1], False).max() < 1.0, "numbered by the rule"
+        assert distance(detection.pixels, view.truth(SYMMETRIC)[::-1], False).max() < 1.0, (
+            "numbered by the rule"
+        )
     assert detected >= 4
 
 
@@ -124,7 +138,9 @@ def test_warm_spots_beyond_the_edge_of_a_thermal_board_are_no_mark() -> None:
 def test_a_marked_board_among_clutter_starts_at_its_mark(roll: float) -> None:
     for seed in range(2):
         around = blobs_around(SYMMETRIC, seed, 60, sheet=1.2)
-        scene = replace(SCENE, sheet=1.3, roll=roll, tilt=20, fill=0.55, marked=True, discs=around, noise=2)
+        scene = replace(
+            SCENE, sheet=1.3, roll=roll, tilt=20, fill=0.55, marked=True, discs=around, noise=2
+        )
         detection = detect(SYMMETRIC, scene.render(SYMMETRIC, seed))
         assert detection.marked
         assert np.linalg.norm(detection.pixels - scene.truth(SYMMETRIC), axis=1).max() < 0.3
@@ -142,7 +158,9 @@ def test_of_two_boards_the_much_larger_is_taken_and_of_two_alike_none() -> None:
     scene = replace(SCENE, fill=0.5, shift=(-60.0, 0.0), second=small, roll=5)
     detection = detect(SYMMETRIC, scene.render(SYMMETRIC))
     assert np.linalg.norm(detection.pixels - scene.truth(SYMMETRIC), axis=1).max() < 0.2
-    mirrored = replace(scene, fill=0.4, shift=(-100.0, 0.0), second=replace(small, fill=0.38, shift=(90.0, 0.0)))
+    mirrored = replace(
+        scene, fill=0.4, shift=(-100.0, 0.0), second=replace(small, fill=0.38, shift=(90.0, 0.0))
+    )
     with raises(DetectionError, "2 boards", "circles:9x7:20"):
         detect(SYMMETRIC, mirrored.render(SYMMETRIC))
 

@@ -1,4 +1,5 @@
-"""Real photographs: OpenCV's own pictures of circle grids, and a camera and projector capture of a chessboard."""
+"""Real photographs: OpenCV's own pictures of circle grids, and a camera and projector capture of a
+chessboard."""
 
 import re
 from pathlib import Path
@@ -28,13 +29,17 @@ def photograph(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("folder", "number", "notation"), PHOTOGRAPHS)
-def test_circles_are_found_where_opencv_finds_them(real_data: Path, folder: str, number: int, notation: str) -> None:
+def test_circles_are_found_where_opencv_finds_them(
+    real_data: Path, folder: str, number: int, notation: str
+) -> None:
     prefix = "circles" if folder == "circles" else "acircles"
     image = photograph(real_data / "opencv_circles" / folder / f"{prefix}{number}.png")
     board = Board.parse(notation)
     pixels = detect(board, image).pixels
     text = (real_data / "opencv_circles" / folder / f"{prefix}_corners{number}.dat").read_text()
-    centres = np.array(re.search(r"data: \[([^]]*)\]", text).group(1).split(","), float).reshape(-1, 2)
+    centres = np.array(re.search(r"data: \[([^]]*)\]", text).group(1).split(","), float).reshape(
+        -1, 2
+    )
     apart = np.linalg.norm(pixels[:, None] - centres[None], axis=2)
     assert sorted(apart.argmin(1)) == list(range(len(pixels)))
     # OpenCV's centres are a tenth of a pixel off themselves; the large photograph has large circles
@@ -50,7 +55,10 @@ def test_circles_are_found_where_opencv_finds_them(real_data: Path, folder: str,
 )
 def test_boards_that_are_not_there_are_refused(real_data: Path, number: int, notation: str) -> None:
     with pytest.raises(DetectionError):
-        detect(Board.parse(notation), photograph(real_data / "opencv_circles" / "negatives" / f"negative_{number}.png"))
+        detect(
+            Board.parse(notation),
+            photograph(real_data / "opencv_circles" / "negatives" / f"negative_{number}.png"),
+        )
 
 
 @pytest.mark.parametrize("pose", [0, *often(1, 2, 3, 4)])
@@ -62,12 +70,15 @@ def test_a_chessboard_is_found_by_either_notation(real_data: Path, pose: int) ->
     apart = np.linalg.norm(pixels[:, None] - turned[None], axis=2)
     assert sorted(apart.argmin(1)) == list(range(63)) and apart.min(1).max() < 0.02
     for board, found in ((wide, pixels), (tall, turned)):
-        # a lens of this quality is close to a pinhole: residuals show sub-pixel errors, and paper that is not flat
+        # a lens of this quality is close to a pinhole: residuals show sub-pixel errors, and paper
+        # that is not flat
         H, _ = cv2.findHomography(board.points[:, :2], found)
         left_over = found - cv2.perspectiveTransform(board.points[None, :, :2], H)[0]
         assert 0.05 < np.sqrt((left_over**2).sum(1).mean()) < 1.2
     mask = board_mask(wide, detect(wide, image), image.shape)
-    squares = np.abs(cv2.contourArea(np.float32([pixels[0], pixels[8], pixels[-1], pixels[-9]]))) / 48
+    squares = (
+        np.abs(cv2.contourArea(np.float32([pixels[0], pixels[8], pixels[-1], pixels[-9]]))) / 48
+    )
     assert np.count_nonzero(mask) == pytest.approx(9.9 * 7.9 * squares, rel=0.1)
 
 

@@ -1,4 +1,5 @@
-"""Printable sheets: the numbers in the files are the board's, to a micrometre, and what is drawn is found."""
+"""Printable sheets: the numbers in the files are the board's, to a micrometre, and what is drawn is
+found."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -28,7 +29,9 @@ def svg_shapes(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     assert root.attrib["viewBox"] == " ".join(
         ["0 0", *(root.attrib[s].removesuffix("mm") for s in ("width", "height"))]
     )
-    circles = [[float(c.attrib[name]) for name in ("cx", "cy", "r")] for c in root.iter(f"{SVG}circle")]
+    circles = [
+        [float(c.attrib[name]) for name in ("cx", "cy", "r")] for c in root.iter(f"{SVG}circle")
+    ]
     path_data = next(root.iter(f"{SVG}path")).attrib["d"]
     rectangles = re.findall(r"M(\S+) (\S+?)h(\S+?)v(\S+?)h(\S+?)z", path_data)
     return np.array(size), np.array(circles), np.array(rectangles, float)[:, :4]
@@ -53,7 +56,9 @@ def pdf_shapes(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for _, _, curves in arcs:
         ends = np.array([line.split()[4:6] for line in curves.strip().split("\n")], float)
         circles.append([*ends.mean(0), np.ptp(ends[:, 0]) / 2])
-    rectangles = np.array(re.findall(r"^(\S+) (\S+) (\S+) (\S+) re$", content, re.M), float).reshape(-1, 4)
+    rectangles = np.array(
+        re.findall(r"^(\S+) (\S+) (\S+) (\S+) re$", content, re.M), float
+    ).reshape(-1, 4)
     page_height = size[1]
 
     def on_page(points: np.ndarray) -> np.ndarray:  # to mm from the top left corner of the paper
@@ -73,7 +78,9 @@ def test_distances_are_exact_to_a_micrometre(notation: str, suffix: str, tmp_pat
     size, circles, rectangles = (svg_shapes if suffix == ".svg" else pdf_shapes)(path)
     wanted = draw_board(board)
     np.testing.assert_allclose(size, (wanted.width, wanted.height), atol=1e-3)
-    np.testing.assert_allclose(circles.reshape(-1, 3), np.array(wanted.circles).reshape(-1, 3), atol=1e-3)
+    np.testing.assert_allclose(
+        circles.reshape(-1, 3), np.array(wanted.circles).reshape(-1, 3), atol=1e-3
+    )
     np.testing.assert_allclose(rectangles, wanted.rectangles, atol=1e-3)
     assert missing_facts(path.read_text(), notation, "100 %") == []
     if board.kind in ("circles", "acircles"):
@@ -93,7 +100,9 @@ def test_a_narrow_margin_has_no_mark_and_a_wide_one_leaves_paper_around_it() -> 
 
 def test_circles_are_half_the_distance_between_neighbours() -> None:
     assert draw_board(Board.parse("circles:5x4:9")).circles[0][2] == pytest.approx(9 / 4)
-    assert draw_board(Board.parse("acircles:4x5:20")).circles[0][2] == pytest.approx(20 * 2**0.5 / 4)
+    assert draw_board(Board.parse("acircles:4x5:20")).circles[0][2] == pytest.approx(
+        20 * 2**0.5 / 4
+    )
 
 
 @pytest.mark.parametrize(
@@ -103,7 +112,9 @@ def test_the_scale_bar_is_as_long_as_it_says(notation: str, length: int) -> None
     drawing = draw_board(Board.parse(notation))
     assert max(w for _, _, w, h in drawing.rectangles if h < 0.5) == length
     assert missing_facts(drawing.texts[0][3], f"{length} mm") == []
-    assert all(x + w <= drawing.width and y + h <= drawing.height for x, y, w, h in drawing.rectangles)
+    assert all(
+        x + w <= drawing.width and y + h <= drawing.height for x, y, w, h in drawing.rectangles
+    )
 
 
 def rasterised(drawing: Drawing) -> np.ndarray:
@@ -115,10 +126,14 @@ def rasterised(drawing: Drawing) -> np.ndarray:
         cv2.circle(page, centre, round(r * fine * 16), 0, -1, shift=4)
     for x, y, w, h in drawing.rectangles:
         page[round(y * fine) : round((y + h) * fine), round(x * fine) : round((x + w) * fine)] = 0
-    return cv2.GaussianBlur(cv2.resize(page, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), (3, 3), 0)
+    return cv2.GaussianBlur(
+        cv2.resize(page, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), (3, 3), 0
+    )
 
 
-@pytest.mark.parametrize("notation", [*NOTATIONS, "chessboard:6x4:10", "charuco:5x6:20:15:DICT_4X4_50"])
+@pytest.mark.parametrize(
+    "notation", [*NOTATIONS, "chessboard:6x4:10", "charuco:5x6:20:15:DICT_4X4_50"]
+)
 def test_a_printed_board_is_found_with_its_numbers(notation: str) -> None:
     board = Board.parse(notation)
     drawing = draw_board(board)
@@ -127,9 +142,13 @@ def test_a_printed_board_is_found_with_its_numbers(notation: str) -> None:
     expected = (board.points[:, :2] + corner) * 4 - 0.5
     np.testing.assert_array_equal(detection.ids, np.arange(len(board.points)))
     assert detection.marked == ("circles" in notation)
-    turned = detect(board, np.rot90(rasterised(drawing), 2)).pixels  # the rule alone would count from the other end
+    turned = detect(
+        board, np.rot90(rasterised(drawing), 2)
+    ).pixels  # the rule alone would count from the other end
     if detection.marked:
-        np.testing.assert_allclose(turned, np.array(rasterised(drawing).shape[::-1]) - 1 - expected, atol=0.15)
+        np.testing.assert_allclose(
+            turned, np.array(rasterised(drawing).shape[::-1]) - 1 - expected, atol=0.15
+        )
     np.testing.assert_allclose(detection.pixels, expected, atol=0.15)
 
 

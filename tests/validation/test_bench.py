@@ -1,4 +1,5 @@
-"""What the benchmark says of its floors and of absent peers; its figures are ratios, and no test's business."""
+"""What the benchmark says of its floors and of absent peers; its figures are ratios, and no test's
+business."""
 
 import json
 
@@ -18,7 +19,9 @@ def test_the_floor_reads_and_writes_every_byte() -> None:
     numbers = rng.random((2, 7, 9)).astype(np.float32)
     grey, single = np.zeros((1, 7, 9), np.uint8), np.zeros((3, 7, 9), np.float32)
     triple = np.zeros((1, 7, 9, 3), np.float32)
-    seconds, floor = time_beside(lambda: None, lambda: move_bytes(frames, numbers, grey, single, triple), 3)
+    seconds, floor = time_beside(
+        lambda: None, lambda: move_bytes(frames, numbers, grey, single, triple), 3
+    )
     assert 0 <= seconds < floor
     np.testing.assert_array_equal(grey[0], np.bitwise_xor.reduce(frames))
     np.testing.assert_allclose(single, np.broadcast_to(numbers.sum(0), single.shape), rtol=1e-6)
@@ -27,8 +30,12 @@ def test_the_floor_reads_and_writes_every_byte() -> None:
 
 def test_the_table_and_its_json() -> None:
     frames = np.zeros((2, 500, 1000), np.uint8)
-    table = Benchmark([row("decode", 0.003, megabytes(frames), 0.002, 0.06)], None, (missing("no-such-peer"),))
-    assert missing_facts(table.text(), "decode", "no-such-peer", "pip install 'slviewer[bench]'") == []
+    table = Benchmark(
+        [row("decode", 0.003, megabytes(frames), 0.002, 0.06)], None, (missing("no-such-peer"),)
+    )
+    assert (
+        missing_facts(table.text(), "decode", "no-such-peer", "pip install 'slviewer[bench]'") == []
+    )
     stage = json.loads(json.dumps(table.to_json()))["stages"][0]
     assert stage["MB"] == 1.0 and abs(stage["ratio to floor"] - 1.5) < 1e-9
     assert abs(stage["ratio NumPy / kernel"] - 20) < 1e-9

@@ -31,7 +31,9 @@ SHAPES = ("plane_03", "sphere_3", "sphere_4")
 
 def few_steps(projector: tuple[int, int]) -> PatternSequence:
     """A third of the usual phase steps."""
-    frames = [f for a in AXES for f in (*phase_steps(a, 6, 18.0), *gray_bits(a, 7), Frame("texture"))]
+    frames = [
+        f for a in AXES for f in (*phase_steps(a, 6, 18.0), *gray_bits(a, 7), Frame("texture"))
+    ]
     return PatternSequence(projector, tuple(frames))
 
 
@@ -55,7 +57,9 @@ def test_a_rig_is_measured_from_its_images(proof: Proof) -> None:
     errors = rig.radius_error_mm[FLOOR]
     assert set(errors) == {"sphere_3", "sphere_4"} and 0 < max(map(abs, errors.values())) < 0.05
     assert 0 < abs(rig.spacing_error_mm[FLOOR]["sphere_3 - sphere_4"]) < 0.05
-    assert json.loads(json.dumps(proof.to_json()))["rigs"][0]["planes"]["plane_03"]["region"] == "R2"
+    assert (
+        json.loads(json.dumps(proof.to_json()))["rigs"][0]["planes"]["plane_03"]["region"] == "R2"
+    )
 
 
 @pytest.mark.computes
@@ -68,19 +72,25 @@ def test_the_perfect_instrument_errs_by_noise_alone() -> None:
     phases = {axis: decode(sequence, frames, axis) for axis in ("x", "y")}
     model = PerfectModel(rig)
     inside = truth.mask.copy()
-    inside[1:-1, 1:-1] &= truth.mask[:-2, 1:-1] & truth.mask[2:, 1:-1] & truth.mask[1:-1, :-2] & truth.mask[1:-1, 2:]
+    inside[1:-1, 1:-1] &= (
+        truth.mask[:-2, 1:-1] & truth.mask[2:, 1:-1] & truth.mask[1:-1, :-2] & truth.mask[1:-1, 2:]
+    )
     points = model.points(phases["x"])
     error = (points - truth.points)[..., 2] / model.sigma_z(phases["x"], points)
     scored = inside & np.isfinite(error) & (np.abs(error) < 6)
     assert np.count_nonzero(scored) > 0.97 * np.count_nonzero(inside)
     assert np.std(error[scored]) == pytest.approx(1, abs=0.1) and abs(np.mean(error[scored])) < 0.1
     # what a model without noise measures is the truth itself
-    exact = replace(phases["x"], phase=(truth.projector[..., 0] * 2 * np.pi / 18).astype(np.float32))
+    exact = replace(
+        phases["x"], phase=(truth.projector[..., 0] * 2 * np.pi / 18).astype(np.float32)
+    )
     found = model.points(exact)[inside & exact.mask]
     assert np.max(np.abs(found - truth.points[inside & exact.mask])) < 0.01
 
 
-def figures(splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, measured=1.0, distorted=True) -> RigFigures:
+def figures(
+    splined=1.0, predicted=1.0, radius=0.004, spacing=0.01, measured=1.0, distorted=True
+) -> RigFigures:
     """A rig whose planes come out so many times the floor."""
     rms = {"stereo": 0.2, "pixelwise": 0.08, "splined": 0.04 * splined, FLOOR: 0.04}
     planes = {

@@ -1,4 +1,5 @@
-"""Faults injected into simulated captures are called by their names; a share of what `prove_causes` runs."""
+"""Faults injected into simulated captures are called by their names; a share of what `prove_causes`
+runs."""
 
 import json
 from functools import cache
@@ -31,7 +32,8 @@ SHARE = (
 """With SINGLE, of each cause one way or two in which it comes about."""
 ALL = SINGLE + SHARE
 FEW = ("two poses",)
-"""Few captures are rendered and read; `tests/calibration/test_diagnosis.py` judges the evidence of the others."""
+"""Few captures are rendered and read; `tests/calibration/test_diagnosis.py` judges the evidence of
+the others."""
 REST = tuple(fault for fault in ALL if fault not in FEW)
 
 
@@ -47,13 +49,17 @@ def test_every_cause_has_a_fault_here() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
-@pytest.mark.parametrize("fault", [*FEW, *(pytest.param(fault, marks=pytest.mark.slow) for fault in REST)])
+@pytest.mark.parametrize(
+    "fault", [*FEW, *(pytest.param(fault, marks=pytest.mark.slow) for fault in REST)]
+)
 def test_each_cause_is_named_first(fault: str) -> None:
     proof = prove(FEW if fault in FEW else REST)
     case = next(case for case in proof.record["cases"] if case["fault"] == fault)
     assert case["causes"][0] == FAULTS[fault][0], case
     assert case["findings"][0][-1] not in ".:"
-    assert (case["level"] == "good") == (fault in SINGLE)  # one pose is excluded, and the others are sound
+    assert (case["level"] == "good") == (
+        fault in SINGLE
+    )  # one pose is excluded, and the others are sound
 
 
 @pytest.mark.computes
@@ -65,7 +71,9 @@ def test_clean_calibrations_raise_no_alarm() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
-@pytest.mark.parametrize("faults", [FEW, pytest.param(REST, marks=pytest.mark.slow)], ids=["few", "rest"])
+@pytest.mark.parametrize(
+    "faults", [FEW, pytest.param(REST, marks=pytest.mark.slow)], ids=["few", "rest"]
+)
 def test_the_table_counts_what_was_named(faults: tuple[str, ...]) -> None:
     proof, clean = prove(faults), int(faults == REST)
     count = len(faults) + clean

@@ -10,7 +10,9 @@ from slviewer.validation.prove_edges import measure_object_edges, measure_ridges
 pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
 
-@pytest.mark.parametrize(("scale", "blur_px"), [(0.25, 0.6), pytest.param(0.5, 1.2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("scale", "blur_px"), [(0.25, 0.6), pytest.param(0.5, 1.2, marks=pytest.mark.slow)]
+)
 def test_the_ridges_of_a_print_are_lower_by_a_factor_of_three(scale: float, blur_px: float) -> None:
     rig = letter(scale, 3)
     rig = replace(rig, sensor=replace(rig.sensor, psf_px=blur_px / scale))

@@ -9,7 +9,14 @@ from facts import raises
 from slviewer.errors import InputError, UsageError
 from slviewer.simulation.hostile import FAULTS
 from slviewer.validation.hostile_captures import CaseReport, MeasuredScan
-from slviewer.validation.prove_hostile import Figures, choose_cases, fit_gauge, judge_case, prove_hostile, score
+from slviewer.validation.prove_hostile import (
+    Figures,
+    choose_cases,
+    fit_gauge,
+    judge_case,
+    prove_hostile,
+    score,
+)
 
 FLOOR = Figures(0.06, 0.06, 0.003, 0.99)
 GOOD = Figures(0.07, 0.06, 0.004, 0.98)
@@ -20,7 +27,9 @@ RIGHT, OTHER = frozenset({"flicker"}), frozenset({"projector-size"})
 
 
 def outcome(figures, *named, severity="medium", error=None):
-    return judge_case(FAULTS["flicker"], severity, CaseReport([], list(named), error), figures, FLOOR)[0]
+    return judge_case(
+        FAULTS["flicker"], severity, CaseReport([], list(named), error), figures, FLOOR
+    )[0]
 
 
 def test_cases_are_judged_by_errors_and_by_what_was_said():
@@ -28,10 +37,15 @@ def test_cases_are_judged_by_errors_and_by_what_was_said():
     assert outcome(GOOD, OTHER) == outcome(WRONG, OTHER) == "WRONG REASON"
     assert outcome(WRONG) == "SILENTLY WRONG" and outcome(WRONG, OTHER, RIGHT) == "degraded, warned"
     assert outcome(NOISY) == "noisier as predicted" and outcome(EMPTY) == "UNEXPLAINED LOSS"
-    assert outcome(NOISY, severity="mild") == outcome(EMPTY, RIGHT, severity="mild") == "TURNED AWAY"
+    assert (
+        outcome(NOISY, severity="mild") == outcome(EMPTY, RIGHT, severity="mild") == "TURNED AWAY"
+    )
     assert outcome(WRONG, severity="mild") == "SILENTLY WRONG"
     assert outcome(None, RIGHT, error=InputError("no")) == "refused"
-    assert outcome(None, error=InputError("9 % of the codes lie outside the projector")) == "WRONG REASON"
+    assert (
+        outcome(None, error=InputError("9 % of the codes lie outside the projector"))
+        == "WRONG REASON"
+    )
     assert outcome(None, error=ValueError("shapes")) == "CRASH"
 
 
@@ -52,7 +66,10 @@ def test_a_rigid_motion_is_no_error_and_a_bend_is_one():
 
 def test_cases_are_chosen_by_name():
     assert len(choose_cases()) >= 60 and len({name for name, _, _ in choose_cases()}) >= 22
-    assert choose_cases(["jpeg:mild"]) == [("jpeg", "mild", "scan"), ("jpeg", "mild", "calibration")]
+    assert choose_cases(["jpeg:mild"]) == [
+        ("jpeg", "mild", "scan"),
+        ("jpeg", "mild", "calibration"),
+    ]
     assert len(choose_cases(["gamma::scan", "flicker"])) == 9
     with raises(UsageError, "jpg"):
         choose_cases(["jpg"])
@@ -62,7 +79,9 @@ def test_cases_are_chosen_by_name():
 @pytest.mark.slow
 def test_three_cases_end_to_end():
     proof = prove_hostile(
-        0.15, cases=["vignetting:mild:scan", "dropped-frame:medium:scan", "hand:mild:scan"], splined=False
+        0.15,
+        cases=["vignetting:mild:scan", "dropped-frame:medium:scan", "hand:mild:scan"],
+        splined=False,
     )
     data = json.loads(json.dumps(proof.to_json()))
     by_fault = {case["fault"]: case for case in data["cases"]}

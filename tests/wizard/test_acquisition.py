@@ -1,4 +1,5 @@
-"""The devices' thread: previews, captures that are whole or absent, and devices that fail and come back."""
+"""The devices' thread: previews, captures that are whole or absent, and devices that fail and come
+back."""
 
 import threading
 import time
@@ -136,16 +137,25 @@ def test_a_fault_ends_one_capture_and_nothing_else(bench: Bench, fault, frame: i
     bench.acquisition.capture(bench.request("broken"))
     bench.acquisition.capture(bench.request("waiting"))
     until(lambda: len(bench.texts) >= 2)
-    assert missing_facts(bench.texts[0], f"{frame + 1} of {FRAMES}", "discarded", "1 waiting", "dropped") == []
+    assert (
+        missing_facts(
+            bench.texts[0], f"{frame + 1} of {FRAMES}", "discarded", "1 waiting", "dropped"
+        )
+        == []
+    )
     assert bench.levels == ["error", "good"]
     assert bench.saved == [] and bench.acquisition.idle
     bench.previews_go_on()
     bench.acquisition.capture(bench.request("after"))
     until(lambda: bench.acquisition.idle)
-    assert [name for name, _, _ in bench.saved] == ["after"] and bench.acquisition.view().fault == ""
+    assert [name for name, _, _ in bench.saved] == [
+        "after"
+    ] and bench.acquisition.view().fault == ""
 
 
-def test_devices_that_do_not_open_are_tried_again_and_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_that_do_not_open_are_tried_again_and_reported_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     clock = Clock()
     bench = Bench(clock)
     tries = []
@@ -160,12 +170,20 @@ def test_devices_that_do_not_open_are_tried_again_and_reported_once(monkeypatch:
 
     monkeypatch.setattr(bench.rig.camera, "open", refuse)
     bench.acquisition.use(bench.rig)
-    for now_s, count in ((0.0, 1), (0.09, 1), (0.11, 2), (0.2, 2), (0.22, 3)):  # 0.1 s after the last one
+    for now_s, count in (
+        (0.0, 1),
+        (0.09, 1),
+        (0.11, 2),
+        (0.2, 2),
+        (0.22, 3),
+    ):  # 0.1 s after the last one
         clock.now_s = now_s
         until(lambda count=count: len(tries) >= count)
         look_at_the_clock_again()
         assert len(tries) == count
-    assert bench.acquisition.view().state == "lost" and bench.texts == ["the camera is not there: plug it in"]
+    assert bench.acquisition.view().state == "lost" and bench.texts == [
+        "the camera is not there: plug it in"
+    ]
     with raises(DeviceError, "in vain"):
         bench.acquisition.capture(bench.request("in vain"))
     monkeypatch.undo()
@@ -180,7 +198,9 @@ def test_a_disk_that_refuses_loses_the_capture_but_not_the_rig(bench: Bench) -> 
 
     bench.open()
     followed: list[bool] = []
-    bench.acquisition.capture(CaptureRequest("pose_01", SEQUENCE, save, lambda: followed.append(True)))
+    bench.acquisition.capture(
+        CaptureRequest("pose_01", SEQUENCE, save, lambda: followed.append(True))
+    )
     until(lambda: bool(bench.texts))
     assert bench.texts == ["pose_01: the disk is full: free some space"] and followed == []
     assert bench.acquisition.view().state == "open"
@@ -231,6 +251,12 @@ def test_closing_gives_the_devices_back(bench: Bench) -> None:
     bench.rig.close()
     bench.open()
     bench.acquisition.close()
-    until(lambda: not any(t.name == "slviewer acquisition" and t.is_alive() for t in threading.enumerate()))
+    until(
+        lambda: (
+            not any(
+                t.name == "slviewer acquisition" and t.is_alive() for t in threading.enumerate()
+            )
+        )
+    )
     bench.rig.open()
     bench.rig.close()

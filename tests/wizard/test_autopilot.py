@@ -1,4 +1,5 @@
-"""The autopilot runs the wizard on a small rig; then everything that can be looked at, exported and undone."""
+"""The autopilot runs the wizard on a small rig; then everything that can be looked at, exported and
+undone."""
 
 import csv
 import importlib
@@ -52,13 +53,18 @@ def acts() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def operator(recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: list[str]) -> Iterator[Operator]:
+def operator(
+    recorded: Path, tmp_path_factory: pytest.TempPathFactory, acts: list[str]
+) -> Iterator[Operator]:
     """After all acts of the autopilot, which found all poses but the last in its session."""
     folder = tmp_path_factory.mktemp("flight") / "session"
     with Session.create(folder):
         pass
     for pose in (f"pose_{i:02d}" for i in range(1, POSES)):
-        for place in (f"captures/{pose}", *(f"results/{made}/{pose}" for made in ("poses", "evidence", "trust"))):
+        for place in (
+            f"captures/{pose}",
+            *(f"results/{made}/{pose}" for made in ("poses", "evidence", "trust")),
+        ):
             copy_session(recorded / "session" / place, folder / place)
     with flown(folder, "p18", acts) as operator:
         yield operator
@@ -69,7 +75,9 @@ def session_of(snapshot: Snapshot) -> SessionView:
     return snapshot.session
 
 
-def test_the_flight_from_recorded_poses_reaches_a_merged_ply(operator: Operator, acts: list[str]) -> None:
+def test_the_flight_from_recorded_poses_reaches_a_merged_ply(
+    operator: Operator, acts: list[str]
+) -> None:
     assert_all_is_measured(operator.snapshot(), acts)
     assert "Capturing pose 7 of 8" not in acts
 
@@ -92,8 +100,14 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     assert session.coverage is not None and session.coverage.share > 0.6
     assert session.enough and session.plan is not None and 0.005 < session.plan.sigma_mm < 0.024  # type: ignore[operator]
     calibration = session.calibration
-    assert calibration is not None and calibration.best == "splined" and abs(calibration.stereo.baseline_mm - 180) < 2
-    assert session.verdict is not None and session.verdict_of_calibration and not calibration.refused
+    assert (
+        calibration is not None
+        and calibration.best == "splined"
+        and abs(calibration.stereo.baseline_mm - 180) < 2
+    )
+    assert (
+        session.verdict is not None and session.verdict_of_calibration and not calibration.refused
+    )
     splined = calibration.splined
     assert splined is not None and splined.summary["noise_px"]["x"] < 0.03
     assert splined.summary["cells_lit"]["camera"] > 0.8
@@ -107,13 +121,17 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     merge = session.merge
     assert merge is not None and merge.record.reference == "scan_03"
     assert set(merge.record.pairs) == {"scan_01", "scan_02"}
-    assert all(0.01 < pair.rms_mm < 0.5 and pair.overlap > 0.5 for pair in merge.record.pairs.values())
+    assert all(
+        0.01 < pair.rms_mm < 0.5 and pair.overlap > 0.5 for pair in merge.record.pairs.values()
+    )
     merged = read_ply(next(e.path for e in session.exports if e.name == "merged_1.ply"))
     assert len(merged.points) == merge.record.points > 30_000
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
     sphere, width = session.measurements
     radius = sphere.quantities[0]
-    assert radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2  # the simulated sphere's
+    assert (
+        radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2
+    )  # the simulated sphere's
     assert 130 < width.quantities[0].value < 150  # the ammonite's
 
 
@@ -123,7 +141,11 @@ def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operato
     session = session_of(snapshot)
     plan = session.plan
     assert plan is not None and session.wanted_mm == 0.0001 and not session.enough
-    assert plan.sigma_next_mm is not None and plan.sigma_mm is not None and plan.sigma_next_mm < plan.sigma_mm
+    assert (
+        plan.sigma_next_mm is not None
+        and plan.sigma_mm is not None
+        and plan.sigma_next_mm < plan.sigma_mm
+    )
     assert snapshot.hands_free
     assert operator.set_wanted_sigma(None) and not operator.set_wanted_sigma(-1.0)
     snapshot = operator.wait_until_idle(HANG_S)
@@ -135,7 +157,11 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
     store = operator.session
     assert store is not None
     cloud = result_views.load_scan_cloud(store, "plane_01")
-    assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {"stereo", "pixelwise", "splined"}
+    assert cloud.points.shape == (300, 400, 3) and set(cloud.errors) == {
+        "stereo",
+        "pixelwise",
+        "splined",
+    }
     measured = np.isfinite(cloud.points).all(-1)
     assert np.isfinite(cloud.phase[measured]).all() and cloud.modulation[measured].min() > 1
     v, u = 150, 200
@@ -147,9 +173,13 @@ def test_panels_find_what_they_draw(operator: Operator) -> None:
     assert result_views.merged_cloud(store, "1").normals is not None
 
 
-def run_guarded(operation: Operation[..., Any, Any], settings: object) -> Callable[[Session, Reporter], object]:
+def run_guarded(
+    operation: Operation[..., Any, Any], settings: object
+) -> Callable[[Session, Reporter], object]:
     """Return the job of an operation, which saves nothing once it is cancelled."""
-    return lambda store, report: operation.run(store.guarded(report.saving), settings, report, print)
+    return lambda store, report: operation.run(
+        store.guarded(report.saving), settings, report, print
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,9 +191,14 @@ def run_guarded(operation: Operation[..., Any, Any], settings: object) -> Callab
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            "poses.observe", lambda store, r: tasks.calibrate_session(store, TARGET, r, print), marks=pytest.mark.slow
+            "poses.observe",
+            lambda store, r: tasks.calibrate_session(store, TARGET, r, print),
+            marks=pytest.mark.slow,
         ),
-        ("capture_clouds.reconstruct_cloud", run_guarded(reconstruct, ReconstructSettings("scan_01"))),
+        (
+            "capture_clouds.reconstruct_cloud",
+            run_guarded(reconstruct, ReconstructSettings("scan_01")),
+        ),
         pytest.param(
             "merge.fuse",
             run_guarded(merge, MergeSettings(["scan_01"], "scan_02")),
@@ -177,7 +212,10 @@ def run_guarded(operation: Operation[..., Any, Any], settings: object) -> Callab
     ],
 )
 def test_work_given_up_inside_a_long_call_saves_nothing(
-    operator: Operator, monkeypatch: pytest.MonkeyPatch, where: str, make: Callable[[Session, Reporter], object]
+    operator: Operator,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    make: Callable[[Session, Reporter], object],
 ) -> None:
     store, report = operator.session, Reporter(lambda: None)
     assert store is not None
@@ -194,7 +232,12 @@ def test_work_given_up_inside_a_long_call_saves_nothing(
 
     def files() -> dict[str, int]:
         kept = (store.folder / folder for folder in ("results", "exports"))
-        return {str(p): p.stat().st_mtime_ns for folder in kept for p in folder.rglob("*") if p.is_file()}
+        return {
+            str(p): p.stat().st_mtime_ns
+            for folder in kept
+            for p in folder.rglob("*")
+            if p.is_file()
+        }
 
     before = files()
     with raises(Cancelled):
@@ -206,7 +249,11 @@ def test_work_given_up_inside_a_long_call_saves_nothing(
 
 def test_files_for_other_programs(operator: Operator) -> None:
     assert operator.export("mesh", "scan_01", "stl") and operator.export("mesh", "scan_01", "glb")
-    assert operator.export("cloud", "scan_02") and operator.export("calibration") and operator.export("table")
+    assert (
+        operator.export("cloud", "scan_02")
+        and operator.export("calibration")
+        and operator.export("table")
+    )
     assert operator.export("merged-mesh") and operator.diagnostic_bundle()
     session = session_of(operator.wait_until_idle(HANG_S))
     files = {export.name: export for export in session.exports}
@@ -220,16 +267,26 @@ def test_files_for_other_programs(operator: Operator) -> None:
     rows = list(csv.DictReader(files["figures.csv"].path.read_text().splitlines()))
     verified = [row for row in rows if row["kind"] == "verify" and row["model"]]
     assert len(verified) == 6 and {row["kind"] for row in rows} == {"verify", "clouds", "merge"}
-    assert [verified[0][key] for key in ("record", "label", "model")] == ["plane_01", "A flat plate", "stereo"]
+    assert [verified[0][key] for key in ("record", "label", "model")] == [
+        "plane_01",
+        "A flat plate",
+        "stereo",
+    ]
     bundle = next(export for export in files.values() if export.name.startswith("diagnostics_"))
     with zipfile.ZipFile(bundle.path) as inside:
         names = inside.namelist()
         assert {"versions.json", "state.json", "log.txt", "session/decisions.json"} <= set(names)
-        assert "previews/pose_01.jpg" in names and not [n for n in names if "frames" in n or n.endswith(".npy")]
+        assert "previews/pose_01.jpg" in names and not [
+            n for n in names if "frames" in n or n.endswith(".npy")
+        ]
         assert missing_facts(inside.read("log.txt").decode(), "8 poses") == []
     assert bundle.bytes < 1_000_000
     assert not operator.export("mesh", "scan_01", "doc") and not operator.export("cloud", "../x")
-    assert not [path for path in (operator.session.folder / "exports").iterdir() if path.name.startswith(".")]  # type: ignore[union-attr]
+    assert not [
+        path
+        for path in (operator.session.folder / "exports").iterdir()
+        if path.name.startswith(".")
+    ]  # type: ignore[union-attr]
 
 
 def read_head(path: Path) -> str:
@@ -237,12 +294,16 @@ def read_head(path: Path) -> str:
         return file.read(1000).decode("ascii", "replace")
 
 
-def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(operator: Operator) -> None:
+def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(
+    operator: Operator,
+) -> None:
     store = operator.session
     assert store is not None
     before = result_views.load_scan_cloud(store, "scan_02").points
     inputs = store.input_hashes("calibration/splined")
-    store.save_result("scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {})
+    store.save_result(
+        "scale/splined", {"factor": 1.001, "certificate": "lab 7", "inputs": inputs}, {}
+    )
     assert operator.choose_model("splined")
     session = session_of(operator.wait_until_idle(HANG_S))
     assert session.calibration is not None and session.calibration.chosen == "splined"
@@ -253,7 +314,11 @@ def test_a_scale_that_was_applied_is_in_the_clouds_and_makes_older_ones_stale(op
     )
     assert operator.reconstruct("scan_02")
     scan = operator.wait_until_idle(HANG_S).scan("scan_02")
-    assert scan is not None and scan.cloud == "fresh" and missing_facts(scan.figures.scale, "+1000 ppm", "lab 7") == []
+    assert (
+        scan is not None
+        and scan.cloud == "fresh"
+        and missing_facts(scan.figures.scale, "+1000 ppm", "lab 7") == []
+    )
     after = result_views.load_scan_cloud(store, "scan_02").points
     both = np.isfinite(before[..., 2]) & np.isfinite(after[..., 2])
     np.testing.assert_allclose(after[both], before[both] * np.float32(1.001), rtol=1e-6)
@@ -274,15 +339,23 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
         and session.calibration.stale == ""
         and len(session.calibration.stereo.poses) == 7
     )
-    assert session.calibration.models == ("stereo", "pixelwise")  # what was made of other poses is gone
+    assert session.calibration.models == (
+        "stereo",
+        "pixelwise",
+    )  # what was made of other poses is gone
     assert any(not missing_facts(notice.text, "splined", 8, 7) for notice in again.notices)
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(
         view.stale for view in session.list_records(Verification)
     )
-    assert session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
+    assert (
+        session.merge is not None and session.merge.stale and again.step("merge").state == "ready"
+    )
     assert again.pose("pose_02").state == "excluded"  # type: ignore[union-attr]
     assert operator.reconstruct("scan_01")
-    assert again.scan("scan_01") is not None and operator.wait_until_idle(HANG_S).scan("scan_01").cloud == "fresh"  # type: ignore[union-attr]
+    assert (
+        again.scan("scan_01") is not None
+        and operator.wait_until_idle(HANG_S).scan("scan_01").cloud == "fresh"
+    )  # type: ignore[union-attr]
     assert operator.undo_merge()
     undone = session_of(operator.wait_until_idle(HANG_S))
     assert undone.merge is None and "merged_1.ply" not in {export.name for export in undone.exports}

@@ -1,4 +1,5 @@
-"""The wizard on damaged files: what is sound is shown, what is not is named, and the page shows the present state."""
+"""The wizard on damaged files: what is sound is shown, what is not is named, and the page shows the
+present state."""
 
 import json
 import shutil
@@ -25,12 +26,15 @@ SEQUENCE = PatternSequence((96, 64), tuple(phase_steps("x", 4, 16.0)))
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A session of two scans and two poses, with a cloud, a merge and a verification as its results."""
+    """A session of two scans and two poses, with a cloud, a merge and a verification as its
+    results."""
     rng = np.random.default_rng(0)
     with Session.create(tmp_path / "session") as session:
         for name in ("scan_01", "scan_02", "pose_01", "pose_02"):
             frames = rng.integers(0, 255, (4, 30, 40), np.uint8)
-            session.save_capture(name, "calibration" if "pose" in name else "scan", SEQUENCE, frames, source="")
+            session.save_capture(
+                name, "calibration" if "pose" in name else "scan", SEQUENCE, frames, source=""
+            )
     return tmp_path / "session"
 
 
@@ -42,7 +46,11 @@ def operator(folder: Path) -> Iterator[Operator]:
 
 
 def test_a_snapshot_that_fails_is_reported_and_built_again() -> None:
-    faults: list[Exception] = [KeyError("target"), OSError(5, "Input/output error"), SlviewerError("it is damaged")]
+    faults: list[Exception] = [
+        KeyError("target"),
+        OSError(5, "Input/output error"),
+        SlviewerError("it is damaged"),
+    ]
 
     def build(version: int, session_changed: bool) -> Snapshot:
         if version > 1:
@@ -51,7 +59,9 @@ def test_a_snapshot_that_fails_is_reported_and_built_again() -> None:
             raise faults.pop(0)
         return Snapshot(version, None, RigView(), None, None, (), (), None, False, "done")
 
-    tested = Publisher(build, Snapshot(0, None, RigView(), None, None, (), (), None, False, ""), retry_s=0.05)
+    tested = Publisher(
+        build, Snapshot(0, None, RigView(), None, None, (), (), None, False, ""), retry_s=0.05
+    )
     shown: list[Snapshot] = []
     tested.listeners.add(shown.append)
     tested.start()
@@ -69,7 +79,13 @@ def test_what_is_sound_is_shown_and_what_is_not_is_named(folder: Path) -> None:
     shutil.copytree(captures / "pose_01", captures / "pose_01 (copy)")
     (captures / "scan_02" / "capture.json").write_text("{")
     with Session.open(folder, write=True) as session:
-        for name in ("clouds/scan_01", "merge/1", "verify/scan_01", "poses/pose_01", "calibration/stereo"):
+        for name in (
+            "clouds/scan_01",
+            "merge/1",
+            "verify/scan_01",
+            "poses/pose_01",
+            "calibration/stereo",
+        ):
             session.save_result(name, {"inputs": {}}, {})
     for name in ("clouds/scan_01", "calibration/stereo"):
         (folder / "results" / name / "meta.json").write_text("{")
@@ -92,19 +108,30 @@ def test_what_is_sound_is_shown_and_what_is_not_is_named(folder: Path) -> None:
         assert set(session.faults) <= set(list_texts(operator, "error"))
         shutil.rmtree(captures / "pose_01 (copy)")
         assert operator.choose_target("circles:7x5:20")
-        assert operator.wait_for(lambda s: not any("(copy)" in fault for fault in s.session.faults), HANG_S)  # type: ignore[union-attr]
+        assert operator.wait_for(
+            lambda s: not any("(copy)" in fault for fault in s.session.faults), HANG_S
+        )  # type: ignore[union-attr]
 
 
-def test_the_page_shows_the_present_state_while_a_file_is_damaged(operator: Operator, folder: Path) -> None:
+def test_the_page_shows_the_present_state_while_a_file_is_damaged(
+    operator: Operator, folder: Path
+) -> None:
     (folder / "decisions.json").write_text("{")
     assert not operator.choose_target("circles:7x5:20")
     operator.set_autopilot_status("going on")
-    failed = operator.wait_for(lambda snapshot: bool(snapshot.session and snapshot.session.faults), HANG_S)
+    failed = operator.wait_for(
+        lambda snapshot: bool(snapshot.session and snapshot.session.faults), HANG_S
+    )
     assert failed is not None and failed.session is not None
-    assert missing_facts(failed.session.faults[0], "decisions.json") == [] and len(failed.session.scans) == 2
+    assert (
+        missing_facts(failed.session.faults[0], "decisions.json") == []
+        and len(failed.session.scans) == 2
+    )
     (folder / "decisions.json").write_text(json.dumps({"names": {"scan_01": "a vase"}}))
     assert operator.choose_target("circles:7x5:20")
-    recovered = operator.wait_for(lambda snapshot: bool(snapshot.session and not snapshot.session.faults), HANG_S)
+    recovered = operator.wait_for(
+        lambda snapshot: bool(snapshot.session and not snapshot.session.faults), HANG_S
+    )
     assert recovered is not None and recovered.session is not None
     assert [scan.label for scan in recovered.session.scans] == ["a vase", "scan_02"]
 
@@ -115,7 +142,9 @@ def test_a_damaged_pose_is_refused_by_name(folder: Path) -> None:
     with Operator(folder, timing=SPARING) as operator:
         assert operator.choose_target("circles:7x5:20")
         operator.wait_until_idle(HANG_S)
-        shown = operator.wait_for(lambda s: bool(s.pose("pose_02")) and s.pose("pose_02").state == "refused", HANG_S)  # type: ignore[union-attr]
+        shown = operator.wait_for(
+            lambda s: bool(s.pose("pose_02")) and s.pose("pose_02").state == "refused", HANG_S
+        )  # type: ignore[union-attr]
         assert shown is not None
         assert missing_facts(shown.pose("pose_02").why, "frame 2 of 4", "damaged") == []  # type: ignore[union-attr]
 

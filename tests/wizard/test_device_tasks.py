@@ -1,4 +1,5 @@
-"""Other work on the devices' thread, captures in several exposures and in colour: they end as captures do."""
+"""Other work on the devices' thread, captures in several exposures and in colour: they end as
+captures do."""
 
 import threading
 import time
@@ -77,7 +78,9 @@ def test_a_task_can_be_cancelled_and_waits_for_its_turn(bench: Bench) -> None:
     assert [name for name, _, _ in bench.saved] == ["first"] and not bench.acquisition.idle
     bench.acquisition.cancel()
     until(lambda: bench.acquisition.idle)
-    assert missing_facts(bench.texts[0], "Checking the rig", "cancelled") == [] and bench.levels == ["info"]
+    assert missing_facts(
+        bench.texts[0], "Checking the rig", "cancelled"
+    ) == [] and bench.levels == ["info"]
     assert done == []
     bench.previews_go_on()
     assert bench.rig.camera.settings().exposure_ms == 1.0
@@ -97,11 +100,20 @@ def test_a_fault_in_a_task_is_treated_as_in_a_capture(bench: Bench) -> None:
     bench.acquisition.run_task("Checking the rig", refused, lambda _: None)
     until(lambda: bool(bench.texts))
     assert bench.levels == ["error"]
-    assert missing_facts(bench.texts[0], "Checking the rig", "the scene is too dark: open the aperture") == []
+    assert (
+        missing_facts(
+            bench.texts[0], "Checking the rig", "the scene is too dark: open the aperture"
+        )
+        == []
+    )
     assert bench.acquisition.view().state == "open"
     bench.acquisition.run_task("Checking the rig", lost, lambda _: None)
     until(lambda: len(bench.texts) >= 3)
-    assert missing_facts(bench.texts[1], "camera") == [] and bench.levels == ["error", "error", "good"]
+    assert missing_facts(bench.texts[1], "camera") == [] and bench.levels == [
+        "error",
+        "error",
+        "good",
+    ]
     bench.previews_go_on()
 
 
@@ -127,11 +139,15 @@ def test_a_capture_in_several_exposures_is_saved_whole(bench: Bench, tmp_path: P
     assert bench.rig.camera.settings().exposure_ms == 1.0
 
 
-def test_a_fault_while_exposures_change_leaves_no_capture_and_the_old_exposure(bench: Bench) -> None:
+def test_a_fault_while_exposures_change_leaves_no_capture_and_the_old_exposure(
+    bench: Bench,
+) -> None:
     bench.open()
     bench.faults.plan("unplugged", 5)
     request = bench.request("broken")
-    bench.acquisition.capture(CaptureRequest("broken", SEQUENCE, request.save, lambda: None, (0.5, 4.0)))
+    bench.acquisition.capture(
+        CaptureRequest("broken", SEQUENCE, request.save, lambda: None, (0.5, 4.0))
+    )
     until(lambda: len(bench.texts) >= 2)
     assert missing_facts(bench.texts[0], "discarded") == [] and bench.levels == ["error", "good"]
     assert bench.saved == []
@@ -163,7 +179,9 @@ def test_what_the_camera_could_not_be_set_to_is_seen(bench: Bench) -> None:
     assert bench.acquisition.view().notes == ("its gain cannot be set",)
     bench.acquisition.set_camera(CameraSettings(1000.0, 1.0))
     until(lambda: bench.acquisition.view().exposure_ms == 100)
-    assert any(missing_facts(note, "100 ms", "1000 ms") == [] for note in bench.acquisition.view().notes)
+    assert any(
+        missing_facts(note, "100 ms", "1000 ms") == [] for note in bench.acquisition.view().notes
+    )
 
 
 def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
@@ -182,13 +200,18 @@ def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
     bench.acquisition.capture(bench.request("waits"))
     other = replace(bench.rig, name="another")
     bench.acquisition.use(other)
-    assert not bench.acquisition.idle  # not before the task has ended: nobody may close what it saves into
+    assert (
+        not bench.acquisition.idle
+    )  # not before the task has ended: nobody may close what it saves into
     until(lambda: bench.acquisition.idle and bench.acquisition.view().state == "open")
     assert (bench.acquisition.view().name, bench.acquisition.view().light) == ("another", "white")
     assert not done and not bench.saved
     assert bench.levels == ["info", "info"]
     cancelled, dropped = sorted(bench.texts)
-    assert missing_facts(cancelled, "Checking the rig", "cancelled") == [] and missing_facts(dropped, "waits") == []
+    assert (
+        missing_facts(cancelled, "Checking the rig", "cancelled") == []
+        and missing_facts(dropped, "waits") == []
+    )
 
 
 def test_a_camera_that_opens_and_gives_no_picture_is_reported_once(

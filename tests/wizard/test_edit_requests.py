@@ -30,13 +30,21 @@ FAR = RegionOfInterest((0.0, 0.0, 9000.0), (10.0, 10.0, 10.0))
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session whose calibration is the truth, with two scans, of which the first is reconstructed."""
+    """A session whose calibration is the truth, with two scans, of which the first is
+    reconstructed."""
     folder, rig = tmp_path_factory.mktemp("captured") / "session", letter(0.2)
     true_calibration(folder, rig)
     world = SimulatedWorld(rig)
     world.place("object")
     for name in ("one", "two"):
-        capture(folder, name, {}, role="scan", patterns="gray", set_up=lambda *_: RigSetup(simulated_rig(world)))
+        capture(
+            folder,
+            name,
+            {},
+            role="scan",
+            patterns="gray",
+            set_up=lambda *_: RigSetup(simulated_rig(world)),
+        )
     with Operator(folder) as engine:
         engine.reconstruct("one")
         engine.wait_until_idle(HANG_S)
@@ -78,7 +86,9 @@ def test_edits_and_region_change_what_is_measured_and_merged(operator: Operator)
     assert session.merge is not None and not session.merge.stale
     assert operator.surface("one").measured.sum() == total
     plane = SupportPlane((0.0, 0.0, -1.0), -float(np.nanmedian(points[..., 2])), 0.0)
-    assert operator.delete_points([Selection("one", points, plane.select_below(points), plane)], "support")
+    assert operator.delete_points(
+        [Selection("one", points, plane.select_below(points), plane)], "support"
+    )
     assert operator.surface("one").measured.sum() < 0.6 * total
     assert operator.undo_edit("one") and not operator.undo_edit("one") and operator.redo_edit("one")
     assert operator.fit_region("one") and operator.switch_region(False)
@@ -100,7 +110,9 @@ def test_what_leaves_nothing_is_refused_with_numbers(operator: Operator) -> None
     operator.reconstruct("two")
     session = view(operator)
     assert session.scans[1].cloud == "absent"
-    assert any(not missing_facts(notice.text, "two", "region", "9000.0") for notice in operator.notices())
+    assert any(
+        not missing_facts(notice.text, "two", "region", "9000.0") for notice in operator.notices()
+    )
     assert operator.switch_region(False)
     operator.reconstruct("two")
     assert view(operator).scans[1].cloud == "fresh"
@@ -116,8 +128,12 @@ def test_edits_of_several_scans_are_made_and_undone_together(operator: Operator)
         return [(len(scan.edits), scan.undone_edits) for scan in view(operator).scans]
 
     clouds = {name: whole_cloud(store, name).points for name in ("one", "two")}
-    halves = {name: points[..., 0] < np.nanmedian(points[..., 0]) for name, points in clouds.items()}
-    assert operator.delete_points([Selection(name, clouds[name], halves[name]) for name in clouds], "left")
+    halves = {
+        name: points[..., 0] < np.nanmedian(points[..., 0]) for name, points in clouds.items()
+    }
+    assert operator.delete_points(
+        [Selection(name, clouds[name], halves[name]) for name in clouds], "left"
+    )
     upper = clouds["two"][..., 1] < np.nanmedian(clouds["two"][..., 1])
     nothing = np.zeros_like(upper)
     assert operator.delete_points(
@@ -130,5 +146,8 @@ def test_edits_of_several_scans_are_made_and_undone_together(operator: Operator)
     assert operator.redo_edit("one", "two") and counts() == [(1, 0), (1, 1)]
     assert operator.redo_edit("one", "two") and counts() == [(1, 0), (2, 0)]
     everything = np.ones_like(upper)
-    selections = [Selection("one", clouds["one"], upper), Selection("two", clouds["two"], everything)]
+    selections = [
+        Selection("one", clouds["one"], upper),
+        Selection("two", clouds["two"], everything),
+    ]
     assert not operator.delete_points(selections, "too much") and counts() == [(1, 0), (2, 0)]

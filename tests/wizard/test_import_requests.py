@@ -57,7 +57,9 @@ def reports(operator: Operator, level: Level, *facts: object) -> bool:
 
 
 @pytest.mark.computes
-def test_a_folder_becomes_poses_and_what_is_skipped_is_said(operator: Operator, source: Path) -> None:
+def test_a_folder_becomes_poses_and_what_is_skipped_is_said(
+    operator: Operator, source: Path
+) -> None:
     assert operator.import_folder(f" {source} ", projector="120x90")
     view = operator.wait_until_idle(HANG_S).session
     assert view is not None and [pose.name for pose in view.poses] == ["capture_0", "capture_2"]
@@ -75,17 +77,26 @@ def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, sourc
     assert operator.session is not None
     assert operator.session.load_capture("capture_0").meta["source"] == "my scans.zip"
     assert not [path for path in operator.session.folder.iterdir() if "import" in path.name]
-    assert operator.import_zip("one.zip", archived(source / "capture_0"), role="scan", projector="120x90")
+    assert operator.import_zip(
+        "one.zip", archived(source / "capture_0"), role="scan", projector="120x90"
+    )
     operator.wait_until_idle(HANG_S)
     assert reports(operator, "warning", "capture_0", "already")
-    assert operator.import_zip("one.zip", archived(source / "capture_0"), projector="120x90")  # as poses
+    assert operator.import_zip(
+        "one.zip", archived(source / "capture_0"), projector="120x90"
+    )  # as poses
     operator.wait_until_idle(HANG_S)
     assert reports(operator, "error", "capture_0", "already")
 
 
-def test_what_cannot_be_imported_is_said_in_words(operator: Operator, source: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_imported_is_said_in_words(
+    operator: Operator, source: Path, tmp_path: Path
+) -> None:
     assert not operator.import_folder("  ")
-    for path, facts in ((tmp_path / "absent", [tmp_path / "absent"]), (tmp_path, [tmp_path, "layouts"])):
+    for path, facts in (
+        (tmp_path / "absent", [tmp_path / "absent"]),
+        (tmp_path, [tmp_path, "layouts"]),
+    ):
         assert operator.import_folder(path)
         operator.wait_until_idle(HANG_S)
         assert reports(operator, "error", *facts), facts
@@ -107,9 +118,16 @@ def test_a_cancelled_import_saves_nothing(operator: Operator, source: Path) -> N
 
 @pytest.mark.process
 @pytest.mark.computes
-def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, tmp_path: Path) -> None:
+def test_an_imported_calibration_without_sizes_waits_for_captures(
+    source: Path, tmp_path: Path
+) -> None:
     K, R = np.array([[400.0, 0, 60], [0, 400.0, 45], [0, 0, 1]]), np.eye(3)
-    matrices = {"K_camera": K, "D_camera": np.zeros(5), "K_projector": K, "D_projector": np.zeros(5)}
+    matrices = {
+        "K_camera": K,
+        "D_camera": np.zeros(5),
+        "K_projector": K,
+        "D_projector": np.zeros(5),
+    }
     write_calibration(tmp_path / "rig.yml", {**matrices, "R": R, "T": np.array([100.0, 0, 0])})
     import_opencv_calibration(tmp_path / "rig.yml", tmp_path / "session")
     with Operator(tmp_path / "session") as operator:
@@ -117,4 +135,8 @@ def test_an_imported_calibration_without_sizes_waits_for_captures(source: Path, 
         assert view is not None and view.calibration is None
         assert operator.import_folder(source, projector="120x90")
         view = operator.wait_until_idle(HANG_S).session
-        assert view is not None and view.calibration is not None and view.calibration.stereo.baseline_mm == 100
+        assert (
+            view is not None
+            and view.calibration is not None
+            and view.calibration.stereo.baseline_mm == 100
+        )

@@ -1,4 +1,5 @@
-"""The worker: order, progress, cancelling what cannot be interrupted, and failures that stay sentences."""
+"""The worker: order, progress, cancelling what cannot be interrupted, and failures that stay
+sentences."""
 
 import os
 import platform
@@ -60,7 +61,13 @@ def test_progress_is_seen(jobs: Jobs) -> None:
     assert half.wait(HANG_S)
     view = jobs.view()
     assert view is not None
-    assert (view.name, view.share, view.stage, view.can_cancel, view.waiting) == ("Working", 0.5, "halfway", True, 1)
+    assert (view.name, view.share, view.stage, view.can_cancel, view.waiting) == (
+        "Working",
+        0.5,
+        "halfway",
+        True,
+        1,
+    )
     go_on.set()
     assert jobs.wait_until_idle(HANG_S)
 
@@ -85,8 +92,16 @@ def test_cooperative_work_stops_at_its_next_report(jobs: Jobs, notices: Notices)
     assert missing_facts(the_only(notices, "info"), "Counting", "cancelled") == []
 
 
-def test_what_cannot_be_interrupted_is_abandoned_and_never_saves(jobs: Jobs, notices: Notices) -> None:
-    started, wake, woke, saved, done = threading.Event(), threading.Event(), threading.Event(), [], []
+def test_what_cannot_be_interrupted_is_abandoned_and_never_saves(
+    jobs: Jobs, notices: Notices
+) -> None:
+    started, wake, woke, saved, done = (
+        threading.Event(),
+        threading.Event(),
+        threading.Event(),
+        [],
+        [],
+    )
 
     def sleeping(report):
         started.set()
@@ -145,11 +160,18 @@ def test_a_save_that_has_begun_is_awaited_and_counts(
         ),
         (KeyError("x"), ["Failing", "KeyError", "log"]),
         (MemoryError(), ["Failing", "memory"]),
-        (OSError(28, "No space left on device", "/x"), ["Failing", "No space left on device", "/x"]),
+        (
+            OSError(28, "No space left on device", "/x"),
+            ["Failing", "No space left on device", "/x"],
+        ),
     ],
 )
 def test_a_failure_becomes_a_notice_and_later_jobs_go_on(
-    jobs: Jobs, notices: Notices, caplog: pytest.LogCaptureFixture, error: Exception, facts: list[str]
+    jobs: Jobs,
+    notices: Notices,
+    caplog: pytest.LogCaptureFixture,
+    error: Exception,
+    facts: list[str],
 ) -> None:
     def work(report):
         raise error
@@ -162,7 +184,9 @@ def test_a_failure_becomes_a_notice_and_later_jobs_go_on(
     first, second = notices.all()
     assert first.level == "error" and missing_facts(first.text, *facts) == []
     assert missing_facts(second.text, "Failing when done") == []
-    assert ("Traceback" in caplog.text) and (("KeyError: 'x'" in caplog.text) == isinstance(error, KeyError))
+    assert ("Traceback" in caplog.text) and (
+        ("KeyError: 'x'" in caplog.text) == isinstance(error, KeyError)
+    )
 
 
 def test_closing_ends_everything(notices: Notices) -> None:
@@ -178,7 +202,14 @@ def test_closing_ends_everything(notices: Notices) -> None:
     assert started.wait(HANG_S)
     jobs.close()
     jobs.submit("Too late", lambda report: None)
-    until(lambda: not any(thread.name == "slviewer worker" and thread.is_alive() for thread in threading.enumerate()))
+    until(
+        lambda: (
+            not any(
+                thread.name == "slviewer worker" and thread.is_alive()
+                for thread in threading.enumerate()
+            )
+        )
+    )
     assert not woke.is_set(), "closing did not wait for it"
     wake.set()
 
@@ -192,7 +223,9 @@ def read_memory_mb() -> float:
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
 def test_memory_freed_between_blocks_in_use_is_returned() -> None:
     release_memory()  # what other tests left
-    blocks = [b"x" * 100_000 for _ in range(2000)]  # smaller than what the system gives in whole pages
+    blocks = [
+        b"x" * 100_000 for _ in range(2000)
+    ]  # smaller than what the system gives in whole pages
     in_use = blocks[::20]
     del blocks
     before = read_memory_mb()

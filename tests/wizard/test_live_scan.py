@@ -1,4 +1,5 @@
-"""Scanning live on a small simulated rig: clouds as a capture gives them, the newest first, and an end in any case."""
+"""Scanning live on a small simulated rig: clouds as a capture gives them, the newest first, and an
+end in any case."""
 
 import threading
 from collections import deque
@@ -31,12 +32,17 @@ from slviewer.wizard.snapshot import Level
 pytestmark = pytest.mark.computes
 
 SCALE = 0.15
-RIG = {"driver": "simulated", "scale": SCALE, "settle_ms": 4}  # what waits beside it needs the cores too
+RIG = {
+    "driver": "simulated",
+    "scale": SCALE,
+    "settle_ms": 4,
+}  # what waits beside it needs the cores too
 SETTINGS = CameraSettings(1.0, 1.0)
 
 
 class Wizard:
-    """A wizard over a session that is calibrated with the truth, and the live clouds that it made."""
+    """A wizard over a session that is calibrated with the truth, and the live clouds that it
+    made."""
 
     def __init__(self, folder: Path) -> None:
         rig = letter(SCALE)
@@ -59,7 +65,10 @@ class Wizard:
     def reports(self, level: Level, *facts: object) -> bool:
         """Whether a notice of this level comes, or has come, that states these facts."""
         shown = self.operator.wait_for(
-            lambda s: any(n.level == level and not missing_facts(n.text, *facts) for n in s.notices), HANG_S
+            lambda s: any(
+                n.level == level and not missing_facts(n.text, *facts) for n in s.notices
+            ),
+            HANG_S,
         )
         return shown is not None
 
@@ -115,7 +124,10 @@ def test_clouds_stream_are_kept_and_give_way_to_a_capture(wizard: Wizard) -> Non
     wizard.ends()
     after = operator.wait_until_idle()
     assert after.session is not None and after.rig.state == "open"
-    assert [(s.label, s.cloud) for s in after.session.scans] == [("a <b>face</b>", "fresh"), ("scan_02", "fresh")]
+    assert [(s.label, s.cloud) for s in after.session.scans] == [
+        ("a <b>face</b>", "fresh"),
+        ("scan_02", "fresh"),
+    ]
 
 
 @pytest.mark.slow
@@ -189,7 +201,9 @@ def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
     frames = world.renderer(False).capture(sequence)
     late = frames.copy()
     moving = (slice(None), slice(60, 180), slice(120, 200))
-    late[9][moving[1:]] = np.roll(frames[9], 4, axis=1)[moving[1:]]  # one of the finest steps, four columns further
+    late[9][moving[1:]] = np.roll(frames[9], 4, axis=1)[
+        moving[1:]
+    ]  # one of the finest steps, four columns further
     phases = [decode(sequence, each, "x") for each in (frames, late)]
 
     class Depth:
@@ -203,7 +217,9 @@ def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
         def sigma_z(self, phase, points):
             return points[..., 2]
 
-    still, moved = (LiveModel(sequence, "x", Depth()).cloud(each)[0][..., 2] for each in (frames, late))
+    still, moved = (
+        LiveModel(sequence, "x", Depth()).cloud(each)[0][..., 2] for each in (frames, late)
+    )
     assert np.isfinite(still).sum() > 0.95 * phases[0].mask.sum() > 1000
     wrong = np.abs(phases[1].phase - phases[0].phase) > 0.5
     assert wrong[moving[1:]].sum() > 200
@@ -216,9 +232,15 @@ def test_one_pass_gives_what_decoding_and_reconstructing_give() -> None:
     world.place("object")
     sequence = short(world.rig.projector.size, "x")
     renderer, shape = world.renderer(False), (180, 240)
-    low, high, ones = np.zeros(shape, np.float32), np.full(shape, 400, np.float32), np.ones(shape, np.float32)
+    low, high, ones = (
+        np.zeros(shape, np.float32),
+        np.full(shape, 400, np.float32),
+        np.ones(shape, np.float32),
+    )
     terms = [np.full(shape, value) for value in (900.0, -1.0, -9e-4, 0.1, 0.05)]
-    fit = PixelFit(np.stack(terms), np.stack([ones] * 3), np.full(shape, 20, np.uint16), low, high, ones)
+    fit = PixelFit(
+        np.stack(terms), np.stack([ones] * 3), np.full(shape, 20, np.uint16), low, high, ones
+    )
     model = PixelwiseModel({"x": fit}, {"x": 18.0}, {}, "x")
     measuring = LiveModel(sequence, "x", model, factor=1.5)
     clouds = []

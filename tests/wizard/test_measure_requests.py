@@ -43,15 +43,25 @@ RADIUS = 25.0
 
 @pytest.fixture(scope="module")
 def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
-    """Over a session whose calibration is the truth, with two balls and the demo object reconstructed."""
+    """Over a session whose calibration is the truth, with two balls and the demo object
+    reconstructed."""
     folder = tmp_path_factory.mktemp("measuring") / "session"
     rig = letter(0.2, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
-    scenes = {"balls": Spheres(CENTRES, RADIUS), "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0])))}
+    scenes = {
+        "balls": Spheres(CENTRES, RADIUS),
+        "object": demo_object(Pose(np.eye(3), np.array([0.0, 0.0, 520.0]))),
+    }
     with Session.create(folder) as store:
         save_true_stereo(store, rig)
         for i, (name, scene) in enumerate(scenes.items()):
-            store.save_capture(name, "scan", sequence, Renderer(rig, scene).capture(sequence, i), source="simulated")
+            store.save_capture(
+                name,
+                "scan",
+                sequence,
+                Renderer(rig, scene).capture(sequence, i),
+                source="simulated",
+            )
     with Operator(folder) as engine:
         for name in scenes:
             assert engine.reconstruct(name)
@@ -88,7 +98,9 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert place_at(on, np.zeros(3), np.array([0.0, 1.0, 0.1])) is None
     for place in (a, b):
         assert operator.measure("balls", add_fit, "sphere", Region.ball(point_at(on, place), 15.0))
-    assert operator.measure("balls", add_distance, a, b) and operator.measure("balls", add_section, a, b)
+    assert operator.measure("balls", add_distance, a, b) and operator.measure(
+        "balls", add_section, a, b
+    )
     assert operator.measure("balls", add_point, a)
     left, right, width, cut, point = now(operator).measurements
     assert operator.measure_between(left.id, right.id)
@@ -100,7 +112,9 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert [each.kind for each in (cut, point, apart)] == ["section", "point", "relation"]
     assert operator.snapshot().step("measure").state == "done"
 
-    assert operator.relabel_measurement(width.id, "Width <b>") and operator.delete_measurement(right.id)
+    assert operator.relabel_measurement(width.id, "Width <b>") and operator.delete_measurement(
+        right.id
+    )
     session = now(operator)
     assert [each.stale for each in session.measurements if each.id == apart.id] == [True]
     assert session.deleted_measurements == 1
@@ -112,19 +126,31 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     assert {row["name"] for row in rows} >= {"Width <b>", left.name}
     assert operator.make_inspection_plan()
     made = next(each for each in now(operator).exports if each.name == "plan.toml")
-    assert {each.kind for each in read_plan(made.path).characteristic} >= {"diameter", "distance of the centres"}
+    assert {each.kind for each in read_plan(made.path).characteristic} >= {
+        "diameter",
+        "distance of the centres",
+    }
 
 
 def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:
     place = place_at(operator.surface("balls"), np.zeros(3), CENTRES[0] - [0, 0, RADIUS])
     assert operator.measure("balls", add_point, place)
     before = now(operator).measurements
-    assert operator.measure("balls", add_fit, "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0))
+    assert operator.measure(
+        "balls", add_fit, "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0)
+    )
     assert lacks(operator, "bends") == []
-    assert operator.measure("balls", add_distance, (0, 0), (1, 1)) and lacks(operator, "(0, 0)") == []
-    assert operator.measure("nothing", add_point, (0, 0)) and lacks(operator, "nothing", "reconstructed") == []
+    assert (
+        operator.measure("balls", add_distance, (0, 0), (1, 1)) and lacks(operator, "(0, 0)") == []
+    )
+    assert (
+        operator.measure("nothing", add_point, (0, 0))
+        and lacks(operator, "nothing", "reconstructed") == []
+    )
     assert operator.measure_between("m1", "m1") and lacks(operator, "twice") == []
-    assert not operator.delete_measurement("m77") and not operator.compare_nominal("object", "../../etc/passwd")
+    assert not operator.delete_measurement("m77") and not operator.compare_nominal(
+        "object", "../../etc/passwd"
+    )
     assert now(operator).measurements == before
 
 
@@ -133,7 +159,9 @@ def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> No
     assert store is not None
     meta, arrays = store.load_result("clouds/balls")
     kept = {key: value for key, value in meta.items() if key not in ("hash", "arrays", "checksums")}
-    store.save_result("clouds/balls", {**kept, "inputs": {**kept["inputs"], "balls": "other"}}, arrays)
+    store.save_result(
+        "clouds/balls", {**kept, "inputs": {**kept["inputs"], "balls": "other"}}, arrays
+    )
     with raises(InputError, "balls"):
         surfaces.load(store, "balls")
     store.save_result("clouds/balls", kept, arrays)
@@ -141,16 +169,22 @@ def test_a_surface_of_what_has_changed_is_not_measured(operator: Operator) -> No
 
 
 @pytest.mark.slow
-def test_a_nominal_model_is_looked_at_kept_and_compared_with(operator: Operator, tmp_path: Path) -> None:
+def test_a_nominal_model_is_looked_at_kept_and_compared_with(
+    operator: Operator, tmp_path: Path
+) -> None:
     content = asset("objects/ammonite.ply").read_bytes()
     assert operator.upload_nominal("../My ammonite.ply", content)
     assert lacks(operator, "My_ammonite.ply", "triangles") == []
-    assert operator.upload_nominal("broken.stl", b"\0" * 300) and lacks(operator, "broken.stl") == []
+    assert (
+        operator.upload_nominal("broken.stl", b"\0" * 300) and lacks(operator, "broken.stl") == []
+    )
     trimesh.creation.box((5.6, 5.0, 1.6)).export(tmp_path / "inch.stl")
     assert operator.upload_nominal("inch.stl", (tmp_path / "inch.stl").read_bytes())
     session = now(operator)
     assert session.nominals == ("My_ammonite.ply", "inch.stl") == list_nominals(session.folder)
-    assert sorted(each.name for each in (session.folder / "nominal").iterdir()) == list(session.nominals)
+    assert sorted(each.name for each in (session.folder / "nominal").iterdir()) == list(
+        session.nominals
+    )
     assert operator.compare_nominal("object", "inch.stl")
     assert lacks(operator, "inch", "mm") == []
 

@@ -39,7 +39,8 @@ def turned(k: int) -> Pose:
 
 @pytest.fixture(scope="module")
 def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
-    """Over a session whose calibration is the truth, with three turned scans of the demo object, and two of a ball."""
+    """Over a session whose calibration is the truth, with three turned scans of the demo object,
+    and two of a ball."""
     folder = tmp_path_factory.mktemp("merging") / "session"
     rig = letter(0.2, seed=2, local_distortion_px=0)
     sequence = one_axis(p18(rig.projector.size), "x")
@@ -48,7 +49,13 @@ def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Operator]:
     with Session.create(folder) as store:
         save_true_stereo(store, rig)
         for i, (name, scene) in enumerate(scenes.items()):
-            store.save_capture(name, "scan", sequence, Renderer(rig, scene).capture(sequence, i), source="simulated")
+            store.save_capture(
+                name,
+                "scan",
+                sequence,
+                Renderer(rig, scene).capture(sequence, i),
+                source="simulated",
+            )
     with Operator(folder) as engine:
         yield engine
 
@@ -87,7 +94,11 @@ def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) 
         ("second", "first"), ("third", "first"), ("third", "second"),
     }  # fmt: skip
     for pair in merge.record.registered:
-        assert 0.01 < pair.rms_mm < 0.5 and 0.4 < pair.overlap <= 1 and pair.point_to_point_rms_mm > pair.rms_mm  # type: ignore[operator]
+        assert (
+            0.01 < pair.rms_mm < 0.5
+            and 0.4 < pair.overlap <= 1
+            and pair.point_to_point_rms_mm > pair.rms_mm
+        )  # type: ignore[operator]
         assert 0 < pair.sigma_shift_mm < 0.05 and 0 < pair.sigma_turn_deg < 0.1  # type: ignore[operator]
         steps = NAMES.index(pair.scan) - NAMES.index(pair.onto)
         assert pair.turned_deg == pytest.approx(steps * STEP_DEG, abs=0.1)
@@ -100,12 +111,17 @@ def test_three_scans_close_a_loop_and_say_how_sure_they_are(operator: Operator) 
     assert all(off_mm(merge, name) < 0.1 for name in NAMES[1:])
     assert operator.session is not None
     kept = read_ply(operator.session.exports / f"merged_{merge.name}.ply")
-    assert set(np.unique(kept.scalars["source"])) == {0, 1, 2} and len(kept.points) == merge.record.points
+    assert (
+        set(np.unique(kept.scalars["source"])) == {0, 1, 2}
+        and len(kept.points) == merge.record.points
+    )
     assert not [notice for notice in snapshot.notices if notice.level == "error"]
 
 
 @pytest.mark.slow
-def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_next_try(operator: Operator) -> None:
+def test_a_turntable_is_told_by_its_angle_and_a_wrong_one_is_refused_until_the_next_try(
+    operator: Operator,
+) -> None:
     before = settled(operator)[1]
     assert operator.merge(NAMES[:2], "first", start="turntable", angle=40.0)
     snapshot, merge = settled(operator)
@@ -130,8 +146,15 @@ def test_picked_pairs_start_a_merge(operator: Operator) -> None:
     here = there @ T[:3, :3].T + T[:3, 3] + np.random.default_rng(0).normal(0, 1.5, there.shape)
     assert operator.merge(["first", "third"], "first", picked={("third", "first"): (there, here)})
     snapshot, merge = settled(operator)
-    assert merge is not None and merge.record.scans == ["first", "third"] and off_mm(merge, "third") < 0.1
-    assert any(not missing_facts(notice.text, "third", "first", "picked points") for notice in snapshot.notices)
+    assert (
+        merge is not None
+        and merge.record.scans == ["first", "third"]
+        and off_mm(merge, "third") < 0.1
+    )
+    assert any(
+        not missing_facts(notice.text, "third", "first", "picked points")
+        for notice in snapshot.notices
+    )
     line = np.outer([0, 1, 2], [10.0, 0, 0]) + MIDDLE
     assert operator.merge(["first", "third"], "first", picked={("third", "first"): (line, line)})
     assert missing_facts(settled(operator)[0].merge_failure, "one line") == []
@@ -176,7 +199,9 @@ def test_scans_are_aligned_as_they_come_and_merged_from_there(operator: Operator
     assert operator.set_align_scans(True)  # nothing that was tried is tried again
     snapshot, _ = settled(operator)
     assert snapshot.session is not None and snapshot.session.aligns_scans
-    placed = {scan.name: scan.placement for scan in snapshot.session.scans if scan.placement is not None}
+    placed = {
+        scan.name: scan.placement for scan in snapshot.session.scans if scan.placement is not None
+    }
     assert set(placed) == set(chosen)
     assert missing_facts(placed["first"].summary(), "first") == []
     assert placed["ball_0"].T_first_scan is None

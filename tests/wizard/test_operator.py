@@ -1,4 +1,5 @@
-"""Requests and what becomes of them, on a small simulated rig: faults, resuming, decisions, hands-free."""
+"""Requests and what becomes of them, on a small simulated rig: faults, resuming, decisions,
+hands-free."""
 
 import os
 import subprocess
@@ -48,7 +49,10 @@ def test_requests_that_cannot_be_granted_become_notices() -> None:
             (operator.capture_pose, ["session"]),
             (operator.calibrate, ["session"]),
             (lambda: operator.open_session("/proc/nowhere/session"), ["/proc/nowhere/session"]),
-            (lambda: operator.choose_rig({"driver": "no such"}), ["driver", "no such", "simulated"]),
+            (
+                lambda: operator.choose_rig({"driver": "no such"}),
+                ["driver", "no such", "simulated"],
+            ),
             (lambda: operator.choose_rig({"scale": 1}), ["scale", 1, "camera"]),
             (lambda: operator.set_exposure(-1), ["exposure", -1]),
             (lambda: operator.export("nonsense"), ["session"]),  # type: ignore[arg-type]
@@ -56,22 +60,38 @@ def test_requests_that_cannot_be_granted_become_notices() -> None:
         ):
             assert request() is False
             refused = operator.wait_until_idle()
-            assert missing_facts(last_notice(refused), *facts) == [] and refused.notices[-1].level == "error"
-        assert operator.snapshot().session is None and operator.snapshot().step("poses").state == "blocked"
+            assert (
+                missing_facts(last_notice(refused), *facts) == []
+                and refused.notices[-1].level == "error"
+            )
+        assert (
+            operator.snapshot().session is None
+            and operator.snapshot().step("poses").state == "blocked"
+        )
 
 
-def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: FaultyRigs, tmp_path: Path) -> None:
+def test_poses_are_judged_kept_and_found_again(
+    operator: Operator, rigs: FaultyRigs, tmp_path: Path
+) -> None:
     versions: list[int] = []
     operator.subscribe(lambda snapshot: versions.append(snapshot.version))
     before = operator.wait_until_idle()
-    assert before.session is not None and before.session.suggestion is not None and before.world is not None
+    assert (
+        before.session is not None
+        and before.session.suggestion is not None
+        and before.world is not None
+    )
     assert before.space is not None and before.space.capture_bytes == 32 * 400 * 300
     for _ in range(2):
         assert operator.place_at_suggestion() and operator.capture_pose()
         after = operator.wait_until_idle()
         assert after.session is not None and after.world is not None
         judged = after.session.poses[-1]
-        assert judged.state == "good" and judged.thumbnail[:2] == b"\xff\xd8" and judged.T_camera_board is not None
+        assert (
+            judged.state == "good"
+            and judged.thumbnail[:2] == b"\xff\xd8"
+            and judged.T_camera_board is not None
+        )
         np.testing.assert_allclose(judged.T_camera_board, after.world.T_camera_object, atol=12)
     assert versions == sorted(set(versions)) and len(versions) > 5
     # a board that is not seen is refused, in words, and the suggestion changes
@@ -89,14 +109,24 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: FaultyR
         wait_until_open(again)
         resumed = again.wait_until_idle()
         assert resumed.session is not None and decided.session is not None
-        assert states(resumed) == states(decided) == {"pose_01": "good", "pose_02": "excluded", "pose_03": "refused"}
+        assert (
+            states(resumed)
+            == states(decided)
+            == {
+                "pose_01": "good",
+                "pose_02": "excluded",
+                "pose_03": "refused",
+            }
+        )
         assert [(s.key, s.state, s.instruction) for s in resumed.steps] == [
             (s.key, s.state, s.instruction) for s in decided.steps
         ]
         assert resumed.rig.name == decided.rig.name and resumed.session.target == TARGET
         for a, b in zip(resumed.session.poses, decided.session.poses, strict=True):
             assert a.thumbnail == b.thumbnail and a.why == b.why
-        np.testing.assert_array_equal(resumed.session.coverage.cells, decided.session.coverage.cells)  # type: ignore[union-attr]
+        np.testing.assert_array_equal(
+            resumed.session.coverage.cells, decided.session.coverage.cells
+        )  # type: ignore[union-attr]
         # what was decided can be undone, retaken, deleted
         assert again.include("pose_02") and again.delete("pose_03")
         assert again.place_at_suggestion() and again.retake_pose("pose_01")
@@ -109,12 +139,16 @@ def test_poses_are_judged_kept_and_found_again(operator: Operator, rigs: FaultyR
 
 
 @pytest.mark.parametrize("fault", [pytest.param("timeout", marks=pytest.mark.slow), "unplugged"])
-def test_a_device_that_fails_leaves_no_half_capture(operator: Operator, rigs: FaultyRigs, fault) -> None:
+def test_a_device_that_fails_leaves_no_half_capture(
+    operator: Operator, rigs: FaultyRigs, fault
+) -> None:
     store = operator.session
     assert store is not None and operator.place_at_suggestion()
     rigs.faults.plan(fault, 12)
     assert operator.capture_pose()
-    assert operator.wait_for(lambda s: any(not missing_facts(n.text, "13 of 32") for n in s.notices), HANG_S)
+    assert operator.wait_for(
+        lambda s: any(not missing_facts(n.text, "13 of 32") for n in s.notices), HANG_S
+    )
     assert operator.wait_for(lambda s: s.notices[-1].level == "good" and s.rig.fault == "", HANG_S)
     assert store.capture_names() == [] and list((store.folder / "captures").iterdir()) == []
     wait_until_open(operator)
@@ -138,7 +172,9 @@ operator.subscribe(lambda s: print(s.rig.capture.frame if s.rig.capture else "",
 operator.capture_pose()
 operator.wait_until_idle()
 """
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
     assert process.stdout is not None
     assert any(line.strip().isdecimal() and int(line) > 3 for line in process.stdout)
     process.kill()
@@ -163,12 +199,19 @@ def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> 
         operator.set_hands_free(True)
         captured = operator.wait_for(lambda s: states(s).get("pose_01") == "good", HANG_S)
         counted = [preview.countdown_s for preview in previews if preview.countdown_s is not None]
-        assert captured is not None and captured.hands_free and counted and all(0 < c <= 0.3 for c in counted)
+        assert (
+            captured is not None
+            and captured.hands_free
+            and counted
+            and all(0 < c <= 0.3 for c in counted)
+        )
         since = len(previews)
 
         def was_seen_there(for_s: float) -> bool:
             """Whether the board has been seen where it was captured for so long."""
-            times = [preview.board.time_s for preview in previews[since:] if preview.board is not None]
+            times = [
+                preview.board.time_s for preview in previews[since:] if preview.board is not None
+            ]
             return len(times) > 5 and times[-1] - times[0] > for_s
 
         until(lambda: was_seen_there(2 * (timing.hold_s + timing.count_s)))
@@ -176,10 +219,15 @@ def test_hands_free_captures_a_board_that_is_held_still_once(tmp_path: Path) -> 
         assert list(states(operator.wait_until_idle())) == ["pose_01"]
 
 
-def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: Operator, tmp_path: Path) -> None:
+def test_a_session_is_opened_for_one_operator_and_changed_for_another(
+    operator: Operator, tmp_path: Path
+) -> None:
     with Operator() as other:
         assert not other.open_session(tmp_path / "session")
-        assert missing_facts(last_notice(other.wait_until_idle()), tmp_path / "session", os.getpid()) == []
+        assert (
+            missing_facts(last_notice(other.wait_until_idle()), tmp_path / "session", os.getpid())
+            == []
+        )
     assert operator.open_session(tmp_path / "second") and operator.session is not None
     assert operator.session.folder == tmp_path / "second"
     Session.open(tmp_path / "session", write=True).close()
@@ -188,9 +236,19 @@ def test_a_session_is_opened_for_one_operator_and_changed_for_another(operator: 
     assert operator.session.decision("rig") == RIG
     assert not operator.choose_target("charuco:8x6:30")
     assert missing_facts(last_notice(operator.wait_until_idle()), "ChArUco") == []
-    assert not operator.capture_pose() and missing_facts(last_notice(operator.wait_until_idle()), "target") == []
-    assert not operator.capture_scan() and missing_facts(last_notice(operator.wait_until_idle()), "calibrate") == []
-    assert not operator.calibrate() and not operator.undo_merge() and not operator.verify(["x"], "plane")
+    assert (
+        not operator.capture_pose()
+        and missing_facts(last_notice(operator.wait_until_idle()), "target") == []
+    )
+    assert (
+        not operator.capture_scan()
+        and missing_facts(last_notice(operator.wait_until_idle()), "calibrate") == []
+    )
+    assert (
+        not operator.calibrate()
+        and not operator.undo_merge()
+        and not operator.verify(["x"], "plane")
+    )
 
 
 @pytest.mark.slow
@@ -199,11 +257,18 @@ def test_a_deleted_pose_can_be_brought_back(operator: Operator) -> None:
     operator.wait_until_idle()
     operator.delete("pose_01")
     gone = operator.wait_until_idle().session
-    assert gone is not None and gone.poses == () and gone.deleted_poses == ("pose_01",) and gone.deleted_scans == ()
+    assert (
+        gone is not None
+        and gone.poses == ()
+        and gone.deleted_poses == ("pose_01",)
+        and gone.deleted_scans == ()
+    )
     operator.undelete("pose_01")
     back = operator.wait_until_idle()
     assert back.session is not None and back.session.deleted_poses == ()
-    assert states(back) == {"pose_01": "good"} and not any(notice.level == "error" for notice in back.notices)
+    assert states(back) == {"pose_01": "good"} and not any(
+        notice.level == "error" for notice in back.notices
+    )
     operator.undelete("pose_01")
     assert missing_facts(last_notice(operator.wait_until_idle()), "deleted", "pose_01") == []
 

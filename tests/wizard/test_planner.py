@@ -1,4 +1,5 @@
-"""The next pose is computed on another thread: a quick plan holds meanwhile, and only the latest request counts."""
+"""The next pose is computed on another thread: a quick plan holds meanwhile, and only the latest
+request counts."""
 
 import threading
 from collections.abc import Iterator
@@ -36,7 +37,9 @@ def plan_of(poses: tuple[str, ...], sigma: float | None = None, depth: float = 6
 
 def given(*poses: str, hashes: str = "", target: str = str(BOARD)) -> PlanInput:
     """An input whose plan takes time: that of a calibrated camera."""
-    rig = StereoRig(nominal_lens(SIZE), nominal_lens((912, 1140)), np.eye(3), np.array([180.0, 0, 0]))
+    rig = StereoRig(
+        nominal_lens(SIZE), nominal_lens((912, 1140)), np.eye(3), np.array([180.0, 0, 0])
+    )
     stereo = StereoModel(rig, target, ("x",), {}, {}, {}, {}, None, {})
     features = {name: PoseFeatures(*np.zeros((3, 4, 3))) for name in poses}
     keys = tuple((name, name + hashes) for name in poses)
@@ -89,7 +92,9 @@ def test_the_quick_plan_holds_until_the_final_one_is_ready(
     assert not is_final and set(quick.poses) == {"a", "b", "c"} and not plans.begun
     planner.request(three)
     assert plans.has_begun.wait(HANG_S)
-    assert planner.look_up(given("a", "b", "c")) == (quick, False) and len(plans.before) == 1, "computed once"
+    assert planner.look_up(given("a", "b", "c")) == (quick, False) and len(plans.before) == 1, (
+        "computed once"
+    )
     plans.final = plan_of((), 0.05, depth=700)
     plans.may_end.set()
     assert changes.acquire(timeout=HANG_S)
@@ -98,10 +103,19 @@ def test_the_quick_plan_holds_until_the_final_one_is_ready(
 
     # one pose more: the predicted sigma and the suggestion still hold; one pose less: they do not
     more, is_final = planner.look_up(given("a", "b", "c", "d"))
-    assert not is_final and more.sigma_mm == 0.05 and more.suggestion is good.suggestion and len(more.poses) == 4
+    assert (
+        not is_final
+        and more.sigma_mm == 0.05
+        and more.suggestion is good.suggestion
+        and len(more.poses) == 4
+    )
     assert plans.before[1] is not None and set(plans.before[1].poses) == {"a", "b", "c"}
     less, _ = planner.look_up(given("a", "b"))
-    assert less.sigma_mm is None and plans.before[2] is not None and set(plans.before[2].poses) == {"a", "b"}
+    assert (
+        less.sigma_mm is None
+        and plans.before[2] is not None
+        and set(plans.before[2].poses) == {"a", "b"}
+    )
     retaken, _ = planner.look_up(given("a", "b", "c", hashes="2"))
     assert retaken.sigma_mm is None and plans.before[3] is not None and not plans.before[3].poses
     planner.look_up(given("a", "b", "c", target="circles:9x7:20"))
@@ -109,7 +123,9 @@ def test_the_quick_plan_holds_until_the_final_one_is_ready(
     assert planner.look_up(three) == (good, True), "cached"
 
 
-def test_only_the_latest_request_is_computed(planner: Planner, plans: Plans, changes: threading.Semaphore) -> None:
+def test_only_the_latest_request_is_computed(
+    planner: Planner, plans: Plans, changes: threading.Semaphore
+) -> None:
     planner.request(given("a"))
     assert plans.has_begun.wait(HANG_S)
     planner.request(given("b"))
@@ -133,5 +149,7 @@ def test_where_computing_fails_the_quick_plan_remains(
     planner.request(given("a"))
     assert changes.acquire(timeout=HANG_S)
     assert quick[1] is False and planner.look_up(given("a")) == (quick[0], True)
-    assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [np.linalg.LinAlgError]
+    assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [
+        np.linalg.LinAlgError
+    ]
     planner.close()

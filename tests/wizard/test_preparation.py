@@ -26,7 +26,9 @@ def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def prepare(status: int) -> list[float | None]:
     """What is reported by a process that ends with this status."""
     reports: list[float | None] = []
-    preparation_process = Preparation(reports.append, [sys.executable, "-c", SCRIPT.format(status=status)])
+    preparation_process = Preparation(
+        reports.append, [sys.executable, "-c", SCRIPT.format(status=status)]
+    )
     preparation_process.start()
     preparation_process._thread.join(HANG_S)
     return reports
@@ -45,7 +47,9 @@ def test_what_failed_is_tried_again_at_the_next_start(done: Path) -> None:
     assert not done.exists()
 
 
-def test_an_environment_variable_switches_it_off(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_variable_switches_it_off(
+    done: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(preparation.SWITCHED_OFF, "1")
     assert prepare(0) == []
     assert not done.exists()
@@ -54,7 +58,9 @@ def test_an_environment_variable_switches_it_off(done: Path, monkeypatch: pytest
 @pytest.mark.slow
 @pytest.mark.process
 def test_the_process_ends_with_the_program_that_started_it() -> None:
-    process = subprocess.Popen(preparation.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        preparation.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
     assert process.stdin is not None and process.stdout is not None
     assert float(process.stdout.readline()) == 0.0  # it works
     process.stdin.close()

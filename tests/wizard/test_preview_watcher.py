@@ -1,4 +1,5 @@
-"""What a preview shows: the board where it is, how bright, how still; and when hands-free captures."""
+"""What a preview shows: the board where it is, how bright, how still; and when hands-free
+captures."""
 
 import math
 import threading
@@ -14,7 +15,14 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 from slviewer.wizard import preview_watcher
-from slviewer.wizard.preview_watcher import HandsFree, Stillness, Watch, Watcher, brightness, reduced
+from slviewer.wizard.preview_watcher import (
+    HandsFree,
+    Stillness,
+    Watch,
+    Watcher,
+    brightness,
+    reduced,
+)
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
 
 BOARD = Board.parse("circles:9x7:20")
@@ -56,11 +64,17 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
     assert 0.001 < np.abs(board.pixels - truth).max() < 0.5
     assert board.T_camera_board is not None
     np.testing.assert_allclose(board.T_camera_board[:3, 3], scene.pose.t, atol=6)
-    assert found[0].image.shape[1] == 800 and 0.7 < found[0].brightest < 0.95 and found[0].saturated == 0
+    assert (
+        found[0].image.shape[1] == 800
+        and 0.7 < found[0].brightest < 0.95
+        and found[0].saturated == 0
+    )
 
 
 @pytest.mark.computes
-def test_an_image_is_searched_again_only_once_something_has_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_is_searched_again_only_once_something_has_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     searched: list[np.ndarray] = []
 
     def detect_nothing(board: Board | None, image: np.ndarray) -> tuple[None, str]:
@@ -108,7 +122,11 @@ def test_brightness_goes_by_the_cameras_range(dtype: type, white: int) -> None:
     frame = np.full((300, 400), white // 2, dtype)
     frame[:30] = white
     saturated, brightest, histogram = brightness(frame)
-    assert saturated == pytest.approx(0.1, abs=0.005) and brightest == 1 and histogram.sum() == pytest.approx(1)
+    assert (
+        saturated == pytest.approx(0.1, abs=0.005)
+        and brightest == 1
+        and histogram.sum() == pytest.approx(1)
+    )
     assert histogram.argmax() == 31 and histogram[-1] == pytest.approx(0.1, abs=0.005)
     assert reduced(frame)[0].dtype == np.uint8
 
@@ -130,7 +148,10 @@ def test_hands_free_counts_down_once_a_place() -> None:
     hands_free = HandsFree()
     assert hands_free.countdown(seen(7), False, 0) is None
     hands_free.switch(True)
-    assert hands_free.countdown(None, False, 0) is None and hands_free.countdown(seen(0.5), False, 0) is None
+    assert (
+        hands_free.countdown(None, False, 0) is None
+        and hands_free.countdown(seen(0.5), False, 0) is None
+    )
     assert hands_free.countdown(seen(7), False, 1.0) == 1.0  # a slow look skips no countdown
     assert hands_free.countdown(seen(7.25), False, 1.25) == pytest.approx(0.75)
     assert hands_free.countdown(seen(0.1), False, 1.5) is None  # moved: it begins anew

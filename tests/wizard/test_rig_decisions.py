@@ -1,4 +1,5 @@
-"""What the operator decides of a rig: several exposures, a name, and what its choice says of its camera."""
+"""What the operator decides of a rig: several exposures, a name, and what its choice says of its
+camera."""
 
 import logging
 import zipfile
@@ -38,18 +39,30 @@ def lacks(operator: Operator, *facts: object) -> list[str]:
 @pytest.mark.slow
 def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator) -> None:
     once = operator.wait_until_idle()
-    assert once.rig.exposure_ms == 0.8 and once.session is not None and once.session.exposures_ms == ()
+    assert (
+        once.rig.exposure_ms == 0.8 and once.session is not None and once.session.exposures_ms == ()
+    )
     assert operator.set_exposures((4.0, 0.5))
     before = operator.wait_until_idle()
     assert before.session is not None and before.session.exposures_ms == (0.5, 4.0)
-    assert before.space is not None and once.space is not None and once.space.capture_bytes is not None
+    assert (
+        before.space is not None and once.space is not None and once.space.capture_bytes is not None
+    )
     assert before.space.capture_bytes == 2 * once.space.capture_bytes
     assert operator.capture_pose()
     after = operator.wait_until_idle()
-    assert states(after) == {"pose_01": "good"} and after.session is not None and after.session.poses[0].thumbnail
-    assert operator.session is not None and operator.session.load_capture("pose_01").exposures_ms == (0.5, 4.0)
+    assert (
+        states(after) == {"pose_01": "good"}
+        and after.session is not None
+        and after.session.poses[0].thumbnail
+    )
+    assert operator.session is not None and operator.session.load_capture(
+        "pose_01"
+    ).exposures_ms == (0.5, 4.0)
     assert operator.wait_until_idle().rig.exposure_ms == 0.8
-    assert operator.set_exposures((4.0, 4.0)) is False and lacks(operator, "exposures", "4, 4") == []
+    assert (
+        operator.set_exposures((4.0, 4.0)) is False and lacks(operator, "exposures", "4, 4") == []
+    )
     assert operator.set_exposures(())
     assert operator.capture_pose()
     operator.wait_until_idle()
@@ -63,7 +76,11 @@ def test_a_suggested_exposure_is_set_and_can_be_undone(operator: Operator) -> No
     assert operator.suggest_exposure()
     after = operator.wait_until_idle()
     change, session = after.exposure_change, after.session
-    assert change is not None and session is not None and last_notice(after) == change.suggestion.text()
+    assert (
+        change is not None
+        and session is not None
+        and last_notice(after) == change.suggestion.text()
+    )
     exposures = change.suggestion.exposures_ms
     assert 0.7 < exposures[0] < 1.5  # at 1 ms the brightest reach the sensor's peak level
     assert change.suggestion.share > 0.95 and change.suggestion.share_before < 0.2
@@ -94,7 +111,9 @@ def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> Non
 def test_several_exposures_follow_the_one_that_they_were_chosen_by(operator: Operator) -> None:
     assert operator.session is not None
     assert operator.set_exposures((0.8, 3.2))
-    assert operator.set_exposure(1.6) and operator.set_exposure(0.4)  # both before the camera has said anything
+    assert operator.set_exposure(1.6) and operator.set_exposure(
+        0.4
+    )  # both before the camera has said anything
     assert operator.session.decision("exposures") == pytest.approx([0.4, 1.6])
 
 
@@ -105,9 +124,15 @@ def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operat
     engine = operator._engine
     assert engine.set_preflight(engine.bench, Preflight((), 37.0, None, None, 1.0))
     assert operator.choose_rig(RIG)
-    assert session.decision("rig") == {**RIG, "settle_ms": 37.0} and session.decision("exposure")["exposure_ms"] == 2.0
+    assert (
+        session.decision("rig") == {**RIG, "settle_ms": 37.0}
+        and session.decision("exposure")["exposure_ms"] == 2.0
+    )
     assert operator.choose_rig({**RIG, "settle_ms": 5.0})  # said by whoever chose it
-    assert session.decision("rig")["settle_ms"] == 5.0 and session.decision("exposure")["exposure_ms"] == 2.0
+    assert (
+        session.decision("rig")["settle_ms"] == 5.0
+        and session.decision("exposure")["exposure_ms"] == 2.0
+    )
     assert operator.choose_rig({**RIG, "scale": 0.2})
     assert "settle_ms" not in session.decision("rig") and session.decision("exposure") is None
 
@@ -115,7 +140,9 @@ def test_a_rig_chosen_once_more_keeps_what_was_measured_and_set(operator: Operat
 @pytest.mark.slow
 def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operator) -> None:
     assert operator.check_rig()
-    assert operator.wait_for(lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, HANG_S)
+    assert operator.wait_for(
+        lambda s: s.rig.capture is not None and s.rig.capture.frame > 0, HANG_S
+    )
     other = {**RIG, "scale": 0.2}
     assert operator.choose_rig(other)
     assert operator.wait_for(lambda s: s.rig.state == "open" and s.rig.choice == other, HANG_S)
@@ -125,7 +152,9 @@ def test_what_a_check_finds_belongs_to_the_rig_that_was_checked(operator: Operat
 
 
 @pytest.mark.slow
-def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, tmp_path: Path) -> None:
+def test_a_session_opens_without_the_rig_that_it_remembers(
+    operator: Operator, tmp_path: Path
+) -> None:
     missing = {
         "camera": {"driver": "opencv", "source": str(tmp_path / "no.avi")},
         "projector": {"driver": "browser", "size": [640, 480]},
@@ -135,14 +164,23 @@ def test_a_session_opens_without_the_rig_that_it_remembers(operator: Operator, t
         store.decide("exposure", {"exposure_ms": 3.0, "gain": None})
     assert operator.open_session(tmp_path / "other") and operator.session is not None
     view = operator.wait_until_idle()
-    assert view.rig.state == "lost" and missing_facts(view.rig.fault, "no.avi") == [] and view.rig.choice == missing
+    assert (
+        view.rig.state == "lost"
+        and missing_facts(view.rig.fault, "no.avi") == []
+        and view.rig.choice == missing
+    )
     assert missing_facts(view.step("rig").problems[0], "no.avi") == []
     assert not operator.choose_rig(missing)  # as the button "Try this rig again" asks
-    assert operator.session.decision("rig") == missing and operator.session.decision("exposure")["exposure_ms"] == 3.0
+    assert (
+        operator.session.decision("rig") == missing
+        and operator.session.decision("exposure")["exposure_ms"] == 3.0
+    )
     assert operator.choose_rig(RIG) and operator.wait_for(lambda s: s.rig.state == "open", HANG_S)
 
 
-def test_sessions_of_one_rig_have_exposures_of_their_own(operator: Operator, tmp_path: Path) -> None:
+def test_sessions_of_one_rig_have_exposures_of_their_own(
+    operator: Operator, tmp_path: Path
+) -> None:
     with Session.create(tmp_path / "other") as store:
         store.decide("rig", RIG)
         store.decide("exposure", {"exposure_ms": 3.0, "gain": 1.0})
@@ -157,17 +195,27 @@ def test_an_open_session_can_be_opened_again_by_any_path_and_with_another_rig(
     (tmp_path / "link").symlink_to(tmp_path / "session")
     (tmp_path / "inner").mkdir()
     store = operator.session
-    assert operator.open_session(tmp_path / "link") and operator.open_session(tmp_path / "inner" / ".." / "session")
+    assert operator.open_session(tmp_path / "link") and operator.open_session(
+        tmp_path / "inner" / ".." / "session"
+    )
     assert operator.session is store
     assert operator.open_session(tmp_path / "link", {**RIG, "exposure_ms": 1.5})
-    assert operator.session is store and store is not None and store.decision("rig")["exposure_ms"] == 1.5
+    assert (
+        operator.session is store
+        and store is not None
+        and store.decision("rig")["exposure_ms"] == 1.5
+    )
     assert operator.wait_for(lambda s: s.rig.exposure_ms == 1.5, HANG_S)
 
 
 @pytest.mark.slow
-def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Operator, tmp_path: Path) -> None:
+def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(
+    operator: Operator, tmp_path: Path
+) -> None:
     capture(tmp_path / "recorded", "a", RIG, patterns="p18")
-    assert operator.set_light("pattern") and operator.wait_for(lambda s: s.rig.light == "pattern", HANG_S)
+    assert operator.set_light("pattern") and operator.wait_for(
+        lambda s: s.rig.light == "pattern", HANG_S
+    )
     assert operator.choose_rig({"driver": "replay", "source": str(tmp_path / "recorded")})
     now = operator.wait_for(lambda s: s.rig.name == "replay" and s.rig.state != "opening", HANG_S)
     assert now is not None and now.rig.state == "open", now and now.rig.fault
@@ -177,12 +225,25 @@ def test_a_recording_is_not_asked_for_light_that_it_does_not_hold(operator: Oper
 def test_a_diagnostic_bundle_tells_no_password(tmp_path: Path) -> None:
     with Operator(tmp_path / "session") as operator:
         assert operator.session is not None
-        camera = {"driver": "opencv", "source": "rtsp://somebody:s3cret@camera.local/1", "size": [8, 8]}
-        operator.session.decide("rig", {"camera": camera, "projector": {"driver": "browser", "size": [8, 8]}})
+        camera = {
+            "driver": "opencv",
+            "source": "rtsp://somebody:s3cret@camera.local/1",
+            "size": [8, 8],
+        }
+        operator.session.decide(
+            "rig", {"camera": camera, "projector": {"driver": "browser", "size": [8, 8]}}
+        )
         logging.getLogger("slviewer").info("rtsp://somebody:s3cret@camera.local/1 is slow")
         assert operator.diagnostic_bundle()
         operator.wait_until_idle()
         with zipfile.ZipFile(next(operator.session.exports.glob("*.zip"))) as bundle:
-            texts = {name: bundle.read(name).decode() for name in bundle.namelist() if name.endswith(("json", "txt"))}
+            texts = {
+                name: bundle.read(name).decode()
+                for name in bundle.namelist()
+                if name.endswith(("json", "txt"))
+            }
     assert not any("s3cret" in text for text in texts.values())
-    assert "rtsp://…@camera.local/1" in texts["log.txt"] and "camera.local" in texts["session/decisions.json"]
+    assert (
+        "rtsp://…@camera.local/1" in texts["log.txt"]
+        and "camera.local" in texts["session/decisions.json"]
+    )

@@ -25,17 +25,23 @@ def planned(covered: bool, sigma_mm: float | None = None) -> PosePlan:
     """Of ten poses, over the whole view or nowhere."""
     n = 4 if covered else 0
     coverage = Coverage(np.full((3, 4), n), np.full(3, n), np.full(5, n), (400.0, 700.0))
-    return PosePlan(LENS, {f"pose_{i}": np.eye(4) for i in range(10)}, coverage, None, 0.024, sigma_mm)
+    return PosePlan(
+        LENS, {f"pose_{i}": np.eye(4) for i in range(10)}, coverage, None, 0.024, sigma_mm
+    )
 
 
 def poses(n: int, state="good", why: str = "") -> tuple[PoseView, ...]:
-    return tuple(PoseView(f"pose_{i}", state, why, "", None, False, None, None, b"") for i in range(n))
+    return tuple(
+        PoseView(f"pose_{i}", state, why, "", None, False, None, None, b"") for i in range(n)
+    )
 
 
 def calibration(stale: str = "") -> CalibrationView:
     rig = StereoRig(LENS, LENS, np.eye(3), np.array([180.0, 0, 0]))
     poses = {"pose_0": np.eye(4)}
-    stereo = StereoModel(rig, "circles:9x7:20", ("x",), {"stereo": 0.1}, poses, {}, {}, (400.0, 600.0), {})
+    stereo = StereoModel(
+        rig, "circles:9x7:20", ("x",), {"stereo": 0.1}, poses, {}, {}, (400.0, 600.0), {}
+    )
     return CalibrationView(stereo, ("stereo",), "stereo", stale)
 
 
@@ -44,36 +50,75 @@ def states(facts: Facts) -> dict[str, str]:
 
 
 def test_the_way_through_the_wizard() -> None:
-    blocked = dict.fromkeys(("calibrate", "verify", "scan", "merge", "measure", "export"), "blocked")
-    assert states(Facts(None, RigView(), None)) == {"rig": "ready", "target": "blocked", "poses": "blocked", **blocked}
-    assert states(Facts(EMPTY, OPEN, None)) == {"rig": "done", "target": "ready", "poses": "blocked", **blocked}
+    blocked = dict.fromkeys(
+        ("calibrate", "verify", "scan", "merge", "measure", "export"), "blocked"
+    )
+    assert states(Facts(None, RigView(), None)) == {
+        "rig": "ready",
+        "target": "blocked",
+        "poses": "blocked",
+        **blocked,
+    }
+    assert states(Facts(EMPTY, OPEN, None)) == {
+        "rig": "done",
+        "target": "ready",
+        "poses": "blocked",
+        **blocked,
+    }
     aimed = replace(EMPTY, target="circles:9x7:20")
-    assert states(Facts(aimed, OPEN, None)) == {"rig": "done", "target": "done", "poses": "ready", **blocked}
+    assert states(Facts(aimed, OPEN, None)) == {
+        "rig": "done",
+        "target": "done",
+        "poses": "ready",
+        **blocked,
+    }
     few = replace(aimed, poses=poses(2))
     blocked_by = next(v for v in views(Facts(few, OPEN, None)) if v.key == "calibrate").blocked_by
     assert missing_facts(blocked_by, 2, MIN_POSES) == []
     enough = replace(aimed, poses=poses(10), plan=planned(True))
     reached = states(Facts(enough, OPEN, None))
-    assert (reached["poses"], reached["calibrate"], reached["verify"]) == ("done", "ready", "blocked")
+    assert (reached["poses"], reached["calibrate"], reached["verify"]) == (
+        "done",
+        "ready",
+        "blocked",
+    )
     done = states(Facts(replace(enough, calibration=calibration()), OPEN, None))
-    assert done["calibrate"] == "done" and done["verify"] == done["scan"] == done["export"] == "ready"
+    assert (
+        done["calibrate"] == "done" and done["verify"] == done["scan"] == done["export"] == "ready"
+    )
     assert done["merge"] == done["measure"] == "blocked"
-    stale = Facts(replace(enough, calibration=calibration("pose_1 was excluded since: calibrate again")), OPEN, None)
+    stale = Facts(
+        replace(enough, calibration=calibration("pose_1 was excluded since: calibrate again")),
+        OPEN,
+        None,
+    )
     assert states(stale)["calibrate"] == "ready"
-    assert missing_facts(next(v for v in views(stale) if v.key == "calibrate").problems[0], "pose_1", "excluded") == []
+    assert (
+        missing_facts(
+            next(v for v in views(stale) if v.key == "calibrate").problems[0], "pose_1", "excluded"
+        )
+        == []
+    )
 
 
 def test_a_rejected_calibration_is_not_used_unless_one_insists() -> None:
     rejected = replace(calibration(), rejected="pose_3 moved by 0.9 px: take the pose again")
-    facts = Facts(replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=rejected), OPEN, None)
+    facts = Facts(
+        replace(EMPTY, target="circles:9x7:20", poses=poses(10), calibration=rejected), OPEN, None
+    )
     found = {view.key: view for view in views(facts)}
     assert {found[key].state for key in ("verify", "scan", "merge")} == {"blocked"}
     assert missing_facts(found["scan"].blocked_by, "pose_3", "0.9 px") == []
     assert missing_facts(found["verify"].blocked_by, "pose_3", "0.9 px", "accept") == []
     assert found["calibrate"].state == "ready"
     assert missing_facts(found["calibrate"].instruction, "rejected") == []
-    accepts_rejected = replace(facts, session=replace(facts.session, calibration=replace(rejected, is_pinned=True)))  # type: ignore[type-var]
-    assert states(accepts_rejected)["scan"] == "ready" and states(accepts_rejected)["calibrate"] == "done"
+    accepts_rejected = replace(
+        facts, session=replace(facts.session, calibration=replace(rejected, is_pinned=True))
+    )  # type: ignore[type-var]
+    assert (
+        states(accepts_rejected)["scan"] == "ready"
+        and states(accepts_rejected)["calibrate"] == "done"
+    )
 
 
 def test_a_recorded_session_needs_no_rig() -> None:
@@ -83,7 +128,9 @@ def test_a_recorded_session_needs_no_rig() -> None:
 
 
 def test_every_step_says_in_one_sentence_what_to_do_and_what_is_wrong() -> None:
-    session = replace(EMPTY, target="t", poses=poses(4, "refused", "12 of 336 circles found: lower the exposure"))
+    session = replace(
+        EMPTY, target="t", poses=poses(4, "refused", "12 of 336 circles found: lower the exposure")
+    )
     lost = replace(OPEN, state="lost", fault="the camera is gone: plug it in")
     facts = Facts(session, lost, Space(1_000_000, 10_000_000), "saturated")
     for view in views(facts):
@@ -102,7 +149,12 @@ def test_poses_that_cover_the_view_may_still_lack_accuracy() -> None:
     covering = replace(EMPTY, target="circles:9x7:20", poses=poses(10), plan=planned(True))
     assert missing_facts(views(Facts(covering, OPEN, None))[2].instruction, 10, "calibrate") == []
     lacking = replace(covering, plan=planned(True, 0.03), wanted_mm=0.024)
-    assert missing_facts(views(Facts(lacking, OPEN, None))[2].instruction, "0.030 mm", "0.024 mm", "add more") == []
+    assert (
+        missing_facts(
+            views(Facts(lacking, OPEN, None))[2].instruction, "0.030 mm", "0.024 mm", "add more"
+        )
+        == []
+    )
     enough = replace(lacking, wanted_mm=0.031)
     instruction = views(Facts(enough, OPEN, None))[2].instruction
     assert enough.enough and missing_facts(instruction, "0.030 mm", "0.031 mm", "calibrate") == []

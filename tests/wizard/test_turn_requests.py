@@ -1,4 +1,5 @@
-"""Scanning all round as an operator asks for it: one request, then merge and mesh; cancelled, broken and resumed."""
+"""Scanning all round as an operator asks for it: one request, then merge and mesh; cancelled,
+broken and resumed."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,7 +40,11 @@ def operator(tmp_path: Path, rigs: FaultyRigs) -> Iterator[Operator]:
 
 def turned(snapshot: Snapshot | None) -> list[tuple[str, float, str]]:
     assert snapshot is not None and snapshot.session is not None
-    return [(s.name, s.turn_step.deg, s.cloud) for s in snapshot.session.scans if s.turn_step is not None]
+    return [
+        (s.name, s.turn_step.deg, s.cloud)
+        for s in snapshot.session.scans
+        if s.turn_step is not None
+    ]
 
 
 @pytest.mark.slow
@@ -56,7 +61,9 @@ def test_one_request_ends_in_a_watertight_mesh(operator: Operator) -> None:
     (path,) = (operator.session.folder / "exports").glob("merged*mesh*.ply")
     mesh = trimesh.load(path, process=False)
     assert mesh.is_watertight and mesh.volume > 3e5
-    assert any(not missing_facts(text, "watertight") for text in list_texts(done, "good")), done.notices
+    assert any(not missing_facts(text, "watertight") for text in list_texts(done, "good")), (
+        done.notices
+    )
 
 
 @pytest.mark.slow
@@ -70,17 +77,26 @@ def test_a_turn_that_fails_or_is_cancelled_is_resumed(operator: Operator, rigs: 
     assert failed.rig.state == "open" and failed.rig.fault == ""  # the camera goes on
     assert operator.resume_turn(then_merge=False)
     assert [deg for _, deg, _ in turned(operator.wait_until_idle(HANG_S))] == [0.0, 120.0, 240.0]
-    assert not operator.resume_turn() and missing_facts(operator.notices()[-1].text, 3, "turn1") == []
+    assert (
+        not operator.resume_turn() and missing_facts(operator.notices()[-1].text, 3, "turn1") == []
+    )
     assert operator.scan_all_round(12, then_merge=False)
-    assert operator.wait_for(lambda s: s.rig.capture is not None and "step 2 of 12" in s.rig.capture.stage, HANG_S)
+    assert operator.wait_for(
+        lambda s: s.rig.capture is not None and "step 2 of 12" in s.rig.capture.stage, HANG_S
+    )
     assert operator.cancel()
     cancelled = operator.wait_until_idle(HANG_S)
     names = [name for name, *_ in turned(cancelled) if name.startswith("turn2")]
-    assert 1 <= len(names) < 12 and any("cancelled" in text for text in list_texts(cancelled, "info"))
+    assert 1 <= len(names) < 12 and any(
+        "cancelled" in text for text in list_texts(cancelled, "info")
+    )
     assert cancelled.session is not None and cancelled.session.merge is None
 
 
 def test_a_rig_without_a_turntable_says_so(operator: Operator) -> None:
     assert operator.choose_rig({"driver": "simulated", "scale": SCALE})
     assert operator.wait_for(lambda s: s.rig.state == "open" and not s.rig.turntable, HANG_S)
-    assert not operator.scan_all_round() and missing_facts(operator.notices()[-1].text, "[turntable]") == []
+    assert (
+        not operator.scan_all_round()
+        and missing_facts(operator.notices()[-1].text, "[turntable]") == []
+    )

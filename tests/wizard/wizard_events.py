@@ -1,4 +1,5 @@
-"""What tests of the wizard share: a timing that spares the machine, and waits for events instead of times."""
+"""What tests of the wizard share: a timing that spares the machine, and waits for events instead of
+times."""
 
 from collections.abc import Callable
 

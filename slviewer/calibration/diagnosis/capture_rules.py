@@ -1,4 +1,5 @@
-"""Rules on the capture of the poses and on the description of their frames; each yields the findings of one cause."""
+"""Rules on the capture of the poses and on the description of their frames; each yields the
+findings of one cause."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -39,16 +40,21 @@ RIPPLE_PEAK = 2.0
 """Peak of a ripple over its RMS."""
 
 _ORDER_REMEDY: dict[Cause, str] = {
-    "frame-lag": "let the camera wait longer after each pattern, or switch its buffering off (the preflight shows "
-    "which), and capture again",
-    "missing-frame": "trigger the camera by the projector or wait longer for each frame, and capture again; of "
-    "imported frames, look for the file that is missing",
+    "frame-lag": (
+        "let the camera wait longer after each pattern, or switch its buffering off (the preflight"
+        " shows which), and capture again"
+    ),
+    "missing-frame": (
+        "trigger the camera by the projector or wait longer for each frame, and capture again; of "
+        "imported frames, look for the file that is missing"
+    ),
     "frame-order": "run the preflight, and capture again",
 }
 
 
 def diagnose_frame_order(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding for each way in which frames are out of order: lagging, missing, or exchanged."""
+    """Yield a finding for each way in which frames are out of order: lagging, missing, or
+    exchanged."""
     orders = {pose.name: order for pose in e.poses if (order := classify_frame_order(pose))}
     for cause in ORDERS:
         names = tuple(name for name, order in orders.items() if order == cause)
@@ -65,58 +71,71 @@ def diagnose_frame_order(e: Evidence) -> Iterator[Finding]:
 
 def diagnose_saturation(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where too many of the boards' pixels are saturated."""
-    shares = {pose.name: max((a.saturated for a in pose.axes.values()), default=0.0) for pose in e.poses}
+    shares = {
+        pose.name: max((a.saturated for a in pose.axes.values()), default=0.0) for pose in e.poses
+    }
     names = tuple(name for name, share in shares.items() if share > MAX_SATURATED)
     if not names:
         return
     median_share = float(np.median([shares[name] for name in names]))
     severity: Severity = "doubtful" if len(names) > 0.25 * len(e.poses) else "note"
-    if len(names) >= COMMON_SHARE * len(e.poses) and (median_share > REJECTED_SATURATED or e.solution is None):
+    if len(names) >= COMMON_SHARE * len(e.poses) and (
+        median_share > REJECTED_SATURATED or e.solution is None
+    ):
         severity = "rejected"
     yield Finding(
         "saturation",
         severity,
-        f"{format_poses(e, names)} {100 * median_share:.0f} % of the board's illuminated pixels are saturated",
-        "lower the exposure or the gain until white stays below the camera's full scale, and capture again",
+        f"{format_poses(e, names)} {100 * median_share:.0f} % of the board's illuminated pixels are"
+        " saturated",
+        "lower the exposure or the gain until white stays below the camera's full scale, and"
+        " capture again",
         names,
     )
 
 
 def diagnose_mirroring(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where the axes are exchanged or one is reversed: the projector's image is a mirror image."""
-    jacobians = {pose.name: np.array(pose.turn) for pose in list_ordered_poses(e) if pose.turn is not None}
+    """Yield a finding where the axes are exchanged or one is reversed: the projector's image is a
+    mirror image."""
+    jacobians = {
+        pose.name: np.array(pose.turn) for pose in list_ordered_poses(e) if pose.turn is not None
+    }
     mirrored = {name: J for name, J in jacobians.items() if np.linalg.det(J) < 0}
     if len(mirrored) <= COMMON_SHARE * len(jacobians):
         return
     mean = np.mean([unit_vectors(J) for J in mirrored.values()], axis=0)
     names = tuple(mirrored)
     observation = (
-        f"in {len(mirrored)} of {len(jacobians)} poses the projector's coordinates are a mirror image of what the "
-        "camera sees"
+        f"in {len(mirrored)} of {len(jacobians)} poses the projector's coordinates are a mirror"
+        " image of what the camera sees"
     )
     if classify_mirroring(mean) == "axes-swapped":
         yield Finding(
             "axes-swapped",
             "rejected",
             f"{observation}, as if x and y were exchanged",
-            "exchange the x and y (V and H) frames in the description of the sequence, or in the projector",
+            "exchange the x and y (V and H) frames in the description of the sequence, or in the"
+            " projector",
             names,
         )
     else:
         axis = "x" if mean[0, 0] < 0 else "y"
-        across, mode = ("left and right", "rear or mirror") if axis == "x" else ("top and bottom", "flip")
+        across, mode = (
+            ("left and right", "rear or mirror") if axis == "x" else ("top and bottom", "flip")
+        )
         yield Finding(
             "axis-reversed",
             "rejected",
             f"{observation}, as if its {axis} axis were reversed ({across})",
-            f"switch off the projector's {mode} mode, or number its {'columns' if axis == 'x' else 'rows'} from the "
-            "other end",
+            f"switch off the projector's {mode} mode, or number its"
+            f" {'columns' if axis == 'x' else 'rows'} from the other end",
             names,
         )
 
 
 def classify_mirroring(jacobian: np.ndarray) -> Cause:
-    """Return the cause of a mirrored Jacobian (2, 2) of projector by camera pixels, assuming both devices upright."""
+    """Return the cause of a mirrored Jacobian (2, 2) of projector by camera pixels, assuming both
+    devices upright."""
     diagonal, off_diagonal = abs(np.diag(jacobian)).sum(), abs(np.diag(jacobian[::-1])).sum()
     return "axes-swapped" if off_diagonal > diagonal else "axis-reversed"
 
@@ -124,11 +143,14 @@ def classify_mirroring(jacobian: np.ndarray) -> Cause:
 def diagnose_period(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where the fringe period differs from its description.
 
-    Evidence is the phase at the Gray code's edges, or the projector's aspect ratio by the calibration.
+    Evidence is the phase at the Gray code's edges, or the projector's aspect ratio by the
+    calibration.
     """
     if e.contradiction:
         sentence, _, remedy = e.contradiction.partition(": ")
-        yield Finding("fringe-period", "rejected", sentence, remedy or "correct the sequence's description")
+        yield Finding(
+            "fringe-period", "rejected", sentence, remedy or "correct the sequence's description"
+        )
         return
     # the code is of another axis or from its other end, or gamma moves the phase at which it starts
     if any(diagnose_mirroring(e)) or _list_aliased_gamma_poses(e):
@@ -138,8 +160,8 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
         yield Finding(
             "fringe-period",
             "rejected",
-            f"the fringe period differs from the sequence's description ({' and '.join(wrong)}), by the phase "
-            "at the Gray code's edges",
+            f"the fringe period differs from the sequence's description ({' and '.join(wrong)}), by"
+            " the phase at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
     elif e.solution is not None and e.solution.aspect > 0 and not e.tilts_undetermined:
@@ -148,13 +170,16 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "fringe-period",
                 "doubtful",
-                f"the projector's rows appear {e.solution.aspect:.2f} times as dense as its columns, as no pixels are",
-                "compare the fringe period of each axis with its description, and turn off the projector's scaling",
+                f"the projector's rows appear {e.solution.aspect:.2f} times as dense as its"
+                " columns, as no pixels are",
+                "compare the fringe period of each axis with its description, and turn off the"
+                " projector's scaling",
             )
 
 
 def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
-    """Describe how the period of an axis differs from its description; "" where it does not, or is not measured."""
+    """Describe how the period of an axis differs from its description; "" where it does not, or is
+    not measured."""
     axes = [pose.axes[axis] for pose in list_ordered_poses(e) if axis in pose.axes]
     periods = np.array([a.period_seen_px for a in axes if np.isfinite(a.period_seen_px)])
     if len(periods) < 3:
@@ -171,7 +196,9 @@ def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
 
 def diagnose_description(e: Evidence) -> Iterator[Finding]:
     """Yield the contradictions between frames and description that no other rule explains."""
-    first = {pose.name: pose.contradictions[0] for pose in list_ordered_poses(e) if pose.contradictions}
+    first = {
+        pose.name: pose.contradictions[0] for pose in list_ordered_poses(e) if pose.contradictions
+    }
     for cause in dict.fromkeys(contradiction.cause for contradiction in first.values()):
         if cause not in CAUSES or cause in _CAUSES_IN_POSES:
             continue
@@ -183,7 +210,11 @@ def diagnose_description(e: Evidence) -> Iterator[Finding]:
         names = tuple(name for name, contradiction in first.items() if contradiction.cause == cause)
         sentence, _, remedy = first[names[0]].message.rpartition(": ")
         yield Finding(
-            cause, rate_severity(e, names, is_excluded=True), f"{format_poses(e, names)} {sentence}", remedy, names
+            cause,
+            rate_severity(e, names, is_excluded=True),
+            f"{format_poses(e, names)} {sentence}",
+            remedy,
+            names,
         )
 
 
@@ -200,40 +231,50 @@ def diagnose_board_size(e: Evidence) -> Iterator[Finding]:
     yield Finding(
         "board-size",
         "rejected",
-        f"{count} of {len(e.poses)} poses show a board of {grid[0]}x{grid[1]} circles, and {given} was given",
+        f"{count} of {len(e.poses)} poses show a board of {grid[0]}x{grid[1]} circles, and {given}"
+        " was given",
         f"give the board as circles:{grid[0]}x{grid[1]}:{rest.split(':', 1)[-1]}",
         tuple(pose.name for pose in e.poses if pose.grid == grid),
     )
 
 
 def max_ripple_px(e: Evidence) -> float:
-    """Return the larger RMS, in px, of both axes' residuals that repeat with the fringe; 0 where not measured.
+    """Return the larger RMS, in px, of both axes' residuals that repeat with the fringe; 0 where
+    not measured.
 
     The larger one, as an axis hides them where a camera pixel covers much of a fringe.
     """
-    return max((ripple.rms_px for ripple in e.solution.ripple.values()), default=0.0) if e.solution else 0.0
+    return (
+        max((ripple.rms_px for ripple in e.solution.ripple.values()), default=0.0)
+        if e.solution
+        else 0.0
+    )
 
 
 def diagnose_ripple(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where residuals repeat with the fringe and matter: the fringe is not sinusoidal."""
-    ripples = {axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.matters}
+    """Yield a finding where residuals repeat with the fringe and matter: the fringe is not
+    sinusoidal."""
+    ripples = {
+        axis: r for axis, r in (e.solution.ripple if e.solution else {}).items() if r.matters
+    }
     if not ripples:
         return
     axis, worst = max(ripples.items(), key=lambda item: item[1].rms_px)
     steps = min((a.steps for p in e.poses for a in p.axes.values() if a.steps), default=0)
     observation = (
-        f"the phase has an error that repeats {worst.waves} times a fringe period ({worst.rms_px:.2f} px RMS in "
-        f"{axis}, {worst.rms_px * worst.mm_per_px:.3f} mm in depth; the noise of a point is {worst.noise_px:.2f} px, "
-        f"{worst.noise_px * worst.mm_per_px:.3f} mm)"
+        f"the phase has an error that repeats {worst.waves} times a fringe period"
+        f" ({worst.rms_px:.2f} px RMS in {axis}, {worst.rms_px * worst.mm_per_px:.3f} mm in depth;"
+        f" the noise of a point is {worst.noise_px:.2f} px,"
+        f" {worst.noise_px * worst.mm_per_px:.3f} mm)"
     )
     if steps and worst.waves % steps == 0:
         yield Finding(
             "gamma",
             "doubtful",
-            f"{observation}, as where the light does not grow evenly with the grey level (gamma) and is read with "
-            f"{steps} phase steps",
-            "set the gamma of projector and camera to 1, or let the preflight make light linear, and take eight phase "
-            "steps or more",
+            f"{observation}, as where the light does not grow evenly with the grey level (gamma)"
+            f" and is read with {steps} phase steps",
+            "set the gamma of projector and camera to 1, or let the preflight make light linear,"
+            " and take eight phase steps or more",
         )
     else:
         yield Finding(
@@ -245,7 +286,8 @@ def diagnose_ripple(e: Evidence) -> Iterator[Finding]:
 
 
 def _list_aliased_gamma_poses(e: Evidence) -> tuple[str, ...]:
-    """List the poses in which gamma shifts the phase of three or four steps; empty unless they are the majority."""
+    """List the poses in which gamma shifts the phase of three or four steps; empty unless they are
+    the majority."""
     names = tuple(pose.name for pose in e.poses if any(s.fault == "gamma" for s in pose.suspects))
     return names if len(names) > COMMON_SHARE * len(e.poses) else ()
 
@@ -256,14 +298,20 @@ def diagnose_gamma(e: Evidence) -> Iterator[Finding]:
         yield Finding(
             "gamma",
             "doubtful",
-            f"{format_poses(e, names)} the light does not grow evenly with the grey level (gamma), which few phase "
-            "steps do not average out: the phase was corrected as far as this could be measured",
-            "set the projector's gamma to 1, or let the preflight make light linear, and take eight phase steps or "
-            "more",
+            f"{format_poses(e, names)} the light does not grow evenly with the grey level (gamma),"
+            " which few phase steps do not average out: the phase was corrected as far as this"
+            " could be measured",
+            "set the projector's gamma to 1, or let the preflight make light linear, and take eight"
+            " phase steps or more",
             names,
         )
         return
-    ratios = [a.harmonic for p in list_ordered_poses(e) for a in p.axes.values() if np.isfinite(a.harmonic)]
+    ratios = [
+        a.harmonic
+        for p in list_ordered_poses(e)
+        for a in p.axes.values()
+        if np.isfinite(a.harmonic)
+    ]
     if not ratios:
         return
     exponent = gamma_from_harmonic(float(np.median(ratios)))
@@ -273,8 +321,13 @@ def diagnose_gamma(e: Evidence) -> Iterator[Finding]:
     yield Finding(
         "gamma",
         "doubtful",
-        f"the projector's light does not grow evenly with the grey level (gamma about {exponent:.1f}), which {steps} "
-        f"phase steps {'average out' if steps >= 8 else 'do not average out'}",
+        "the projector's light does not grow evenly with the grey level (gamma about"
+        f" {exponent:.1f}), which {steps} phase steps"
+        f" {'average out' if steps >= 8 else 'do not average out'}",
         "set the projector's gamma to 1, or let the preflight make light linear"
-        + (", and keep to eight phase steps or more" if steps >= 8 else ", and take eight phase steps or more"),
+        + (
+            ", and keep to eight phase steps or more"
+            if steps >= 8
+            else ", and take eight phase steps or more"
+        ),
     )

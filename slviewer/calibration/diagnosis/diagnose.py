@@ -24,9 +24,10 @@ from slviewer.target.board import Board
 class DiagnosedCalibration:
     """A stereo calibration with the verdict on it and the evidence for the verdict.
 
-    ``stereo``: the calibrated model; of a rejected calibration a solution for inspection, or None where there is none.
-    ``observations``: the poses that it used, circles at their centres. ``excluded``: the other poses, with the reason.
-    ``warning``: a further message for the operator, or "".
+    ``stereo``: the calibrated model; of a rejected calibration a solution for inspection, or None
+    where there is none. ``observations``: the poses that it used, circles at their centres.
+    ``excluded``: the other poses, with the reason. ``warning``: a further message for the operator,
+    or "".
     """
 
     verdict: Verdict
@@ -46,9 +47,9 @@ def calibrate_with_diagnosis(
 ) -> DiagnosedCalibration:
     """Calibrate camera and projector from the readable poses, and judge the result.
 
-    ``observations``: the readable poses; ``poses``: the evidence of all poses, unreadable ones included; ``projector``:
-    its (width, height) px; ``excluded``: poses excluded beforehand, with the reason. A calibration that cannot be made
-    is returned with a rejecting verdict, not raised.
+    ``observations``: the readable poses; ``poses``: the evidence of all poses, unreadable ones
+    included; ``projector``: its (width, height) px; ``excluded``: poses excluded beforehand, with
+    the reason. A calibration that cannot be made is returned with a rejecting verdict, not raised.
     """
     observations, warning = reconcile_marks(board, observations)
     poses = [_add_numbering(pose, board, observations) for pose in poses]
@@ -75,40 +76,62 @@ def calibrate_with_diagnosis(
     reasons = dict(stereo.excluded if stereo else excluded_before)
     for finding in verdict.findings:  # the finding is more specific than the fit's reason
         if finding.cause in ("moved", "outlier", "board-numbering") and len(finding.poses) == 1:
-            by_fit = [name for name in finding.poses if name in reasons and name not in excluded_before]
+            by_fit = [
+                name for name in finding.poses if name in reasons and name not in excluded_before
+            ]
             reasons |= dict.fromkeys(by_fit, finding.text())
     return DiagnosedCalibration(verdict, evidence, stereo, tuple(used), reasons, warning)
 
 
 def _solve_unchecked(
-    observations: Sequence[Observation], projector: tuple[int, int], board: Board, excluded: Mapping[str, str]
+    observations: Sequence[Observation],
+    projector: tuple[int, int],
+    board: Board,
+    excluded: Mapping[str, str],
 ) -> tuple[StereoModel | None, list[Observation]]:
     """Solve the rig without checks, for diagnosis only.
 
-    Returns the model and the poses that it used; (None, []) where there is no solution or its residuals are not finite.
+    Returns the model and the poses that it used; (None, []) where there is no solution or its
+    residuals are not finite.
     """
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of boards that lie behind a device
-            stereo, used = calibrate_centres(observations, projector, str(board), excluded, strict=False)
+            stereo, used = calibrate_centres(
+                observations, projector, str(board), excluded, strict=False
+            )
     except CalibrationRejected:
         return None, []
     is_finite = all(np.isfinite(px) for px in stereo.reprojection_rms_px.values())
     return (stereo, used) if is_finite and stereo.depth_range_mm is not None else (None, [])
 
 
-def _add_numbering(pose: PoseEvidence, board: Board, observations: Sequence[Observation]) -> PoseEvidence:
-    """Return the evidence of a pose with the check of its features' numbering added, if the pose was read."""
+def _add_numbering(
+    pose: PoseEvidence, board: Board, observations: Sequence[Observation]
+) -> PoseEvidence:
+    """Return the evidence of a pose with the check of its features' numbering added, if the pose
+    was read."""
     o = next((o for o in observations if o.name == pose.name), None)
-    return pose if o is None else replace(pose, numbering=describe_misnumbering(board, o.points, o.camera))
+    return (
+        pose
+        if o is None
+        else replace(pose, numbering=describe_misnumbering(board, o.points, o.camera))
+    )
 
 
-def _select_unfit_poses(poses: Sequence[PoseEvidence], observations: Sequence[Observation]) -> dict[str, str]:
+def _select_unfit_poses(
+    poses: Sequence[PoseEvidence], observations: Sequence[Observation]
+) -> dict[str, str]:
     """Return the readable poses to exclude from the fit, with the reason.
 
-    Empty where fewer than MIN_POSES or half of the poses would remain: the fault is then common to all of them.
+    Empty where fewer than MIN_POSES or half of the poses would remain: the fault is then common to
+    all of them.
     """
     names = {o.name for o in observations}
     limit = motion_limit_px(poses)
-    unfit = {pose.name: why for pose in poses if pose.name in names and (why := reason_to_exclude(pose, limit))}
+    unfit = {
+        pose.name: why
+        for pose in poses
+        if pose.name in names and (why := reason_to_exclude(pose, limit))
+    }
     return unfit if len(names) - len(unfit) >= max(MIN_POSES, len(names) / 2) else {}

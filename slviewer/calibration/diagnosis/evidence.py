@@ -18,10 +18,11 @@ from slviewer.records.plain import from_plain
 class AxisEvidence:
     """Measurements from the frames of one axis; NaN where not measurable.
 
-    ``period_px``: fringe period by the sequence's description; ``period_seen_px``: measured, from the phases at the
-    Gray code's edges. ``steps``: of the finest phase shift, 0 for Gray code alone. ``readable``, ``saturated``: share
-    of the board's illuminated pixels (of the image's, where no board was detected) that are valid, and that clip.
-    ``harmonic``: amplitude of the fringe's second harmonic over the first.
+    ``period_px``: fringe period by the sequence's description; ``period_seen_px``: measured, from
+    the phases at the Gray code's edges. ``steps``: of the finest phase shift, 0 for Gray code
+    alone. ``readable``, ``saturated``: share of the board's illuminated pixels (of the image's,
+    where no board was detected) that are valid, and that clip. ``harmonic``: amplitude of the
+    fringe's second harmonic over the first.
     """
 
     period_px: float
@@ -36,11 +37,12 @@ class AxisEvidence:
 class PoseEvidence:
     """Evidence of one capture of the target.
 
-    ``refused``: why its board or phase could not be read, "" where they could. ``grid``: columns and rows of the grid
-    of circles detected where the given board does not fit it. ``suspects``: frames that contradict the others.
-    ``displaced``: number of frames by which the white frame is late (positive) or early. ``moved_px``: motion of the
-    features in the camera between the frames of the two axes. ``numbering``: how the features are misnumbered, "" where
-    they are not. ``turn`` (2, 2): mean Jacobian of the projector coordinates by camera pixels over the board.
+    ``refused``: why its board or phase could not be read, "" where they could. ``grid``: columns
+    and rows of the grid of circles detected where the given board does not fit it. ``suspects``:
+    frames that contradict the others. ``displaced``: number of frames by which the white frame is
+    late (positive) or early. ``moved_px``: motion of the features in the camera between the frames
+    of the two axes. ``numbering``: how the features are misnumbered, "" where they are not.
+    ``turn`` (2, 2): mean Jacobian of the projector coordinates by camera pixels over the board.
     ``contradictions``: between a refused capture and the sequence's description.
     """
 
@@ -58,14 +60,18 @@ class PoseEvidence:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
         """Return the evidence that `records.to_plain` saved; None is read as NaN."""
-        axes = {name: {k: np.nan if v is None else v for k, v in axis.items()} for name, axis in data["axes"].items()}
+        axes = {
+            name: {k: np.nan if v is None else v for k, v in axis.items()}
+            for name, axis in data["axes"].items()
+        }
         moved = np.nan if data["moved_px"] is None else data["moved_px"]
         return from_plain({**data, "axes": axes, "moved_px": moved}, cls)
 
 
 @dataclass(frozen=True)
 class ExcludedPose:
-    """RMS residuals in px of a pose that the fit excluded, under the calibration from the other poses."""
+    """RMS residuals in px of a pose that the fit excluded, under the calibration from the other
+    poses."""
 
     camera_px: float
     projector_px: float
@@ -75,10 +81,11 @@ class ExcludedPose:
 class SolutionEvidence:
     """Evidence of a stereo calibration and of the poses it excluded.
 
-    ``used``: names of the poses; ``excluded``: residuals of those that the fit excluded. ``median_pose_rms_px``: median
-    over the poses of (camera, projector) reprojection RMS. ``focal_sigma``: relative standard deviation of the focal
-    length by device; ``tilt_spread_deg``: the largest angle between two boards; ``empty_corners``: corners of the image
-    that the projector illuminates and no pose covers; ``aspect``: fy / fx of the projector. ``ripple``: residuals that
+    ``used``: names of the poses; ``excluded``: residuals of those that the fit excluded.
+    ``median_pose_rms_px``: median over the poses of (camera, projector) reprojection RMS.
+    ``focal_sigma``: relative standard deviation of the focal length by device; ``tilt_spread_deg``:
+    the largest angle between two boards; ``empty_corners``: corners of the image that the projector
+    illuminates and no pose covers; ``aspect``: fy / fx of the projector. ``ripple``: residuals that
     repeat with the fringe, by axis.
     """
 
@@ -97,9 +104,10 @@ class SolutionEvidence:
 class Evidence:
     """Evidence of a calibration: of each pose and of the solution.
 
-    ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason. ``refusal``: why no
-    calibration could be made, or why it was rejected; "" otherwise. ``contradiction``: why the sequence's description
-    cannot be true, or "". ``tilt_spread_deg``: the largest angle between two boards, estimated with a nominal lens.
+    ``board``: its notation. ``excluded``: poses excluded before the fit, with the reason.
+    ``refusal``: why no calibration could be made, or why it was rejected; "" otherwise.
+    ``contradiction``: why the sequence's description cannot be true, or "". ``tilt_spread_deg``:
+    the largest angle between two boards, estimated with a nominal lens.
     """
 
     board: str
@@ -113,7 +121,8 @@ class Evidence:
 
     @property
     def tilts_undetermined(self) -> bool:
-        """Whether the boards are so nearly parallel that a fit's angles and focal lengths are undetermined."""
+        """Whether the boards are so nearly parallel that a fit's angles and focal lengths are
+        undetermined."""
         return self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
 
     @property

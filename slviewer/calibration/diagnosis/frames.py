@@ -30,8 +30,8 @@ def measure_axis(
 ) -> AxisEvidence:
     """Measure the evidence from one axis' frames.
 
-    ``stack`` (n, h, w): all frames of the capture; ``board`` (h, w) bool: the detected board's pixels, None for the
-    whole image.
+    ``stack`` (n, h, w): all frames of the capture; ``board`` (h, w) bool: the detected board's
+    pixels, None for the whole image.
     """
     valid = phase.reason == Reason.VALID
     where = np.ones(phase.reason.shape, bool) if board is None else board
@@ -49,9 +49,11 @@ def measure_axis(
 
 
 def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """Return the amplitude of the finest fringe's second harmonic over the first, positive for a gamma above 1.
+    """Return the amplitude of the finest fringe's second harmonic over the first, positive for a
+    gamma above 1.
 
-    NaN for fewer than five phase steps, which do not separate the two, and where too few pixels have fringes.
+    NaN for fewer than five phase steps, which do not separate the two, and where too few pixels
+    have fringes.
     """
     layout = axis_layout(sequence, axis)
     if layout.steps < 5:
@@ -64,12 +66,16 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
     n = len(indices)
     first, second = (
         np.einsum(
-            "k,kp->p", np.exp(-2j * np.pi * m * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n), frames
+            "k,kp->p",
+            np.exp(-2j * np.pi * m * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n),
+            frames,
         )
         for m in (1, 2)
     )
     strength = np.abs(first)
-    modulated = strength > max(8.0 * white / 255, 0.3 * float(np.quantile(strength, 0.95)) if strength.size else np.inf)
+    modulated = strength > max(
+        8.0 * white / 255, 0.3 * float(np.quantile(strength, 0.95)) if strength.size else np.inf
+    )
     if np.count_nonzero(modulated) < FEWEST:
         return np.nan
     first, second, strength = first[modulated], second[modulated], strength[modulated]
@@ -80,8 +86,9 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
 def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
     """Measure the fringe period in px from the phase at which the Gray code starts.
 
-    The code's origin in px is known from the sequence's description, and its phase from the code's edges. NaN without
-    both a phase shift and a Gray code, where the origin is too close to phase 0, or where the edges do not agree.
+    The code's origin in px is known from the sequence's description, and its phase from the code's
+    edges. NaN without both a phase shift and a Gray code, where the origin is too close to phase 0,
+    or where the edges do not agree.
     """
     layout = axis_layout(sequence, axis)
     if not (layout.shifts and layout.gray) or abs(layout.gray_origin_px) < MIN_ORIGIN_PX:
@@ -96,13 +103,18 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
 
 
 def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> float:
-    """Return the phase at which the codes start, in periods, -0.5 to 0.5; NaN where the edges do not agree.
+    """Return the phase at which the codes start, in periods, -0.5 to 0.5; NaN where the edges do
+    not agree.
 
-    An edge is at a phase between those of two neighbouring pixels. The result is the phase inside the largest number
-    of these intervals, which is more precise than any one of them.
+    An edge is at a phase between those of two neighbouring pixels. The result is the phase inside
+    the largest number of these intervals, which is more precise than any one of them.
     """
-    wrapped, modulation, background, _ = phase_shift(stack, layout.shifts[0].indices, layout.sign, layout.offset_rad)
-    illuminated = modulation >= dark_limit(background, measure_noise(layout, stack, white), white, dark_sigmas(layout))
+    wrapped, modulation, background, _ = phase_shift(
+        stack, layout.shifts[0].indices, layout.sign, layout.offset_rad
+    )
+    illuminated = modulation >= dark_limit(
+        background, measure_noise(layout, stack, white), white, dark_sigmas(layout)
+    )
     code, digit = np.zeros(illuminated.shape, np.int32), np.zeros(illuminated.shape, np.int32)
     for i in [*layout.gray] + ([] if layout.complementary is None else [layout.complementary]):
         digit ^= bit_heights(layout, stack, i, background) > 0
@@ -112,7 +124,9 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
     for here, there in ((first, second), (second, first)):
         edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
         below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
-        if layout.complementary is not None:  # the cell that starts here is the second half of a period if odd
+        if (
+            layout.complementary is not None
+        ):  # the cell that starts here is the second half of a period if odd
             below = below - (code[there][edge] & 1) * np.pi
             above = above - (code[there][edge] & 1) * np.pi
         origins.append(below)
@@ -125,7 +139,9 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
     start = np.mod((origin + np.pi) / (2 * np.pi), 1.0) * _ORIGIN_CANDIDATES
     change = np.zeros(3 * _ORIGIN_CANDIDATES)
     np.add.at(change, np.ceil(start).astype(int), 1.0)
-    np.add.at(change, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0)
+    np.add.at(
+        change, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0
+    )
     count = np.cumsum(change).reshape(3, _ORIGIN_CANDIDATES).sum(0)
     if count.max() < MIN_CONCENTRATION * len(origin):
         return np.nan
@@ -134,9 +150,11 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
 
 
 def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
-    """Return the delay of the white frame: 1 where it is one frame late, -1 where early, 0 where on time or unknown.
+    """Return the delay of the white frame: 1 where it is one frame late, -1 where early, 0 where on
+    time or unknown.
 
-    Only a white frame next to pattern frames is decisive, as the projector may show white after the last one.
+    Only a white frame next to pattern frames is decisive, as the projector may show white after the
+    last one.
     """
     rows = select_rows(*stack.shape[1:])
     frames = stack[:, rows].reshape(len(stack), -1)
@@ -156,13 +174,20 @@ def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
     return 0
 
 
-def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float) -> float:
-    """Measure the median motion in px of features at ``pixels`` (n, 2) between the frames of the two axes.
+def measure_motion_px(
+    sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float
+) -> float:
+    """Measure the median motion in px of features at ``pixels`` (n, 2) between the frames of the
+    two axes.
 
-    ``pitch``: distance of neighbouring features, px. NaN where only one axis was captured, or where fewer than four
-    features can be tracked.
+    ``pitch``: distance of neighbouring features, px. NaN where only one axis was captured, or where
+    fewer than four features can be tracked.
     """
-    scenes = [image for axis in sequence.axes if (image := _scene_image(sequence, stack, axis)) is not None]
+    scenes = [
+        image
+        for axis in sequence.axes
+        if (image := _scene_image(sequence, stack, axis)) is not None
+    ]
     if len(scenes) < 2 or len(pixels) < 4:
         return np.nan
     top = max(1.0, *(float(np.percentile(image[::4, ::4], 99.5)) for image in scenes))
@@ -179,7 +204,8 @@ def measure_motion_px(sequence: PatternSequence, stack: np.ndarray, pixels: np.n
 
 
 def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np.ndarray | None:
-    """Average the frames of one axis to an image (h, w) float32 without patterns; None where they do not cancel."""
+    """Average the frames of one axis to an image (h, w) float32 without patterns; None where they
+    do not cancel."""
     layout = axis_layout(sequence, axis)
     frames = list(layout.shifts[-1].indices) if layout.shifts else []
     if not frames and layout.inverse:
@@ -193,12 +219,16 @@ def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np
 
 
 def gamma_from_harmonic(harmonic: float) -> float:
-    """Return the exponent for which a power of a sinusoidal fringe has this ratio of second harmonic to first."""
+    """Return the exponent for which a power of a sinusoidal fringe has this ratio of second
+    harmonic to first."""
     return float((1 + 2 * harmonic) / (1 - harmonic))
 
 
-def fit_mean_turn(camera: np.ndarray, projector: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Fit the Jacobian (2, 2) of projector pixels (n, 2) by camera pixels (n, 2), least squares over all features.
+def fit_mean_turn(
+    camera: np.ndarray, projector: np.ndarray
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Fit the Jacobian (2, 2) of projector pixels (n, 2) by camera pixels (n, 2), least squares
+    over all features.
 
     Rows with NaN do not count; None for fewer than four others.
     """

@@ -1,4 +1,5 @@
-"""Checks of the numbering of a pose's features, and the size of the grid of circles that an image shows."""
+"""Checks of the numbering of a pose's features, and the size of the grid of circles that an image
+shows."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,9 +27,11 @@ _INLIER_PITCHES = 0.25  # largest residual of inliers in the fit of homography a
 
 
 def describe_misnumbering(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
-    """Describe how features with ``points`` (n, 3) mm at ``pixels`` (n, 2) are misnumbered; "" where they are not.
+    """Describe how features with ``points`` (n, 3) mm at ``pixels`` (n, 2) are misnumbered; ""
+    where they are not.
 
-    Where the numbering of a whole grid does not fit, typical misnumberings (transposed, shifted) are tried.
+    Where the numbering of a whole grid does not fit, typical misnumberings (transposed, shifted)
+    are tried.
     """
     columns, rows = board.features
     residual, is_mirrored = _measure_misfit(points, pixels, board.pitch_mm)
@@ -53,21 +56,27 @@ def describe_misnumbering(board: Board, points: np.ndarray, pixels: np.ndarray) 
     return best
 
 
-def reconcile_marks(board: Board, observations: Sequence[Observation]) -> tuple[list[Observation], str]:
-    """Renumber poses of a board of circles so that all are numbered by its mark, or none; return them and a warning.
+def reconcile_marks(
+    board: Board, observations: Sequence[Observation]
+) -> tuple[list[Observation], str]:
+    """Renumber poses of a board of circles so that all are numbered by its mark, or none; return
+    them and a warning.
 
-    A board has a mark in all poses or in none. Marks that only a minority of poses shows are treated as clutter: these
-    poses are renumbered by the rule for boards without a mark (``slviewer.target.numbering``). The warning is "" where
-    nothing was changed.
+    A board has a mark in all poses or in none. Marks that only a minority of poses shows are
+    treated as clutter: these poses are renumbered by the rule for boards without a mark
+    (``slviewer.target.numbering``). The warning is "" where nothing was changed.
     """
     doubtful = [o.name for o in observations if o.marked]
     if not doubtful or 2 * len(doubtful) >= len(observations):
         return list(observations), ""
     numbered = [_number_by_rule(board, o) if o.marked else o for o in observations]
-    return numbered, (
-        f"a mark was detected in {len(doubtful)} of {len(observations)} poses ({', '.join(doubtful)}) only: treated as "
-        "clutter next to the board, these poses are numbered like the others; if the board has a mark, keep it in view "
-        "and uncovered"
+    return (
+        numbered,
+        (
+            f"a mark was detected in {len(doubtful)} of {len(observations)} poses"
+            f" ({', '.join(doubtful)}) only: treated as clutter next to the board, these poses are"
+            " numbered like the others; if the board has a mark, keep it in view and uncovered"
+        ),
     )
 
 
@@ -81,13 +90,20 @@ def _number_by_rule(board: Board, observation: Observation) -> Observation:
     if np.array_equal(select_upright(board, observation.camera, [same, partner]), same):
         return plain
     slopes = None if observation.slopes is None else observation.slopes[partner]
-    return replace(plain, camera=observation.camera[partner], projector=observation.projector[partner], slopes=slopes)
+    return replace(
+        plain,
+        camera=observation.camera[partner],
+        projector=observation.projector[partner],
+        slopes=slopes,
+    )
 
 
 def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
-    """Detect the (columns, rows) of the grid of circles in an image, whatever the board's own; None without a grid.
+    """Detect the (columns, rows) of the grid of circles in an image, whatever the board's own; None
+    without a grid.
 
-    The longer side is given as the board's longer side. None for boards that are no regular grid of circles.
+    The longer side is given as the board's longer side. None for boards that are no regular grid of
+    circles.
     """
     if board.kind != "circles":
         return None
@@ -110,10 +126,11 @@ def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
 
 
 def _measure_misfit(points: np.ndarray, pixels: np.ndarray, pitch_mm: float) -> tuple[float, bool]:
-    """Return (residual of the worst 1 % of the features in pitches, whether the homography is mirrored).
+    """Return (residual of the worst 1 % of the features in pitches, whether the homography is
+    mirrored).
 
-    Residuals are those of a homography and a cubic polynomial (lens distortion), fitted robustly to points (n, 3) mm
-    and pixels (n, 2); inf where there is no homography.
+    Residuals are those of a homography and a cubic polynomial (lens distortion), fitted robustly to
+    points (n, 3) mm and pixels (n, 2); inf where there is no homography.
     """
     board = np.asarray(points[:, :2], float) / pitch_mm
     scale = float(np.sqrt(np.ptp(pixels, axis=0).prod() / max(np.ptp(board, axis=0).prod(), 1e-9)))
@@ -124,7 +141,9 @@ def _measure_misfit(points: np.ndarray, pixels: np.ndarray, pitch_mm: float) -> 
         return np.inf, False
     H = H * np.sign(board.mean(0) @ H[2, :2] + H[2, 2])
     with np.errstate(divide="ignore", invalid="ignore"):
-        offset = np.nan_to_num((pixels - to_image(H, board)) / max(scale, 1e-6), nan=1e6, posinf=1e6, neginf=-1e6)
+        offset = np.nan_to_num(
+            (pixels - to_image(H, board)) / max(scale, 1e-6), nan=1e6, posinf=1e6, neginf=-1e6
+        )
     terms = monomials(scale_to_unit_square(board), 3)
     inlier = np.asarray(inliers).ravel() > 0
     residual = lengths(offset)

@@ -1,8 +1,8 @@
 """Ripple: phase errors that repeat with the fringe, as of a non-linear response or of flicker.
 
-A response that is not linear puts harmonics h into the fringe, and n phase steps read those with h = k n +- 1 as an
-error of the phase with n k waves a period (Guo, He and Zhang, Opt. Lasers Eng. 43, 2005). Light that changes between
-the frames leaves one or two waves a period. A lens bends neither.
+A response that is not linear puts harmonics h into the fringe, and n phase steps read those with h
+= k n +- 1 as an error of the phase with n k waves a period (Guo, He and Zhang, Opt. Lasers Eng. 43,
+2005). Light that changes between the frames leaves one or two waves a period. A lens bends neither.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,24 +20,27 @@ from slviewer.geometry.vectors import finite_rows
 MAX_WAVES = 8
 """Largest number of waves per fringe period that is fitted."""
 DEGREE = 6
-"""Degree of the polynomial in camera pixels that removes lens distortion from a pose's residuals."""
+"""Degree of the polynomial in camera pixels that removes lens distortion from a pose's
+residuals."""
 OUTLIER_SIGMAS = 5.0
 MIN_SAMPLES = 500
 MIN_RESPONSE = 0.15
-"""Waves that the mean over a sample's block attenuates to less than this share of their amplitude are not fitted."""
+"""Waves that the mean over a sample's block attenuates to less than this share of their amplitude
+are not fitted."""
 
 MIN_DEPTH_SHARE = 3e-5
-"""Depth errors of a smaller share of the depth do not matter: 18 um at 600 mm, half the Letter rig's noise floor."""
+"""Depth errors of a smaller share of the depth do not matter: 18 um at 600 mm, half the Letter
+rig's noise floor."""
 
 
 @dataclass(frozen=True)
 class Ripple:
     """Ripple of one axis in projector px.
 
-    ``rms_px``: RMS of all residuals that repeat with the fringe; ``waves``: waves per period of their strongest
-    component, ``strongest_px`` its RMS; ``noise_px``: predicted noise of one camera pixel, median over the samples;
-    ``mm_per_px``: change of depth by one projector px, in the axis that gives the depth; ``depth_mm``: median depth of
-    the samples.
+    ``rms_px``: RMS of all residuals that repeat with the fringe; ``waves``: waves per period of
+    their strongest component, ``strongest_px`` its RMS; ``noise_px``: predicted noise of one camera
+    pixel, median over the samples; ``mm_per_px``: change of depth by one projector px, in the axis
+    that gives the depth; ``depth_mm``: median depth of the samples.
     """
 
     rms_px: float
@@ -49,8 +52,12 @@ class Ripple:
 
     @property
     def matters(self) -> bool:
-        """Whether it is larger than the noise of a point and than `MIN_DEPTH_SHARE` of the depth."""
-        return self.rms_px > self.noise_px and self.rms_px * self.mm_per_px > MIN_DEPTH_SHARE * self.depth_mm
+        """Whether it is larger than the noise of a point and than `MIN_DEPTH_SHARE` of the
+        depth."""
+        return (
+            self.rms_px > self.noise_px
+            and self.rms_px * self.mm_per_px > MIN_DEPTH_SHARE * self.depth_mm
+        )
 
 
 def measure_ripple(observations: Sequence[Observation], stereo: StereoModel) -> dict[Axis, Ripple]:
@@ -69,25 +76,37 @@ def measure_ripple(observations: Sequence[Observation], stereo: StereoModel) -> 
         for column, axis in enumerate(AXES):
             if axis in detrended and o.periods_px[axis] > 2.0:
                 periods = o.samples.projector[:, column] / o.periods_px[axis]
-                block = np.broadcast_to(_measure_blocks(o.samples.camera, periods), (len(periods), 3))
-                residuals[axis].append(np.column_stack([periods, detrended[axis], o.samples.sigma[:, column], block]))
+                block = np.broadcast_to(
+                    _measure_blocks(o.samples.camera, periods), (len(periods), 3)
+                )
+                residuals[axis].append(
+                    np.column_stack([periods, detrended[axis], o.samples.sigma[:, column], block])
+                )
     if not depths:
         return {}
     depth_mm, mm_per_px = np.nanmedian(np.concatenate(depths), axis=0).tolist()
-    ripples = {axis: _fit_ripple(np.concatenate(rows), mm_per_px, depth_mm) for axis, rows in residuals.items() if rows}
+    ripples = {
+        axis: _fit_ripple(np.concatenate(rows), mm_per_px, depth_mm)
+        for axis, rows in residuals.items()
+        if rows
+    }
     return {axis: ripple for axis, ripple in ripples.items() if ripple is not None}
 
 
 def _intersect_board(samples: Samples, stereo: StereoModel, pose: str) -> np.ndarray:
-    """Return where the camera rays of a pose's samples meet its board: (n, 3) mm in the camera's frame."""
+    """Return where the camera rays of a pose's samples meet its board: (n, 3) mm in the camera's
+    frame."""
     T = stereo.poses[pose]
-    rays = np.column_stack([stereo.rig.camera.undistort(samples.camera), np.ones(len(samples.camera))])
+    rays = np.column_stack(
+        [stereo.rig.camera.undistort(samples.camera), np.ones(len(samples.camera))]
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         return rays * ((T[:3, 2] @ T[:3, 3]) / (rays @ T[:3, 2]))[:, None]
 
 
 def _measure_depths(points: np.ndarray, stereo: StereoModel) -> np.ndarray:
-    """Return the depth in mm of points (n, 3), and how many mm it changes by one projector px along the ray: (n, 2)."""
+    """Return the depth in mm of points (n, 3), and how many mm it changes by one projector px along
+    the ray: (n, 2)."""
     further = points * (1 + 1.0 / points[:, 2:])  # by 1 mm
     px_per_mm = np.abs(stereo.rig.project(further) - stereo.rig.project(points)).max(axis=1)
     with np.errstate(divide="ignore"):
@@ -97,8 +116,8 @@ def _measure_depths(points: np.ndarray, stereo: StereoModel) -> np.ndarray:
 def _detrend_residuals(samples: Samples, difference: np.ndarray) -> Mapping[Axis, np.ndarray]:
     """Return measured less predicted projector coordinates (n,) px of a pose's samples, by axis.
 
-    A polynomial in camera pixels is removed, which takes the lens distortion. Axes with too few samples are missing.
-    ``difference`` (n, 2) px.
+    A polynomial in camera pixels is removed, which takes the lens distortion. Axes with too few
+    samples are missing. ``difference`` (n, 2) px.
     """
     u, v = samples.camera.T
     box = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5)
@@ -115,9 +134,11 @@ def _detrend_residuals(samples: Samples, difference: np.ndarray) -> Mapping[Axis
 
 
 def _measure_blocks(camera: np.ndarray, periods: np.ndarray) -> np.ndarray:
-    """Return the change of the phase in periods per camera pixel along u and along v, and the blocks' side in px, (3,).
+    """Return the change of the phase in periods per camera pixel along u and along v, and the
+    blocks' side in px, (3,).
 
-    ``camera`` (n, 2) px: centres of a pose's blocks; ``periods`` (n,): their projector coordinates in fringe periods.
+    ``camera`` (n, 2) px: centres of a pose's blocks; ``periods`` (n,): their projector coordinates
+    in fringe periods.
     """
     slopes = np.abs(fit_slopes(camera, periods[:, None]))
     columns, counts = np.unique(np.round(2 * camera[:, 0]) / 2, return_counts=True)
@@ -127,10 +148,12 @@ def _measure_blocks(camera: np.ndarray, periods: np.ndarray) -> np.ndarray:
 
 
 def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Ripple | None:
-    """Fit waves of 1 to MAX_WAVES per fringe period to residuals, by least squares; None for fewer than MIN_SAMPLES.
+    """Fit waves of 1 to MAX_WAVES per fringe period to residuals, by least squares; None for fewer
+    than MIN_SAMPLES.
 
-    ``samples`` (n, 6): projector coordinate in periods, residual px, predicted noise px, and the three numbers of
-    ``_measure_blocks``, by which the mean over a block attenuates each wave. Rows with NaN do not count.
+    ``samples`` (n, 6): projector coordinate in periods, residual px, predicted noise px, and the
+    three numbers of ``_measure_blocks``, by which the mean over a block attenuates each wave. Rows
+    with NaN do not count.
     """
     samples = samples[finite_rows(samples)]
     if len(samples) < MIN_SAMPLES:
@@ -156,7 +179,9 @@ def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Rippl
         rms_px=float(np.sqrt(power.sum())),
         waves=int(waves[strongest]),
         strongest_px=float(np.sqrt(power[strongest])),
-        noise_px=float(np.median(sigma * samples[:, 5])),  # the noise of a block's mean, times the block's side
+        noise_px=float(
+            np.median(sigma * samples[:, 5])
+        ),  # the noise of a block's mean, times the block's side
         mm_per_px=mm_per_px,
         depth_mm=depth_mm,
     )

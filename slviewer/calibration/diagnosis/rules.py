@@ -1,8 +1,9 @@
-"""The order in which the rules are applied to the evidence of a calibration, and the rules on the set of poses.
+"""The order in which the rules are applied to the evidence of a calibration, and the rules on the
+set of poses.
 
-A rule yields the findings of one cause. Faults of the frames come first, as nothing that follows can be trusted; then
-wrong descriptions; then single poses; then the set of poses as a whole. The stages after a rejecting finding are not
-run, as their findings could be its consequences.
+A rule yields the findings of one cause. Faults of the frames come first, as nothing that follows
+can be trusted; then wrong descriptions; then single poses; then the set of poses as a whole. The
+stages after a rejecting finding are not run, as their findings could be its consequences.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,7 +31,11 @@ HIGH_REPROJECTION_PX = 1.0
 
 def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
     """Yield a finding where fewer poses are usable than a calibration needs."""
-    count = len(e.solution.used) if e.solution else len([p for p in e.usable if p.name not in e.excluded])
+    count = (
+        len(e.solution.used)
+        if e.solution
+        else len([p for p in e.usable if p.name not in e.excluded])
+    )
     if count >= FEW_POSES:
         return
     refused = [f"{pose.name}: {pose.refused}" for pose in e.poses if pose.refused]
@@ -39,7 +44,8 @@ def diagnose_pose_count(e: Evidence) -> Iterator[Finding]:
         "too-few-poses",
         "rejected" if count < MIN_POSES else "doubtful",
         f"{count} usable pose{'s' * (count != 1)} of {len(e.poses)}{because}",
-        f"capture the board in more positions and tilts: {FEW_POSES} at least, and a dozen is better",
+        f"capture the board in more positions and tilts: {FEW_POSES} at least, and a dozen is"
+        " better",
     )
 
 
@@ -74,9 +80,11 @@ def diagnose_empty_corners(e: Evidence) -> Iterator[Finding]:
 
 
 def diagnose_uncertainty(e: Evidence) -> Iterator[Finding]:
-    """Yield findings on a large reprojection error, and on focal lengths that the poses leave uncertain.
+    """Yield findings on a large reprojection error, and on focal lengths that the poses leave
+    uncertain.
 
-    With a large reprojection error an uncertain focal length is at most doubtful: it may be a consequence.
+    With a large reprojection error an uncertain focal length is at most doubtful: it may be a
+    consequence.
     """
     if e.solution is None:
         return
@@ -86,7 +94,8 @@ def diagnose_uncertainty(e: Evidence) -> Iterator[Finding]:
             "residuals",
             "rejected" if e.refusal else "doubtful",
             f"the reprojection error is {e.solution.reprojection_px:.1f} px",
-            "check that the board is flat, in focus and held still, and look at the poses with the largest residuals",
+            "check that the board is flat, in focus and held still, and look at the poses with the"
+            " largest residuals",
         )
     for device, sigma in e.solution.focal_sigma.items():
         if not sigma < MAX_FOCAL_UNCERTAINTY:

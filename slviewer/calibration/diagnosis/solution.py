@@ -1,4 +1,5 @@
-"""Evidence from a stereo calibration: excluded poses, uncertainties, tilts, and coverage of the image's corners."""
+"""Evidence from a stereo calibration: excluded poses, uncertainties, tilts, and coverage of the
+image's corners."""
 
 from collections.abc import Sequence
 
@@ -24,18 +25,23 @@ _GRID = 12  # test pixels along each side of a corner
 
 
 def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -> SolutionEvidence:
-    """Measure the evidence of a stereo calibration; ``observations``: all, those that the fit excluded too."""
+    """Measure the evidence of a stereo calibration; ``observations``: all, those that the fit
+    excluded too."""
     used = [o for o in observations if o.name in stereo.poses]
     K = stereo.rig.projector.K
     normals = np.array([T[:3, 2] * np.sign(T[2, 2] or 1) for T in stereo.poses.values()])
     camera, projector = np.array([stereo.pose_rms_px[o.name] for o in used]).T
     return SolutionEvidence(
         used=tuple(stereo.poses),
-        excluded={o.name: measure_excluded(o, stereo) for o in observations if o.name not in stereo.poses},
+        excluded={
+            o.name: measure_excluded(o, stereo) for o in observations if o.name not in stereo.poses
+        },
         reprojection_px=stereo.reprojection_rms_px["stereo"],
         median_pose_rms_px=(float(np.median(camera)), float(np.median(projector))),
         focal_sigma={
-            "camera": stereo.focal_sigma_px["camera"] / float(min(np.diag(stereo.rig.camera.K)[:2])),
+            "camera": (
+                stereo.focal_sigma_px["camera"] / float(min(np.diag(stereo.rig.camera.K)[:2]))
+            ),
             "projector": stereo.focal_sigma_px["projector"] / float(min(np.diag(K)[:2])),
         },
         tilt_spread_deg=largest_angle_deg(normals),
@@ -46,21 +52,28 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
 
 
 def measure_excluded(observation: Observation, stereo: StereoModel) -> ExcludedPose:
-    """Measure the residuals of an excluded pose under the calibration; inf where its pose cannot be solved."""
+    """Measure the residuals of an excluded pose under the calibration; inf where its pose cannot be
+    solved."""
     camera = stereo.rig.camera
     detected = finite_rows(observation.camera)
     T = None
     if np.count_nonzero(detected) >= 6:
-        T = solve_pose(observation.points[detected], observation.camera[detected], camera.K, camera.D)
+        T = solve_pose(
+            observation.points[detected], observation.camera[detected], camera.K, camera.D
+        )
     if T is None:
         return ExcludedPose(np.inf, np.inf)
     X = move_points(T, observation.points)
-    residuals = camera.project(X) - observation.camera, stereo.rig.project(X) - observation.projector
+    residuals = (
+        camera.project(X) - observation.camera,
+        stereo.rig.project(X) - observation.projector,
+    )
     return ExcludedPose(*map(_trimmed_rms, residuals))
 
 
 def list_empty_corners(observations: Sequence[Observation], stereo: StereoModel) -> tuple[str, ...]:
-    """List the corners of the image that no board covers, among those illuminated at the boards' depths."""
+    """List the corners of the image that no board covers, among those illuminated at the boards'
+    depths."""
     width, height = stereo.rig.camera.size
     if stereo.depth_range_mm is None:
         return ()
@@ -68,7 +81,9 @@ def list_empty_corners(observations: Sequence[Observation], stereo: StereoModel)
     for name, (right, bottom) in CORNERS.items():
         along = [
             (np.arange(_GRID) + 0.5) / _GRID * share * size + side * (1 - share) * size
-            for share, size, side in zip(CORNER_SHARE, (width, height), (right, bottom), strict=True)
+            for share, size, side in zip(
+                CORNER_SHARE, (width, height), (right, bottom), strict=True
+            )
         ]
         pixels = grid_points(*along)
         illuminated = _is_illuminated(pixels, stereo)
@@ -83,7 +98,8 @@ def list_empty_corners(observations: Sequence[Observation], stereo: StereoModel)
 
 
 def _is_illuminated(pixels: np.ndarray, stereo: StereoModel) -> np.ndarray:
-    """(n,) bool: camera pixels (n, 2) on whose rays the projector illuminates two of three of the boards' depths."""
+    """(n,) bool: camera pixels (n, 2) on whose rays the projector illuminates two of three of the
+    boards' depths."""
     near, far = stereo.depth_range_mm or (0.0, 0.0)
     rays = stereo.rig.camera.undistort(pixels)
     inside = []
@@ -104,7 +120,8 @@ def _is_covered(observation: Observation, pixels: np.ndarray) -> np.ndarray:
 
 
 def _trimmed_rms(residuals: np.ndarray) -> float:
-    """RMS length of the smaller 90 % of residuals (n, 2), as single features may be wrong; inf without finite ones."""
+    """RMS length of the smaller 90 % of residuals (n, 2), as single features may be wrong; inf
+    without finite ones."""
     squares = np.sort(np.sum(residuals**2, axis=1))
     squares = squares[np.isfinite(squares)]
     trimmed = squares[: max(1, int(0.9 * len(squares)))]

@@ -9,7 +9,8 @@ from slviewer.records.plain import to_plain
 
 Level = Literal["good", "doubtful", "rejected"]
 Severity = Literal["note", "doubtful", "rejected"]
-"""note: repaired already, as by excluding a pose; doubtful: may be used with care; rejected: must not be used."""
+"""note: repaired already, as by excluding a pose; doubtful: may be used with care; rejected: must
+not be used."""
 Cause = Literal[
     "frame-lag",
     "missing-frame",
@@ -43,7 +44,8 @@ CAUSES: tuple[Cause, ...] = get_args(Cause)
 
 @dataclass(frozen=True)
 class Finding:
-    """A detected fault: its cause and severity, the observation (``sentence``), the ``remedy``, and the poses."""
+    """A detected fault: its cause and severity, the observation (``sentence``), the ``remedy``, and
+    the poses."""
 
     cause: Cause
     severity: Severity
@@ -64,9 +66,12 @@ class Verdict:
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
-        """Return the verdict of findings sorted by severity, the worst first, then by cause, root causes first."""
+        """Return the verdict of findings sorted by severity, the worst first, then by cause, root
+        causes first."""
         severities = get_args(Severity)
-        ranked = sorted(findings, key=lambda f: (-severities.index(f.severity), CAUSES.index(f.cause)))
+        ranked = sorted(
+            findings, key=lambda f: (-severities.index(f.severity), CAUSES.index(f.cause))
+        )
         return cls(tuple(ranked))
 
     @property
@@ -97,9 +102,10 @@ class Verdict:
 
 
 DOUBTFUL_RATIO = 4.0
-"""Ratio of residuals to predicted noise. It is 0.5 to 1.1 on clean simulated rigs with local distortion, and 0.8 on
-real Gray code. Noise that is correlated between pixels, as after demosaicing or compression, raises it to less than 4:
-it would be 5 if the 5 by 5 camera pixels of a block had identical noise."""
+"""Ratio of residuals to predicted noise. It is 0.5 to 1.1 on clean simulated rigs with local
+distortion, and 0.8 on real Gray code. Noise that is correlated between pixels, as after demosaicing
+or compression, raises it to less than 4: it would be 5 if the 5 by 5 camera pixels of a block had
+identical noise."""
 EXPLAINING_CAUSES = ("gamma", "saturation", "moved", "frame-lag", "frame-order", "missing-frame")
 REJECTED_RATIO = 25.0
 REJECTED_PX = 1.0
@@ -107,7 +113,8 @@ REJECTED_PX = 1.0
 
 
 def judge_splined(verdict: Verdict, noise: Noise) -> Verdict:
-    """Return the verdict with a finding added where the joint adjustment's residuals exceed their predicted noise.
+    """Return the verdict with a finding added where the joint adjustment's residuals exceed their
+    predicted noise.
 
     The finding names the first of ``EXPLAINING_CAUSES`` among the others as its probable cause.
     """
@@ -119,9 +126,10 @@ def judge_splined(verdict: Verdict, noise: Noise) -> Verdict:
     finding = Finding(
         "residuals",
         "rejected" if ratio > REJECTED_RATIO and px > REJECTED_PX else "doubtful",
-        f"the residuals of the joint adjustment in {axis}, {px:.2f} px, are {ratio:.1f} times the predicted noise"
-        f"{because}",
-        "see that light, exposure and rig did not change while a pose was captured, that the projector scales nothing, "
-        "and that its response is linear; sigmas of clouds are raised by that factor",
+        f"the residuals of the joint adjustment in {axis}, {px:.2f} px, are {ratio:.1f} times the"
+        f" predicted noise{because}",
+        "see that light, exposure and rig did not change while a pose was captured, that the"
+        " projector scales nothing, and that its response is linear; sigmas of clouds are raised by"
+        " that factor",
     )
     return Verdict.of([*verdict.findings, finding])

@@ -1,9 +1,9 @@
 """Drift check: whether a saved calibration is still valid, from one capture of its board.
 
-The check estimates the change of the projector's pose relative to the camera: a rotation about its own centre, and a
-translation of that centre. Flatness would not show it: a rotation of 0.1 mrad leaves flat boards flat, and distorts
-space by 700 ppm. Changes along the epipolar lines change the board's apparent scale; changes across them move the
-pattern off its epipolar lines.
+The check estimates the change of the projector's pose relative to the camera: a rotation about its
+own centre, and a translation of that centre. Flatness would not show it: a rotation of 0.1 mrad
+leaves flat boards flat, and distorts space by 700 ppm. Changes along the epipolar lines change the
+board's apparent scale; changes across them move the pattern off its epipolar lines.
 """
 
 from collections.abc import Sequence
@@ -43,11 +43,16 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     Raises InputError where no axis of the pattern could be read.
     """
     if not view.axes:
-        raise InputError(f"{view.name}: no axis of the pattern could be read on the board: illuminate the whole board")
+        raise InputError(
+            f"{view.name}: no axis of the pattern could be read on the board: illuminate the whole"
+            " board"
+        )
     estimate = reference.estimate_change(view)
     own = reference.pose_changes
     growth = BOARD_PPM * 1e-6
-    C = estimate.covariance(reference.sigmas) + growth**2 * np.outer(estimate.by_growth, estimate.by_growth)
+    C = estimate.covariance(reference.sigmas) + growth**2 * np.outer(
+        estimate.by_growth, estimate.by_growth
+    )
     information = np.linalg.inv(C)
     squared_distance = float(estimate.change @ information @ estimate.change)
     degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
@@ -61,22 +66,26 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
     worst = max(a.misfit_px for a in own)
     if estimate.misfit_px > MAX_MISFIT_RATIO * worst:
         reasons.append(
-            f"residuals of {estimate.misfit_px:.3f} px RMS remain with any movement of the projector "
-            f"(at most {worst:.3f} px in the poses of the calibration): "
-            "was a lens refocused, the board moved, or is it another one?"
+            f"residuals of {estimate.misfit_px:.3f} px RMS remain with any movement of the"
+            f" projector (at most {worst:.3f} px in the poses of the calibration): was a lens"
+            " refocused, the board moved, or is it another one?"
         )
     elif squared_distance > limit:
         reasons.append(_list_movements(estimate, information, squared_distance, along))
         if abs(estimate.scale) > 3 * scale_sigma:
             reasons.append(
-                f"the board seems {1e6 * estimate.scale:+.0f} ppm larger than it is (+- {1e6 * scale_sigma:.0f})"
+                f"the board seems {1e6 * estimate.scale:+.0f} ppm larger than it is (+-"
+                f" {1e6 * scale_sigma:.0f})"
             )
         if across_sigma is not None and abs(estimate.across_px) > 4 * across_sigma:
             reasons.append(
-                f"the pattern is {estimate.across_px:+.4f} px off its epipolar lines (+- {across_sigma:.4f})"
+                f"the pattern is {estimate.across_px:+.4f} px off its epipolar lines (+-"
+                f" {across_sigma:.4f})"
             )
     sigmas = np.sqrt(np.diag(C))
-    seen_alone = (np.sqrt(limit) + 1.645) / np.sqrt(np.diag(information)) * np.array([1e3] * 3 + [1.0] * 3)
+    seen_alone = (
+        (np.sqrt(limit) + 1.645) / np.sqrt(np.diag(information)) * np.array([1e3] * 3 + [1.0] * 3)
+    )
     return Drift(
         capture=view.name,
         axes=view.axes,
@@ -95,11 +104,16 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         misfit_px=estimate.misfit_px,
         chance=chance,
         seen_alone=(*to_vector(seen_alone[:3]), *to_vector(seen_alone[3:])),
-        unseen=(*_list_undetermined(seen_alone, view.axes), "common motion of both devices (harmless)"),
+        unseen=(
+            *_list_undetermined(seen_alone, view.axes),
+            "common motion of both devices (harmless)",
+        ),
     )
 
 
-def _list_movements(estimate: PoseChange, information: np.ndarray, squared_distance: float, along: np.ndarray) -> str:
+def _list_movements(
+    estimate: PoseChange, information: np.ndarray, squared_distance: float, along: np.ndarray
+) -> str:
     """Describe the single movements that explain the change best, with their sizes.
 
     ``information`` (6, 6): inverse covariance of the change; ``squared_distance``: its Mahalanobis
@@ -114,12 +128,18 @@ def _list_movements(estimate: PoseChange, information: np.ndarray, squared_dista
     for i in np.argsort(-share):
         if share[i] > 0.9 * share.max():
             form, unit = (".4f", "mrad") if i < 3 else (".1f", "um")
-            words.append(f"a {names[i]} by {1e3 * sizes[i]:+{form}} +- {1e3 * sigmas[i]:{form}} {unit}")
-    return f"the projector has moved, as by {' or '.join(words)} ({100 * share.max():.0f} % of the change)"
+            words.append(
+                f"a {names[i]} by {1e3 * sizes[i]:+{form}} +- {1e3 * sigmas[i]:{form}} {unit}"
+            )
+    return (
+        f"the projector has moved, as by {' or '.join(words)} ({100 * share.max():.0f} % of the"
+        " change)"
+    )
 
 
 def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str]:
-    """Describe the movements whose detection limits (6,) mrad and mm are too large, with the reason and remedy."""
+    """Describe the movements whose detection limits (6,) mrad and mm are too large, with the reason
+    and remedy."""
     limits = [TURN_MRAD] * 3 + [SHIFT_MM] * 3
     undetermined = []
     for i, ((move, lines, axis), limit) in enumerate(zip(_MOVES, limits, strict=True)):
@@ -128,8 +148,11 @@ def _list_undetermined(seen_alone: np.ndarray, axes: Sequence[Axis]) -> list[str
             why = (
                 f"it moves the pattern's {lines}, and the capture holds axis {axes[0]} alone"
                 if len(axes) == 1 and axis not in axes
-                else f"at this pose it moves the pattern by too little; {'capture both axes, or ' * (len(axes) < 2)}"
-                "bring the board nearer and tilt it"
+                else (
+                    "at this pose it moves the pattern by too little;"
+                    f" {'capture both axes, or ' * (len(axes) < 2)}bring the board nearer and"
+                    " tilt it"
+                )
             )
             undetermined.append(f"a {move} of less than {size}: {why}")
     return undetermined

@@ -1,8 +1,9 @@
 """One view of the board, linearised in the board's pose, the projector's pose and the lens errors.
 
-A view is a calibration pose or a later capture of the same board: its features in the camera, and the projector's
-coordinates at a grid of the board's pixels. All unknowns are small (tenths of a pixel), so that one linearisation at
-the calibration and at the board's pose by the camera is sufficient.
+A view is a calibration pose or a later capture of the same board: its features in the camera, and
+the projector's coordinates at a grid of the board's pixels. All unknowns are small (tenths of a
+pixel), so that one linearisation at the calibration and at the board's pose by the camera is
+sufficient.
 """
 
 from dataclasses import dataclass
@@ -34,8 +35,9 @@ STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
 
 @dataclass(frozen=True, eq=False)
 class DriftView:
-    """``camera`` (n, 2) px of board ``points`` (n, 3) mm; ``pixels`` (m, 2) px of the board in the camera, and the
-    ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was not captured."""
+    """``camera`` (n, 2) px of board ``points`` (n, 3) mm; ``pixels`` (m, 2) px of the board in the
+    camera, and the ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was
+    not captured."""
 
     name: str
     points: Floats
@@ -50,7 +52,8 @@ class DriftView:
         v, u = np.nonzero(observation.region)
         if not len(v):
             raise InputError(
-                f"{observation.name}: no pixel of the board carries a readable pattern: illuminate the board"
+                f"{observation.name}: no pixel of the board carries a readable pattern: illuminate"
+                " the board"
             )
         step = max(1, int(np.sqrt(len(v) / SAMPLES)))
         on_grid = (u % step == 0) & (v % step == 0)
@@ -69,7 +72,8 @@ class DriftView:
 
 @dataclass(frozen=True, eq=False)
 class DisplacementField:
-    """A cubic B-spline displacement field over an image of ``size`` px: ``cells`` (across, down)."""
+    """A cubic B-spline displacement field over an image of ``size`` px: ``cells`` (across,
+    down)."""
 
     size: tuple[int, int]
 
@@ -89,28 +93,36 @@ class DisplacementField:
             cubic_basis(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
             for k, (size, cells) in enumerate(zip(self.size, self.cells, strict=True))
         )
-        columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (i[:, None] + np.arange(4))[:, None]
+        columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (
+            i[:, None] + np.arange(4)
+        )[:, None]
         values = wv[:, :, None] * wu[:, None]
         rows = np.repeat(np.arange(len(pixels)), 16)
         return sp.csr_array((values.ravel(), (rows, columns.ravel())), (len(pixels), self.unknowns))
 
     @cached_property
     def roughness(self) -> sp.csr_array:
-        """Quadratic form (unknowns, unknowns) of the squared second differences of one component's coefficients."""
+        """Quadratic form (unknowns, unknowns) of the squared second differences of one component's
+        coefficients."""
         across, down = (n + 3 for n in self.cells)
 
-        u, v = sp.kron(sp.eye(down), second_differences(across)), sp.kron(second_differences(down), sp.eye(across))
+        u, v = (
+            sp.kron(sp.eye(down), second_differences(across)),
+            sp.kron(second_differences(down), sp.eye(across)),
+        )
         return sp.csr_array(u.T @ u + v.T @ v)
 
 
 @dataclass(frozen=True, eq=False)
 class LinearView:
-    """A view's linear equations ``residuals = pose a + change b + shared c``, one row per observed coordinate (px).
+    """A view's linear equations ``residuals = pose a + change b + shared c``, one row per observed
+    coordinate (px).
 
-    ``kinds`` (k,): index into KINDS of each row. Derivatives: ``pose`` (k, 6) by the board's pose; ``change`` (k, 6) by
-    the projector's rotation about its own centre and axes (rad) and its translation (mm); ``scale`` (k,) by the board's
-    relative growth; ``shared`` (k, unknowns) by the lens errors: u and v components of the camera's field, then of the
-    projector's. ``across`` (k,): weight of each projector coordinate in the offset across the epipolar lines.
+    ``kinds`` (k,): index into KINDS of each row. Derivatives: ``pose`` (k, 6) by the board's pose;
+    ``change`` (k, 6) by the projector's rotation about its own centre and axes (rad) and its
+    translation (mm); ``scale`` (k,) by the board's relative growth; ``shared`` (k, unknowns) by the
+    lens errors: u and v components of the camera's field, then of the projector's. ``across`` (k,):
+    weight of each projector coordinate in the offset across the epipolar lines.
     """
 
     name: str
@@ -137,20 +149,30 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
     middle = view.points.mean(0)
 
     def model(at: np.ndarray, moved: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose, projector, scale."""
+        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose,
+        projector, scale."""
         R = cv2.Rodrigues(at[:3])[0] @ T[:3, :3]
         t = T[:3, 3] + at[3:6]
-        rays = np.concatenate([rig.camera.undistort(view.pixels + moved), np.ones((len(view.pixels), 1))], 1)
+        rays = np.concatenate(
+            [rig.camera.undistort(view.pixels + moved), np.ones((len(view.pixels), 1))], 1
+        )
         on_board = rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[:, None]
         in_projector = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
         points = middle + (view.points - middle) * (1 + at[12])
         return rig.camera.project(points @ R.T + t), rig.projector.project(in_projector)
 
     steps = np.diag(np.r_[STEPS, STEPS, 1e-4])
-    columns = [_flatten(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum()) for s in steps]
+    columns = [
+        _flatten(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum())
+        for s in steps
+    ]
     features, samples = model(np.zeros(13))
     J = np.stack(
-        [(model(np.zeros(13), 0.1 * e)[1] - model(np.zeros(13), -0.1 * e)[1]) / 0.2 for e in np.eye(2)], 2
+        [
+            (model(np.zeros(13), 0.1 * e)[1] - model(np.zeros(13), -0.1 * e)[1]) / 0.2
+            for e in np.eye(2)
+        ],
+        2,
     )  # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
     camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
     on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
@@ -158,11 +180,16 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
     n, m = len(view.camera), len(view.pixels)
 
     def moved_by(row: int) -> list[sp.csr_array]:
-        """Return the derivatives of a projector coordinate by the camera's field, u and v components."""
+        """Return the derivatives of a projector coordinate by the camera's field, u and v
+        components."""
         return [-sp.csr_array(sp.diags(np.nan_to_num(J[:, row, k])) @ at_pixels) for k in (0, 1)]
 
     interleaved = [sp.csr_array(sp.kron(on_features, np.eye(2)[:, k : k + 1])) for k in (0, 1)]
-    rows = [*interleaved, None, None], [*moved_by(0), on_samples, None], [*moved_by(1), None, on_samples]
+    rows = (
+        [*interleaved, None, None],
+        [*moved_by(0), on_samples, None],
+        [*moved_by(1), None, on_samples],
+    )
     shared = sp.block_array(rows, format="csr")
     by_shift = np.stack([column[2 * n :].reshape(2, m).T for column in columns[3:6]], 2)
     towards = unit_vectors(by_shift @ T[:3, 2])  # along the normal
@@ -179,13 +206,17 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
 
 
 def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
-    """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2 m,)."""
+    """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2
+    m,)."""
     return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
 
 
 def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:
-    """Solve T_camera_board (4, 4) mm from the features in the camera; raises InputError without a solution."""
+    """Solve T_camera_board (4, 4) mm from the features in the camera; raises InputError without a
+    solution."""
     T = solve_pose(view.points, rig.camera.undistort(view.camera), np.eye(3), np.zeros(5))
     if T is None:
-        raise InputError(f"{view.name}: no pose of the board fits its features: is it the calibration's board?")
+        raise InputError(
+            f"{view.name}: no pose of the board fits its features: is it the calibration's board?"
+        )
     return T

@@ -1,1 +1,2 @@
-"""Suggest the next board poses: predicted uncertainty from the information that candidate poses would add."""
+"""Suggest the next board poses: predicted uncertainty from the information that candidate poses
+would add."""

@@ -1,4 +1,5 @@
-"""Approximate rig from few poses, and the coarse model with which guidance predicts visibility and information."""
+"""Approximate rig from few poses, and the coarse model with which guidance predicts visibility and
+information."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,12 +16,19 @@ from slviewer.calibration.splined.unknowns import Arrangement, State, UnknownLay
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import Floats, move_points, nearest_rotation, rotation_angle, transform_from_rvec
+from slviewer.geometry.rigid import (
+    Floats,
+    move_points,
+    nearest_rotation,
+    rotation_angle,
+    transform_from_rvec,
+)
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.board import Board
 
 COARSE_CELLS = 10
-"""Cells of the displacement fields across an image; the joint adjustment has more (``fields.CELLS_ACROSS``)."""
+"""Cells of the displacement fields across an image; the joint adjustment has more
+(``fields.CELLS_ACROSS``)."""
 FEATURES, SAMPLES = (5, 4), (9, 7)
 """Points (across, down) that represent all features of a board, and all its bright pixels."""
 BOARD_SAMPLES = 4000
@@ -33,8 +41,8 @@ MAX_FEATURES = 60
 POSES_FOR_TWO_COEFFICIENTS = 6
 """With fewer poses only one radial distortion coefficient is estimated."""
 MAX_DISAGREEMENT = 0.05, 0.1
-"""Largest median deviation of the poses' camera-projector transforms from the common one: rotation in rad, and
-translation over its length."""
+"""Largest median deviation of the poses' camera-projector transforms from the common one: rotation
+in rad, and translation over its length."""
 _FOCALS = 0.4, 12.0  # plausible focal lengths, in widths of the image
 
 
@@ -42,8 +50,9 @@ _FOCALS = 0.4, 12.0  # plausible focal lengths, in widths of the image
 class ExpectedNoise:
     """Expected noise and local lens distortion before a joint adjustment has measured them.
 
-    ``feature`` and ``sample``: standard deviations of a coordinate, in widths of the image; ``strengths``: of the
-    camera's and the projector's prior at the adjustment's own knots, for displacements in widths of the image.
+    ``feature`` and ``sample``: standard deviations of a coordinate, in widths of the image;
+    ``strengths``: of the camera's and the projector's prior at the adjustment's own knots, for
+    displacements in widths of the image.
     """
 
     feature: float = 2.5e-5
@@ -51,20 +60,24 @@ class ExpectedNoise:
     strengths: tuple[float, float] = (4e8, 2e8)
 
     def with_noise(self, samples: np.ndarray) -> "ExpectedNoise":
-        """Return the expectation updated by the measured noise (n,) of some poses' samples, in widths of the image.
+        """Return the expectation updated by the measured noise (n,) of some poses' samples, in
+        widths of the image.
 
-        NaN where a pose's noise is not known. Larger noise raises that of the features in proportion; smaller does not
-        lower it.
+        NaN where a pose's noise is not known. Larger noise raises that of the features in
+        proportion; smaller does not lower it.
         """
         if not np.isfinite(samples).any():
             return self
         measured = float(np.nanmedian(samples))
-        return replace(self, sample=measured, feature=self.feature * max(measured / self.sample, 1.0))
+        return replace(
+            self, sample=measured, feature=self.feature * max(measured / self.sample, 1.0)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class GuidanceModel:
-    """Coarse model of one rig and one board, for predicting which poses are visible and how informative they are."""
+    """Coarse model of one rig and one board, for predicting which poses are visible and how
+    informative they are."""
 
     stereo: StereoRig
     board: Board
@@ -73,7 +86,9 @@ class GuidanceModel:
     @cached_property
     def rig(self) -> Arrangement:
         """Both devices without local distortion, on coarse knots."""
-        camera, projector = (_coarse_device(lens) for lens in (self.stereo.camera, self.stereo.projector))
+        camera, projector = (
+            _coarse_device(lens) for lens in (self.stereo.camera, self.stereo.projector)
+        )
         return Arrangement(camera, projector, np.array(self.stereo.R), np.array(self.stereo.t))
 
     @cached_property
@@ -106,26 +121,34 @@ class GuidanceModel:
         return len(self.board.points) / len(self.points)
 
     def sample_pixels(self, T_camera_board: Floats) -> list[Floats]:
-        """Return camera pixels (m, 2) on a regular grid of the board, as far as both devices see them, for each pose.
+        """Return camera pixels (m, 2) on a regular grid of the board, as far as both devices see
+        them, for each pose.
 
         ``T_camera_board``: (k, 4, 4) mm.
         """
         outline = self.board.outline()
         shares = [(np.arange(n) + 0.5) / n for n in SAMPLES]
-        grid = grid_points(*(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares)))
+        grid = grid_points(
+            *(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares))
+        )
         pixels, visible = self._project(T_camera_board, np.pad(grid, ((0, 0), (0, 1))), 0)
         return [p[v] for p, v in zip(pixels, visible, strict=True)]
 
     def is_visible(self, T_camera_board: Floats) -> NDArray[np.bool_]:
-        """(k,) bool: poses (k, 4, 4) mm at which both devices see every feature of the board, with a margin."""
+        """(k,) bool: poses (k, 4, 4) mm at which both devices see every feature of the board, with
+        a margin."""
         margin = 0.25 * self.board.pitch_mm if self.board.kind in ("circles", "acircles") else None
-        return np.asarray(self._project(T_camera_board, self.board.outline(margin), MARGIN)[1].all(1))
+        return np.asarray(
+            self._project(T_camera_board, self.board.outline(margin), MARGIN)[1].all(1)
+        )
 
-    def _project(self, T_camera_board: Floats, points: Floats, margin: float) -> tuple[Floats, NDArray[np.bool_]]:
+    def _project(
+        self, T_camera_board: Floats, points: Floats, margin: float
+    ) -> tuple[Floats, NDArray[np.bool_]]:
         """Project board points (n, 3) mm at each pose (k, 4, 4).
 
-        Returns the camera's pixels (k, n, 2) and whether they are inside both images, (k, n) bool, with a ``margin`` in
-        widths of the image.
+        Returns the camera's pixels (k, n, 2) and whether they are inside both images, (k, n) bool,
+        with a ``margin`` in widths of the image.
         """
         X = move_points(T_camera_board, points)
         camera, projector = self.stereo.camera, self.stereo.projector
@@ -134,7 +157,8 @@ class GuidanceModel:
         return pixels, seen & projector.contains(self.stereo.project(X), margin * projector.size[0])
 
     def prior(self) -> Floats:
-        """Return the information matrix (unknowns, unknowns) before any pose, in the order of ``layout``."""
+        """Return the information matrix (unknowns, unknowns) before any pose, in the order of
+        ``layout``."""
         at = self.layout
         A = np.zeros((at.size, at.size))
         cell_ratio = CELLS_ACROSS / COARSE_CELLS
@@ -151,9 +175,12 @@ class GuidanceModel:
         return A
 
     def _weak_prior_sigmas(self) -> Floats:
-        """(24,): wide prior standard deviations of both lenses, rotation (rad) and translation (mm)."""
+        """(24,): wide prior standard deviations of both lenses, rotation (rad) and translation
+        (mm)."""
         lens = [
-            np.concatenate([np.repeat(0.3 * K[[0, 1], [0, 1]].mean(), 4), [0.5, 0.5, 0.02, 0.02, 2.0]])
+            np.concatenate(
+                [np.repeat(0.3 * K[[0, 1], [0, 1]].mean(), 4), [0.5, 0.5, 0.02, 0.02, 2.0]]
+            )
             for K in (self.stereo.camera.K, self.stereo.projector.K)
         ]
         return np.concatenate([*lens, [0.3] * 3, [300.0] * 3])
@@ -163,7 +190,9 @@ def _coarse_device(lens: Lens) -> Device:
     """Return a device with the lens's parameters and a zero displacement field on coarse knots."""
     width, height = lens.size
     down = int(np.clip(round(COARSE_CELLS * height / width), 4, 2 * COARSE_CELLS))
-    return Device(lens.parameters, np.zeros((2, down + 3, COARSE_CELLS + 3)), np.array(lens.size, float))
+    return Device(
+        lens.parameters, np.zeros((2, down + 3, COARSE_CELLS + 3)), np.array(lens.size, float)
+    )
 
 
 def estimate_rig(
@@ -172,16 +201,19 @@ def estimate_rig(
     projector: Sequence[np.ndarray],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[StereoRig, list[Floats]] | None:
-    """Estimate an approximate rig and T_camera_board (4, 4) mm of every pose; None where the poses do not determine it.
+    """Estimate an approximate rig and T_camera_board (4, 4) mm of every pose; None where the poses
+    do not determine it.
 
-    Of each pose: ``points`` (n, 3) mm on the board, and their ``camera`` and ``projector`` pixels (n, 2), NaN where
-    unknown. ``sizes``: (width, height) px of camera and projector.
+    Of each pose: ``points`` (n, 3) mm on the board, and their ``camera`` and ``projector`` pixels
+    (n, 2), NaN where unknown. ``sizes``: (width, height) px of camera and projector.
     """
     features = [_select_features(*each) for each in zip(points, camera, projector, strict=True)]
     if len(features) < MIN_POSES or any(len(each[0]) < MIN_FEATURES for each in features):
         return None
     boards, *images = zip(*features, strict=True)
-    devices = [_calibrate_device(boards, seen, size) for seen, size in zip(images, sizes, strict=True)]
+    devices = [
+        _calibrate_device(boards, seen, size) for seen, size in zip(images, sizes, strict=True)
+    ]
     if devices[0] is None or devices[1] is None:
         return None
     lenses, poses = zip(*devices, strict=True)
@@ -196,8 +228,11 @@ def estimate_rig(
     return StereoRig(lenses[0], lenses[1], R, t), poses[0]
 
 
-def _select_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarray) -> list[NDArray[np.float32]]:
-    """Return at most MAX_FEATURES of a pose's points and pixels (k, ...) float32, of those that both devices see."""
+def _select_features(
+    points: np.ndarray, camera: np.ndarray, projector: np.ndarray
+) -> list[NDArray[np.float32]]:
+    """Return at most MAX_FEATURES of a pose's points and pixels (k, ...) float32, of those that
+    both devices see."""
     known = np.nonzero(finite_rows(camera, projector))[0]
     if len(known):
         known = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
@@ -207,14 +242,22 @@ def _select_features(points: np.ndarray, camera: np.ndarray, projector: np.ndarr
 def _calibrate_device(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
 ) -> tuple[Lens, list[Floats]] | None:
-    """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible solution."""
+    """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible
+    solution."""
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if len(points) < POSES_FOR_TWO_COEFFICIENTS:
         flags |= cv2.CALIB_FIX_K2
     try:
-        _, K, D, rvecs, tvecs = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+        _, K, D, rvecs, tvecs = cv2.calibrateCamera(
+            points, pixels, size, np.eye(3), np.zeros(5), flags=flags
+        )
     except cv2.error:
         return None
-    if not (np.isfinite(K).all() and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))):
+    if not (
+        np.isfinite(K).all()
+        and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))
+    ):
         return None
-    return Lens(K, np.ravel(D)[:5], size), [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
+    return Lens(K, np.ravel(D)[:5], size), [
+        transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)
+    ]

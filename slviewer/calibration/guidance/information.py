@@ -1,4 +1,5 @@
-"""Information of target poses on the rig: the uncertainty in the working volume, and the gain of one more pose."""
+"""Information of target poses on the rig: the uncertainty in the working volume, and the gain of
+one more pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +21,12 @@ from slviewer.calibration.splined.normal import (
 )
 from slviewer.calibration.splined.posterior import compute_point_jacobian
 from slviewer.calibration.splined.residuals import HEIGHT, feature_row, sample_row
-from slviewer.calibration.splined.volume import Volume, remove_rigid_motion, select_depth_axis, working_volume
+from slviewer.calibration.splined.volume import (
+    Volume,
+    remove_rigid_motion,
+    select_depth_axis,
+    working_volume,
+)
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import finite_rows
@@ -33,20 +39,26 @@ POSE = HEIGHT
 
 @dataclass(frozen=True, eq=False)
 class VolumeSensitivity:
-    """Points of the working volume and the Jacobian (3 m, unknowns) of their errors, less their common rigid motion."""
+    """Points of the working volume and the Jacobian (3 m, unknowns) of their errors, less their
+    common rigid motion."""
 
     volume: Volume
     jacobian: Floats
 
     @classmethod
-    def from_model(cls, model: GuidanceModel, depths_mm: tuple[float, float]) -> "VolumeSensitivity":
-        """Compute the Jacobian of a regular grid of points; ``depths_mm``: nearest and farthest board."""
+    def from_model(
+        cls, model: GuidanceModel, depths_mm: tuple[float, float]
+    ) -> "VolumeSensitivity":
+        """Compute the Jacobian of a regular grid of points; ``depths_mm``: nearest and farthest
+        board."""
         volume = working_volume(model.rig, depths_mm)
         by_rig = compute_point_jacobian(
             model.state, select_depth_axis(model.rig, volume), volume.pixels, volume.z
         ).toarray()
         known = finite_rows(by_rig.reshape(len(volume.z), -1))
-        volume = Volume(volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known])
+        volume = Volume(
+            volume.pixels[known], volume.z[known], volume.points[known], volume.projector[known]
+        )
         by_rig = by_rig.reshape(len(known), 3, -1)[known].reshape(3 * len(volume.z), -1)
         jacobian = np.zeros((len(by_rig), model.layout.size))
         jacobian[:, model.layout.rig :] = remove_rigid_motion(by_rig.T, volume.points).T
@@ -57,9 +69,10 @@ class VolumeSensitivity:
 class RigInformation:
     """Uncertainty of the rig after some poses.
 
-    ``variances`` (m,) mm^2 of the volume's points. ``modes`` (n, n) float32: a factor of the unknowns' covariance,
-    ``modes @ modes.T``, whose columns act on the volume independently of each other and with increasing effect;
-    ``mode_rms_mm`` (k,) float32: RMS error over the volume's points by each of the last k modes.
+    ``variances`` (m,) mm^2 of the volume's points. ``modes`` (n, n) float32: a factor of the
+    unknowns' covariance, ``modes @ modes.T``, whose columns act on the volume independently of each
+    other and with increasing effect; ``mode_rms_mm`` (k,) float32: RMS error over the volume's
+    points by each of the last k modes.
     """
 
     variances: Floats
@@ -92,20 +105,28 @@ class RigInformation:
         return float(np.sqrt(self.variances.mean()))
 
     def gain(self, rows: Floats) -> float:
-        """Return the decrease in mm^2 of the points' mean variance by one more pose with these information rows."""
+        """Return the decrease in mm^2 of the points' mean variance by one more pose with these
+        information rows."""
         by_mode = rows.astype(np.float32) @ self.modes
         inner = (by_mode @ by_mode.T).astype(np.float64)
         inner[np.diag_indices(len(inner))] += 1.0
         weighted = by_mode[:, -len(self.mode_rms_mm) :] * self.mode_rms_mm
         L = cholesky(inner, lower=True, check_finite=False)
-        return float((solve_triangular(L, weighted.astype(np.float64), lower=True, check_finite=False) ** 2).sum())
+        return float(
+            (
+                solve_triangular(L, weighted.astype(np.float64), lower=True, check_finite=False)
+                ** 2
+            ).sum()
+        )
 
 
 def information_rows(model: GuidanceModel, T_camera_board: Floats) -> list[Floats]:
-    """Compute the information of a flat board at each pose (k, 4, 4) mm on all unknowns but the pose itself.
+    """Compute the information of a flat board at each pose (k, 4, 4) mm on all unknowns but the
+    pose itself.
 
-    Returns J (rows, unknowns) of each pose: derivatives of features and samples over their standard deviations, with
-    the pose projected out, so that J.T @ J is the information. Rows of what a device does not see are 0.
+    Returns J (rows, unknowns) of each pose: derivatives of features and samples over their standard
+    deviations, with the pose projected out, so that J.T @ J is the information. Rows of what a
+    device does not see are 0.
     """
     at = model.layout
     starts = at.starts + POSE
@@ -113,7 +134,9 @@ def information_rows(model: GuidanceModel, T_camera_board: Floats) -> list[Float
     feature_sigma = model.expected.feature * widths[0] / np.sqrt(model.features_per_point)
     information = []
     for T, pixels in zip(T_camera_board, model.sample_pixels(T_camera_board), strict=True):
-        sample_sigma = model.expected.sample * widths[1] / np.sqrt(BOARD_SAMPLES / max(len(pixels), 1))
+        sample_sigma = (
+            model.expected.sample * widths[1] / np.sqrt(BOARD_SAMPLES / max(len(pixels), 1))
+        )
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
         rows = np.zeros((2 * (len(model.points) + len(pixels)), POSE + at.size))
         pixels = np.ascontiguousarray(pixels)
@@ -127,11 +150,17 @@ def information_rows(model: GuidanceModel, T_camera_board: Floats) -> list[Float
 
 @kernel()
 def _fill_rows(rig, R, t, points, frame, pixels, feature_weight, sample_weight, at, rows):
-    """Fill ``rows`` with the weighted derivatives of a board's features (two rows each), then of its sample pixels.
+    """Fill ``rows`` with the weighted derivatives of a board's features (two rows each), then of
+    its sample pixels.
 
     ``at``: indices at which height, offsets, rig, camera field and projector field start in a row.
     """
-    work, row, by_field, cells = allocate_workspace(), np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros(4, np.int64)
+    work, row, by_field, cells = (
+        allocate_workspace(),
+        np.zeros((2, ROW)),
+        np.zeros((2, 2)),
+        np.zeros(4, np.int64),
+    )
     heights, nowhere = np.zeros(HEIGHT_TERMS), np.zeros(2)
     columns = dense_columns(at)
     columns[:POSE] = np.arange(POSE)
@@ -143,7 +172,9 @@ def _fill_rows(rig, R, t, points, frame, pixels, feature_weight, sample_weight, 
             _scatter_row(row, columns, feature_weight, rows[2 * n : 2 * n + 2])
     samples = rows[2 * points.shape[0] :]
     for n in range(pixels.shape[0]):
-        u, _, ci, cj, pi, pj = sample_row(rig, R, t, heights, frame, pixels[n, 0], pixels[n, 1], work, row, by_field)
+        u, _, ci, cj, pi, pj = sample_row(
+            rig, R, t, heights, frame, pixels[n, 0], pixels[n, 1], work, row, by_field
+        )
         if np.isfinite(u):
             cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
             set_sample_columns(columns, rig, cells, at)
@@ -153,7 +184,8 @@ def _fill_rows(rig, R, t, points, frame, pixels, feature_weight, sample_weight, 
 
 @kernel()
 def _scatter_row(row, columns, weight, out):
-    """Add the weighted derivatives (2, ROW) of an observation to full rows (2, unknowns), each to its column."""
+    """Add the weighted derivatives (2, ROW) of an observation to full rows (2, unknowns), each to
+    its column."""
     for k in range(2):
         for c in range(ROW):
             out[k, columns[c]] += weight * row[k, c]

@@ -1,4 +1,5 @@
-"""Robust bundle adjustment of devices, board and poses by Gauss-Newton, with weights and priors estimated from data."""
+"""Robust bundle adjustment of devices, board and poses by Gauss-Newton, with weights and priors
+estimated from data."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,7 +11,11 @@ from threadpoolctl import threadpool_limits
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
-from slviewer.calibration.splined.half_turns import detect_half_turns, is_numbering_ambiguous, renumber_poses
+from slviewer.calibration.splined.half_turns import (
+    detect_half_turns,
+    is_numbering_ambiguous,
+    renumber_poses,
+)
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
@@ -20,7 +25,13 @@ from slviewer.calibration.splined.normal import (
     predict_observations,
 )
 from slviewer.calibration.splined.prior import Prior
-from slviewer.calibration.splined.residual_noise import Noise, estimate_noise, pose_sigmas, pose_trust, robust_weights
+from slviewer.calibration.splined.residual_noise import (
+    Noise,
+    estimate_noise,
+    pose_sigmas,
+    pose_trust,
+    robust_weights,
+)
 from slviewer.calibration.splined.unknowns import State
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
@@ -28,7 +39,8 @@ from slviewer.errors import CalibrationRejected, InputError
 MIN_POSES = 3
 MAX_STEPS = 30
 LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
-"""Damping relative to the information's diagonal: smallest value, factor between trials, and limit."""
+"""Damping relative to the information's diagonal: smallest value, factor between trials, and
+limit."""
 CONVERGENCE_SIGMAS = 0.02
 """Largest RMS change of the predicted observations at convergence, in sigmas."""
 FIRST_STRENGTH = 10.0
@@ -38,14 +50,18 @@ STRENGTH_STEPS = 3
 MIN_SAMPLES = 3
 """Least number of samples with which a pose has illuminated a cell of a field."""
 MIN_TRUST = 0.5
-"""Least mean robust weight of a pose's features and samples; below, the pose contradicts the others."""
+"""Least mean robust weight of a pose's features and samples; below, the pose contradicts the
+others."""
 
 
-def gather_data(observations: Sequence[Observation], stereo: StereoModel) -> tuple[list[str], PoseData, np.ndarray]:
-    """Collect the observations of the poses that the stereo calibration used and that hold both axes.
+def gather_data(
+    observations: Sequence[Observation], stereo: StereoModel
+) -> tuple[list[str], PoseData, np.ndarray]:
+    """Collect the observations of the poses that the stereo calibration used and that hold both
+    axes.
 
-    Returns their names, the observations, and the samples' predicted noise (m, 2) px. Raises InputError for fewer than
-    MIN_POSES poses with both axes, and for observations without samples.
+    Returns their names, the observations, and the samples' predicted noise (m, 2) px. Raises
+    InputError for fewer than MIN_POSES poses with both axes, and for observations without samples.
     """
     both = _select_complete(observations, stereo)
     every = np.concatenate([o.points for o in both])
@@ -68,14 +84,21 @@ def _select_complete(observations: Sequence[Observation], stereo: StereoModel) -
     """Select the observations of ``gather_data``; raises its errors."""
     both = [o for o in observations if o.name in stereo.poses and len(o.surfaces) == 2]
     if len(both) < MIN_POSES:
-        single = sorted({axis for o in observations for axis in o.surfaces}) if len(both) < len(observations) else []
+        single = (
+            sorted({axis for o in observations for axis in o.surfaces})
+            if len(both) < len(observations)
+            else []
+        )
         alone = f"; others hold axis {' or '.join(single)} alone" if single else ""
         raise InputError(
-            f"{len(both)} target poses hold both projector coordinates{alone}: splined compares both, so capture at "
-            f"least {MIN_POSES} poses with the patterns of x and of y"
+            f"{len(both)} target poses hold both projector coordinates{alone}: splined compares"
+            f" both, so capture at least {MIN_POSES} poses with the patterns of x and of y"
         )
     if any(o.samples is None for o in both):
-        raise InputError("these target poses were read without samples of their phase: calibrate from the frames again")
+        raise InputError(
+            "these target poses were read without samples of their phase: calibrate from the frames"
+            " again"
+        )
     return both
 
 
@@ -86,13 +109,17 @@ def adjust_bundle(
     *,
     cells_across: int | None = None,
 ) -> Bundle:
-    """Adjust devices, board and poses jointly, from the observations that the stereo calibration used.
+    """Adjust devices, board and poses jointly, from the observations that the stereo calibration
+    used.
 
-    ``cells_across``: cells of each displacement field across its image; by default ``fields.CELLS_ACROSS``.
-    Raises InputError as ``gather_data`` does, and CalibrationRejected where the adjustment does not converge, is
-    undetermined, or where too few poses agree with each other.
+    ``cells_across``: cells of each displacement field across its image; by default
+    ``fields.CELLS_ACROSS``. Raises InputError as ``gather_data`` does, and CalibrationRejected
+    where the adjustment does not converge, is undetermined, or where too few poses agree with each
+    other.
     """
-    with threadpool_limits(numba.get_num_threads(), user_api="blas"):  # for one large matrix, not for many small ones
+    with threadpool_limits(
+        numba.get_num_threads(), user_api="blas"
+    ):  # for one large matrix, not for many small ones
         return _adjust(observations, stereo, progress, cells_across)
 
 
@@ -110,7 +137,9 @@ def _adjust(
     strengths = [FIRST_STRENGTH, FIRST_STRENGTH]
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
-    certain = np.array([name in marked or not is_numbering_ambiguous(stereo.board) for name in names])
+    certain = np.array(
+        [name in marked or not is_numbering_ambiguous(stereo.board) for name in names]
+    )
     half_turned = np.zeros(len(names), bool)
     updates, count, damping = 0, 0, 0.0
     residuals = _residuals(state, data)
@@ -130,7 +159,9 @@ def _adjust(
         factor = BlockFactor(A, layout)
         count = int(sum(np.count_nonzero(w) for w in weights))
         cost = partial(_cost, weights=weights, prior=prior, strengths=strengths)
-        state, residuals, move, damping = _take_step(state, residuals, data, cost, (A, b, factor.solve(b)), damping)
+        state, residuals, move, damping = _take_step(
+            state, residuals, data, cost, (A, b, factor.solve(b)), damping
+        )
         moved = float(np.sqrt(max(move @ b, 0.0) / count))
         if progress:
             progress(step / (step + 3))
@@ -141,8 +172,9 @@ def _adjust(
             break
     else:
         raise CalibrationRejected(
-            f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps: check the stereo "
-            "calibration's residuals, exclude poses that stand out, and add some that reach into the corners"
+            f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps: check"
+            " the stereo calibration's residuals, exclude poses that stand out, and add some that"
+            " reach into the corners"
         )
     if np.count_nonzero(~is_excluded) < MIN_POSES:
         raise CalibrationRejected(
@@ -151,8 +183,11 @@ def _adjust(
         )
     fits = _fit_statistics(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
     excluded = {
-        name: f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera, "
-        f"{fits[name].projector_trust:.2f} in the projector): was the board moved during the capture?"
+        name: (
+            f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera,"
+            f" {fits[name].projector_trust:.2f} in the projector): was the board moved during the"
+            " capture?"
+        )
         for name, out in zip(names, is_excluded, strict=True)
         if out
     }
@@ -170,7 +205,9 @@ def _adjust(
         projector_poses=projector_poses,
         packed_factor=_pack_factor(factorize(A)[layout.rig :, layout.rig :]),
         steps=step,
-        half_turned_poses=tuple(name for name, flag in zip(names, half_turned, strict=True) if flag),
+        half_turned_poses=tuple(
+            name for name, flag in zip(names, half_turned, strict=True) if flag
+        ),
     )
 
 
@@ -187,7 +224,8 @@ def _cost(
     prior: Prior,
     strengths: Sequence[float],
 ) -> float:
-    """Return half the weighted sum of squared residuals plus the prior's cost; NaN for invisible observations."""
+    """Return half the weighted sum of squared residuals plus the prior's cost; NaN for invisible
+    observations."""
     total = 0.0
     for r, w in zip(residuals, weights, strict=True):
         used = w > 0
@@ -205,9 +243,10 @@ def _take_step(
 ) -> tuple[State, ObservedValues, np.ndarray, float]:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
-    ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose are damped: together
-    with the fields they have a curved valley of the cost at strong distortion. Returns the new state, its residuals,
-    the step, and the damping; the unchanged state where no damping helps.
+    ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose
+    are damped: together with the fields they have a curved valley of the cost at strong distortion.
+    Returns the new state, its residuals, the step, and the damping; the unchanged state where no
+    damping helps.
     """
     A, b, full = system
     before = cost(state, residuals)
@@ -227,7 +266,9 @@ def _pack_factor(factor: np.ndarray) -> np.ndarray:
     return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
 
 
-def _sigmas(residuals: ObservedValues, noise: Noise, sample_sigma: np.ndarray, data: PoseData) -> ObservedValues:
+def _sigmas(
+    residuals: ObservedValues, noise: Noise, sample_sigma: np.ndarray, data: PoseData
+) -> ObservedValues:
     """Return the standard deviations of features (n, 2) and samples (m, 2), px."""
     return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
@@ -251,26 +292,42 @@ def _fit_statistics(
     fits = {}
     for i, name in enumerate(names):
         rms = []
-        for r, w, start in zip(residuals, fresh, (data.feature_from, data.sample_from), strict=True):
+        for r, w, start in zip(
+            residuals, fresh, (data.feature_from, data.sample_from), strict=True
+        ):
             part = slice(start[i], start[i + 1])
             good = np.where(w[part] > 0, r[part], np.nan)
-            rms.append(float(np.sqrt(np.nanmean(np.nansum(good**2, axis=1)))) if (w[part] > 0).any() else np.nan)
+            rms.append(
+                float(np.sqrt(np.nanmean(np.nansum(good**2, axis=1))))
+                if (w[part] > 0).any()
+                else np.nan
+            )
         fits[name] = PoseFit(rms[0], rms[1], float(trust[i, 0]), float(trust[i, 1]))
     return fits
 
 
 def _depth_range(state: State, data: PoseData, is_excluded: np.ndarray) -> tuple[float, float]:
-    """Return the nearest and farthest depth in mm of a feature in the poses that are not excluded."""
+    """Return the nearest and farthest depth in mm of a feature in the poses that are not
+    excluded."""
     pose = np.repeat(np.arange(len(is_excluded)), np.diff(data.feature_from))
-    z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature]) + state.t_board[pose, 2]
+    z = (
+        np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
+        + state.t_board[pose, 2]
+    )
     z = z[~is_excluded[pose]]
     return float(z.min()), float(z.max())
 
 
-def _count_poses(state: State, weights: ObservedValues, data: PoseData) -> tuple[np.ndarray, np.ndarray]:
-    """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the projector's field."""
+def _count_poses(
+    state: State, weights: ObservedValues, data: PoseData
+) -> tuple[np.ndarray, np.ndarray]:
+    """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the
+    projector's field."""
     counts = []
-    for device, pixels in ((state.rig.camera, data.sample_px), (state.rig.projector, data.projector_px)):
+    for device, pixels in (
+        (state.rig.camera, data.sample_px),
+        (state.rig.projector, data.projector_px),
+    ):
         rows, columns = (n - 3 for n in device.coefficients.shape[1:])
         width, height = device.size
         total = np.zeros((rows, columns), np.uint16)

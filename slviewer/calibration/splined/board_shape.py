@@ -1,7 +1,8 @@
 """The board as an unknown: a smooth height, and features that are not quite where they should be.
 
-The height is a sum of products of Legendre polynomials of degrees 2 to 4 in all over the features' rectangle: bow both
-ways, twist, and what bends in itself. Constants and slopes are missing because the pose has them.
+The height is a sum of products of Legendre polynomials of degrees 2 to 4 in all over the features'
+rectangle: bow both ways, twist, and what bends in itself. Constants and slopes are missing because
+the pose has them.
 """
 
 import numpy as np
@@ -17,7 +18,8 @@ HEIGHT_SIGMA_MM = np.array([{2: 0.3, 3: 0.1, 4: 0.05}[i + j] for i, j in HEIGHT_
 OFFSET_SIGMA_MM = 0.03
 """Of a printed feature along x and along y."""
 GAUGE_MM = 1e-6
-"""How nearly the offsets' common shift, turn and growth are held at nothing: the poses and the pitch have those."""
+"""How nearly the offsets' common shift, turn and growth are held at nothing: the poses and the
+pitch have those."""
 
 
 def board_frame(points: np.ndarray) -> np.ndarray:
@@ -27,16 +29,20 @@ def board_frame(points: np.ndarray) -> np.ndarray:
 
 
 def offset_gauge(points: np.ndarray) -> np.ndarray:
-    """(4, 2n) unit rows: what offsets (x0, y0, x1, y1, ...) have of a shift in x and y, a turn and a growth."""
+    """(4, 2n) unit rows: what offsets (x0, y0, x1, y1, ...) have of a shift in x and y, a turn and
+    a growth."""
     x, y = (points[:, :2] - points[:, :2].mean(0)).T
     one, none = np.ones_like(x), np.zeros_like(x)
-    rows = np.array([np.stack(pair, 1).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))])
+    rows = np.array(
+        [np.stack(pair, 1).ravel() for pair in ((one, none), (none, one), (-y, x), (x, y))]
+    )
     return unit_vectors(rows)
 
 
 @kernel()
 def height_terms(x, y, frame, terms):
-    """Fills (3, 12): the polynomials, and their slopes along x and along y, at a board point (mm)."""
+    """Fills (3, 12): the polynomials, and their slopes along x and along y, at a board point
+    (mm)."""
     a, b = (x - frame[0]) / frame[2], (y - frame[1]) / frame[3]
     pa, pb = np.empty(5), np.empty(5)
     da, db = np.empty(5), np.empty(5)

@@ -24,8 +24,8 @@ _OWN_ARRAYS = ("points", "camera_poses", "projector_poses")
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Residuals of one pose: RMS px of its features in the camera and of its samples in the projector, without
-    outliers, and the trust in each, 0 ... 1; undisturbed poses reach 0.8."""
+    """Residuals of one pose: RMS px of its features in the camera and of its samples in the
+    projector, without outliers, and the trust in each, 0 ... 1; undisturbed poses reach 0.8."""
 
     camera_rms_px: float
     projector_rms_px: float
@@ -37,10 +37,11 @@ class PoseFit:
 class Bundle:
     """Result of the joint adjustment of ``poses``.
 
-    ``points`` (f, 3) mm: the board's features, without the offsets in the state. ``strengths`` 1/px^2: of the camera's
-    and the projector's prior. ``excluded``: poses not used, with the reason. ``camera_poses`` and ``projector_poses``:
-    how many poses illuminated each cell of the fields (rows, columns). ``half_turned_poses``: poses whose numbering was
-    corrected by half a turn.
+    ``points`` (f, 3) mm: the board's features, without the offsets in the state. ``strengths``
+    1/px^2: of the camera's and the projector's prior. ``excluded``: poses not used, with the
+    reason. ``camera_poses`` and ``projector_poses``: how many poses illuminated each cell of the
+    fields (rows, columns). ``half_turned_poses``: poses whose numbering was corrected by half a
+    turn.
 
     ``packed_factor``: the lower triangle of ``factor``, row by row, float32.
     """
@@ -61,8 +62,10 @@ class Bundle:
 
     @cached_property
     def factor(self) -> NDArray[np.float32]:
-        """(n, n) float32, lower triangular: factor @ factor.T is the information (inverse covariance) of the rig's n
-        unknowns in the order of ``UnknownLayout`` from ``rig`` on, with poses and board marginalised out."""
+        """(n, n) float32, lower triangular: factor @ factor.T is the information (inverse
+        covariance) of the rig's n unknowns in the order of ``UnknownLayout`` from ``rig`` on, with
+        poses and board marginalised out.
+        """
         layout = self.state.layout
         n = layout.size - layout.rig
         factor = np.zeros((n, n), np.float32)
@@ -70,15 +73,18 @@ class Bundle:
         return factor
 
     def point_jacobian(self, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
-        """Return the Jacobian (3 n, unknowns) of measured points, mm per unit of the rig's unknowns.
+        """Return the Jacobian (3 n, unknowns) of measured points, mm per unit of the rig's
+        unknowns.
 
-        The points are those at camera ``pixels`` (n, 2) and depths ``z`` (n,) mm, measured from the phase of one axis;
-        rows: x, y, z of the first point, then of the next. NaN where the projector cannot see the point.
+        The points are those at camera ``pixels`` (n, 2) and depths ``z`` (n,) mm, measured from the
+        phase of one axis; rows: x, y, z of the first point, then of the next. NaN where the
+        projector cannot see the point.
         """
         return compute_point_jacobian(self.state, axis, pixels, z)
 
     def whiten(self, jacobian: sp.csr_matrix | np.ndarray) -> np.ndarray:
-        """Return Y (unknowns, m), where Y.T @ Y is the covariance of the values with ``jacobian`` (m, unknowns)."""
+        """Return Y (unknowns, m), where Y.T @ Y is the covariance of the values with ``jacobian``
+        (m, unknowns)."""
         dense = jacobian if isinstance(jacobian, np.ndarray) else jacobian.toarray()
         right = np.asarray(dense, self.factor.dtype).T
         return solve_triangular(self.factor, right, lower=True, check_finite=False)
@@ -87,7 +93,8 @@ class Bundle:
         """Return the fields that are not arrays, as JSON types."""
         keys = ("poses", "noise", "strengths", "fits", "depth_range_mm", "steps")
         data: dict[str, Any] = to_plain(
-            {key: getattr(self, key) for key in keys} | {"turned": self.half_turned_poses, "left_out": self.excluded}
+            {key: getattr(self, key) for key in keys}
+            | {"turned": self.half_turned_poses, "left_out": self.excluded}
         )
         return data
 

@@ -1,8 +1,10 @@
-"""Fast inversion of the splined model: a rational function per pixel, plus a coarse grid of corrections.
+"""Fast inversion of the splined model: a rational function per pixel, plus a coarse grid of
+corrections.
 
-Along a camera ray depth is nearly a rational function of the projector's coordinate s, the Letter's eq. 9: the function
-through three exact points of each pixel, ``z0 = (c0 + c1 s)/(1 + c2 s)``, has errors of some hundredths of a
-millimetre. They vary slowly, and a grid over (u, v, z0) corrects them.
+Along a camera ray depth is nearly a rational function of the projector's coordinate s, the Letter's
+eq. 9: the function through three exact points of each pixel, ``z0 = (c0 + c1 s)/(1 + c2 s)``, has
+errors of some hundredths of a millimetre. They vary slowly, and a grid over (u, v, z0) corrects
+them.
 """
 
 from collections.abc import Callable
@@ -25,9 +27,11 @@ GRID_CELLS_ACROSS = 100
 """Number of grid cells across the image's width: 16 px each at a width of 1600."""
 DEPTHS = 65
 MAX_CORRECTION = 0.02
-"""Largest correction over the depth range; beyond it, the coordinate is nearly constant or not monotonic in depth."""
+"""Largest correction over the depth range; beyond it, the coordinate is nearly constant or not
+monotonic in depth."""
 MIN_SLOPE = 0.005
-"""Smallest change of the coordinate with depth, px per mm; below it, the depth noise would be many mm."""
+"""Smallest change of the coordinate with depth, px per mm; below it, the depth noise would be many
+mm."""
 MARGIN = 0.25
 """Distance beyond the projector's image, over its size, up to which rays are evaluated."""
 
@@ -36,10 +40,11 @@ MARGIN = 0.25
 class CompiledAxis:
     """Fast inversion of one axis.
 
-    ``coefficients`` (3, h, w) float32: rational function of the coordinate minus ``centre`` px. ``grid`` (nv, nu, nz)
-    float32 mm: corrections at nodes ``step`` px and (far - near)/(nz - 1) mm apart, from pixel (0, 0) and ``near``.
-    ``supported_grid``: ``grid`` with NaN where no target pose illuminated the camera's or the projector's cell. NaN
-    where the projector does not see the ray, or where the coordinate hardly changes with depth.
+    ``coefficients`` (3, h, w) float32: rational function of the coordinate minus ``centre`` px.
+    ``grid`` (nv, nu, nz) float32 mm: corrections at nodes ``step`` px and (far - near)/(nz - 1) mm
+    apart, from pixel (0, 0) and ``near``. ``supported_grid``: ``grid`` with NaN where no target
+    pose illuminated the camera's or the projector's cell. NaN where the projector does not see the
+    ray, or where the coordinate hardly changes with depth.
     """
 
     coefficients: NDArray[np.float32]
@@ -50,21 +55,35 @@ class CompiledAxis:
     near: float
     far: float
 
-    def depth(self, phase: np.ndarray, px_per_rad: float, rays: np.ndarray, supported: bool) -> np.ndarray:
-        """Return points (h, w, 3) float32 mm from absolute phase (h, w) rad; NaN where invalid or beyond near and far.
+    def depth(
+        self, phase: np.ndarray, px_per_rad: float, rays: np.ndarray, supported: bool
+    ) -> np.ndarray:
+        """Return points (h, w, 3) float32 mm from absolute phase (h, w) rad; NaN where invalid or
+        beyond near and far.
 
-        ``rays`` (2, h, w): from ``pixel_rays``; ``supported``: only points that target poses support.
+        ``rays`` (2, h, w): from ``pixel_rays``; ``supported``: only points that target poses
+        support.
         """
         out = np.empty((*phase.shape, 3), np.float32)
         grid = self.supported_grid if supported else self.grid
         numbers = np.array(
-            [px_per_rad, self.centre, self.near, (grid.shape[2] - 1) / (self.far - self.near)], np.float32
+            [px_per_rad, self.centre, self.near, (grid.shape[2] - 1) / (self.far - self.near)],
+            np.float32,
         )
-        evaluate(np.ascontiguousarray(phase, np.float32), numbers, self.coefficients, rays, grid, self.step, out)
+        evaluate(
+            np.ascontiguousarray(phase, np.float32),
+            numbers,
+            self.coefficients,
+            rays,
+            grid,
+            self.step,
+            out,
+        )
         return out
 
     def depth_per_px(self, phase: np.ndarray, px_per_rad: float) -> np.ndarray:
-        """Return |dz/ds| (h, w) float32 mm per px of the rational function at a phase map (h, w) rad."""
+        """Return |dz/ds| (h, w) float32 mm per px of the rational function at a phase map (h, w)
+        rad."""
         c0, c1, c2 = self.coefficients
         s = phase * np.float32(px_per_rad) - np.float32(self.centre)
         return np.abs(c1 - c0 * c2) / (1 + c2 * s) ** 2
@@ -87,20 +106,26 @@ def compile_axis(
 ) -> CompiledAxis:
     """Compile one axis for depths between the two ``depths`` mm.
 
-    ``rays`` (2, h, w): from ``pixel_rays``; ``illuminated``: the camera's and the projector's cells (rows, columns)
-    bool that target poses illuminated.
+    ``rays`` (2, h, w): from ``pixel_rays``; ``illuminated``: the camera's and the projector's cells
+    (rows, columns) bool that target poses illuminated.
     """
     near, far = depths
     row = 0 if axis == "x" else 1
     width, height = (int(n) for n in rig.camera.size)
     centre = (float(rig.projector.size[row]) - 1) / 2
     coefficients = np.empty((3, height, width), np.float32)
-    _split_rows(height, lambda rows: _fit_rational(rig, row, centre, near, far, rays, rows, coefficients))
+    _split_rows(
+        height, lambda rows: _fit_rational(rig, row, centre, near, far, rays, rows, coefficients)
+    )
     step = max(2, -(-width // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
     grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
-    _split_rows(shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, *illuminated, rows, grid, known))
-    # a pixel needs its eight nodes: dilating the known nodes by one gives each pixel about its own support
+    _split_rows(
+        shape[0],
+        lambda rows: _tabulate(rig, row, centre, near, far, step, *illuminated, rows, grid, known),
+    )
+    # a pixel needs its eight nodes: dilating the known nodes by one gives each pixel about its own
+    # support
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
     supported_grid = np.where(unknown, np.float32(np.nan), grid)
     return CompiledAxis(coefficients, centre, grid, supported_grid, step, near, far)
@@ -115,7 +140,8 @@ def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
 
 @kernel()
 def _fill_rays(camera, rows, rays):
-    """Fill ``rays`` (2, h, w) with the undistorted normalised coordinates of the pixels in some ``rows``."""
+    """Fill ``rays`` (2, h, w) with the undistorted normalised coordinates of the pixels in some
+    ``rows``."""
     basis = np.zeros((4, 4))
     for v in rows:
         for u in range(rays.shape[2]):
@@ -127,14 +153,18 @@ def _project_depth(rig, x, y, z, basis):
     """Return the projector pixel (u, v) of the point (x z, y z, z); NaN far outside its image."""
     u, v = project_point(rig, x, y, z, basis)
     width, height = rig.projector.size[0], rig.projector.size[1]
-    if -MARGIN * width <= u <= (1.0 + MARGIN) * width and -MARGIN * height <= v <= (1.0 + MARGIN) * height:
+    if (
+        -MARGIN * width <= u <= (1.0 + MARGIN) * width
+        and -MARGIN * height <= v <= (1.0 + MARGIN) * height
+    ):
         return u, v
     return np.nan, np.nan
 
 
 @kernel()
 def _depth_interval(rig, x, y, near, far, basis):
-    """Return the first and last depth from ``near`` to ``far`` at which a ray is near the projector's image, or NaN."""
+    """Return the first and last depth from ``near`` to ``far`` at which a ray is near the
+    projector's image, or NaN."""
     first = last = np.nan
     for k in range(33):
         z = near + (far - near) * k / 32.0
@@ -155,7 +185,8 @@ def _depth_interval(rig, x, y, near, far, basis):
 
 @kernel()
 def _locate_edge(rig, x, y, inside, outside, basis):
-    """Return the depth next to ``outside`` at which a ray is near the projector's image, by bisection."""
+    """Return the depth next to ``outside`` at which a ray is near the projector's image, by
+    bisection."""
     for _ in range(20):
         middle = 0.5 * (inside + outside)
         if np.isfinite(_project_depth(rig, x, y, middle, basis)[0]):
@@ -167,9 +198,12 @@ def _locate_edge(rig, x, y, inside, outside, basis):
 
 @kernel()
 def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
-    """Return (c0, c1, c2, first depth, last depth) of the ray (x, y, 1); NaN without a rational function."""
+    """Return (c0, c1, c2, first depth, last depth) of the ray (x, y, 1); NaN without a rational
+    function."""
     first, last = near, far
-    if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(_project_depth(rig, x, y, far, basis)[0]):
+    if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(
+        _project_depth(rig, x, y, far, basis)[0]
+    ):
         first, last = _depth_interval(rig, x, y, near, far, basis)
         if not last - first > 1e-3 * (far - near):
             return np.nan, np.nan, np.nan, np.nan, np.nan
@@ -192,11 +226,14 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
 
 @kernel()
 def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
-    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in some ``rows``; NaN without one."""
+    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in some ``rows``;
+    NaN without one."""
     basis = np.zeros((4, 4))
     for v in rows:
         for u in range(rays.shape[2]):
-            c0, c1, c2, _, _ = _interpolate_rational(rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis)
+            c0, c1, c2, _, _ = _interpolate_rational(
+                rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis
+            )
             coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = c0, c1, c2
 
 
@@ -206,23 +243,32 @@ def _is_cell_supported(illuminated, u, v, size):
     if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
         return False
     column = min(int((u + 0.5) / size[0] * illuminated.shape[1]), illuminated.shape[1] - 1)
-    return illuminated[min(int((v + 0.5) / size[1] * illuminated.shape[0]), illuminated.shape[0] - 1), column]
+    return illuminated[
+        min(int((v + 0.5) / size[1] * illuminated.shape[0]), illuminated.shape[0] - 1), column
+    ]
 
 
 @kernel()
-def _tabulate(rig, row, centre, near, far, step, camera_illuminated, projector_illuminated, rows, grid, known):
-    """Fill ``grid`` with exact depth minus rational function at its nodes; ``known``: whether poses support them."""
+def _tabulate(
+    rig, row, centre, near, far, step, camera_illuminated, projector_illuminated, rows, grid, known
+):
+    """Fill ``grid`` with exact depth minus rational function at its nodes; ``known``: whether poses
+    support them."""
     basis = np.zeros((4, 4))
     for j in rows:
         for i in range(grid.shape[1]):
             u, v = float(i * step), float(j * step)
             x, y = undistort_pixel(rig.camera, u, v, basis)
-            c0, c1, c2, first, last = _interpolate_rational(rig, row, centre, x, y, near, far, basis)
+            c0, c1, c2, first, last = _interpolate_rational(
+                rig, row, centre, x, y, near, far, basis
+            )
             if np.isnan(c0):
                 continue
             # the last nodes may be outside the image, where the edge pixel's support applies
             edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            camera_supported = _is_cell_supported(camera_illuminated, edge_u, edge_v, rig.camera.size)
+            camera_supported = _is_cell_supported(
+                camera_illuminated, edge_u, edge_v, rig.camera.size
+            )
             for k in range(grid.shape[2]):
                 target = near + (far - near) * k / (grid.shape[2] - 1.0)
                 z = min(max(target, first), last)

@@ -1,4 +1,5 @@
-"""The grid of corrections to the rational function's depths, applied a row of the image at a time; see `compiled`."""
+"""The grid of corrections to the rational function's depths, applied a row of the image at a time;
+see `compiled`."""
 
 import numpy as np
 from numba import njit, prange
@@ -11,7 +12,8 @@ from slviewer.geometry.rays import fill_points
 def locate_layers(rational, near, per_mm, deepest):
     """Locate a depth of the rational function between two layers of the grid.
 
-    Returns whether it is inside the grid, the first layer (-1 outside), and the fraction of the way to the next.
+    Returns whether it is inside the grid, the first layer (-1 outside), and the fraction of the way
+    to the next.
     """
     depth = (rational - near) * per_mm
     inside = (depth >= np.float32(0.0)) & (depth <= deepest)
@@ -22,18 +24,23 @@ def locate_layers(rational, near, per_mm, deepest):
 
 @njit(inline="always")
 def _blend_rows(above, below, down, i, k):
-    """Interpolate linearly between the rows ``above`` and ``below`` of the grid at column ``i`` and layer ``k``."""
-    column, layer = np.uint64(i), np.uint64(k)  # an index with a sign would be tested for counting from the end
+    """Interpolate linearly between the rows ``above`` and ``below`` of the grid at column ``i`` and
+    layer ``k``."""
+    column, layer = (
+        np.uint64(i),
+        np.uint64(k),
+    )  # an index with a sign would be tested for counting from the end
     upper = above[column, layer]
     return fma(down, below[column, layer] - upper, upper)
 
 
 @njit(inline="always")
 def add_corrections(z, cell, rest, grid, step, row):
-    """Add the grid to an image row's depths ``z`` (w,); ``cell`` int32 and ``rest`` (w,) as `locate_layers` has them.
+    """Add the grid to an image row's depths ``z`` (w,); ``cell`` int32 and ``rest`` (w,) as
+    `locate_layers` has them.
 
-    Where a surface is, the pixels of a grid cell lie between two or three layers, whose few numbers then serve all of
-    them in the processor's wide registers; elsewhere each pixel looks up its own.
+    Where a surface is, the pixels of a grid cell lie between two or three layers, whose few numbers
+    then serve all of them in the processor's wide registers; elsewhere each pixel looks up its own.
     """
     j = row // step
     per_px = np.float32(1.0 / step)
@@ -51,9 +58,18 @@ def add_corrections(z, cell, rest, grid, step, row):
         if top < 0:
             continue
         if top <= k + 1:
-            a0, a1 = _blend_rows(above, below, down, i, k), _blend_rows(above, below, down, i, k + 1)
-            b0, b1 = _blend_rows(above, below, down, i + 1, k), _blend_rows(above, below, down, i + 1, k + 1)
-            a2, b2 = _blend_rows(above, below, down, i, top + 1), _blend_rows(above, below, down, i + 1, top + 1)
+            a0, a1 = (
+                _blend_rows(above, below, down, i, k),
+                _blend_rows(above, below, down, i, k + 1),
+            )
+            b0, b1 = (
+                _blend_rows(above, below, down, i + 1, k),
+                _blend_rows(above, below, down, i + 1, k + 1),
+            )
+            a2, b2 = (
+                _blend_rows(above, below, down, i, top + 1),
+                _blend_rows(above, below, down, i + 1, top + 1),
+            )
             for q in range(len(here)):
                 first, deep = cells[q] == k, part[q]
                 a = fma(deep, a1 - a0, a0) if first else fma(deep, a2 - a1, a1)
@@ -63,7 +79,10 @@ def add_corrections(z, cell, rest, grid, step, row):
             for q in range(len(here)):
                 n, deep = np.int64(cells[q]), part[q]
                 if n >= 0:
-                    a, b = _blend_rows(above, below, down, i, n), _blend_rows(above, below, down, i + 1, n)
+                    a, b = (
+                        _blend_rows(above, below, down, i, n),
+                        _blend_rows(above, below, down, i + 1, n),
+                    )
                     a = fma(deep, _blend_rows(above, below, down, i, n + 1) - a, a)
                     b = fma(deep, _blend_rows(above, below, down, i + 1, n + 1) - b, b)
                     here[q] += fma(np.float32(q) * per_px, b - a, a)
@@ -71,14 +90,18 @@ def add_corrections(z, cell, rest, grid, step, row):
 
 @kernel(parallel=True)
 def evaluate(phase, numbers, c, rays, grid, step, out):
-    """Fill ``out`` (h, w, 3) mm from phases (h, w), all float32. ``numbers``: px per rad, the coordinate's centre px,
-    the grid's first depth mm and its layers per mm; ``c``, ``grid`` and ``step`` as `Compiled` has them, ``rays``
-    (2, h, w)."""
+    """Fill ``out`` (h, w, 3) mm from phases (h, w), all float32. ``numbers``: px per rad, the
+    coordinate's centre px, the grid's first depth mm and its layers per mm; ``c``, ``grid`` and
+    ``step`` as `Compiled` has them, ``rays`` (2, h, w)."""
     px_per_rad, centre, near, per_mm = numbers[0], numbers[1], numbers[2], numbers[3]
     one, none = np.float32(1.0), np.float32(np.nan)
     width, deepest = phase.shape[1], np.float32(grid.shape[2] - 1.0001)
     for v in prange(phase.shape[0]):
-        z, cell, rest = np.empty(width, np.float32), np.empty(width, np.int32), np.empty(width, np.float32)
+        z, cell, rest = (
+            np.empty(width, np.float32),
+            np.empty(width, np.int32),
+            np.empty(width, np.float32),
+        )
         for u in range(width):
             s = fma(px_per_rad, phase[v, u], -centre)
             rational = np.divide(fma(c[1, v, u], s, c[0, v, u]), fma(c[2, v, u], s, one))

@@ -1,7 +1,9 @@
-"""Displacements over an image as uniform cubic B-splines: what a lens does that Brown's polynomial cannot express.
+"""Displacements over an image as uniform cubic B-splines: what a lens does that Brown's polynomial
+cannot express.
 
-A point that pinhole and Brown put at pixel p is imaged at p + W(p). ``coefficients`` (2, ny + 3, nx + 3) px hold W for
-ny x nx equal cells of the image, from its outer edge (-0.5) on; beyond the image W stays what it is at the edge.
+A point that pinhole and Brown put at pixel p is imaged at p + W(p). ``coefficients`` (2, ny + 3, nx
++ 3) px hold W for ny x nx equal cells of the image, from its outer edge (-0.5) on; beyond the image
+W stays what it is at the edge.
 """
 
 from typing import NamedTuple
@@ -14,14 +16,16 @@ from slviewer.geometry.jit import kernel
 from slviewer.geometry.splines import bending_energy
 
 CELLS_ACROSS = 26
-"""Of any image: half a wavelength of the finest distortion that matters holds two or three cells."""
+"""Of any image: half a wavelength of the finest distortion that matters holds two or three
+cells."""
 RIDGE = 0.05
-"""Of the squared coefficients, relative to their squared second differences: without data, W is nothing."""
+"""Of the squared coefficients, relative to their squared second differences: without data, W is
+nothing."""
 
 
 class Device(NamedTuple):
-    """A camera or projector in the compiled kernels: a ``Lens``'s ten ``numbers``, its field's ``coefficients``, and
-    the image's ``size`` (2,) float64 px."""
+    """A camera or projector in the compiled kernels: a ``Lens``'s ten ``numbers``, its field's
+    ``coefficients``, and the image's ``size`` (2,) float64 px."""
 
     numbers: np.ndarray
     coefficients: np.ndarray
@@ -29,7 +33,8 @@ class Device(NamedTuple):
 
 
 def cells_for(size: tuple[int, int], cells_across: int | None = None) -> tuple[int, int]:
-    """Cells (across, down) of an image of ``size``: square ones where pixels are; ``CELLS_ACROSS`` by default."""
+    """Cells (across, down) of an image of ``size``: square ones where pixels are; ``CELLS_ACROSS``
+    by default."""
     across = CELLS_ACROSS if cells_across is None else cells_across
     return across, int(np.clip(round(across * size[1] / size[0]), 6, 2 * across))
 
@@ -41,13 +46,15 @@ def no_displacement(size: tuple[int, int], cells_across: int | None = None) -> n
 
 
 def roughness(coefficients: np.ndarray) -> np.ndarray:
-    """(n, n): the prior's quadratic form of one component's n coefficients, second differences and a small ridge."""
+    """(n, n): the prior's quadratic form of one component's n coefficients, second differences and
+    a small ridge."""
     rows, columns = coefficients.shape[1:]
     return (bending_energy(columns, rows) + RIDGE * sp.eye(rows * columns)).toarray()
 
 
 def undistort(device: Device, pixels: np.ndarray) -> np.ndarray:
-    """Undistorted normalised coordinates (n, 2) of ``pixels`` (n, 2); NaN for NaN and where the inversion fails."""
+    """Undistorted normalised coordinates (n, 2) of ``pixels`` (n, 2); NaN for NaN and where the
+    inversion fails."""
     rays = np.empty((len(pixels), 2))
     _undistort_all(device, np.ascontiguousarray(pixels, np.float64), rays)
     return rays
@@ -78,7 +85,8 @@ def spline_basis(position, length, cells, weights, slopes):
 
 @kernel()
 def displacement(device, u, v, basis):
-    """(du, dv, their slopes ddu/du, ddu/dv, ddv/du, ddv/dv, first column, first row) of W at a pixel.
+    """(du, dv, their slopes ddu/du, ddu/dv, ddv/du, ddv/dv, first column, first row) of W at a
+    pixel.
 
     ``basis`` (4, 4) is filled with the values and slopes of the splines across, then down.
     """
@@ -120,7 +128,8 @@ def remove_displacement(device, u, v, basis):
 
 @kernel()
 def distort_to_pixel(device, x, y, basis):
-    """The pixel of an undistorted normalised point, without derivatives; NaN past the fold of Brown's polynomial."""
+    """The pixel of an undistorted normalised point, without derivatives; NaN past the fold of
+    Brown's polynomial."""
     u, v = distort_to_px(x, y, device.numbers)
     if np.isnan(u):
         return u, v
@@ -130,7 +139,8 @@ def distort_to_pixel(device, x, y, basis):
 
 @kernel()
 def project_point(rig, x, y, z, basis):
-    """Return the projector's pixel of the point (x z, y z, z) mm in the camera's frame; NaN behind the projector."""
+    """Return the projector's pixel of the point (x z, y z, z) mm in the camera's frame; NaN behind
+    the projector."""
     X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
     X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
     X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
@@ -141,7 +151,8 @@ def project_point(rig, x, y, z, basis):
 
 @kernel()
 def undistort_pixel(device, u, v, basis):
-    """Return the undistorted normalised point imaged at a pixel, without derivatives; NaN where the inversion fails."""
+    """Return the undistorted normalised point imaged at a pixel, without derivatives; NaN where the
+    inversion fails."""
     k = device.numbers
     x, y = remove_displacement(device, u, v, basis)
     return undistort_point((x - k[2]) / k[0], (y - k[3]) / k[1], k)
@@ -149,7 +160,8 @@ def undistort_pixel(device, u, v, basis):
 
 @kernel()
 def _undistort_all(device, pixels, rays):
-    """Fill ``rays`` (n, 2) with the undistorted normalised coordinates of pixels (n, 2); NaN where not possible."""
+    """Fill ``rays`` (n, 2) with the undistorted normalised coordinates of pixels (n, 2); NaN where
+    not possible."""
     basis = np.zeros((4, 4))
     for n in range(pixels.shape[0]):
         rays[n, 0], rays[n, 1] = np.nan, np.nan

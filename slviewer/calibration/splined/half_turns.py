@@ -1,8 +1,10 @@
-"""Detection of poses numbered from the board's other end: a grid of circles looks the same turned by 180 degrees.
+"""Detection of poses numbered from the board's other end: a grid of circles looks the same turned
+by 180 degrees.
 
-Printing errors of the circles identify the board. Each pose's estimate of them is compared with the others': of its
-part that changes sign under a half turn, less the smooth part that lens distortion may cause. That part agrees between
-poses of one numbering, and has the opposite sign in a pose numbered from the other end.
+Printing errors of the circles identify the board. Each pose's estimate of them is compared with the
+others': of its part that changes sign under a half turn, less the smooth part that lens distortion
+may cause. That part agrees between poses of one numbering, and has the opposite sign in a pose
+numbered from the other end.
 """
 
 from dataclasses import replace
@@ -17,14 +19,16 @@ from slviewer.geometry.vectors import box_middle, finite_rows, lengths, unit_vec
 from slviewer.target.board import Board
 
 DECISION_SIGMAS = 5.0
-"""Least anticorrelation with the other poses, in sigmas of chance, of a pose that counts as turned."""
+"""Least anticorrelation with the other poses, in sigmas of chance, of a pose that counts as
+turned."""
 SMOOTH_DEGREE = 4
 """Degree of the polynomials that are removed as possible lens distortion."""
 _STEP_MM = 0.01
 
 
 def is_numbering_ambiguous(notation: str) -> bool:
-    """Whether a board, by its notation, looks the same turned by 180 degrees unless its mark is detected."""
+    """Whether a board, by its notation, looks the same turned by 180 degrees unless its mark is
+    detected."""
     try:
         return Board.parse(notation).kind in ("circles", "acircles")
     except InputError:  # a calibration made elsewhere
@@ -32,18 +36,27 @@ def is_numbering_ambiguous(notation: str) -> bool:
 
 
 def opposite_features(points: np.ndarray) -> np.ndarray | None:
-    """Return the index (f,) of the feature opposite to each of ``points`` (f, 3) mm; None without that symmetry."""
+    """Return the index (f,) of the feature opposite to each of ``points`` (f, 3) mm; None without
+    that symmetry."""
     middle = box_middle(points)
     away = lengths((2 * middle - points)[:, None, :2] - points[None, :, :2])
     partner = np.argmin(away, axis=1)
     apart = away[np.arange(len(points)), partner].max()
-    return partner if apart < 1e-3 and np.array_equal(partner[partner], np.arange(len(points))) else None
+    return (
+        partner
+        if apart < 1e-3 and np.array_equal(partner[partner], np.arange(len(points)))
+        else None
+    )
 
 
-def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certain: np.ndarray) -> np.ndarray:
-    """Detect the poses (p,) bool numbered from the other end than the ``certain`` (p,) bool ones, or than most.
+def detect_half_turns(
+    state: State, data: PoseData, residuals: np.ndarray, certain: np.ndarray
+) -> np.ndarray:
+    """Detect the poses (p,) bool numbered from the other end than the ``certain`` (p,) bool ones,
+    or than most.
 
-    ``residuals`` (n, 2) px: of the features. All False for boards without the symmetry and for fewer than three poses.
+    ``residuals`` (n, 2) px: of the features. All False for boards without the symmetry and for
+    fewer than three poses.
     """
     partner = opposite_features(data.points)
     count = state.layout.poses
@@ -66,7 +79,8 @@ def detect_half_turns(state: State, data: PoseData, residuals: np.ndarray, certa
 
 
 def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[State, PoseData]:
-    """Return state and data with the given ``poses`` (p,) bool numbered from the board's other end."""
+    """Return state and data with the given ``poses`` (p,) bool numbered from the board's other
+    end."""
     partner = opposite_features(data.points)
     if partner is None or not poses.any():
         return state, data
@@ -81,14 +95,20 @@ def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[Sta
 
 
 def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.ndarray:
-    """Return the offset (p, f, 2) mm of each feature on the board by each pose; 0 where missing or an outlier."""
+    """Return the offset (p, f, 2) mm of each feature on the board by each pose; 0 where missing or
+    an outlier."""
     by_place = []
-    data = data._replace(sample_from=np.zeros_like(data.sample_from))  # the samples' predictions are not needed
+    data = data._replace(
+        sample_from=np.zeros_like(data.sample_from)
+    )  # the samples' predictions are not needed
     here, _ = predict_observations(state, data)
     for k in range(2):
         step = np.zeros_like(state.offsets)
         step[:, k] = _STEP_MM
-        by_place.append((predict_observations(replace(state, offsets=state.offsets + step), data)[0] - here) / _STEP_MM)
+        by_place.append(
+            (predict_observations(replace(state, offsets=state.offsets + step), data)[0] - here)
+            / _STEP_MM
+        )
     J = np.stack(by_place, axis=2)  # of px by mm
     usable = finite_rows(J.reshape(len(J), -1), residuals)
     usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
@@ -96,7 +116,9 @@ def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.
     deviations[usable] = np.linalg.solve(J[usable], residuals[usable][..., None])[..., 0]
     deviations[usable] += state.offsets[data.feature[usable]]
     places = np.zeros((state.layout.poses, len(data.points), 2))
-    for i, (first, last) in enumerate(zip(data.feature_from[:-1], data.feature_from[1:], strict=True)):
+    for i, (first, last) in enumerate(
+        zip(data.feature_from[:-1], data.feature_from[1:], strict=True)
+    ):
         each = deviations[first:last]
         outlying = (np.abs(each) > 6 * 1.4826 * np.median(np.abs(each), axis=0)).any(1)
         places[i, data.feature[first:last]] = np.where(outlying[:, None], 0.0, each)
@@ -104,8 +126,10 @@ def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.
 
 
 def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the part (p, 2 f) of offsets (p, f, 2) that changes sign under a half turn, without its smooth part."""
-    # the opposite circle's offset is reversed by the turn: the antisymmetric part is the mean of both
+    """Return the part (p, 2 f) of offsets (p, f, 2) that changes sign under a half turn, without
+    its smooth part."""
+    # the opposite circle's offset is reversed by the turn: the antisymmetric part is the mean of
+    # both
     odd = (places + places[:, partner]) / 2
     basis, _ = np.linalg.qr(monomials(scale_to_unit_square(points[:, :2]), SMOOTH_DEGREE))
     odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)

@@ -1,4 +1,5 @@
-"""The splined calibration as a model: points from phase, what supports them, and their uncertainty."""
+"""The splined calibration as a model: points from phase, what supports them, and their
+uncertainty."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,9 +15,17 @@ from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.compiled import CompiledAxis, compile_axis, pixel_rays
 from slviewer.calibration.splined.fields import undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
-from slviewer.calibration.splined.uncertainty import SigmaMap, compute_sigma_map, summarise_volume_sigma
+from slviewer.calibration.splined.uncertainty import (
+    SigmaMap,
+    compute_sigma_map,
+    summarise_volume_sigma,
+)
 from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
-from slviewer.calibration.splined.volume import in_illuminated_cells, select_depth_axis, working_volume
+from slviewer.calibration.splined.volume import (
+    in_illuminated_cells,
+    select_depth_axis,
+    working_volume,
+)
 from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
@@ -30,7 +39,8 @@ NEAR, FAR = 0.7, 1.4
 
 @dataclass(frozen=True, eq=False)
 class SplinedModel:
-    """The splined calibration: a bundle adjustment with spline displacement fields, compiled on first use.
+    """The splined calibration: a bundle adjustment with spline displacement fields, compiled on
+    first use.
 
     Pixels in cells of camera or projector that no target pose illuminated are masked by default.
     """
@@ -58,26 +68,33 @@ class SplinedModel:
     @cached_property
     def pinholes(self) -> StereoRig:
         """Both lenses without their displacement fields, and their relative pose."""
-        return StereoRig(pinhole_lens(self.rig.camera), pinhole_lens(self.rig.projector), self.rig.R, self.rig.t)
+        return StereoRig(
+            pinhole_lens(self.rig.camera), pinhole_lens(self.rig.projector), self.rig.R, self.rig.t
+        )
 
     def residuals_over_noise(self, axis: Axis) -> float:
-        """Return the ratio of the residuals of an axis to their predicted noise; 1 where noise explains them."""
+        """Return the ratio of the residuals of an axis to their predicted noise; 1 where noise
+        explains them."""
         return self.bundle.noise.ratio[AXES.index(axis)]
 
     @property
     def residual_px(self) -> float:
-        """Standard deviation in projector px beyond noise, of the axis where it is larger (see ``excess_px``)."""
+        """Standard deviation in projector px beyond noise, of the axis where it is larger (see
+        ``excess_px``)."""
         return max(self.excess_px(axis) for axis in AXES)
 
-    def undistort_pairs(self, pixels: np.ndarray, projector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and ``projector`` pixels (n, 2).
+    def undistort_pairs(
+        self, pixels: np.ndarray, projector: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and
+        ``projector`` pixels (n, 2).
 
         NaN where no target pose illuminated the cell of one of them.
         """
         rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
-        known = in_illuminated_cells(self.rig.camera, pixels, self.bundle.camera_poses > 0) & in_illuminated_cells(
-            self.rig.projector, projector, self.bundle.projector_poses > 0
-        )
+        known = in_illuminated_cells(
+            self.rig.camera, pixels, self.bundle.camera_poses > 0
+        ) & in_illuminated_cells(self.rig.projector, projector, self.bundle.projector_poses > 0)
         return np.where(known[:, None], rays[0], np.nan), np.where(known[:, None], rays[1], np.nan)
 
     @cached_property
@@ -101,10 +118,17 @@ class SplinedModel:
         return {}
 
     def compile_depth(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled` takes the result."""
+        """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled`
+        takes the result."""
         axis = select_depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
         fast, sigma = self.fast_axis(axis), self.sigma_map(axis)
-        data = {"axis": axis, "centre": fast.centre, "step": fast.step, "near": fast.near, "far": fast.far}
+        data = {
+            "axis": axis,
+            "centre": fast.centre,
+            "step": fast.step,
+            "near": fast.near,
+            "far": fast.far,
+        }
         return data, {
             "coefficients": fast.coefficients,
             "grid": fast.grid,
@@ -114,10 +138,15 @@ class SplinedModel:
         }
 
     def restore_compiled(self, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-        """Take what `compile_depth` of the same calibration returned, which takes seconds to compute."""
+        """Take what `compile_depth` of the same calibration returned, which takes seconds to
+        compute."""
         axis, depths = data["axis"], (data["near"], data["far"])
-        coefficients, grid, supported_grid = (arrays[name] for name in ("coefficients", "grid", "supported_grid"))
-        self._compiled[axis] = CompiledAxis(coefficients, data["centre"], grid, supported_grid, data["step"], *depths)
+        coefficients, grid, supported_grid = (
+            arrays[name] for name in ("coefficients", "grid", "supported_grid")
+        )
+        self._compiled[axis] = CompiledAxis(
+            coefficients, data["centre"], grid, supported_grid, data["step"], *depths
+        )
         self._sigma_maps[axis] = SigmaMap(arrays["sigma"], *depths)
         vars(self)["single_rays"] = arrays["rays"]
 
@@ -125,56 +154,73 @@ class SplinedModel:
         """Return the compiled form of one axis; cached."""
         if axis not in self._compiled:
             illuminated = self.bundle.camera_poses > 0, self.bundle.projector_poses > 0
-            self._compiled[axis] = compile_axis(self.rig, axis, self.rays, self.depths_mm, illuminated)
+            self._compiled[axis] = compile_axis(
+                self.rig, axis, self.rays, self.depths_mm, illuminated
+            )
         return self._compiled[axis]
 
     def points(self, phase: PhaseMap, supported: bool = True) -> np.ndarray:
         """Return the points (h, w, 3) float32 mm of a phase map, in the camera's frame.
 
-        NaN where the phase is invalid, beyond ``depths_mm``, and, if ``supported``, in cells that no target pose
-        illuminated.
+        NaN where the phase is invalid, beyond ``depths_mm``, and, if ``supported``, in cells that
+        no target pose illuminated.
         """
         check_map(self.rig.camera.size, phase.phase, "phases")
         px_per_rad = phase.period_px / (2 * np.pi)
-        return self.fast_axis(phase.axis).depth(phase.phase, px_per_rad, self.single_rays, supported)
+        return self.fast_axis(phase.axis).depth(
+            phase.phase, px_per_rad, self.single_rays, supported
+        )
 
     def support(self, phase: PhaseMap) -> np.ndarray:
-        """(h, w) bool: measured pixels in cells that target poses illuminated, in camera and projector."""
+        """(h, w) bool: measured pixels in cells that target poses illuminated, in camera and
+        projector."""
         return np.isfinite(self.points(phase)[..., 2])
 
     def depth_per_rad(self, phase: PhaseMap) -> np.ndarray:
         """(h, w) float32: |dz/dphi| mm/rad at the phases measured."""
         check_map(self.rig.camera.size, phase.phase, "phases")
         px_per_rad = phase.period_px / (2 * np.pi)
-        return self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(px_per_rad)
+        return self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(
+            px_per_rad
+        )
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
-        """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``; NaN where points are."""
+        """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``; NaN where
+        points are."""
         sigma = self.depth_per_rad(phase) * phase.sigma_phase
         return np.where(np.isfinite(points[..., 2]), sigma, np.nan).astype(np.float32)
 
     def excess_px(self, axis: Axis) -> float:
-        """Return the standard deviation in projector px of the residuals beyond their predicted noise; 0 if none."""
+        """Return the standard deviation in projector px of the residuals beyond their predicted
+        noise; 0 if none."""
         excess = float(self.bundle.noise.excess_px[AXES.index(axis)])
-        return excess if excess > 2 * MIN_SIGMA_PX else 0.0  # the least that an estimate can be means none
+        return (
+            excess if excess > 2 * MIN_SIGMA_PX else 0.0
+        )  # the least that an estimate can be means none
 
     def sigma_map(self, axis: Axis) -> SigmaMap:
-        """Return the map of the depth uncertainty by the calibration, for depths measured through one axis; cached."""
+        """Return the map of the depth uncertainty by the calibration, for depths measured through
+        one axis; cached."""
         if axis not in self._sigma_maps:
             self._sigma_maps[axis] = compute_sigma_map(self.bundle, axis, *self.depths_mm)
         return self._sigma_maps[axis]
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
-        """Return the standard deviation (h, w) float32 mm of depth by the calibration, without common rigid motion.
+        """Return the standard deviation (h, w) float32 mm of depth by the calibration, without
+        common rigid motion.
 
-        NaN where the organised ``points`` (h, w, 3) are. It is systematic: the same in every scan. Where residuals
-        exceed their noise it is increased by that ratio, as they are not independent then.
+        NaN where the organised ``points`` (h, w, 3) are. It is systematic: the same in every scan.
+        Where residuals exceed their noise it is increased by that ratio, as they are not
+        independent then.
         """
-        return self.sigma_map(axis).interpolate(points) * np.float32(self.residuals_over_noise(axis))
+        return self.sigma_map(axis).interpolate(points) * np.float32(
+            self.residuals_over_noise(axis)
+        )
 
     @cached_property
     def sigma_volume(self) -> dict[str, Any]:
-        """Uncertainty of the working volume, as ``uncertainty.summarise_volume_sigma`` returns it."""
+        """Uncertainty of the working volume, as ``uncertainty.summarise_volume_sigma`` returns
+        it."""
         return summarise_volume_sigma(self.bundle)
 
     def summary(self) -> dict[str, Any]:
@@ -182,7 +228,10 @@ class SplinedModel:
         bundle = self.bundle
         fields = {
             device: rms(part.coefficients[:, 1:-1, 1:-1])
-            for device, part in (("camera", bundle.state.rig.camera), ("projector", bundle.state.rig.projector))
+            for device, part in (
+                ("camera", bundle.state.rig.camera),
+                ("projector", bundle.state.rig.projector),
+            )
         }
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
         return {
@@ -216,23 +265,37 @@ class SplinedModel:
         u, v, z = sigma["worst_at"]
         return "\n".join(
             [
-                f"splined: residuals camera {noise['camera']:.4f} px, projector x {noise['x']:.4f}, "
-                f"y {noise['y']:.4f} px (robust; {max(bundle.noise.ratio):.1f} times the predicted noise), "
-                f"after {s['steps']} steps",
-                f"  local distortion {local['camera']:.3f} px RMS in the camera, "
-                f"{local['projector']:.3f} px in the projector",
-                f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
-                f"{s['board_offsets_rms_mm']:.4f} mm RMS",
+                (
+                    f"splined: residuals camera {noise['camera']:.4f} px, projector x"
+                    f" {noise['x']:.4f}, y {noise['y']:.4f} px (robust;"
+                    f" {max(bundle.noise.ratio):.1f} times the predicted noise), after {s['steps']}"
+                    " steps"
+                ),
+                (
+                    f"  local distortion {local['camera']:.3f} px RMS in the camera, "
+                    f"{local['projector']:.3f} px in the projector"
+                ),
+                (
+                    f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
+                    f"{s['board_offsets_rms_mm']:.4f} mm RMS"
+                ),
                 *(
-                    [f"  board turned by 180 degrees in {', '.join(half_turned)}: numbered as in the others"]
+                    [
+                        f"  board turned by 180 degrees in {', '.join(half_turned)}: numbered as in"
+                        " the others"
+                    ]
                     * bool(half_turned)
                 ),
-                f"  illuminated by target poses: {100 * illuminated['camera']:.0f} % of the camera's cells, "
-                f"{100 * illuminated['projector']:.0f} % of the projector's",
-                f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma): median "
-                f"{sigma['median']:.4f} mm and 95 % below {sigma['p95']:.4f} mm "
-                f"over the {100 * sigma['supported']:.0f} % that the poses support; "
-                f"worst {sigma['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm",
+                (
+                    f"  illuminated by target poses: {100 * illuminated['camera']:.0f} % of the"
+                    f" camera's cells, {100 * illuminated['projector']:.0f} % of the projector's"
+                ),
+                (
+                    f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma):"
+                    f" median {sigma['median']:.4f} mm and 95 % below {sigma['p95']:.4f} mm over"
+                    f" the {100 * sigma['supported']:.0f} % that the poses support; worst"
+                    f" {sigma['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm"
+                ),
             ]
         )
 
@@ -245,7 +308,9 @@ class SplinedModel:
         return self.bundle.to_arrays()
 
     @classmethod
-    def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "SplinedModel":
+    def from_arrays(
+        cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    ) -> "SplinedModel":
         """The inverse of ``to_dict`` and ``to_arrays``."""
         return cls(Bundle.from_arrays(data, arrays))
 
@@ -259,7 +324,8 @@ def calibrate_splined(
 ) -> SplinedModel:
     """Calibrate the splined model from the poses that the stereo calibration used.
 
-    ``cells_across``: cells of each displacement field across its image; by default ``fields.CELLS_ACROSS``.
-    Raises InputError where poses lack an axis, and CalibrationRejected where they contradict each other.
+    ``cells_across``: cells of each displacement field across its image; by default
+    ``fields.CELLS_ACROSS``. Raises InputError where poses lack an axis, and CalibrationRejected
+    where they contradict each other.
     """
     return SplinedModel(adjust_bundle(observations, stereo, progress, cells_across=cells_across))

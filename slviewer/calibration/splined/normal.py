@@ -8,7 +8,14 @@ import numpy as np
 from scipy.linalg import blas, cho_solve, lapack, solve_triangular
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
-from slviewer.calibration.splined.residuals import CAMERA, DENSE, HEIGHT, OFFSET, feature_row, sample_row
+from slviewer.calibration.splined.residuals import (
+    CAMERA,
+    DENSE,
+    HEIGHT,
+    OFFSET,
+    feature_row,
+    sample_row,
+)
 from slviewer.calibration.splined.unknowns import RIG, State, UnknownLayout
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.jit import kernel
@@ -18,8 +25,8 @@ MAX_LANES = 4
 _ROWS_ADDED = 128  # of two matrices at a time
 FIELD = 16
 CAMERA_FIELD, PROJECTOR_FIELD, ROW = DENSE, DENSE + 2 * FIELD, DENSE + 4 * FIELD
-"""Coefficients of one component of a field that reach a place; index of each field's first entry in a whole row, behind
-the dense part; and the row's length."""
+"""Coefficients of one component of a field that reach a place; index of each field's first entry in
+a whole row, behind the dense part; and the row's length."""
 
 
 ObservedValues = tuple[np.ndarray, np.ndarray]
@@ -29,10 +36,10 @@ ObservedValues = tuple[np.ndarray, np.ndarray]
 class PoseData(NamedTuple):
     """What was observed, all poses one after another.
 
-    Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) their indices on the board, and
-    ``feature_px`` (n, 2), their pixels; and samples ``sample_from[i] : ...``: camera pixels ``sample_px`` (m, 2), and
-    ``projector_px`` (m, 2), their projector coordinates, NaN for an axis not captured. ``points`` (f, 3) mm
-    and ``frame`` (4,) are the board's.
+    Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) their indices on
+    the board, and ``feature_px`` (n, 2), their pixels; and samples ``sample_from[i] : ...``: camera
+    pixels ``sample_px`` (m, 2), and ``projector_px`` (m, 2), their projector coordinates, NaN for
+    an axis not captured. ``points`` (f, 3) mm and ``frame`` (4,) are the board's.
     """
 
     feature_from: np.ndarray
@@ -62,11 +69,12 @@ class Workspace(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """Sums of one thread over observations in the same cells, before they are added to the normal equations.
+    """Sums of one thread over observations in the same cells, before they are added to the normal
+    equations.
 
-    ``rows`` (4, ROW), ``w`` and ``r`` (4,): those of two observations, added at once, their weights and residuals;
-    ``S`` (ROW, ROW) and ``s`` (ROW,): their weighted products; ``columns`` (ROW,): of a row's entries, in the order of
-    the vector of unknowns.
+    ``rows`` (4, ROW), ``w`` and ``r`` (4,): those of two observations, added at once, their weights
+    and residuals; ``S`` (ROW, ROW) and ``s`` (ROW,): their weighted products; ``columns`` (ROW,):
+    of a row's entries, in the order of the vector of unknowns.
     """
 
     rows: np.ndarray
@@ -87,7 +95,8 @@ def allocate_workspace():
 
 
 def predict_observations(state: State, data: PoseData) -> ObservedValues:
-    """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where not visible."""
+    """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where
+    not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
     model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
     shares = _split_poses(state.layout.poses)
@@ -101,7 +110,8 @@ def normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return J'WJ (N, N), of which the upper triangle is filled, and J'W r (N,).
 
-    ``residuals`` and ``weights``: of features (n, 2), and of samples (m, 2); what weighs 0 may be NaN.
+    ``residuals`` and ``weights``: of features (n, 2), and of samples (m, 2); what weighs 0 may be
+    NaN.
     """
     layout = state.layout
     shares = _split_poses(layout.poses)
@@ -127,9 +137,10 @@ def normal_equations(
 class BlockFactor:
     """Cholesky factor of a normal matrix (N, N), given by its upper triangle, which stays as it is.
 
-    The ``separable`` blocks of the unknowns are eliminated one by one, and what is left is factorised as a whole: less
-    than half the operations of a factor without regard to the zeros between the blocks. ``damping``: factor by which
-    the diagonal of lenses and relative pose is increased. Raises CalibrationRejected as `factorize` does.
+    The ``separable`` blocks of the unknowns are eliminated one by one, and what is left is
+    factorised as a whole: less than half the operations of a factor without regard to the zeros
+    between the blocks. ``damping``: factor by which the diagonal of lenses and relative pose is
+    increased. Raises CalibrationRejected as `factorize` does.
     """
 
     def __init__(self, A: np.ndarray, layout: UnknownLayout, damping: float = 0.0) -> None:
@@ -137,7 +148,9 @@ class BlockFactor:
         self._blocks = layout.separable
         first, second = slice(0, layout.offsets), slice(layout.rig, layout.projector_field)
         self._rest = np.r_[first, second]
-        rest = np.block([[A[first, first], A[first, second]], [A[first, second].T, A[second, second]]])
+        rest = np.block(
+            [[A[first, first], A[first, second]], [A[first, second].T, A[second, second]]]
+        )
         rig = layout.offsets + np.arange(RIG)
         rest[rig, rig] *= 1 + damping
         self._factors, self._couplings = [], []
@@ -157,34 +170,48 @@ class BlockFactor:
             solve_triangular(factor, right[block], lower=True, check_finite=False)
             for factor, block in zip(self._factors, self._blocks, strict=True)
         ]
-        rest = right[self._rest] - sum(c.T @ part for c, part in zip(self._couplings, parts, strict=True))
+        rest = right[self._rest] - sum(
+            c.T @ part for c, part in zip(self._couplings, parts, strict=True)
+        )
         out = np.empty_like(right)
         out[self._rest] = rest = cho_solve((self._rest_factor, True), rest, check_finite=False)
-        for block, factor, coupling, part in zip(self._blocks, self._factors, self._couplings, parts, strict=True):
-            out[block] = solve_triangular(factor, part - coupling @ rest, lower=True, trans=1, check_finite=False)
+        for block, factor, coupling, part in zip(
+            self._blocks, self._factors, self._couplings, parts, strict=True
+        ):
+            out[block] = solve_triangular(
+                factor, part - coupling @ rest, lower=True, trans=1, check_finite=False
+            )
         return out
 
 
 def factorize(A: np.ndarray) -> np.ndarray:
-    """Return the lower Cholesky factor of a matrix given by its upper triangle in C order; overwrites A.
+    """Return the lower Cholesky factor of a matrix given by its upper triangle in C order;
+    overwrites A.
 
     Raises CalibrationRejected where the matrix is not positive definite.
     """
     factor, failed = lapack.dpotrf(A.T, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise CalibrationRejected(
-            "the poses leave the joint adjustment undetermined: capture the board in more positions and tilts"
+            "the poses leave the joint adjustment undetermined: capture the board in more positions"
+            " and tilts"
         )
     return np.asarray(factor)
 
 
 def _sort_by_cell(state: State, data: PoseData) -> np.ndarray:
-    """Indices (m,) of the samples, pose by pose, with those in the same cell of both fields one after another."""
+    """Indices (m,) of the samples, pose by pose, with those in the same cell of both fields one
+    after another."""
     keys = []
-    for device, px in ((state.rig.projector, data.projector_px), (state.rig.camera, data.sample_px)):
+    for device, px in (
+        (state.rig.projector, data.projector_px),
+        (state.rig.camera, data.sample_px),
+    ):
         cells = np.array(device.coefficients.shape[:0:-1]) - 3
         keys += list(np.nan_to_num((px + 0.5) * cells / device.size).astype(np.int64).T)
-    return np.lexsort([*keys, np.repeat(np.arange(len(data.sample_from) - 1), np.diff(data.sample_from))])
+    return np.lexsort(
+        [*keys, np.repeat(np.arange(len(data.sample_from) - 1), np.diff(data.sample_from))]
+    )
 
 
 def _split_poses(poses: int) -> list[np.ndarray]:
@@ -201,19 +228,41 @@ def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
     for i in poses:
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
             f = data.feature[n]
-            u, v, _, _ = feature_row(rig, R[i], t[i], heights, data.frame, data.points[f], offsets[f], work, row)
+            u, v, _, _ = feature_row(
+                rig, R[i], t[i], heights, data.frame, data.points[f], offsets[f], work, row
+            )
             features[n, 0], features[n, 1] = u, v
         for n in range(data.sample_from[i], data.sample_from[i + 1]):
             px = data.sample_px[n]
-            u, v, _, _, _, _ = sample_row(rig, R[i], t[i], heights, data.frame, px[0], px[1], work, row, by_field)
+            u, v, _, _, _, _ = sample_row(
+                rig, R[i], t[i], heights, data.frame, px[0], px[1], work, row, by_field
+            )
             samples[n, 0], samples[n, 1] = u, v
 
 
 @kernel()
-def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_w, sample_w, at, order, poses, A, b):
-    """Add the observations of some ``poses`` to the normal matrix A (upper triangle) and the right-hand side b.
+def _accumulate(
+    rig,
+    R,
+    t,
+    heights,
+    offsets,
+    data,
+    feature_r,
+    sample_r,
+    feature_w,
+    sample_w,
+    at,
+    order,
+    poses,
+    A,
+    b,
+):
+    """Add the observations of some ``poses`` to the normal matrix A (upper triangle) and the
+    right-hand side b.
 
-    Samples are taken in ``order`` (m,); those in the same cells of both fields are summed before they are added to A.
+    Samples are taken in ``order`` (m,); those in the same cells of both fields are summed before
+    they are added to A.
     """
     work, row = allocate_workspace(), np.zeros((2, ROW))
     sums = Sums(
@@ -222,18 +271,41 @@ def _accumulate(rig, R, t, heights, offsets, data, feature_r, sample_r, feature_
     for i in poses:
         for c in range(HEIGHT):
             sums.columns[c] = 6 * i + c
-        _add_features(rig, R[i], t[i], heights, offsets, data, i, feature_r, feature_w, at, work, row, sums, A, b)
+        _add_features(
+            rig,
+            R[i],
+            t[i],
+            heights,
+            offsets,
+            data,
+            i,
+            feature_r,
+            feature_w,
+            at,
+            work,
+            row,
+            sums,
+            A,
+            b,
+        )
         part = order[data.sample_from[i] : data.sample_from[i + 1]]
-        _add_samples(rig, R[i], t[i], heights, data, part, sample_r, sample_w, at, work, row, sums, A, b)
+        _add_samples(
+            rig, R[i], t[i], heights, data, part, sample_r, sample_w, at, work, row, sums, A, b
+        )
 
 
 @kernel()
-def _add_features(rig, R, t, heights, offsets, data, pose, residuals, weights, at, work, row, sums, A, b):
-    """Add the features of one ``pose``, whose ``residuals`` and ``weights`` are (n, 2), to A and b."""
+def _add_features(
+    rig, R, t, heights, offsets, data, pose, residuals, weights, at, work, row, sums, A, b
+):
+    """Add the features of one ``pose``, whose ``residuals`` and ``weights`` are (n, 2), to A and
+    b."""
     for n in range(data.feature_from[pose], data.feature_from[pose + 1]):
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
             f = data.feature[n]
-            _, _, i, j = feature_row(rig, R, t, heights, data.frame, data.points[f], offsets[f], work, row)
+            _, _, i, j = feature_row(
+                rig, R, t, heights, data.frame, data.points[f], offsets[f], work, row
+            )
             set_feature_columns(sums.columns, rig, f, i, j, at)
             fill_feature_fields(row, work)
             _set_rows(sums, 0, row, weights[n], residuals[n])
@@ -249,7 +321,9 @@ def _add_samples(rig, R, t, heights, data, part, residuals, weights, at, work, r
     for n in part:
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
             u, v = data.sample_px[n]
-            _, _, ci, cj, pi, pj = sample_row(rig, R, t, heights, data.frame, u, v, work, row, by_field)
+            _, _, ci, cj, pi, pj = sample_row(
+                rig, R, t, heights, data.frame, u, v, work, row, by_field
+            )
             if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
                 _add_rows(sums, ROW)
                 _move_sums(sums, ROW, A, b)
@@ -267,7 +341,8 @@ def _add_samples(rig, R, t, heights, data, part, residuals, weights, at, work, r
 
 @kernel()
 def dense_columns(at):
-    """Return the columns (ROW,) of a row's entries in the vector of unknowns, of height and rig; the others are 0.
+    """Return the columns (ROW,) of a row's entries in the vector of unknowns, of height and rig;
+    the others are 0.
 
     ``at``: first columns of height, offsets, rig, camera's field, and projector's field.
     """
@@ -288,7 +363,8 @@ def set_feature_columns(columns, rig, feature, i, j, at):
 
 @kernel()
 def set_sample_columns(columns, rig, cells, at):
-    """Fill in the columns of the fields in their ``cells`` (i, j of the camera, i, j of the projector)."""
+    """Fill in the columns of the fields in their ``cells`` (i, j of the camera, i, j of the
+    projector)."""
     columns[OFFSET], columns[OFFSET + 1] = at[1], at[1] + 1  # a sample's row has zeros there
     _set_field_columns(columns, CAMERA_FIELD, rig.camera, cells[0], cells[1], at[3])
     _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, cells[2], cells[3], at[4])
@@ -296,18 +372,22 @@ def set_sample_columns(columns, rig, cells, at):
 
 @kernel()
 def _set_field_columns(columns, first, device, i, j, start):
-    """Fill in the columns of the coefficients of both components that reach the cell (i, j) of a device's field."""
+    """Fill in the columns of the coefficients of both components that reach the cell (i, j) of a
+    device's field."""
     stride = device.coefficients.shape[2]
     knots = stride * device.coefficients.shape[1]
     for k in range(2):
         for m in range(4):
             for n in range(4):
-                columns[first + k * FIELD + 4 * m + n] = start + k * knots + (j + m) * stride + i + n
+                columns[first + k * FIELD + 4 * m + n] = (
+                    start + k * knots + (j + m) * stride + i + n
+                )
 
 
 @kernel()
 def fill_feature_fields(row, work):
-    """Fill in the derivatives of a feature by the camera's field; u's coefficients are in row u alone, v's in row v."""
+    """Fill in the derivatives of a feature by the camera's field; u's coefficients are in row u
+    alone, v's in row v."""
     for k in range(2):
         _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, 1.0 - k, float(k))
 
@@ -316,13 +396,16 @@ def fill_feature_fields(row, work):
 def fill_sample_fields(row, work, by_field):
     """Fill in the derivatives of a sample by both fields; both rows look through the camera's."""
     for k in range(2):
-        _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, by_field[0, k], by_field[1, k])
+        _fill_field(
+            row, CAMERA_FIELD + k * FIELD, work.camera_basis, by_field[0, k], by_field[1, k]
+        )
         _fill_field(row, PROJECTOR_FIELD + k * FIELD, work.projector_basis, 1.0 - k, float(k))
 
 
 @kernel()
 def _fill_field(row, first, basis, by_u, by_v):
-    """Fill in the derivatives of u and v by one component's coefficients; ``by_u``, ``by_v``: by its displacement."""
+    """Fill in the derivatives of u and v by one component's coefficients; ``by_u``, ``by_v``: by
+    its displacement."""
     for m in range(4):
         for n in range(4):
             value = basis[2, m] * basis[0, n]
@@ -332,7 +415,8 @@ def _fill_field(row, first, basis, by_u, by_v):
 
 @kernel()
 def _set_rows(sums, first, row, weight, residual):
-    """Fill in rows ``first`` and ``first`` + 1 with the two of an observation, their weights and residuals."""
+    """Fill in rows ``first`` and ``first`` + 1 with the two of an observation, their weights and
+    residuals."""
     for k in range(2):
         sums.rows[first + k] = row[k]
         sums.w[first + k] = weight[k]
@@ -341,7 +425,8 @@ def _set_rows(sums, first, row, weight, residual):
 
 @kernel(fastmath=True)
 def _add_rows(sums, length):
-    """Add the weighted products of four rows with themselves to S (upper triangle), and with the residuals to s.
+    """Add the weighted products of four rows with themselves to S (upper triangle), and with the
+    residuals to s.
 
     Then the weights are set to zero.
     """

@@ -1,4 +1,5 @@
-"""Derivatives of measured points by the rig's unknowns, which turn their covariance into the cloud's."""
+"""Derivatives of measured points by the rig's unknowns, which turn their covariance into the
+cloud's."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,17 +11,23 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 
 MAX_ENTRIES = RIG + 48
-"""A row's unknowns: lenses, rotation and translation; 16 knots of either component of the camera's field, 16 of one of
-the projector's."""
+"""A row's unknowns: lenses, rotation and translation; 16 knots of either component of the camera's
+field, 16 of one of the projector's."""
 
 
-def compute_point_jacobian(state: State, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
+def compute_point_jacobian(
+    state: State, axis: Axis, pixels: np.ndarray, z: np.ndarray
+) -> sp.csr_matrix:
     """Compute the Jacobian (3 n, unknowns) described in ``Bundle.point_jacobian``."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or z.shape != pixels.shape[:1]:
-        raise InputError(f"pixels {pixels.shape} and depths {z.shape} were given: (n, 2) and (n,) are needed")
+        raise InputError(
+            f"pixels {pixels.shape} and depths {z.shape} were given: (n, 2) and (n,) are needed"
+        )
     if axis not in ("x", "y"):
-        raise InputError(f"the axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)")
+        raise InputError(
+            f"the axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)"
+        )
     at = state.layout
     starts = np.array([at.camera_field - at.rig, at.projector_field - at.rig], np.int64)
     values, columns = np.zeros((len(z), 3, MAX_ENTRIES)), np.zeros((len(z), MAX_ENTRIES), np.int64)
@@ -32,16 +39,22 @@ def compute_point_jacobian(state: State, axis: Axis, pixels: np.ndarray, z: np.n
 
 @kernel()
 def _fill_rows(rig, row, pixels, depths, starts, values, columns):
-    """Fill ``values`` (n, 3, MAX_ENTRIES) and ``columns`` (n, MAX_ENTRIES) of the points' sparse Jacobian."""
+    """Fill ``values`` (n, 3, MAX_ENTRIES) and ``columns`` (n, MAX_ENTRIES) of the points' sparse
+    Jacobian."""
     basis, other = np.zeros((4, 4)), np.zeros((4, 4))
     by_point, by_lens = np.zeros((2, 3)), np.zeros((2, 9))
     ray_by_lens, ray_by_field = np.zeros((2, 9)), np.zeros((2, 2))
     X, V, m, by_turn = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     stride, across = rig.camera.coefficients.shape[2], rig.projector.coefficients.shape[2]
-    knots, others = stride * rig.camera.coefficients.shape[1], across * rig.projector.coefficients.shape[1]
+    knots, others = (
+        stride * rig.camera.coefficients.shape[1],
+        across * rig.projector.coefficients.shape[1],
+    )
     for n in range(depths.shape[0]):
         z = depths[n]
-        x, y, ci, cj = undistort_ray(rig.camera, pixels[n, 0], pixels[n, 1], basis, ray_by_lens, ray_by_field)
+        x, y, ci, cj = undistort_ray(
+            rig.camera, pixels[n, 0], pixels[n, 1], basis, ray_by_lens, ray_by_field
+        )
         for a in range(3):
             V[a] = z * (rig.R[a, 0] * x + rig.R[a, 1] * y + rig.R[a, 2])
             X[a] = V[a] + rig.t[a]
@@ -69,11 +82,18 @@ def _fill_rows(rig, row, pixels, depths, starts, values, columns):
             for b in range(4):
                 k, spline = 4 * a + b, basis[2, a] * basis[0, b]
                 for component in range(2):
-                    dx, dy = ray_by_field[0, component] * spline, ray_by_field[1, component] * spline
+                    dx, dy = (
+                        ray_by_field[0, component] * spline,
+                        ray_by_field[1, component] * spline,
+                    )
                     dz = per_z * z * (m[0] * dx + m[1] * dy)
                     c = RIG + 16 * component + k
                     columns[n, c] = starts[0] + component * knots + (cj + a) * stride + ci + b
-                    values[n, 0, c], values[n, 1, c], values[n, 2, c] = x * dz + z * dx, y * dz + z * dy, dz
+                    values[n, 0, c], values[n, 1, c], values[n, 2, c] = (
+                        x * dz + z * dx,
+                        y * dz + z * dy,
+                        dz,
+                    )
                 columns[n, RIG + 32 + k] = starts[1] + row * others + (pj + a) * across + pi + b
                 _depth_direction(values[n], RIG + 32 + k, x, y, per_z * other[2, a] * other[0, b])
 

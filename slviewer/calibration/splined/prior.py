@@ -5,7 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.calibration.splined.board_shape import GAUGE_MM, HEIGHT_SIGMA_MM, OFFSET_SIGMA_MM, offset_gauge
+from slviewer.calibration.splined.board_shape import (
+    GAUGE_MM,
+    HEIGHT_SIGMA_MM,
+    OFFSET_SIGMA_MM,
+    offset_gauge,
+)
 from slviewer.calibration.splined.fields import roughness
 from slviewer.calibration.splined.normal import PoseData
 from slviewer.calibration.splined.residual_noise import update_strength
@@ -17,8 +22,8 @@ POSE_SIGMA = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Normal distributions: of the fields' coefficients by their roughness (``forms``, times a strength), of the
-    board's height and offsets by what boards are like, and of the poses widely.
+    """Normal distributions: of the fields' coefficients by their roughness (``forms``, times a
+    strength), of the board's height and offsets by what boards are like, and of the poses widely.
 
     ``features_per_point``: how many of the board's features each offset of the state represents.
     """
@@ -57,7 +62,9 @@ class Prior:
     def cost(self, state: State, strengths: Sequence[float]) -> float:
         """Half the prior's chi square at a state."""
         offsets = state.offsets.ravel()
-        total = np.sum((state.heights / HEIGHT_SIGMA_MM) ** 2) + np.sum(offsets**2) / OFFSET_SIGMA_MM**2
+        total = (
+            np.sum((state.heights / HEIGHT_SIGMA_MM) ** 2) + np.sum(offsets**2) / OFFSET_SIGMA_MM**2
+        )
         for _, field, form, strength in self._fields(state, strengths):
             total += strength * float(np.sum(field * (field @ form)))
         return 0.5 * float(total)
@@ -72,9 +79,14 @@ class Prior:
             for first, field, form, strength in self._fields(state, strengths)
         ]
 
-    def _fields(self, state: State, strengths: Sequence[float]) -> Iterator[tuple[int, np.ndarray, np.ndarray, float]]:
-        """Iterate over both fields: first unknown, coefficients (2, n), quadratic form (n, n), and strength."""
+    def _fields(
+        self, state: State, strengths: Sequence[float]
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, float]]:
+        """Iterate over both fields: first unknown, coefficients (2, n), quadratic form (n, n), and
+        strength."""
         at = state.layout
         firsts = at.camera_field, at.projector_field
-        fields = [device.coefficients.reshape(2, -1) for device in (state.rig.camera, state.rig.projector)]
+        fields = [
+            device.coefficients.reshape(2, -1) for device in (state.rig.camera, state.rig.projector)
+        ]
         return zip(firsts, fields, self.forms, strengths, strict=True)

@@ -1,8 +1,9 @@
-"""What the unknowns predict, with analytic derivatives: features in the camera, and the projector's coordinates of what
-a camera pixel sees on the board.
+"""What the unknowns predict, with analytic derivatives: features in the camera, and the projector's
+coordinates of what a camera pixel sees on the board.
 
-Derivatives follow the vector of ``unknowns``, with a small dense row for pose (6), height (12), offset (2) and rig
-(24), and for each field the splines' values at one place, from which a row's entries are products.
+Derivatives follow the vector of ``unknowns``, with a small dense row for pose (6), height (12),
+offset (2) and rig (24), and for each field the splines' values at one place, from which a row's
+entries are products.
 """
 
 import numpy as np
@@ -18,7 +19,8 @@ POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 
 
 @kernel()
 def _fill_pixel_by_lens(x, y, xd, yd, k, by_lens):
-    """Fill ``by_lens`` (2, 9) with the derivatives of a pixel, before its displacement, by the lens's numbers ``k``.
+    """Fill ``by_lens`` (2, 9) with the derivatives of a pixel, before its displacement, by the
+    lens's numbers ``k``.
 
     (x, y): the undistorted normalised point; (xd, yd): the distorted one.
     """
@@ -45,7 +47,8 @@ def fill_cross(a, b, scale, out):
 def project_to_device(device, X, basis, by_point, by_lens):
     """(u, v, first column, first row of the field's cell) of a point X (3,) in the device's frame.
 
-    Fills ``by_point`` (2, 3) and ``by_lens`` (2, 9); the derivative by the field's coefficients is ``basis``'s product.
+    Fills ``by_point`` (2, 3) and ``by_lens`` (2, 9); the derivative by the field's coefficients is
+    ``basis``'s product.
     """
     k = device.numbers
     inverse = 1.0 / X[2]
@@ -56,7 +59,12 @@ def project_to_device(device, X, basis, by_point, by_lens):
     u, v = k[0] * xd + k[2], k[1] * yd + k[3]
     du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
     _fill_pixel_by_lens(x, y, xd, yd, k, by_lens)
-    ux, uy, vx, vy = k[0] * dxx, k[0] * dxy, k[1] * dxy, k[1] * dyy  # d(u, v before displacement) by x, y
+    ux, uy, vx, vy = (
+        k[0] * dxx,
+        k[0] * dxy,
+        k[1] * dxy,
+        k[1] * dyy,
+    )  # d(u, v before displacement) by x, y
     by_point[0, 0], by_point[0, 1] = ux * inverse, uy * inverse
     by_point[1, 0], by_point[1, 1] = vx * inverse, vy * inverse
     by_point[0, 2] = -(ux * x + uy * y) * inverse
@@ -73,7 +81,8 @@ def project_to_device(device, X, basis, by_point, by_lens):
 def undistort_ray(device, u, v, basis, by_lens, by_field):
     """(x, y, first column, first row): the undistorted normalised point that a camera pixel sees.
 
-    Fills ``by_lens`` (2, 9), and ``by_field`` (2, 2): by a displacement along u and v where the field is evaluated.
+    Fills ``by_lens`` (2, 9), and ``by_field`` (2, 2): by a displacement along u and v where the
+    field is evaluated.
     """
     k = device.numbers
     qu, qv = remove_displacement(device, u, v, basis)
@@ -120,7 +129,9 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
         return u, v, i, j
     for k in range(2):
         m0, m1, m2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
-        fill_cross(L, work.by_point[k], 1.0, row[k, POSE : POSE + 3])  # a turn w moves the point by w x L
+        fill_cross(
+            L, work.by_point[k], 1.0, row[k, POSE : POSE + 3]
+        )  # a turn w moves the point by w x L
         row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = m0, m1, m2
         along = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
         for c in range(heights.shape[0]):
@@ -134,19 +145,24 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
 
 @kernel()
 def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
-    """(u_p, v_p, then first column and row in the camera's field, and in the projector's): where the projector lights
-    what camera pixel (u, v) sees of the board at pose (R, t).
+    """(u_p, v_p, then first column and row in the camera's field, and in the projector's): where
+    the projector lights what camera pixel (u, v) sees of the board at pose (R, t).
 
-    Fills ``row`` (2, 44), ``by_field`` (2, 2) by the camera's displacement, and both bases of ``work``.
+    Fills ``row`` (2, 44), ``by_field`` (2, 2) by the camera's displacement, and both bases of
+    ``work``.
     """
     row[:] = 0.0
-    x, y, ci, cj = undistort_ray(rig.camera, u, v, work.camera_basis, work.ray_by_lens, work.ray_by_field)
+    x, y, ci, cj = undistort_ray(
+        rig.camera, u, v, work.camera_basis, work.ray_by_lens, work.ray_by_field
+    )
     facing = R[0, 2] * x + R[1, 2] * y + R[2, 2]
     if not (np.isfinite(x) and facing != 0.0):
         return np.nan, np.nan, ci, cj, 0, 0
     s = (R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2]) / facing
     Y, N = work.local, work.normal
-    for _ in range(4):  # onto the bent surface: the bow is a thousandth of the distance, so this squares fast
+    for _ in range(
+        4
+    ):  # onto the bent surface: the bow is a thousandth of the distance, so this squares fast
         Y[0], Y[1], Y[2] = s * x - t[0], s * y - t[1], s - t[2]
         bx = R[0, 0] * Y[0] + R[1, 0] * Y[1] + R[2, 0] * Y[2]
         by = R[0, 1] * Y[0] + R[1, 1] * Y[1] + R[2, 1] * Y[2]
@@ -164,7 +180,9 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
     for a in range(3):
         V[a] = s * (rig.R[a, 0] * x + rig.R[a, 1] * y + rig.R[a, 2])
         X[a] = V[a] + rig.t[a]
-    pu, pv, pi, pj = project_to_device(rig.projector, X, work.projector_basis, work.by_point, work.by_lens)
+    pu, pv, pi, pj = project_to_device(
+        rig.projector, X, work.projector_basis, work.by_point, work.by_lens
+    )
     if not np.isfinite(pu):
         return np.nan, np.nan, ci, cj, pi, pj
     for k in range(2):
@@ -176,7 +194,11 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
         m2 = p0 * rig.R[0, 2] + p1 * rig.R[1, 2] + p2 * rig.R[2, 2]
         along = (m0 * x + m1 * y + m2) / facing
         fill_cross(Y, N, along, row[k, POSE : POSE + 3])
-        row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = along * N[0], along * N[1], along * N[2]
+        row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = (
+            along * N[0],
+            along * N[1],
+            along * N[2],
+        )
         for c in range(heights.shape[0]):
             row[k, HEIGHT + c] = along * work.terms[0, c]
         ex, ey = s * (m0 - along * N[0]), s * (m1 - along * N[1])

@@ -1,11 +1,12 @@
-"""Calibration uncertainty at every point: systematic, so that neither longer exposure nor repeated scans reduce it.
+"""Calibration uncertainty at every point: systematic, so that neither longer exposure nor repeated
+scans reduce it.
 
-All uncertainties exclude a common rigid motion: the pose of the whole space in the camera's frame is thirty times less
-certain than its shape, and measurements of a shape do not depend on it.
+All uncertainties exclude a common rigid motion: the pose of the whole space in the camera's frame
+is thirty times less certain than its shape, and measurements of a shape do not depend on it.
 
-Outside the calibrated region, the fields are extrapolated by their priors. A prior assumes independent second
-differences; where those of a lens are correlated, the errors exceed the prior's prediction by a factor estimated from
-the fields' supported part: ``persistence_ratio``.
+Outside the calibrated region, the fields are extrapolated by their priors. A prior assumes
+independent second differences; where those of a lens are correlated, the errors exceed the prior's
+prediction by a factor estimated from the fields' supported part: ``persistence_ratio``.
 """
 
 from dataclasses import dataclass
@@ -33,8 +34,8 @@ from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 
 NODES = (21, 16, 11)
-"""Nodes of the map across, down, and in depth: interpolation errors stay below 10 to 20 %, and a map takes about a
-second."""
+"""Nodes of the map across, down, and in depth: interpolation errors stay below 10 to 20 %, and a
+map takes about a second."""
 MIN_FITTED_POINTS = 3
 EXTRAPOLATED_CELLS = 3
 """Approximate distance, in cells, of the working volume's border from the supported cells."""
@@ -42,20 +43,28 @@ EXTRAPOLATED_CELLS = 3
 
 @dataclass(frozen=True, eq=False)
 class SigmaMap:
-    """Standard deviation of z for one axis: ``nodes`` (nv, nu, nz) float32 mm, evenly spaced over the image and from
-    ``near`` to ``far`` mm."""
+    """Standard deviation of z for one axis: ``nodes`` (nv, nu, nz) float32 mm, evenly spaced over
+    the image and from ``near`` to ``far`` mm."""
 
     nodes: NDArray[np.float32]
     near: float
     far: float
 
     def interpolate(self, points: np.ndarray) -> NDArray[np.float32]:
-        """Interpolate at the organised points (h, w, 3) mm of the whole image; returns (h, w) float32 mm, NaN at NaN.
+        """Interpolate at the organised points (h, w, 3) mm of the whole image; returns (h, w)
+        float32 mm, NaN at NaN.
 
-        The logarithm is interpolated linearly, since the value grows hundredfold where support ends.
+        The logarithm is interpolated linearly, since the value grows hundredfold where support
+        ends.
         """
         out = np.empty(points.shape[:2], np.float32)
-        _interpolate(np.ascontiguousarray(points[..., 2], np.float32), np.log(self.nodes), self.near, self.far, out)
+        _interpolate(
+            np.ascontiguousarray(points[..., 2], np.float32),
+            np.log(self.nodes),
+            self.near,
+            self.far,
+            out,
+        )
         return out
 
 
@@ -72,13 +81,18 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     width, height = (int(n) for n in rig.camera.size)
     across, down, deep = NODES
     v, u, z = np.meshgrid(
-        np.linspace(0, height - 1, down), np.linspace(0, width - 1, across), np.linspace(near, far, deep), indexing="ij"
+        np.linspace(0, height - 1, down),
+        np.linspace(0, width - 1, across),
+        np.linspace(near, far, deep),
+        indexing="ij",
     )
     pixels, nodes = np.column_stack([u.ravel(), v.ravel()]), z.ravel()
     jacobian = bundle.point_jacobian(axis, pixels, nodes)[2::3]
     jacobian.data[~np.isfinite(jacobian.data)] = 0.0
     places = Volume(pixels, nodes, *view_pixels(rig, pixels, nodes))
-    depths = bundle.whiten(jacobian) - moved @ motion.displace(places.points)[2::3].astype(np.float32).T
+    depths = (
+        bundle.whiten(jacobian) - moved @ motion.displace(places.points)[2::3].astype(np.float32).T
+    )
     sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths)) * extrapolation_factor(bundle, places)
     unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
     sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
@@ -98,10 +112,11 @@ def volume_sigmas(bundle: Bundle, axis: Axis, volume: Volume) -> Floats:
 
 
 def extrapolation_factor(bundle: Bundle, places: Volume) -> Floats:
-    """Return the factors (n,) by which the priors underestimate the standard deviations at ``places``.
+    """Return the factors (n,) by which the priors underestimate the standard deviations at
+    ``places``.
 
-    1 inside the calibrated region; elsewhere the ``persistence_ratio`` of the field that no pose illuminated there, the
-    larger one of two.
+    1 inside the calibrated region; elsewhere the ``persistence_ratio`` of the field that no pose
+    illuminated there, the larger one of two.
     """
     factor = np.ones(len(places.z))
     rig = bundle.state.rig
@@ -110,12 +125,15 @@ def extrapolation_factor(bundle: Bundle, places: Volume) -> Floats:
         (rig.projector, places.projector, bundle.projector_poses),
     ):
         supported = in_illuminated_cells(device, pixels, poses > 0)
-        factor = np.where(supported, factor, np.maximum(factor, persistence_ratio(device, poses > 0)))
+        factor = np.where(
+            supported, factor, np.maximum(factor, persistence_ratio(device, poses > 0))
+        )
     return factor
 
 
 def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
-    """Return the standard deviation of sums of a field's second differences, over that of independent ones; at least 1.
+    """Return the standard deviation of sums of a field's second differences, over that of
+    independent ones; at least 1.
 
     The sums are over neighbouring cells that are all ``illuminated`` (rows, columns) bool.
     """
@@ -126,20 +144,26 @@ def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
     if not whole.any():
         return 1.0
     middle = 2 * c[:, 1:-1, 1:-1]
-    across, down = c[:, 1:-1, :-2] - middle + c[:, 1:-1, 2:], c[:, :-2, 1:-1] - middle + c[:, 2:, 1:-1]
+    across, down = (
+        c[:, 1:-1, :-2] - middle + c[:, 1:-1, 2:],
+        c[:, :-2, 1:-1] - middle + c[:, 2:, 1:-1],
+    )
     each, together = 0.0, 0.0
     for differences in (*across, *down):
         each += float(np.mean(differences[known] ** 2))
-        together += float(np.mean(uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2)) * EXTRAPOLATED_CELLS**2
+        together += (
+            float(np.mean(uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2))
+            * EXTRAPOLATED_CELLS**2
+        )
     return max(1.0, float(np.sqrt(together / max(each, 1e-300))))
 
 
 def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
     """Summarise the 3D uncertainty of the working volume's points.
 
-    ``median``, ``p95`` mm over the points that target poses support; ``worst`` mm of all, and ``worst_at`` (u, v, z);
-    ``supported``: share of supported points in the common view of camera and projector; ``depths_mm``; ``axis``: the
-    projector axis of the measurement.
+    ``median``, ``p95`` mm over the points that target poses support; ``worst`` mm of all, and
+    ``worst_at`` (u, v, z); ``supported``: share of supported points in the common view of camera
+    and projector; ``depths_mm``; ``axis``: the projector axis of the measurement.
     """
     rig = bundle.state.rig
     volume = working_volume(rig, bundle.depth_range_mm)
@@ -152,21 +176,31 @@ def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
         "p95": float(np.percentile(sigma[fitted], 95)),
         "worst": float(sigma[worst]),
         "worst_at": [*volume.pixels[worst].tolist(), float(volume.z[worst])],
-        "supported": float(np.mean(volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0))),
+        "supported": float(
+            np.mean(volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0))
+        ),
         "depths_mm": [float(volume.z.min()), float(volume.z.max())],
         "axis": axis,
     }
 
 
 def _select_fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
-    """Select the points (n,) bool for the fit of the rigid motion: the supported ones, or all if these are too few."""
-    supported = volume.supported(bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
-    return supported if np.count_nonzero(supported) >= MIN_FITTED_POINTS else np.ones(len(supported), bool)
+    """Select the points (n,) bool for the fit of the rigid motion: the supported ones, or all if
+    these are too few."""
+    supported = volume.supported(
+        bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0
+    )
+    return (
+        supported
+        if np.count_nonzero(supported) >= MIN_FITTED_POINTS
+        else np.ones(len(supported), bool)
+    )
 
 
 @kernel(parallel=True)
 def _interpolate(z, logs, near, far, out):
-    """Fill ``out`` (h, w) with the exponential of ``logs`` (nv, nu, nz) interpolated linearly at depths z (h, w)."""
+    """Fill ``out`` (h, w) with the exponential of ``logs`` (nv, nu, nz) interpolated linearly at
+    depths z (h, w)."""
     height, width = z.shape
     down, across, deep = logs.shape
     per_mm, deepest = np.float32((deep - 1.0) / (far - near)), np.float32(deep - 1.0001)

@@ -31,11 +31,12 @@ class Arrangement(NamedTuple):
 
 @dataclass(frozen=True)
 class UnknownLayout:
-    """Order of the unknowns: poses (6 each), height, offsets (2 each), then the rig: both lenses (9 each), rotation and
-    translation, the camera's field and the projector's (u's coefficients, then v's).
+    """Order of the unknowns: poses (6 each), height, offsets (2 each), then the rig: both lenses (9
+    each), rotation and translation, the camera's field and the projector's (u's coefficients, then
+    v's).
 
-    The rig's unknowns are last, so that the last block of a Cholesky factor is their information with all others
-    marginalised out.
+    The rig's unknowns are last, so that the last block of a Cholesky factor is their information
+    with all others marginalised out.
     """
 
     poses: int
@@ -75,20 +76,24 @@ class UnknownLayout:
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """(5,): the first unknown of height, offsets, rig, camera's field, and projector's field, for the kernels."""
-        return np.array([self.height, self.offsets, self.rig, self.camera_field, self.projector_field], np.int64)
+        """(5,): the first unknown of height, offsets, rig, camera's field, and projector's field,
+        for the kernels."""
+        return np.array(
+            [self.height, self.offsets, self.rig, self.camera_field, self.projector_field], np.int64
+        )
 
     @property
     def separable(self) -> tuple[slice, ...]:
-        """Blocks of which no two share an observation or a prior: offsets, and u and v of the projector's field."""
+        """Blocks of which no two share an observation or a prior: offsets, and u and v of the
+        projector's field."""
         v = self.projector_field + self.projector_knots
         return slice(self.offsets, self.rig), slice(self.projector_field, v), slice(v, self.size)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The unknowns' values. ``R_board`` (p, 3, 3), ``t_board`` (p, 3): board to camera; ``heights`` (12,) and
-    ``offsets`` (f, 2) mm: the board's shape."""
+    """The unknowns' values. ``R_board`` (p, 3, 3), ``t_board`` (p, 3): board to camera; ``heights``
+    (12,) and ``offsets`` (f, 2) mm: the board's shape."""
 
     rig: Arrangement
     R_board: Floats
@@ -102,11 +107,16 @@ class State:
     ) -> "State":
         """Return the initial state from a stereo calibration: no displacement, a flat board.
 
-        ``cells_across``: cells of each displacement field across its image; by default ``fields.CELLS_ACROSS``.
+        ``cells_across``: cells of each displacement field across its image; by default
+        ``fields.CELLS_ACROSS``.
         """
         rig = stereo.rig
         devices = [
-            Device(lens.parameters, no_displacement(lens.size, cells_across), np.array(lens.size, float))
+            Device(
+                lens.parameters,
+                no_displacement(lens.size, cells_across),
+                np.array(lens.size, float),
+            )
             for lens in (rig.camera, rig.projector)
         ]
         T = np.array([stereo.poses[name] for name in poses])
@@ -125,7 +135,8 @@ class State:
         return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
 
     def step(self, step: Floats) -> "State":
-        """Return the state after a step (N,) in the order of ``layout``; rotation vectors apply from the left."""
+        """Return the state after a step (N,) in the order of ``layout``; rotation vectors apply
+        from the left."""
         at = self.layout
         pose = step[: at.height].reshape(-1, 6)
         rig, s = self.rig, step[at.rig :]
@@ -138,7 +149,9 @@ class State:
                 rotate_left(rig.R, s[2 * LENS : 2 * LENS + 3]),
                 rig.t + s[2 * LENS + 3 : RIG],
             ),
-            R_board=np.array([rotate_left(R, w) for R, w in zip(self.R_board, pose[:, :3], strict=True)]),
+            R_board=np.array(
+                [rotate_left(R, w) for R, w in zip(self.R_board, pose[:, :3], strict=True)]
+            ),
             t_board=self.t_board + pose[:, 3:],
             heights=self.heights + step[at.height : at.offsets],
             offsets=self.offsets + step[at.offsets : at.rig].reshape(-1, 2),

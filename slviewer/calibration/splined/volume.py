@@ -1,4 +1,5 @@
-"""The working volume: points at which uncertainty is evaluated, and removal of their common rigid motion."""
+"""The working volume: points at which uncertainty is evaluated, and removal of their common rigid
+motion."""
 
 from dataclasses import dataclass
 
@@ -13,16 +14,16 @@ from slviewer.geometry.rigid import Floats, motion_jacobian
 from slviewer.geometry.vectors import finite_rows, rms
 
 DEPTH_FACTORS = (0.87, 1.13)
-"""Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind (R3), as the Letter
-measured."""
+"""Of the nearest and the farthest calibrated depth: in front of them (R1), inside (R2) and behind
+(R3), as the Letter measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
     """Points in the view of camera and projector.
 
-    Camera ``pixels`` (n, 2), depths ``z`` (n,) mm, ``points`` (n, 3) mm in the camera's frame, and ``projector`` pixels
-    (n, 2).
+    Camera ``pixels`` (n, 2), depths ``z`` (n,) mm, ``points`` (n, 3) mm in the camera's frame, and
+    ``projector`` pixels (n, 2).
     """
 
     pixels: Floats
@@ -33,10 +34,11 @@ class Volume:
     def supported(
         self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
     ) -> np.ndarray:
-        """(n,) bool: points in cells (rows, columns) bool that target poses illuminated, in both devices."""
-        return in_illuminated_cells(rig.camera, self.pixels, camera_illuminated) & in_illuminated_cells(
-            rig.projector, self.projector, projector_illuminated
-        )
+        """(n,) bool: points in cells (rows, columns) bool that target poses illuminated, in both
+        devices."""
+        return in_illuminated_cells(
+            rig.camera, self.pixels, camera_illuminated
+        ) & in_illuminated_cells(rig.projector, self.projector, projector_illuminated)
 
 
 def working_volume(
@@ -46,11 +48,12 @@ def working_volume(
     rows: int = 7,
     depths: int = 5,
 ) -> Volume:
-    """Return the points of a regular grid over the camera's image and depths that the projector's image contains.
+    """Return the points of a regular grid over the camera's image and depths that the projector's
+    image contains.
 
-    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``DEPTH_FACTORS``; ``columns``, ``rows``,
-    ``depths`` of the grid. Raises InputError for an empty range of depths, and where the projector's image contains no
-    point.
+    ``calibrated_mm``: nearest and farthest calibrated depth, multiplied by ``DEPTH_FACTORS``;
+    ``columns``, ``rows``, ``depths`` of the grid. Raises InputError for an empty range of depths,
+    and where the projector's image contains no point.
     """
     near, far = (factor * mm for factor, mm in zip(DEPTH_FACTORS, calibrated_mm, strict=True))
     if not 0 < near < far:
@@ -64,22 +67,31 @@ def working_volume(
     )
     volume = select_visible(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
     if not len(volume.z):
-        raise InputError(f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm")
+        raise InputError(
+            f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm"
+        )
     return volume
 
 
 def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
-    """Select the camera ``pixels`` (n, 2) at depths ``z`` (n,) mm whose points project into the projector's image."""
+    """Select the camera ``pixels`` (n, 2) at depths ``z`` (n,) mm whose points project into the
+    projector's image."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     points, projector = view_pixels(rig, pixels, z)
-    in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)  # False for NaN
+    in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(
+        axis=1
+    )  # False for NaN
     return Volume(pixels[in_view], z[in_view], points[in_view], projector[in_view])
 
 
-def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3) mm of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm, and their projector pixels (n, 2).
+def view_pixels(
+    rig: Arrangement, pixels: np.ndarray, z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 3) mm of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm, and their
+    projector pixels (n, 2).
 
-    Projector pixels may be outside its image; NaN where a distortion cannot be inverted or a point is behind a device.
+    Projector pixels may be outside its image; NaN where a distortion cannot be inverted or a point
+    is behind a device.
     """
     points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
     _view_all(rig, pixels, z, points, projector)
@@ -87,7 +99,8 @@ def view_pixels(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> tuple[np
 
 
 def in_illuminated_cells(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses illuminated.
+    """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses
+    illuminated.
 
     Pixels outside the image count to the cell at its edge; False for NaN.
     """
@@ -99,7 +112,8 @@ def in_illuminated_cells(device: Device, pixels: np.ndarray, illuminated: np.nda
 
 
 def select_depth_axis(rig: Arrangement, volume: Volume) -> Axis:
-    """Return the projector axis whose coordinate changes more with depth, in the median over the volume."""
+    """Return the projector axis whose coordinate changes more with depth, in the median over the
+    volume."""
     _, later = view_pixels(rig, volume.pixels, 1.001 * volume.z)
     across, down = np.nanmedian(np.abs(later - volume.projector), axis=0)
     return "y" if down > across else "x"
@@ -109,8 +123,8 @@ def select_depth_axis(rig: Arrangement, volume: Volume) -> Axis:
 class BestMotion:
     """Least-squares estimator of a small rigid motion from errors of points.
 
-    Errors (3 n,) times ``weights`` (3 n, 6) are three translations (mm), and three rotations about ``centre`` (3,) mm
-    times ``arm`` mm.
+    Errors (3 n,) times ``weights`` (3 n, 6) are three translations (mm), and three rotations about
+    ``centre`` (3,) mm times ``arm`` mm.
     """
 
     weights: np.ndarray
@@ -119,50 +133,64 @@ class BestMotion:
 
     @classmethod
     def fit(cls, points: np.ndarray, fitted: np.ndarray | None = None) -> "BestMotion":
-        """Build the estimator for ``points`` (n, 3) mm; only those in ``fitted`` (n,) bool have weights.
+        """Build the estimator for ``points`` (n, 3) mm; only those in ``fitted`` (n,) bool have
+        weights.
 
         Raises InputError for fewer than three points.
         """
         chosen = np.ones(len(points), bool) if fitted is None else np.asarray(fitted, bool)
         if np.count_nonzero(chosen) < 3:
-            raise InputError(f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three")
+            raise InputError(
+                f"{np.count_nonzero(chosen)} points were given: a rigid motion needs three"
+            )
         centre = points[chosen].mean(axis=0)
         arm = max(rms(points[chosen] - centre), 1e-12)
         held = _motion_basis(points, centre, arm) * np.repeat(chosen, 3)[:, None]
         return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
 
     def displace(self, points: np.ndarray) -> np.ndarray:
-        """Return the displacements (3 n, 6) of points (n, 3) mm by the six motions; x, y, z of each point in turn."""
+        """Return the displacements (3 n, 6) of points (n, 3) mm by the six motions; x, y, z of each
+        point in turn."""
         return _motion_basis(points, self.centre, self.arm)
 
 
-def remove_rigid_motion(whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None) -> np.ndarray:
-    """Remove the common rigid motion, to which measurements of a shape are invariant, from ``whitened`` (m, 3 n).
+def remove_rigid_motion(
+    whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None
+) -> np.ndarray:
+    """Remove the common rigid motion, to which measurements of a shape are invariant, from
+    ``whitened`` (m, 3 n).
 
-    The columns are x, y, z of the first of ``points`` (n, 3) mm, then of the next; pass a Jacobian by the unknowns
-    transposed. The motion is the best fit to all points, or to those that are ``fitted`` (n,) bool, and is removed from
-    all. Raises InputError where fewer than three points are fitted.
+    The columns are x, y, z of the first of ``points`` (n, 3) mm, then of the next; pass a Jacobian
+    by the unknowns transposed. The motion is the best fit to all points, or to those that are
+    ``fitted`` (n,) bool, and is removed from all. Raises InputError where fewer than three points
+    are fitted.
     """
     motion = BestMotion.fit(points, fitted)
-    weights, moved = motion.weights.astype(whitened.dtype), motion.displace(points).astype(whitened.dtype)
+    weights, moved = (
+        motion.weights.astype(whitened.dtype),
+        motion.displace(points).astype(whitened.dtype),
+    )
     return whitened - (whitened @ weights) @ moved.T
 
 
 def sigma_3d(whitened: np.ndarray) -> np.ndarray:
-    """Return the 3D standard deviation (n,) mm of each point from a factor (m, 3 n) of the points' covariance."""
+    """Return the 3D standard deviation (n,) mm of each point from a factor (m, 3 n) of the points'
+    covariance."""
     squares = np.einsum("mn,mn->n", whitened, whitened, dtype=np.float64)
     return np.sqrt(squares.reshape(-1, 3).sum(axis=1))
 
 
 def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
-    """Return the displacements (3 n, 6) of points (n, 3) by translations and by rotations about ``centre``."""
+    """Return the displacements (3 n, 6) of points (n, 3) by translations and by rotations about
+    ``centre``."""
     J = motion_jacobian((points - centre) / arm)
     return J[:, :, [3, 4, 5, 0, 1, 2]].reshape(-1, 6)
 
 
 @kernel()
 def _view_all(rig, pixels, depths, points, projector):
-    """Fill ``points`` (n, 3) mm and ``projector`` (n, 2) px of camera pixels (n, 2) at depths (n,) mm."""
+    """Fill ``points`` (n, 3) mm and ``projector`` (n, 2) px of camera pixels (n, 2) at depths (n,)
+    mm."""
     basis = np.zeros((4, 4))
     for n in range(depths.shape[0]):
         x, y = undistort_pixel(rig.camera, pixels[n, 0], pixels[n, 1], basis)

@@ -1,4 +1,5 @@
-"""A ball bar, a sphere or a plane with its certificate, and what the operator asks of the instrument."""
+"""A ball bar, a sphere or a plane with its certificate, and what the operator asks of the
+instrument."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -60,8 +61,9 @@ class Limits:
 class Artefact:
     """The content of an artefact's certificate, and how the test was made.
 
-    ``spacing`` of a ball bar's centres; ``diameters``: one a ball; ``form``: how far its balls (or its plane) are from
-    ideal ones, range, mm. All at ``reference_celsius``. ``positions``: {position: capture, or a pattern of captures}.
+    ``spacing`` of a ball bar's centres; ``diameters``: one a ball; ``form``: how far its balls (or
+    its plane) are from ideal ones, range, mm. All at ``reference_celsius``. ``positions``:
+    {position: capture, or a pattern of captures}.
     """
 
     kind: Kind
@@ -77,7 +79,8 @@ class Artefact:
     limits: Limits
 
     def at_measurement(self, length: Length) -> tuple[float, float]:
-        """(mm, its standard uncertainty in mm) of a calibrated length at the temperature of the measurement."""
+        """(mm, its standard uncertainty in mm) of a calibrated length at the temperature of the
+        measurement."""
         warmer, ppm = self.temperature.celsius - self.reference_celsius, 1e-6 * length.mm
         parts = (
             length.U_mm / 2,
@@ -88,34 +91,43 @@ class Artefact:
 
     @property
     def form_U_mm(self) -> float:
-        """Expanded uncertainty (k = 2) that the artefact's own form brings into a range: 2 sqrt((F/2)^2 + u(F)^2)."""
+        """Expanded uncertainty (k = 2) that the artefact's own form brings into a range: 2
+        sqrt((F/2)^2 + u(F)^2)."""
         return 2 * hypot(self.form.mm / 2, self.form.U_mm / 2)
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
-        """Return an artefact from the table of its file. Raises InputError for what is missing, unknown or
-        impossible."""
+        """Return an artefact from the table of its file. Raises InputError for what is missing,
+        unknown or impossible."""
         _check_keys(given)
         kind = given.get("kind")
         if kind not in tuple(BALLS):  # it may be of any type
             raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
-        calibrated, measured, limits = (given.get(table, {}) for table in ("calibrated", "measured", "limits"))
+        calibrated, measured, limits = (
+            given.get(table, {}) for table in ("calibrated", "measured", "limits")
+        )
         spacing = None
         if kind == "ball-bar":
-            spacing = Length(_number(calibrated, "spacing_mm"), _number(calibrated, "spacing_U_mm", least=0))
+            spacing = Length(
+                _number(calibrated, "spacing_mm"), _number(calibrated, "spacing_U_mm", least=0)
+            )
         return cls(
             kind=kind,
             name=str(given.get("name", kind)),
             certificate=str(given.get("certificate", "none given")),
             spacing=spacing,
             diameters=_read_diameters(calibrated, BALLS[kind]),
-            form=Length(_number(calibrated, "form_mm", 0.0, 0), _number(calibrated, "form_U_mm", 0.0, 0)),
+            form=Length(
+                _number(calibrated, "form_mm", 0.0, 0), _number(calibrated, "form_U_mm", 0.0, 0)
+            ),
             reference_celsius=_number(calibrated, "temperature_C", 20.0, -50),
             expansion=Expansion(
-                _number(calibrated, "expansion_ppm_K", least=-10), _number(calibrated, "expansion_U_ppm_K", least=0)
+                _number(calibrated, "expansion_ppm_K", least=-10),
+                _number(calibrated, "expansion_U_ppm_K", least=0),
             ),
             temperature=Temperature(
-                _number(measured, "temperature_C", least=-50), _number(measured, "temperature_U_K", least=0)
+                _number(measured, "temperature_C", least=-50),
+                _number(measured, "temperature_U_K", least=0),
             ),
             positions=_read_positions(measured.get("captures")),
             limits=Limits(**{key: _number(limits, key) for key in limits}),
@@ -123,15 +135,19 @@ class Artefact:
 
 
 def _check_keys(given: Mapping[str, Any]) -> None:
-    """Raise InputError for a table of the artefact's file that is none, and for a key that is not in `_KEYS`."""
+    """Raise InputError for a table of the artefact's file that is none, and for a key that is not
+    in `_KEYS`."""
     for table, known in _KEYS.items():
         part = given if not table else given.get(table, {})
         if not isinstance(part, Mapping):
-            raise InputError(f"the artefact's [{table}] must be a table: write [{table}] and its values below it")
+            raise InputError(
+                f"the artefact's [{table}] must be a table: write [{table}] and its values below it"
+            )
         if unknown := set(part) - known:
             raise InputError(
-                f"the artefact's file says {sorted(unknown)[0]!r}{f' in [{table}]' if table else ''}, which is "
-                f"unknown: use {', '.join(sorted(known))}"
+                "the artefact's file says"
+                f" {sorted(unknown)[0]!r}{f' in [{table}]' if table else ''}, which is unknown: use"
+                f" {', '.join(sorted(known))}"
             )
 
 
@@ -151,20 +167,31 @@ def _read_positions(captures: object) -> dict[str, str]:
     """Return {position: capture} from a list of captures or a table."""
     if isinstance(captures, list):
         captures = {str(name): name for name in captures}  # any values: they are checked next
-    if not isinstance(captures, Mapping) or not captures or not all(isinstance(c, str) for c in captures.values()):
+    if (
+        not isinstance(captures, Mapping)
+        or not captures
+        or not all(isinstance(c, str) for c in captures.values())
+    ):
         raise InputError(
-            'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a table '
-            "[measured.captures] of position = capture"
+            'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a'
+            " table [measured.captures] of position = capture"
         )
     return {str(position): capture for position, capture in captures.items()}
 
 
-def _number(table: Mapping[str, Any], key: str, otherwise: float | None = None, least: float | None = None) -> float:
-    """The number at ``key``, above 0 or at least ``least``, and at most what `_MOST` says of its unit."""
+def _number(
+    table: Mapping[str, Any], key: str, otherwise: float | None = None, least: float | None = None
+) -> float:
+    """The number at ``key``, above 0 or at least ``least``, and at most what `_MOST` says of its
+    unit."""
     value = table.get(key, otherwise)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"the artefact's file says {key} = {value!r}: give a number, as its certificate does")
+        raise InputError(
+            f"the artefact's file says {key} = {value!r}: give a number, as its certificate does"
+        )
     most = next(most for unit, most in _MOST.items() if key.endswith(unit))
     if not ((value > 0 if least is None else value >= least) and value <= most):
-        raise InputError(f"the artefact's file says {key} = {value:g}, which is impossible: check unit and sign")
+        raise InputError(
+            f"the artefact's file says {key} = {value:g}, which is impossible: check unit and sign"
+        )
     return float(value)

@@ -1,9 +1,9 @@
 """What a test says of one property: an error, its uncertainty, and whether it is allowed.
 
-There are two kinds of ranges. Of *form* and *flatness* the error itself is a range: the narrowest interval that
-holds 95 % (99.7 %) of the points' deviations from the fitted shape, so that a few stray points do not decide. Of
-*size*, *spacing* and *scale* the error is one number, and its ranges are where the true error lies with 95 % (99.7 %)
-probability, by the test's own uncertainty.
+There are two kinds of ranges. Of *form* and *flatness* the error itself is a range: the narrowest
+interval that holds 95 % (99.7 %) of the points' deviations from the fitted shape, so that a few
+stray points do not decide. Of *size*, *spacing* and *scale* the error is one number, and its ranges
+are where the true error lies with 95 % (99.7 %) probability, by the test's own uncertainty.
 """
 
 from collections.abc import Sequence
@@ -34,15 +34,24 @@ def make_length_error(name: str, position: str, error_mm: float, u_mm: float) ->
     return PropertyError(name, position, error_mm, 2 * u_mm, inner, outer)
 
 
-def judge_property(name: str, figures: Sequence[PropertyError], limit_mm: float | None) -> JudgedProperty:
+def judge_property(
+    name: str, figures: Sequence[PropertyError], limit_mm: float | None
+) -> JudgedProperty:
     """The decision on one property from its figures at all positions."""
     mine = [figure for figure in figures if figure.property == name]
     worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
-    return JudgedProperty(name, worst, limit_mm, None if limit_mm is None else decide(mine, limit_mm))
+    return JudgedProperty(
+        name, worst, limit_mm, None if limit_mm is None else decide(mine, limit_mm)
+    )
 
 
 def decide(figures: Sequence[PropertyError], limit_mm: float) -> Decision:
-    """Decide with a guard band: fail if any error exceeds the limit by more than U, pass if error + U never does."""
+    """Decide with a guard band: fail if any error exceeds the limit by more than U, pass if error +
+    U never does."""
     if any(abs(figure.error_mm) - figure.U_mm > limit_mm for figure in figures):
         return "fail"
-    return "pass" if all(abs(figure.error_mm) + figure.U_mm <= limit_mm for figure in figures) else "undecided"
+    return (
+        "pass"
+        if all(abs(figure.error_mm) + figure.U_mm <= limit_mm for figure in figures)
+        else "undecided"
+    )

@@ -13,7 +13,12 @@ from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import PositionErrors, PropertyError
 
-FORM, SIZE, SPACING, FLATNESS = "probing error of form", "probing error of size", "sphere-spacing error", "flatness"
+FORM, SIZE, SPACING, FLATNESS = (
+    "probing error of form",
+    "probing error of size",
+    "sphere-spacing error",
+    "flatness",
+)
 
 
 def measure_artefact(
@@ -24,7 +29,8 @@ def measure_artefact(
     depth_range: tuple[float, float] | None = None,
     plate: np.ndarray | None = None,
 ) -> PositionErrors:
-    """Measure the figures of one position. ``plate`` (h, w) bool: the plane's pixels, if these are known.
+    """Measure the figures of one position. ``plate`` (h, w) bool: the plane's pixels, if these are
+    known.
 
     Raises InputError where the artefact is not found in the cloud.
     """
@@ -43,7 +49,9 @@ def measure_artefact(
         capture=capture,
         figures=figures,
         rms_mm=[result.rms_mm for result in shown],
-        floor_mm=[None if np.isnan(result.noise_floor_mm) else result.noise_floor_mm for result in shown],
+        floor_mm=[
+            None if np.isnan(result.noise_floor_mm) else result.noise_floor_mm for result in shown
+        ],
         points=int(np.count_nonzero(region)),
         noise_mm=noise,
         incidence=None if depth_range is None else incidence(cloud.points, region, depth_range),
@@ -54,11 +62,17 @@ def measure_artefact(
 def _measure_balls(
     artefact: Artefact, cloud: Cloud, balls: list[SphereResult], position: str
 ) -> tuple[list[PropertyError], float]:
-    """The figures of one ball or two, and the noise of a length between their centres (of a diameter, for one)."""
+    """The figures of one ball or two, and the noise of a length between their centres (of a
+    diameter, for one)."""
     known = [artefact.at_measurement(diameter) for diameter in artefact.diameters]
     # the certificate's order says nothing of left and right: the balls' own sizes do
     sizes = np.array([2 * ball.radius_mm for ball in balls])
-    known = list(min(permutations(known), key=lambda order: float(np.abs(sizes - [mm for mm, _ in order]).sum())))
+    known = list(
+        min(
+            permutations(known),
+            key=lambda order: float(np.abs(sizes - [mm for mm, _ in order]).sum()),
+        )
+    )
     spreads = [_fit_covariance(cloud.points, ball) for ball in balls]
     figures = []
     for ball, (diameter, u), spread in zip(balls, known, spreads, strict=True):

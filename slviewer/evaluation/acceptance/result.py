@@ -50,27 +50,45 @@ class Acceptance:
         return tuple(gaps)
 
 
-def conclude_test(artefact: Artefact, model: str, positions: Sequence[PositionErrors]) -> Acceptance:
+def conclude_test(
+    artefact: Artefact, model: str, positions: Sequence[PositionErrors]
+) -> Acceptance:
     """The test's result from its positions. Raises InputError where there is none."""
     if not positions:
-        raise InputError(f"no capture shows {artefact.name}: name some in [measured] captures of its file")
+        raise InputError(
+            f"no capture shows {artefact.name}: name some in [measured] captures of its file"
+        )
     figures = [figure for position in positions for figure in position.figures]
     limits = artefact.limits
-    allowed = {FORM: limits.form_mm, SIZE: limits.size_mm, SPACING: limits.spacing_mm, FLATNESS: limits.flatness_mm}
+    allowed = {
+        FORM: limits.form_mm,
+        SIZE: limits.size_mm,
+        SPACING: limits.spacing_mm,
+        FLATNESS: limits.flatness_mm,
+    }
     present = {figure.property for figure in figures}
-    judgements = tuple(judge_property(name, figures, limit) for name, limit in allowed.items() if name in present)
-    return Acceptance(artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions))
+    judgements = tuple(
+        judge_property(name, figures, limit) for name, limit in allowed.items() if name in present
+    )
+    return Acceptance(
+        artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions)
+    )
 
 
 def _estimate_scale(artefact: Artefact, positions: Sequence[PositionErrors]) -> ScaleError | None:
-    """Estimate the scale by the spacing of a ball bar's centres, by a sphere's diameter; None for a plane."""
+    """Estimate the scale by the spacing of a ball bar's centres, by a sphere's diameter; None for a
+    plane."""
     length = artefact.spacing or (artefact.diameters[0] if artefact.diameters else None)
     if length is None:
         return None
     mm, u_shared = artefact.at_measurement(length)
     name = SIZE if artefact.spacing is None else SPACING
-    errors = np.array([f.error_mm for position in positions for f in position.figures if f.property == name])
+    errors = np.array(
+        [f.error_mm for position in positions for f in position.figures if f.property == name]
+    )
     n = len(errors)
     per_deviation = stdtrit(n - 1, 0.975) / K_95 / np.sqrt(n)
     u_mean = float(errors.std(ddof=1) * per_deviation) if n > 1 else positions[0].noise_mm
-    return ScaleError(1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n)
+    return ScaleError(
+        1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n
+    )

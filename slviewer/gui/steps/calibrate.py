@@ -1,4 +1,5 @@
-"""Step 4: calibrate the models from the good poses, and inspect the residuals of poses and pixels."""
+"""Step 4: calibrate the models from the good poses, and inspect the residuals of poses and
+pixels."""
 
 from typing import Any, cast
 
@@ -16,7 +17,16 @@ from slviewer.gui.calibration_html import (
 from slviewer.gui.inputs import Choice, SessionValue, change, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
-from slviewer.gui.widgets import Html, Text, coloured, paint, paragraph, report_table, table, to_html
+from slviewer.gui.widgets import (
+    Html,
+    Text,
+    coloured,
+    paint,
+    paragraph,
+    report_table,
+    table,
+    to_html,
+)
 from slviewer.pipeline.report import calibration_view
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures, PixelCurve
@@ -75,7 +85,9 @@ class CalibratePanel(StepPanel):
             self._exclude = context.button("Exclude this pose", self._toggle_pose, color="orange")
             self._device = gui.add_dropdown("Residuals", DEVICES)
             self._arrows = Plot(gui)
-        with gui.add_folder("Parameters", visible=False, expand_by_default=False) as self._parameters_folder:
+        with gui.add_folder(
+            "Parameters", visible=False, expand_by_default=False
+        ) as self._parameters_folder:
             self._parameters = Text(gui)
         with gui.add_folder("Pixel-wise model", visible=False) as self._pixels_folder:
             self._fits = Text(gui)
@@ -102,7 +114,11 @@ class CalibratePanel(StepPanel):
             self._snapshot = snapshot
             session, calibration, busy = snapshot.session, snapshot.calibration, snapshot.is_busy
             label = "Calibrate again" if calibration else "Calibrate"
-            change(self._calibrate, disabled=busy or snapshot.step(self.key).state == "blocked", label=label)
+            change(
+                self._calibrate,
+                disabled=busy or snapshot.step(self.key).state == "blocked",
+                label=label,
+            )
             self._draw_verdict(session, calibration)
             self._draw_models(calibration, busy)
             change(self._poses_folder, visible=bool(calibration and calibration.stereo.poses))
@@ -111,7 +127,9 @@ class CalibratePanel(StepPanel):
             self._summary.set(_summary(calibration) if calibration else "")
             if session is None or calibration is None:
                 return
-            names = [pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")]
+            names = [
+                pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")
+            ]
             self._pose.offer([(name, name) for name in names], worst(calibration))
             self._axis.offer([(axis, axis) for axis in calibration.fit_rms_mm])
             clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
@@ -124,7 +142,9 @@ class CalibratePanel(StepPanel):
                 change(self._row, value=max(int(v), 0))
             self._refresh()
 
-    def _draw_verdict(self, session: SessionView | None, calibration: CalibrationView | None) -> None:
+    def _draw_verdict(
+        self, session: SessionView | None, calibration: CalibrationView | None
+    ) -> None:
         """Show the verdict, the poses that it names and the exclusions."""
         verdict = session.verdict if session else None
         if session is not None and verdict is not None:
@@ -136,7 +156,9 @@ class CalibratePanel(StepPanel):
         change(self._anyway, visible=bool(calibration and calibration.rejected))
         self._anyway_value.update(bool(calibration and calibration.is_pinned))
         known = calibration.stereo.pose_rms_px if calibration else {}
-        names = tuple(name for name in named_poses(verdict, calibration) if name in known)[:_MOST_NAMED]
+        names = tuple(name for name in named_poses(verdict, calibration) if name in known)[
+            :_MOST_NAMED
+        ]
         if names and names != self._named.options:
             self._named.options = names
         change(self._named, visible=bool(names))
@@ -144,24 +166,34 @@ class CalibratePanel(StepPanel):
 
     def _draw_models(self, calibration: CalibrationView | None, busy: bool) -> None:
         """Show the choice and the comparison of the models, where there are several."""
-        several = calibration is not None and len(calibration.models) > 1 and bool(calibration.stereo.poses)
+        several = (
+            calibration is not None
+            and len(calibration.models) > 1
+            and bool(calibration.stereo.poses)
+        )
         change(self._models_folder, visible=several)
         if calibration is None or not several:
             return
         self._choice_note.set(model_choice_html(calibration))
         options = [("", f"{calibration.recommended} (recommended)")]
-        self._use.offer(options + [(model, model) for model in calibration.models], calibration.chosen)
+        self._use.offer(
+            options + [(model, model) for model in calibration.models], calibration.chosen
+        )
         if calibration.chosen != self._chosen:
             self._chosen = calibration.chosen
             self._use.choose(calibration.chosen)
         compared = calibration.comparison
         label = "Compare models" if compared is None else "Compare again"
         change(self._compare, disabled=busy or bool(calibration.stale), label=label)
-        self._comparison.set("" if compared is None else report_table(comparison_table(compared, calibration.best)))
+        self._comparison.set(
+            "" if compared is None else report_table(comparison_table(compared, calibration.best))
+        )
         if calibration.splined is not None:
             self._splined.set(splined_html(calibration.splined))
         else:
-            self._splined.write(f"No splined model: {calibration.missing}." if calibration.missing else "", "dim")
+            self._splined.write(
+                f"No splined model: {calibration.missing}." if calibration.missing else "", "dim"
+            )
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers, and react to clicks into the scene while shown."""
@@ -183,14 +215,19 @@ class CalibratePanel(StepPanel):
                     "bars",
                     made,
                     lambda: pose_bars(
-                        calibration.stereo.pose_rms_px, calibration.stereo.reprojection_rms_px, width=PLOT_PX
+                        calibration.stereo.pose_rms_px,
+                        calibration.stereo.reprojection_rms_px,
+                        width=PLOT_PX,
                     ),
                     self._bars.set,
                 )
             self._draw_pose(session, calibration)
             self._draw_boards(session, calibration)
             self._painter.request(
-                "parameters", made, lambda: _parameters(self._load_details(made)), self._parameters.set
+                "parameters",
+                made,
+                lambda: _parameters(self._load_details(made)),
+                self._parameters.set,
             )
             axis = cast(Axis, self._axis.value)
             if axis not in calibration.fit_rms_mm:
@@ -198,7 +235,9 @@ class CalibratePanel(StepPanel):
             self._painter.request(
                 "maps",
                 (made, axis),
-                lambda: rms_maps(result_views.pixel_fits(context.session)[axis].rms_mm, axis, width=PLOT_PX),
+                lambda: rms_maps(
+                    result_views.pixel_fits(context.session)[axis].rms_mm, axis, width=PLOT_PX
+                ),
                 self._maps.set,
             )
             pixel = (int(self._column.value), int(self._row.value))
@@ -220,7 +259,9 @@ class CalibratePanel(StepPanel):
         rms = calibration.stereo.pose_rms_px.get(name)
         if rms is None:
             why = f": {pose.why}" if pose.why else ""
-            self._pose_note.write(f"{name} is not in this calibration ({pose.state}{why}).", "warning")
+            self._pose_note.write(
+                f"{name} is not in this calibration ({pose.state}{why}).", "warning"
+            )
             self._painter.cancel("arrows")
             self._arrows.hide()
             return
@@ -236,21 +277,28 @@ class CalibratePanel(StepPanel):
         made = fingerprint(calibration)
 
         def arrows() -> Figure | None:
-            """Plot the residuals of the pose as arrows in the chosen device; None where there are none."""
+            """Plot the residuals of the pose as arrows in the chosen device; None where there are
+            none."""
             details = self._load_details(made)
             residuals, title = details.residuals.get(name), f"{name}, {device}"
             if residuals is None:
                 return None
             if device == "camera":
-                return residual_arrows(title, residuals.pixels, residuals.camera, details.stereo.rig.camera.size)
+                return residual_arrows(
+                    title, residuals.pixels, residuals.camera, details.stereo.rig.camera.size
+                )
             return residual_arrows(
-                title, residuals.projector_pixels, residuals.projector, details.stereo.rig.projector.size
+                title,
+                residuals.projector_pixels,
+                residuals.projector,
+                details.stereo.rig.projector.size,
             )
 
         self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
     def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
-        """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one thick."""
+        """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one
+        thick."""
         scene, chosen = self._scene, self._pose.value
         key = (
             fingerprint(calibration),
@@ -265,15 +313,29 @@ class CalibratePanel(StepPanel):
         if self._over.value or not calibration.stereo.board:
             return
         outline = Board.parse(calibration.stereo.board).outline()
-        usual = np.sqrt(np.mean(np.square([max(rms) for rms in calibration.stereo.pose_rms_px.values()] or [1.0])))
+        usual = np.sqrt(
+            np.mean(
+                np.square([max(rms) for rms in calibration.stereo.pose_rms_px.values()] or [1.0])
+            )
+        )
         for pose in session.poses:
             if pose.T_camera_board is not None and pose.name in calibration.stereo.pose_rms_px:
-                share = float(np.clip(max(calibration.stereo.pose_rms_px[pose.name]) / usual - 0.5, 0, 1))
+                share = float(
+                    np.clip(max(calibration.stereo.pose_rms_px[pose.name]) / usual - 0.5, 0, 1)
+                )
                 colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
                 here = pose.name == chosen
                 label = pose.name if here else ""
                 width = 5.0 if here else 1.5
-                scene.board(BOARDS, pose.name, pose.T_camera_board, outline, colour, label=label, width_px=width)
+                scene.board(
+                    BOARDS,
+                    pose.name,
+                    pose.T_camera_board,
+                    outline,
+                    colour,
+                    label=label,
+                    width_px=width,
+                )
         scene.show(BOARDS, self._visible)
 
     def _load_details(self, made: tuple[Any, ...]) -> CalibrationFigures:
@@ -286,7 +348,9 @@ class CalibratePanel(StepPanel):
         """Show data and fit of a pixel, or that it has too few poses."""
         (u, v), curve = made
         if curve is None:
-            self._curve_note.write(f"Pixel ({u}, {v}) saw the board in too few poses: choose another.", "warning")
+            self._curve_note.write(
+                f"Pixel ({u}, {v}) saw the board in too few poses: choose another.", "warning"
+            )
             self._curves.hide()
             return
         self._curve_note.write("")
@@ -297,7 +361,11 @@ class CalibratePanel(StepPanel):
     def _toggle_anyway(self) -> None:
         """Request that the rejected calibration be used, or no longer."""
         calibration = self._snapshot.calibration if self._snapshot else None
-        if calibration is not None and calibration.rejected and self._anyway.value != calibration.is_pinned:
+        if (
+            calibration is not None
+            and calibration.rejected
+            and self._anyway.value != calibration.is_pinned
+        ):
             self._operator.accept_rejected_calibration(self._anyway.value)
 
     def _choose_model(self) -> None:
@@ -335,7 +403,10 @@ class CalibratePanel(StepPanel):
         self._refresh()
         context = self._context
         self._painter.request(
-            "cloud", name, lambda: result_views.load_scan_cloud(context.session, name), self._draw_cloud
+            "cloud",
+            name,
+            lambda: result_views.load_scan_cloud(context.session, name),
+            self._draw_cloud,
         )
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
@@ -375,11 +446,22 @@ def _summary(calibration: CalibrationView) -> Html:
     rms = stereo.reprojection_rms_px
     rows: list[tuple[object, object]] = []
     if rms:
-        rows.append(("Reprojection RMS, camera", coloured(f"{rms['camera']:.3f} px", "plain", bold=True)))
-        rows.append(("Reprojection RMS, projector", coloured(f"{rms['projector']:.3f} px", "plain", bold=True)))
-    rows.append(("Poses used", f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}"))
+        rows.append(
+            ("Reprojection RMS, camera", coloured(f"{rms['camera']:.3f} px", "plain", bold=True))
+        )
+        rows.append(
+            (
+                "Reprojection RMS, projector",
+                coloured(f"{rms['projector']:.3f} px", "plain", bold=True),
+            )
+        )
+    rows.append(
+        ("Poses used", f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}")
+    )
     if stereo.depth_range_mm:
-        rows.append(("Calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)))
+        rows.append(
+            ("Calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm))
+        )
     rows.append(("Baseline", f"{stereo.baseline_mm:.2f} mm"))
     rows.append(("Models", ", ".join(calibration.models)))
     rows.append(("Model in use", "none: rejected" if calibration.refused else calibration.best))
@@ -399,7 +481,11 @@ def _fits(calibration: CalibrationView) -> Html:
 def _parameters(details: CalibrationFigures) -> Html:
     """Return tables of the lens and rig parameters with their standard deviations."""
     stereo = details.stereo
-    lenses = [(f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)]
+    lenses = [
+        (f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)
+    ]
     rig = [*rig_rows(stereo), ("Target", stereo.board or "imported")]
     note = paragraph(coloured("±: one standard deviation.", "dim"))
-    return Html(table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + to_html(note))
+    return Html(
+        table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + to_html(note)
+    )

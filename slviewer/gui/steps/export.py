@@ -46,7 +46,10 @@ FORMAT_NAMES = {
     "npz": "NumPy",
 }
 NUMBERS: dict[What, tuple[str, str]] = {
-    "calibration": ("calibration", "Lenses and poses of camera and projector, and the reprojection errors"),
+    "calibration": (
+        "calibration",
+        "Lenses and poses of camera and projector, and the reprojection errors",
+    ),
     "poses": ("poses", "Poses of camera, projector, target and merged scans, as 4x4 matrices"),
     "coefficients": ("coefficients", "Coefficients of the rational function of every camera pixel"),
 }
@@ -71,9 +74,13 @@ class MeshInputs:
 
     def __init__(self, context: PanelContext, changed: Callable[[], None]) -> None:
         gui = context.gui
-        self._method = Choice(gui, "Method", "Pixel grid keeps every point; the others smooth out noise")
+        self._method = Choice(
+            gui, "Method", "Pixel grid keeps every point; the others smooth out noise"
+        )
         self._holes = gui.add_dropdown("Holes", (SMALL, OPEN, SIZED, CLOSED))
-        self._size = gui.add_number("Hole size, mm", 2.0, min=0.1, max=500.0, step=0.1, visible=False)
+        self._size = gui.add_number(
+            "Hole size, mm", 2.0, min=0.1, max=500.0, step=0.1, visible=False
+        )
         self._thin = gui.add_number(
             "Triangles", 0, min=0, max=50_000_000, step=1000, hint="Maximum number; 0: no limit"
         )
@@ -86,7 +93,9 @@ class MeshInputs:
 
     def draw(self, visible: bool, merged: bool) -> None:
         """Show or hide the inputs; merged points have no pixel grid."""
-        self._method.offer([(name, text) for name, text in METHODS.items() if not (merged and name == "grid")])
+        self._method.offer(
+            [(name, text) for name, text in METHODS.items() if not (merged and name == "grid")]
+        )
         self._method.set_visible(visible)
         inputs: list[Any] = [self._holes, self._thin, self._smooth]
         for handle in inputs:
@@ -105,7 +114,9 @@ class MeshInputs:
         # the pixel grid covers one side only: it is never closed
         method = None if holes == CLOSED and chosen == "grid" else chosen
         sizes = {OPEN: 0.0, SIZED: float(self._size.value)}
-        return MeshingPlan(method, sizes.get(holes), self.triangles, SMOOTHING[self._smooth.value], holes == CLOSED)
+        return MeshingPlan(
+            method, sizes.get(holes), self.triangles, SMOOTHING[self._smooth.value], holes == CLOSED
+        )
 
 
 class ExportPanel(StepPanel):
@@ -131,15 +142,21 @@ class ExportPanel(StepPanel):
             self._mesh = MeshInputs(context, self._describe)
             self._shape_format = Choice(gui, "File type")
             self._texture: Any = gui.add_dropdown(
-                "Texture", tuple(TEXTURES), hint="An image of the surface, projected from the scans; thins the mesh"
+                "Texture",
+                tuple(TEXTURES),
+                hint="An image of the surface, projected from the scans; thins the mesh",
             )
             self._white = gui.add_checkbox(
-                "White balance", False, hint="Takes the board's white for neutral; for colour cameras"
+                "White balance",
+                False,
+                hint="Takes the board's white for neutral; for colour cameras",
             )
             self._shape_note = Text(gui)
             self._shape_link = Text(gui)
             self._shape_result = Text(gui)
-            self._write = context.button("Write file", self._request_shape, viser.Icon.FILE_EXPORT, None)
+            self._write = context.button(
+                "Write file", self._request_shape, viser.Icon.FILE_EXPORT, None
+            )
             context.view_button(lambda: self._points)
         with gui.add_folder("Calibration and poses"):
             self._numbers = Choice(gui, "Content")
@@ -149,7 +166,9 @@ class ExportPanel(StepPanel):
             self._write_numbers = context.button(
                 "Write calibration", self._request_numbers, viser.Icon.FILE_EXPORT, None
             )
-        with gui.add_folder("Figures", visible=False, expand_by_default=False) as self._figures_folder:
+        with gui.add_folder(
+            "Figures", visible=False, expand_by_default=False
+        ) as self._figures_folder:
             self._figures = Text(gui)
         with gui.add_folder("Report and tables"):
             self._report = context.button("Write report", operator.report, viser.Icon.REPORT, None)
@@ -180,7 +199,9 @@ class ExportPanel(StepPanel):
         self._source.offer(things)
         models = calibration.models if calibration else ()
         coefficients = bool({"pixelwise", "splined"} & set(models))
-        self._numbers.offer([(k, text) for k, (text, _) in NUMBERS.items() if k != "coefficients" or coefficients])
+        self._numbers.offer(
+            [(k, text) for k, (text, _) in NUMBERS.items() if k != "coefficients" or coefficients]
+        )
         unusable = snapshot.is_busy or (calibration is not None and bool(calibration.refused))
         blocked = snapshot.step(self.key).state == "blocked"
         change(self._report, disabled=snapshot.is_busy or blocked)
@@ -196,7 +217,11 @@ class ExportPanel(StepPanel):
         """Show the tables of all records, drawn again only where the session has changed."""
         if session is not self._drawn:
             self._drawn, labels = session, {scan.name: scan.label for scan in session.scans}
-            self._figures.set("".join(records_html(session.list_records(kind), labels) for kind in RECORDS.values()))
+            self._figures.set(
+                "".join(
+                    records_html(session.list_records(kind), labels) for kind in RECORDS.values()
+                )
+            )
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers, and move the views to the cloud."""
@@ -207,7 +232,9 @@ class ExportPanel(StepPanel):
         """Return what is to be exported, and its name; empty where nothing is offered."""
         name, mesh, session = self._source.value, self._as.value == MESH, self._session
         if name == MERGED:
-            return "merged-mesh" if mesh else "merge", session.merge.name if session and session.merge else ""
+            return "merged-mesh" if mesh else "merge", (
+                session.merge.name if session and session.merge else ""
+            )
         return "mesh" if mesh else "cloud", name
 
     def _describe(self) -> None:
@@ -222,9 +249,16 @@ class ExportPanel(StepPanel):
         what, name = self._get_shape()
         mesh = what in MESHES
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
-        self._shape_format.offer([(each, FORMAT_NAMES.get(each, each.upper())) for each in formats(what)])
-        change(self._texture, visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS)
-        change(self._white, visible=self._texture.visible and TEXTURES[self._texture.value] is not None)
+        self._shape_format.offer(
+            [(each, FORMAT_NAMES.get(each, each.upper())) for each in formats(what)]
+        )
+        change(
+            self._texture,
+            visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS,
+        )
+        change(
+            self._white, visible=self._texture.visible and TEXTURES[self._texture.value] is not None
+        )
         if not name:
             self._shape_note.write("Nothing reconstructed yet: scan an object first.", "warning")
             self._shape_link.set("")
@@ -232,10 +266,13 @@ class ExportPanel(StepPanel):
             return
         chosen = self._shape_format.value
         file = _get_export(session, default_file_name(what, name, chosen))
-        predicted = estimate_file_bytes(what, chosen, *_points(session, name), self._mesh.triangles if mesh else None)
+        predicted = estimate_file_bytes(
+            what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
+        )
         shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
         self._shape_note.write(
-            describe_shape_file(session, shown_type, name, chosen, None if file else predicted), "dim"
+            describe_shape_file(session, shown_type, name, chosen, None if file else predicted),
+            "dim",
         )
         self._shape_link.set(self._link_html(file))
         self._shape_result.write(self._result_text(file) if file and mesh else "", "dim")
@@ -256,7 +293,11 @@ class ExportPanel(StepPanel):
 
     def _request_cloud(self, session: SessionView) -> None:
         """Request the cloud of the chosen source."""
-        name, merge, context = self._source.value, session.merge.name if session.merge else "", self._context
+        name, merge, context = (
+            self._source.value,
+            session.merge.name if session.merge else "",
+            self._context,
+        )
         if not name:
             self._painter.cancel("cloud")
             self._scene.clear(LAYER)
@@ -298,7 +339,11 @@ class ExportPanel(StepPanel):
         if name:
             plan = self._mesh.plan() if what in MESHES else None
             chosen = self._shape_format.value
-            texture = TEXTURES[self._texture.value] if plan is not None and chosen in TEXTURED_FORMATS else None
+            texture = (
+                TEXTURES[self._texture.value]
+                if plan is not None and chosen in TEXTURED_FORMATS
+                else None
+            )
             white = BOARD if texture is not None and self._white.value else ""
             self._operator.export(what, name, chosen, plan, texture, white)
 
@@ -328,12 +373,18 @@ class ExportPanel(StepPanel):
             )
             for export in sorted(exports, key=_rank_export)
         ]
-        return Html(f'<div style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "Size", ""), rows)}</div>')
+        return Html(
+            "<div"
+            f' style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "Size", ""), rows)}</div>'
+        )
 
     def _result_text(self, export: ExportView) -> str:
-        """Return the notice about this file, without its name; empty where it is no longer among the notices."""
+        """Return the notice about this file, without its name; empty where it is no longer among
+        the notices."""
         notices = reversed(self._snapshot.notices if self._snapshot else ())
-        text = next((each.text for each in notices if each.text.startswith(f"{export.name} is ready")), "")
+        text = next(
+            (each.text for each in notices if each.text.startswith(f"{export.name} is ready")), ""
+        )
         return text.partition(": ")[2]
 
     def _link_html(self, export: ExportView | None) -> str:
@@ -341,11 +392,14 @@ class ExportPanel(StepPanel):
         return (
             ""
             if export is None
-            else paragraph(self._format_link(export, f"Download {export.name}, {format_bytes(export.bytes)}"))
+            else paragraph(
+                self._format_link(export, f"Download {export.name}, {format_bytes(export.bytes)}")
+            )
         )
 
     def _format_link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
-        """Return a download link, plain text if `quiet`, else a button; empty where the file is gone."""
+        """Return a download link, plain text if `quiet`, else a button; empty where the file is
+        gone."""
         try:
             address = self._context.offer(export.path)
             return (
@@ -357,7 +411,9 @@ class ExportPanel(StepPanel):
             return to_html("")
 
 
-def describe_shape_file(session: SessionView, what: What, name: str, file_format: str, size_bytes: int | None) -> str:
+def describe_shape_file(
+    session: SessionView, what: What, name: str, file_format: str, size_bytes: int | None
+) -> str:
     """Describe a file of a scan or merge: its content, units, and approximate size, where known."""
     points, _ = _points(session, name)
     content = {
@@ -384,11 +440,15 @@ def _get_export(session: SessionView, name: str) -> ExportView | None:
 
 
 def _button_colour(file: ExportView | None) -> Literal["gray"] | None:
-    """Return grey for a file that exists already, which is rather downloaded; else the main colour."""
+    """Return grey for a file that exists already, which is rather downloaded; else the main
+    colour."""
     return None if file is None else "gray"
 
 
 def _rank_export(export: ExportView) -> tuple[int, str]:
     """Return a sort key: merged clouds, then other shapes, then documents."""
-    shaped = Path(export.name).suffix.removeprefix(".").lower() in {*point_formats(), *mesh_formats()}
+    shaped = Path(export.name).suffix.removeprefix(".").lower() in {
+        *point_formats(),
+        *mesh_formats(),
+    }
     return (0 if export.name.startswith("merged") else 1 if shaped else 2, export.name)

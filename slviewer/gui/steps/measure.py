@@ -60,7 +60,9 @@ class MeasurePanel(StepPanel):
             self._build_fit()
             self._build_relation()
             self._build_deviation()
-            self._end = context.button("End tool", lambda: self._select_tool(""), viser.Icon.X, hint="Key: Esc")
+            self._end = context.button(
+                "End tool", lambda: self._select_tool(""), viser.Icon.X, hint="Key: Esc"
+            )
         self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
         self._escape.on_trigger(context.callback(lambda: self._select_tool("")))
         self._results.build()
@@ -72,10 +74,14 @@ class MeasurePanel(StepPanel):
         self._by: Any = self._gui.add_dropdown("Region", (BALL, RECTANGLE), visible=False)
         self._by.on_update(self._context.callback(self._change_region))
         hint = "Of the ball in 3D"
-        self._radius: Any = self._gui.add_slider("Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint=hint)
+        self._radius: Any = self._gui.add_slider(
+            "Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint=hint
+        )
         self._radius.on_update(self._context.callback(self._draw_ball))
         self._inside = Text(self._gui)
-        self._fit = self._context.button("Fit", self._request_fit, viser.Icon.CHECK, None, visible=False)
+        self._fit = self._context.button(
+            "Fit", self._request_fit, viser.Icon.CHECK, None, visible=False
+        )
 
     def _build_relation(self) -> None:
         """Create the inputs to measure between two results."""
@@ -91,17 +97,30 @@ class MeasurePanel(StepPanel):
     def _build_deviation(self) -> None:
         """Create the inputs to upload a nominal model and compare with it."""
         gui, context, operator = self._gui, self._context, self._operator
-        with gui.add_folder(None, visible=False) as self._nominal_folder:  # viser cannot hide upload buttons alone
+        with gui.add_folder(
+            None, visible=False
+        ) as self._nominal_folder:  # viser cannot hide upload buttons alone
             upload = gui.add_upload_button(
-                "Upload model", icon=viser.Icon.UPLOAD, color="gray", mime_type=".stl,.ply,.obj,.step,.stp,.3mf"
+                "Upload model",
+                icon=viser.Icon.UPLOAD,
+                color="gray",
+                mime_type=".stl,.ply,.obj,.step,.stp,.3mf",
             )
-            upload.on_upload(context.callback(lambda: operator.upload_nominal(upload.value.name, upload.value.content)))
+            upload.on_upload(
+                context.callback(
+                    lambda: operator.upload_nominal(upload.value.name, upload.value.content)
+                )
+            )
             self._nominal = Choice(gui, "Nominal")
             hint = "Of the nominal model; unknown: mm, if the sizes agree"
             self._units: Any = gui.add_dropdown("Units", (UNKNOWN, *MM), hint=hint)
             hint = "0: without a verdict"
-            self._tolerance = gui.add_number("Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint)
-            self._compare = context.button("Compare", self._request_comparison, viser.Icon.ARROWS_DIFF, None)
+            self._tolerance = gui.add_number(
+                "Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint
+            )
+            self._compare = context.button(
+                "Compare", self._request_comparison, viser.Icon.ARROWS_DIFF, None
+            )
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the surfaces and measurements of a snapshot."""
@@ -121,7 +140,8 @@ class MeasurePanel(StepPanel):
             change(self._fit, disabled=snapshot.is_busy)
 
     def show(self, visible: bool) -> None:
-        """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is selected."""
+        """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is
+        selected."""
         with self._lock:
             self._tool.select("")
             self._draw_tool()
@@ -141,7 +161,8 @@ class MeasurePanel(StepPanel):
             self._draw_tool()
 
     def _listen_for_clicks(self) -> None:
-        """React to clicks into the scene while the tool needs them; another step handles its own clicks."""
+        """React to clicks into the scene while the tool needs them; another step handles its own
+        clicks."""
         if self._visible:
             change(self._escape, disabled=not self._tool.name)
             rectangle = self._tool.fits and self._tool.by_rectangle
@@ -186,7 +207,9 @@ class MeasurePanel(StepPanel):
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
         text = Html(title + to_html(tool.instruction))
-        self._instruction.set(alert(text, "info") if tool.name else paragraph(coloured(text, "dim")))
+        self._instruction.set(
+            alert(text, "info") if tool.name else paragraph(coloured(text, "dim"))
+        )
         change(self._end, visible=bool(tool.name))
         change(self._by, visible=tool.fits)
         change(self._radius, visible=tool.fits and not tool.by_rectangle)
@@ -230,7 +253,8 @@ class MeasurePanel(StepPanel):
             )
 
     def _make_region(self) -> Region | None:
-        """Return the ball around the picked point, or the box that was drawn; None unless the tool fits and has one."""
+        """Return the ball around the picked point, or the box that was drawn; None unless the tool
+        fits and has one."""
         on = self._surface.on
         if on is None or not self._tool.has_region:
             return None
@@ -241,7 +265,8 @@ class MeasurePanel(StepPanel):
     # the surface and the results
 
     def _handle_loaded(self) -> None:
-        """Handle that another surface is shown: drop picked points, and adapt the ball to its size."""
+        """Handle that another surface is shown: drop picked points, and adapt the ball to its
+        size."""
         with self._lock:
             on = self._surface.on
             assert on is not None
@@ -258,17 +283,23 @@ class MeasurePanel(StepPanel):
         """Show the surface on which a measurement was made."""
         if measured is not None and measured.source != self._surface.name:
             self._surface.choose(measured.source)
-        self._surface.show_deviation(measured if measured is not None and measured.kind == "deviation" else None)
+        self._surface.show_deviation(
+            measured if measured is not None and measured.kind == "deviation" else None
+        )
 
     # requests
 
     def _offer_inputs(self, session: SessionView | None) -> None:
         """Offer the results to relate, by default the latest two, and the nominal models."""
         measured = session.measurements if session else ()
-        related = [(each.id, each.name) for each in measured if each.kind in KINDS and not each.stale]
+        related = [
+            (each.id, each.name) for each in measured if each.kind in KINDS and not each.stale
+        ]
         for choice in (self._from, self._to):
             choice.offer(related)
-        if related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]:  # likely the latest two
+        if (
+            related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]
+        ):  # likely the latest two
             self._from.choose(related[-2][0])
             self._to.choose(related[-1][0])
         self._related = related

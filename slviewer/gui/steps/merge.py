@@ -1,4 +1,5 @@
-"""Step 7: choose scans, the reference and the initial alignment; merge, and compare before with after."""
+"""Step 7: choose scans, the reference and the initial alignment; merge, and compare before with
+after."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +10,15 @@ import viser
 from slviewer.gui.inputs import Choice, change, display_name, scan_options
 from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html
 from slviewer.gui.merge_picking import PointPicker
-from slviewer.gui.merge_views import AFTER, BEFORE, MERGED, SHOWN, ColouredClouds, colour_merge, colour_scans
+from slviewer.gui.merge_views import (
+    AFTER,
+    BEFORE,
+    MERGED,
+    SHOWN,
+    ColouredClouds,
+    colour_merge,
+    colour_scans,
+)
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
@@ -33,8 +42,10 @@ STARTS: dict[str, StartKind] = {
 """Initial alignments by what they are called here; picked points take the place of features."""
 SIDE_BY_SIDE = "side by side, to pick"
 _START_NOTES = {
-    MARKERS: "For coded markers on or beside the object, three or more in common: slviewer target markers:0-23:20 "
-    "draws them.",
+    MARKERS: (
+        "For coded markers on or beside the object, three or more in common: slviewer target"
+        " markers:0-23:20 draws them."
+    ),
     CURRENT: "For scans between which neither the object nor the camera moved, or hardly.",
 }
 
@@ -67,12 +78,19 @@ class MergePanel(StepPanel):
             self._start.on_update(context.callback(self._change_start))
             self._start.on_update(context.callback(self._keep_start, by_user=True))
             self._angle: Any = gui.add_number(
-                "Angle, °", 30.0, min=1.0, max=180.0, step=0.5, hint="Of the turntable, from each scan to the next"
+                "Angle, °",
+                30.0,
+                min=1.0,
+                max=180.0,
+                step=0.5,
+                hint="Of the turntable, from each scan to the next",
             )
             self._angle.on_update(context.callback(self._refresh))
             self._start_note = Text(gui)
             self._picker.build()
-            self._merge = context.button("Merge", self._request_merge, viser.Icon.LAYERS_INTERSECT, None)
+            self._merge = context.button(
+                "Merge", self._request_merge, viser.Icon.LAYERS_INTERSECT, None
+            )
             self._failure = Text(gui)
         self._result = Text(gui)
         self._undo = context.button(
@@ -99,7 +117,11 @@ class MergePanel(StepPanel):
             labels = {scan.name: scan.label for scan in scans}
             self._result.set(merge_html(merge, labels) if merge else "")
             failure = snapshot.merge_failure
-            self._failure.set(merge_failure_html(failure, labels, merge, snapshot.merge_refusal) if failure else "")
+            self._failure.set(
+                merge_failure_html(failure, labels, merge, snapshot.merge_refusal)
+                if failure
+                else ""
+            )
             self._offer_views(merge)
             self._propose_start(scans)
             number = int(merge.name) if merge is not None else 0
@@ -119,11 +141,16 @@ class MergePanel(StepPanel):
     def _draw_boxes(self, scans: list[ScanView]) -> None:
         """Update the check boxes, one per scan."""
         names, labels = [scan.name for scan in scans], [scan.label for scan in scans]
-        self._none.write("" if scans else "No reconstructed scan yet: capture two or more in the step Scan.", "warning")
+        self._none.write(
+            "" if scans else "No reconstructed scan yet: capture two or more in the step Scan.",
+            "warning",
+        )
         for name in [name for name in self._boxes if name not in names]:
             self._boxes.pop(name).remove()
         for scan in scans:
-            label = scan.label if labels.count(scan.label) == 1 else display_name(scan.name, scan.label)
+            label = (
+                scan.label if labels.count(scan.label) == 1 else display_name(scan.name, scan.label)
+            )
             if scan.name not in self._boxes:
                 with self._scans_folder:
                     box = self._gui.add_checkbox(label, True)
@@ -132,7 +159,8 @@ class MergePanel(StepPanel):
             change(self._boxes[scan.name], label=label)
 
     def _offer_views(self, merge: Stored[Merge] | None) -> None:
-        """Offer the 3D views: before and after the merge, merged, or side by side to pick points."""
+        """Offer the 3D views: before and after the merge, merged, or side by side to pick
+        points."""
         views = [BEFORE] if merge is None else [AFTER, BEFORE, *MERGED]
         if self._start.value == PICKED:
             views.append(SIDE_BY_SIDE)
@@ -144,7 +172,8 @@ class MergePanel(StepPanel):
         self._is_start_chosen = True
 
     def _propose_start(self, scans: list[ScanView]) -> None:
-        """Choose the initial alignment that the chosen scans bring along, unless the operator chose one."""
+        """Choose the initial alignment that the chosen scans bring along, unless the operator chose
+        one."""
         if self._is_start_chosen:
             return
         names = set(self._list_chosen())
@@ -169,10 +198,15 @@ class MergePanel(StepPanel):
         """List the scans to merge, with the reference, in the order of their capture."""
         scans = _list_mergeable(self._session)
         boxes, reference = self._boxes, self._reference.value
-        return [s.name for s in scans if s.name == reference or (s.name in boxes and boxes[s.name].value)]
+        return [
+            s.name
+            for s in scans
+            if s.name == reference or (s.name in boxes and boxes[s.name].value)
+        ]
 
     def _get_stored_angles(self, names: list[str]) -> list[float] | None:
-        """Return the angles, deg, that are stored with scans of one turn; None where they are of several or of none."""
+        """Return the angles, deg, that are stored with scans of one turn; None where they are of
+        several or of none."""
         scans = {scan.name: scan for scan in self._session.scans} if self._session else {}
         steps = [step for name in names if (step := scans[name].turn_step) is not None]
         same = len(steps) == len(names) and len({step.turn for step in steps}) == 1
@@ -206,10 +240,16 @@ class MergePanel(StepPanel):
             chosen = {name: versions[name] for name in names}
             self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
             ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
-            change(self._merge, label=f"Merge {len(names)} scans", disabled=snapshot.is_busy or not ready)
+            change(
+                self._merge,
+                label=f"Merge {len(names)} scans",
+                disabled=snapshot.is_busy or not ready,
+            )
             shown = self._list_shown(session, names, versions)
             editable = self._view.value not in MERGED and not self._is_picking
-            self._editing.draw([scan for scan in session.scans if scan.name in shown] if editable else [])
+            self._editing.draw(
+                [scan for scan in session.scans if scan.name in shown] if editable else []
+            )
             self._show_layers()
             if not self._is_picking:
                 self._request_clouds(session, names, versions, labels)
@@ -225,7 +265,11 @@ class MergePanel(StepPanel):
             self._start_note.write(_START_NOTES.get(start, ""), "dim")
 
     def _request_clouds(
-        self, session: SessionView, names: list[str], versions: Mapping[str, Any], labels: dict[str, str]
+        self,
+        session: SessionView,
+        names: list[str],
+        versions: Mapping[str, Any],
+        labels: dict[str, str],
     ) -> None:
         """Request the clouds of the chosen view."""
         merge, view, context = session.merge, self._view.value, self._context
@@ -246,16 +290,23 @@ class MergePanel(StepPanel):
             """Load and colour the merged surface or the scans."""
             if merge is not None and view in MERGED:
                 return colour_merge(
-                    context.session, merge.name, view, [labels.get(name, name) for name in merge.record.scans]
+                    context.session,
+                    merge.name,
+                    view,
+                    [labels.get(name, name) for name in merge.record.scans],
                 )
             return colour_scans(context.session, shown, poses, labels)
 
         self._painter.request("clouds", key, make, self._draw_clouds)
 
-    def _list_shown(self, session: SessionView, names: list[str], versions: Mapping[str, Any]) -> list[str]:
+    def _list_shown(
+        self, session: SessionView, names: list[str], versions: Mapping[str, Any]
+    ) -> list[str]:
         """List the scans in the 3D view: those of the merge, else those to merge."""
         return [
-            name for name in (session.merge.record.scans if session.merge is not None else names) if name in versions
+            name
+            for name in (session.merge.record.scans if session.merge is not None else names)
+            if name in versions
         ]
 
     def _redraw(self) -> None:
@@ -267,7 +318,9 @@ class MergePanel(StepPanel):
         """Draw the loaded clouds, and remove others."""
         for name in set(self._scene.names(LAYER)) - set(clouds.clouds):
             self._scene.remove(LAYER, name)
-        shown = self._editing.set_scans(clouds.scans) or [points for points, _ in clouds.clouds.values()]
+        shown = self._editing.set_scans(clouds.scans) or [
+            points for points, _ in clouds.clouds.values()
+        ]
         for points, (name, (_, painted)) in zip(shown, clouds.clouds.items(), strict=True):
             self._scene.cloud(LAYER, name, points, painted, SHOWN)
         with self._lock:

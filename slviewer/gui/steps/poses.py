@@ -13,22 +13,38 @@ from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pose_list import TONES, PoseBoards, pose_table
 from slviewer.gui.preview import board_html, draw_preview, exposure_html, legend
 from slviewer.gui.scene import GHOST
-from slviewer.gui.widgets import Html, Picture, Sound, Text, alert, coloured, paragraph, thumbnail, to_html
+from slviewer.gui.widgets import (
+    Html,
+    Picture,
+    Sound,
+    Text,
+    alert,
+    coloured,
+    paragraph,
+    thumbnail,
+    to_html,
+)
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PoseView, PreviewView, SessionView, Snapshot
 
 LAYER, WORLD = "poses", "board"
 _DRAG_S = 0.15  # between two requests while a board is dragged
 _QUIET_S = 1.0  # after which the gizmo follows the board again
-_COLOURS = ("var(--mantine-color-gray-light)", "var(--mantine-color-green-3)", "var(--mantine-color-green-6)")
+_COLOURS = (
+    "var(--mantine-color-gray-light)",
+    "var(--mantine-color-green-3)",
+    "var(--mantine-color-green-6)",
+)
 _TILTS = {(1, 1): "●", (0, 1): "▲", (1, 2): "▶", (2, 1): "▼", (1, 0): "◀"}
-"""Place (row, column) and arrow of each of the coverage's tilts: facing, then the side that is farther away."""
+"""Place (row, column) and arrow of each of the coverage's tilts: facing, then the side that is
+farther away."""
 
 
 def coverage_chart(coverage: Coverage) -> Html:
     """Return three small charts side by side; a field is full once GOAL_POSES poses cover it."""
     depths = "".join(
-        f'<div style="display:flex;align-items:center;gap:0.4em">{_draw_field(n, 44, 15)}<span>{name}</span></div>'
+        "<div"
+        f' style="display:flex;align-items:center;gap:0.4em">{_draw_field(n, 44, 15)}<span>{name}</span></div>'
         for name, n in zip(("near", "middle", "far"), coverage.depths, strict=True)
     )
     tilts = np.full((3, 3), -1)
@@ -36,16 +52,24 @@ def coverage_chart(coverage: Coverage) -> Html:
         tilts[place] = n
     near, far = coverage.range_mm
     charts = "".join(
-        f'<div><div style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}</div>{chart}</div>'
+        "<div><div"
+        f' style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}</div>{chart}</div>'
         for title, chart in (
             ("Image", _draw_grid(coverage.cells)),
             (f"Depth, {near:.0f}–{far:.0f} mm", depths),
             ("Tilt", _draw_grid(tilts, _TILTS)),
         )
     )
-    title = coloured(f"Coverage {100 * coverage.share:.0f} %", "good" if coverage.share > 0.9 else "plain", bold=True)
+    title = coloured(
+        f"Coverage {100 * coverage.share:.0f} %",
+        "good" if coverage.share > 0.9 else "plain",
+        bold=True,
+    )
     return paragraph(
-        Html(f'<div>{title}</div><div style="display:flex;justify-content:space-between;gap:0.8em">{charts}</div>')
+        Html(
+            f"<div>{title}</div><div"
+            f' style="display:flex;justify-content:space-between;gap:0.8em">{charts}</div>'
+        )
     )
 
 
@@ -95,13 +119,21 @@ class PosesPanel(StepPanel):
             "Place board", operator.place_at_suggestion, viser.Icon.TARGET_ARROW, "cyan", visible=False,
             hint="Moves the simulated board to the suggested pose",
         )  # fmt: skip
-        self._capture = context.button("Capture pose", operator.capture_pose, viser.Icon.CAMERA, None, hint="Key: C")
-        self._hotkey = gui.add_command("Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True)
+        self._capture = context.button(
+            "Capture pose", operator.capture_pose, viser.Icon.CAMERA, None, hint="Key: C"
+        )
+        self._hotkey = gui.add_command(
+            "Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True
+        )
         self._hotkey.on_trigger(context.callback(operator.capture_pose))
-        self._hands_free = gui.add_checkbox("Hands-free", False, hint="Captures whenever the board is held still")
+        self._hands_free = gui.add_checkbox(
+            "Hands-free", False, hint="Captures whenever the board is held still"
+        )
         self._hands_free_value = SessionValue(self._hands_free)
         self._hands_free.on_update(
-            context.callback(lambda: operator.set_hands_free(bool(self._hands_free.value)), by_user=True)
+            context.callback(
+                lambda: operator.set_hands_free(bool(self._hands_free.value)), by_user=True
+            )
         )
         self._accuracy = Text(gui)
         self._wanted = gui.add_number(
@@ -110,7 +142,9 @@ class PosesPanel(StepPanel):
         )  # fmt: skip
         self._wanted_value = SessionValue(self._wanted)
         self._wanted.on_update(
-            context.callback(lambda: operator.set_wanted_sigma(float(self._wanted.value) or None), by_user=True)
+            context.callback(
+                lambda: operator.set_wanted_sigma(float(self._wanted.value) or None), by_user=True
+            )
         )
         self._coverage = Text(gui)
         with gui.add_folder("Captured poses"):
@@ -132,7 +166,9 @@ class PosesPanel(StepPanel):
             self._target, self._board = target, Board.parse(target) if target else None
             self._world = None
         change(self._capture, disabled=snapshot.rig.state != "open" or self._board is None)
-        can_place = session is not None and session.suggestion is not None and session.pending_plan is None
+        can_place = (
+            session is not None and session.suggestion is not None and session.pending_plan is None
+        )
         change(self._place, visible=snapshot.world is not None, disabled=not can_place)
         self._hands_free_value.update(snapshot.hands_free)
         self._draw_world(snapshot)
@@ -155,8 +191,13 @@ class PosesPanel(StepPanel):
         self._draw_choice(snapshot)
 
     def draw_preview(self, preview: PreviewView) -> None:
-        """Show the live image with the detected board, and the countdown of a hands-free capture."""
-        hint = coloured("Dashed blue: hold the board here", "info") if self._ghost_px is not None else Html("")
+        """Show the live image with the detected board, and the countdown of a hands-free
+        capture."""
+        hint = (
+            coloured("Dashed blue: hold the board here", "info")
+            if self._ghost_px is not None
+            else Html("")
+        )
         self._picture.set(
             draw_preview(preview, self._board, self._ghost_px),
             legend(preview, board_html(preview, self._board), exposure_html(preview), hint),
@@ -189,7 +230,11 @@ class PosesPanel(StepPanel):
             if session.enough:
                 self._accuracy.write(f"{text}: reached.", "good")
             else:
-                following = f"; {plan.sigma_next_mm:.3f} mm with the next pose" if plan.sigma_next_mm else ""
+                following = (
+                    f"; {plan.sigma_next_mm:.3f} mm with the next pose"
+                    if plan.sigma_next_mm
+                    else ""
+                )
                 self._accuracy.write(text + following, "info")
         if session is not None and session.plan is not None:
             self._wanted_value.update(round(session.wanted_mm, 3))
@@ -203,14 +248,22 @@ class PosesPanel(StepPanel):
         else:
             outline = self._board.outline()
             self._scene.board(
-                LAYER, "suggestion", suggestion.T_camera_board, outline, GHOST, label="next pose", width_px=4.0
+                LAYER,
+                "suggestion",
+                suggestion.T_camera_board,
+                outline,
+                GHOST,
+                label="next pose",
+                width_px=4.0,
             )
 
     def _draw_world(self, snapshot: Snapshot) -> None:
         """Draw the simulated board and its handle, or which other object is in view."""
         world, scene = snapshot.world, self._scene
         other = "" if world is None or world.standing == "board" else world.standing
-        self._other_object.write(other and f"In view: the {other}. Place the board first.", "warning")
+        self._other_object.write(
+            other and f"In view: the {other}. Place the board first.", "warning"
+        )
         if world is None or world.standing != "board" or self._board is None:
             if self._world is not None:
                 scene.clear(WORLD)
@@ -235,19 +288,27 @@ class PosesPanel(StepPanel):
         if pose is None:
             self._detail.set("")
             return
-        lines = [Html(f"<b>{to_html(pose.name)}</b>"), coloured(pose.state, TONES[pose.state], bold=True)]
+        lines = [
+            Html(f"<b>{to_html(pose.name)}</b>"),
+            coloured(pose.state, TONES[pose.state], bold=True),
+        ]
         if pose.why:
             lines.append(to_html(pose.why))
         if pose.rms_px is not None:
             lines.append(
-                to_html(f"Reprojection RMS: camera {pose.rms_px[0]:.3f} px, projector {pose.rms_px[1]:.3f} px")
+                to_html(
+                    f"Reprojection RMS: camera {pose.rms_px[0]:.3f} px, projector"
+                    f" {pose.rms_px[1]:.3f} px"
+                )
             )
         if pose.T_camera_board is not None:
             about = "" if pose.calibrated else "about "
             lines.append(coloured(f"Distance {about}{pose.T_camera_board[2, 3]:.0f} mm", "dim"))
         picture = thumbnail(pose.thumbnail, 150, pose.name)
         text = "".join(f"<div>{line}</div>" for line in lines)
-        self._detail.set(paragraph(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>')))
+        self._detail.set(
+            paragraph(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>'))
+        )
 
     def _play_sound(self, poses: tuple[PoseView, ...], hands_free: bool) -> None:
         """Play a sound for the result of the last pose, as the operator is looking at the board."""
@@ -270,7 +331,8 @@ class PosesPanel(StepPanel):
         self._draw_choice()
 
     def _request_action(self, action: str) -> None:
-        """Request the action of a button for the chosen pose: exclude, include, retake or delete."""
+        """Request the action of a button for the chosen pose: exclude, include, retake or
+        delete."""
         name, operator = self._chosen.value, self._operator
         if not name:
             self._context.notify("info", "Capture a pose first.")
@@ -293,7 +355,9 @@ class PosesPanel(StepPanel):
     def _place_board(self, T_camera_centre: np.ndarray) -> None:
         """Place the simulated board where its handle is, T (4, 4) mm of the board's centre."""
         if self._board is not None:
-            self._operator.place("board", T_camera_centre @ np.linalg.inv(self._get_board_centre(self._board)))
+            self._operator.place(
+                "board", T_camera_centre @ np.linalg.inv(self._get_board_centre(self._board))
+            )
 
     @staticmethod
     def _get_board_centre(board: Board) -> np.ndarray:

@@ -13,7 +13,8 @@ from slviewer.wizard.snapshot import PreviewView, RigView, Snapshot
 
 LIGHTS = {"White": "white", "Grey": "grey", "Dark": "dark", "Fringes": "pattern"}
 _THIRD_OF_A_STOP = 2 ** (1 / 3)
-_SETTLES_S = 1.5  # an exposure that is being dragged is not set back to what the camera reported a moment ago
+# an exposure that is being dragged is not set back to what the camera reported a moment ago
+_SETTLES_S = 1.5
 
 
 class RigPanel(StepPanel):
@@ -82,10 +83,14 @@ class RigPanel(StepPanel):
         now = self._operator.snapshot().rig.exposure_ms
         if now is not None:
             self._entered = 0.0
-            self._operator.set_exposure(now * _THIRD_OF_A_STOP if direction == "Brighter" else now / _THIRD_OF_A_STOP)
+            self._operator.set_exposure(
+                now * _THIRD_OF_A_STOP if direction == "Brighter" else now / _THIRD_OF_A_STOP
+            )
 
     def _set_light(self) -> None:
         """Request the chosen light; where it is refused, show the current one again."""
         if not self._operator.set_light(LIGHTS[self._light.value]):
             now = self._operator.snapshot().rig.light
-            change(self._light, value=next(label for label, light in LIGHTS.items() if light == now))
+            change(
+                self._light, value=next(label for label, light in LIGHTS.items() if light == now)
+            )

@@ -10,7 +10,14 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.gui.exposures import ExposureInputs
 from slviewer.gui.import_inputs import ImportInputs
-from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change, display_name, scan_options
+from slviewer.gui.inputs import (
+    Choice,
+    RestoreButton,
+    SessionValue,
+    change,
+    display_name,
+    scan_options,
+)
 from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import PanelContext, StepPanel
@@ -38,7 +45,13 @@ from slviewer.gui.widgets import (
 from slviewer.records.verification import Verification
 from slviewer.report.maps import error_limit
 from slviewer.simulation.concave import CONCAVE
-from slviewer.wizard.result_views import AlignedScans, ScanCloud, aligned_scans, used_points, whole_cloud
+from slviewer.wizard.result_views import (
+    AlignedScans,
+    ScanCloud,
+    aligned_scans,
+    used_points,
+    whole_cloud,
+)
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView, Snapshot
 
 LAYER = "scan"
@@ -74,30 +87,49 @@ class ScanPanel(StepPanel):
         with gui.add_folder("Capture", visible=False) as self._capture_folder:
             self._picture = Picture(gui, "Live image", width_px=SMALL_PX)
             self._capture = context.button(
-                "Capture scan", lambda: operator.capture_scan(self._label.value), viser.Icon.CAMERA, None
+                "Capture scan",
+                lambda: operator.capture_scan(self._label.value),
+                viser.Icon.CAMERA,
+                None,
             )
             self._patterns = gui.add_dropdown(
-                "Patterns", tuple(PRESETS), hint="micro for concave metal, wax and other surfaces that light themselves"
+                "Patterns",
+                tuple(PRESETS),
+                hint="micro for concave metal, wax and other surfaces that light themselves",
             )
             self._patterns_value = SessionValue(self._patterns)
             self._patterns.on_update(
-                context.callback(lambda: operator.choose_patterns(self._patterns.value), by_user=True)
+                context.callback(
+                    lambda: operator.choose_patterns(self._patterns.value), by_user=True
+                )
             )
             self._exposures = ExposureInputs(context, for_scan=True)
             self._align = gui.add_checkbox(
-                "Align as you scan", False, hint="Shows each new scan in its place beside those before it"
+                "Align as you scan",
+                False,
+                hint="Shows each new scan in its place beside those before it",
             )
             self._align_value = SessionValue(self._align)
-            self._align.on_update(context.callback(lambda: operator.set_align_scans(self._align.value), by_user=True))
+            self._align.on_update(
+                context.callback(lambda: operator.set_align_scans(self._align.value), by_user=True)
+            )
             self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
-            self._live = context.button("Live", self._toggle_live, viser.Icon.PLAYER_PLAY, "teal", hint=LIVE_HINT)
+            self._live = context.button(
+                "Live", self._toggle_live, viser.Icon.PLAYER_PLAY, "teal", hint=LIVE_HINT
+            )
             self._save = context.button(
-                "Save cloud", lambda: operator.save_live(self._label.value), viser.Icon.DOWNLOAD, "green", visible=False
+                "Save cloud",
+                lambda: operator.save_live(self._label.value),
+                viser.Icon.DOWNLOAD,
+                "green",
+                visible=False,
             )
             self._live_status = Text(gui)
             self._turn = TurnInputs(context)
             self._simulated = SimulatedObject(
-                context, LAYER, ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
+                context,
+                LAYER,
+                ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE),
             )
         self._gallery = Text(gui)
         with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
@@ -111,9 +143,13 @@ class ScanPanel(StepPanel):
                 None,
             )
             self._placement = Text(gui)
-            self._place = context.button("Align scan", lambda: operator.align(self._scan.value), viser.Icon.PUZZLE)
+            self._place = context.button(
+                "Align scan", lambda: operator.align(self._scan.value), viser.Icon.PUZZLE
+            )
             self._take_out = context.button(
-                "Undo alignment", lambda: operator.undo_alignment(self._scan.value), viser.Icon.ARROW_BACK_UP
+                "Undo alignment",
+                lambda: operator.undo_alignment(self._scan.value),
+                viser.Icon.ARROW_BACK_UP,
             )
             self._support = context.button(
                 "Remove support", lambda: operator.remove_support(*self._shown_scans()), viser.Icon.TABLE_MINUS,
@@ -128,7 +164,9 @@ class ScanPanel(StepPanel):
             self._editing = PointEditing(context, LAYER, self._redraw, self._show_point)
             self._new_name = gui.add_text("New name", "")
             context.button(
-                "Rename scan", lambda: operator.rename(self._scan.value, self._new_name.value), viser.Icon.PENCIL
+                "Rename scan",
+                lambda: operator.rename(self._scan.value, self._new_name.value),
+                viser.Icon.PENCIL,
             )
             context.button(
                 "Delete scan", lambda: operator.delete(self._scan.value), viser.Icon.TRASH, "red",
@@ -203,7 +241,9 @@ class ScanPanel(StepPanel):
         """Update buttons and figures of the live scan, during which a captured cloud is hidden."""
         icon = viser.Icon.PLAYER_PLAY if live is None else viser.Icon.PLAYER_STOP
         label, colour = ("Live", "teal") if live is None else ("Stop live", "red")
-        change(self._live, label=label, color=colour, icon=icon, disabled=live is None and not ready)
+        change(
+            self._live, label=label, color=colour, icon=icon, disabled=live is None and not ready
+        )
         change(self._save, visible=live is not None, disabled=live is None or not live.clouds_per_s)
         self._live_status.set("" if live is None else live_html(live, self._screen.points))
         if live is None and self._is_live:
@@ -238,21 +278,32 @@ class ScanPanel(StepPanel):
             if snapshot is None or session is None or scan is None:
                 return
             is_absent, busy = scan.cloud == "absent", snapshot.is_busy
-            change(self._reconstruct, disabled=busy, label="Reconstruct" if is_absent else "Reconstruct again")
+            change(
+                self._reconstruct,
+                disabled=busy,
+                label="Reconstruct" if is_absent else "Reconstruct again",
+            )
             self._figures.set(scan_html(scan))
             self._region.draw(session, "" if is_absent else scan.name)
             self._editing.draw([scan])
             self._draw_placement(scan, busy)
             shown = len(self._shown_scans())
             label = "Remove support" if shown == 1 else f"Remove support, {shown} scans"
-            change(self._support, label=label, disabled=busy or is_absent or shape_of(scan) != "scan")
+            change(
+                self._support, label=label, disabled=busy or is_absent or shape_of(scan) != "scan"
+            )
             self._gallery.set(gallery(sort_scans(session.scans), scan.name))
             if self._is_live:
                 return
             if self._view.value == ALIGNED:
-                placed = tuple((each.name, each.figures.model) for each in session.scans if each.is_placed)
+                placed = tuple(
+                    (each.name, each.figures.model) for each in session.scans if each.is_placed
+                )
                 self._painter.request(
-                    "cloud", (ALIGNED, placed), lambda: aligned_scans(self._context.session), self._draw_aligned
+                    "cloud",
+                    (ALIGNED, placed),
+                    lambda: aligned_scans(self._context.session),
+                    self._draw_aligned,
                 )
             elif is_absent:
                 self._clear_cloud()
@@ -267,8 +318,8 @@ class ScanPanel(StepPanel):
         colour = self._colour.value
 
         def make() -> tuple[ScanCloud, ScanCloud, str, str]:
-            """Load the cloud, unless it is loaded already; returns it, what is used of it, the chosen colours, and
-            why nothing is used."""
+            """Load the cloud, unless it is loaded already; returns it, what is used of it, the
+            chosen colours, and why nothing is used."""
             if self._loaded is None or self._loaded[0] != key:
                 self._loaded = key, whole_cloud(self._context.session, scan.name)
             whole = self._loaded[1]
@@ -287,7 +338,8 @@ class ScanPanel(StepPanel):
         return (self._scan.value,)
 
     def _offer_views(self, scans: Sequence[ScanView]) -> None:
-        """Offer to view the aligned scans together, and do so when another one came to its place."""
+        """Offer to view the aligned scans together, and do so when another one came to its
+        place."""
         placed = tuple(sorted(scan.name for scan in scans if scan.is_placed))
         together = [(ALIGNED, f"{len(placed)} scans in place")] if len(placed) > 1 else []
         self._view.offer([(ONE, "this scan"), *together], ONE)
@@ -302,7 +354,9 @@ class ScanPanel(StepPanel):
         change(self._take_out, visible=scan.is_placed, disabled=is_busy)
         tone: Tone = "good" if scan.is_placed else "warning"
         self._placement.set(
-            "" if placement is None else paragraph(coloured(f"{scan.label}: {placement.summary()}", tone))
+            ""
+            if placement is None
+            else paragraph(coloured(f"{scan.label}: {placement.summary()}", tone))
         )
 
     def _draw_aligned(self, aligned: AlignedScans) -> None:
@@ -342,7 +396,9 @@ class ScanPanel(StepPanel):
         removed = int(whole.measured_count - cloud.measured_count)
         kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
         note = f"{shown:,} points shown{kept}. Click a point for its values."
-        self._legend.set(bar + paragraph(coloured(note, "dim")) + (alert(why, "warning") if why else ""))
+        self._legend.set(
+            bar + paragraph(coloured(note, "dim")) + (alert(why, "warning") if why else "")
+        )
         if is_new:
             self._scene.remove(LAYER, "picked")
             self._point.set("")
@@ -356,7 +412,9 @@ class ScanPanel(StepPanel):
             return
         u, v = pixel
         self._point.set(point_html(cloud, u, v))
-        self._scene.mark(LAYER, "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm")
+        self._scene.mark(
+            LAYER, "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"
+        )
 
 
 def aligned_html(aligned: AlignedScans) -> Html:
@@ -365,7 +423,9 @@ def aligned_html(aligned: AlignedScans) -> Html:
         f"<span style='color:rgb{colour}'>■</span> {text}"
         for colour, text in ((SEEN_ONCE, "seen by one scan"), (SEEN_AGAIN, "by more than one"))
     )
-    share = f"{100 * aligned.share_seen_again:.0f} % is seen by more than one; gaps were not seen yet."
+    share = (
+        f"{100 * aligned.share_seen_again:.0f} % is seen by more than one; gaps were not seen yet."
+    )
     return paragraph(Html(f"<div>{marks}</div>{coloured(share, 'dim')}"))
 
 
@@ -381,18 +441,26 @@ def live_html(live: LiveView, shown: int) -> Html:
     if not live.points:
         return Html(
             paragraph(Html(html))
-            + alert("No points: check that the object is illuminated and within the calibrated depths.", "warning")
+            + alert(
+                "No points: check that the object is illuminated and within the calibrated depths.",
+                "warning",
+            )
         )
-    note = f"{live.points:,} points, {shown:,} shown; moving parts are masked. Nothing is saved yet."
+    note = (
+        f"{live.points:,} points, {shown:,} shown; moving parts are masked. Nothing is saved yet."
+    )
     return Html(paragraph(Html(html)) + paragraph(coloured(note, "dim")))
 
 
 def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
-    """Colour a cloud by one of COLOURS: ((h, w) grey levels or (h, w, 3) RGB, uint8; the legend)."""
+    """Colour a cloud by one of COLOURS: ((h, w) grey levels or (h, w, 3) RGB, uint8; the
+    legend)."""
     if colour == "error":
         if not cloud.errors:
             grey = np.full(cloud.points.shape, 150, np.uint8)
-            return grey, paragraph(coloured("No errors yet: measure this capture in the step Verify.", "warning"))
+            return grey, paragraph(
+                coloured("No errors yet: measure this capture in the step Verify.", "warning")
+            )
         model = cloud.model if cloud.model in cloud.errors else next(iter(cloud.errors))
         limit = error_limit(list(cloud.errors.values()))
         bar = colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", f"error of {model}")
@@ -414,7 +482,8 @@ def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
 
 
 def uncertainty(cloud: ScanCloud) -> np.ndarray:
-    """Return the standard deviation of z (h, w) mm from noise, calibration and edges, as far as known."""
+    """Return the standard deviation of z (h, w) mm from noise, calibration and edges, as far as
+    known."""
     sigma = np.where(np.isfinite(cloud.points[..., 2]), cloud.sigma_z, np.nan)
     for part in (cloud.sigma_calibration, cloud.sigma_edges):
         sigma = sigma if part is None else np.hypot(sigma, part)
@@ -434,7 +503,9 @@ def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
     if cloud.sigma_calibration is not None:
         rows.append(("Uncertainty of the calibration", f"{cloud.sigma_calibration[v, u]:.3f} mm"))
         rows.append(("Uncertainty of z (1 sigma)", f"{uncertainty(cloud)[v, u]:.3f} mm"))
-    rows += [(f"Error of {model}", f"{errors[v, u]:.3f} mm") for model, errors in cloud.errors.items()]
+    rows += [
+        (f"Error of {model}", f"{errors[v, u]:.3f} mm") for model, errors in cloud.errors.items()
+    ]
     return table(("Clicked point", ""), rows)
 
 
@@ -442,9 +513,14 @@ def scan_html(scan: ScanView) -> Html:
     """Return a table of a scan's figures, with warnings."""
     if scan.cloud == "absent":
         return paragraph(coloured("Not reconstructed yet.", "warning"))
-    rows: list[tuple[object, object]] = [("Points", f"{scan.figures.points:,}"), ("Model", scan.figures.model)]
+    rows: list[tuple[object, object]] = [
+        ("Points", f"{scan.figures.points:,}"),
+        ("Model", scan.figures.model),
+    ]
     if scan.figures.depth_mm is not None:
-        rows.append(("Depth range", f"{scan.figures.depth_mm[0]:.0f} to {scan.figures.depth_mm[1]:.0f} mm"))
+        rows.append(
+            ("Depth range", f"{scan.figures.depth_mm[0]:.0f} to {scan.figures.depth_mm[1]:.0f} mm")
+        )
     if scan.figures.noise_mm is not None:
         rows.append(("Median noise of z", f"{scan.figures.noise_mm:.3f} mm"))
     if scan.figures.masked is not None:
@@ -455,12 +531,15 @@ def scan_html(scan: ScanView) -> Html:
     if scan.figures.scale:
         html += paragraph(f"{scan.figures.scale[:1].upper()}{scan.figures.scale[1:]}.")
     if scan.cloud == "stale":
-        html += paragraph(coloured("Made with an older calibration: reconstruct it again.", "warning"))
+        html += paragraph(
+            coloured("Made with an older calibration: reconstruct it again.", "warning")
+        )
     return Html(html)
 
 
 def sort_scans(scans: Sequence[ScanView]) -> list[ScanView]:
-    """Sort scans of objects first, then captures of planes and spheres; the newest of each first."""
+    """Sort scans of objects first, then captures of planes and spheres; the newest of each
+    first."""
     return sorted(reversed(scans), key=lambda scan: shape_of(scan) != "scan")
 
 
@@ -474,7 +553,8 @@ def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
         state = _STATES[scan.cloud] or f"{scan.figures.points:,} points"
         tone: Tone = "dim" if scan.cloud == "fresh" else "warning"
         cards.append(
-            f'<div style="width:92px;border:2px solid {frame};border-radius:6px;padding:2px;font-size:0.8rem;'
+            '<div style="width:92px;border:2px solid'
+            f" {frame};border-radius:6px;padding:2px;font-size:0.8rem;"
             f'line-height:1.25;overflow-wrap:anywhere">{thumbnail(scan.thumbnail, 84, scan.label)}'
             f"<div>{to_html(scan.label)}</div>{coloured(state, tone)}</div>"
         )

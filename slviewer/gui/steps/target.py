@@ -19,7 +19,9 @@ KINDS = {
     "Chessboard": "chessboard",
     "ChArUco": "charuco",
 }
-DICTIONARIES = tuple(f"DICT_{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000))
+DICTIONARIES = tuple(
+    f"DICT_{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)
+)
 _EXPLANATIONS = {
     "circles": "Circles per row and column; pitch: distance of their centres",
     "acircles": "Circles per row, number of rows; pitch: half the distance of neighbours in a row",
@@ -44,14 +46,23 @@ class TargetPanel(StepPanel):
         self._kind = gui.add_dropdown("Board", tuple(self._kinds))
         self._columns = gui.add_number("Columns", board.columns, min=2, max=200, step=1)
         self._rows = gui.add_number("Rows", board.rows, min=3, max=200, step=1)
-        self._pitch = gui.add_number("Pitch, mm", float(board.pitch_mm), min=0.1, max=1000.0, step=0.01)
-        self._marker = gui.add_number("Marker, mm", 1.0, min=0.1, max=1000.0, step=0.01, visible=False)
+        self._pitch = gui.add_number(
+            "Pitch, mm", float(board.pitch_mm), min=0.1, max=1000.0, step=0.01
+        )
+        self._marker = gui.add_number(
+            "Marker, mm", 1.0, min=0.1, max=1000.0, step=0.01, visible=False
+        )
         self._dictionary = gui.add_dropdown("Dictionary", DICTIONARIES, visible=False)
         self._note = Text(gui)
         self._use = context.button(
-            "Use this board", lambda: self._operator.choose_target(str(self._parse_entered())), viser.Icon.CHECK, None
+            "Use this board",
+            lambda: self._operator.choose_target(str(self._parse_entered())),
+            viser.Icon.CHECK,
+            None,
         )
-        context.button("Create PDF", self._write_sheet, viser.Icon.PRINTER, hint="To print the board to scale")
+        context.button(
+            "Create PDF", self._write_sheet, viser.Icon.PRINTER, hint="To print the board to scale"
+        )
         self._sheet = Text(gui)
         self._picture = Picture(gui, "Live image")
         for field in (self._columns, self._rows, self._pitch, self._marker, self._dictionary):
@@ -80,13 +91,18 @@ class TargetPanel(StepPanel):
     def _parse_entered(self) -> Board:
         """Return the board that the fields describe. Raises InputError for an invalid one."""
         kind = self._kinds[self._kind.value]
-        notation = f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}"
+        notation = (
+            f"{kind}:{int(self._columns.value)}x{int(self._rows.value)}:{self._pitch.value:g}"
+        )
         markers = f":{self._marker.value:g}:{self._dictionary.value}" if kind == "charuco" else ""
         return Board.parse(notation + markers)
 
     def _fill_fields(self, board: Board) -> None:
         """Fill the fields from a board."""
-        change(self._kind, value=next(label for label, kind in self._kinds.items() if kind == board.kind))
+        change(
+            self._kind,
+            value=next(label for label, kind in self._kinds.items() if kind == board.kind),
+        )
         change(self._columns, value=board.columns)
         change(self._rows, value=board.rows)
         change(self._pitch, value=float(board.pitch_mm))
@@ -117,7 +133,9 @@ class TargetPanel(StepPanel):
         in_use = str(board) == self._target
         change(self._use, disabled=in_use)
         state = coloured(
-            f"● In use: {board}" if in_use else f"Not in use: {board}", "good" if in_use else "warning", bold=in_use
+            f"● In use: {board}" if in_use else f"Not in use: {board}",
+            "good" if in_use else "warning",
+            bold=in_use,
         )
         self._note.set(paragraph(Html(f"{explanation}<br>{state}")))
 

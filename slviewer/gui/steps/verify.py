@@ -1,4 +1,5 @@
-"""Step 5: measure a plane or a sphere by each model, and compare with the noise floor of the capture."""
+"""Step 5: measure a plane or a sphere by each model, and compare with the noise floor of the
+capture."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -48,10 +49,16 @@ class VerifyPanel(StepPanel):
         with gui.add_folder("Capture", visible=False) as self._capture_folder:
             self._picture = Picture(gui, "Live image", width_px=SMALL_PX)
             self._plane = context.button(
-                "Capture plane", lambda: operator.capture_plane(self._label.value), viser.Icon.SQUARE, None
+                "Capture plane",
+                lambda: operator.capture_plane(self._label.value),
+                viser.Icon.SQUARE,
+                None,
             )
             self._sphere = context.button(
-                "Capture sphere", lambda: operator.capture_sphere(self._label.value), viser.Icon.SPHERE, None
+                "Capture sphere",
+                lambda: operator.capture_sphere(self._label.value),
+                viser.Icon.SPHERE,
+                None,
             )
             self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
             self._simulated = SimulatedObject(context, LAYER, ("plane", "sphere"))
@@ -70,14 +77,21 @@ class VerifyPanel(StepPanel):
             self._recorded = Choice(gui, "Capture")
             hint = "Approximate radius of a sphere, to detect it; 0: unknown"
             self._radius = gui.add_number("Radius, mm", 0.0, min=0.0, max=2000.0, hint=hint)
-            shapes: tuple[tuple[Shape, Any], ...] = (("plane", viser.Icon.SQUARE), ("sphere", viser.Icon.SPHERE))
+            shapes: tuple[tuple[Shape, Any], ...] = (
+                ("plane", viser.Icon.SQUARE),
+                ("sphere", viser.Icon.SPHERE),
+            )
             self._all: dict[Shape, viser.GuiButtonHandle] = {}
             for shape, icon in shapes:
-                measure = lambda shape=shape: self._request_verification([self._recorded.value], shape)  # noqa: E731
+                measure = lambda shape=shape: self._request_verification(
+                    [self._recorded.value], shape
+                )  # noqa: E731
                 context.button(f"Measure {shape}", measure, icon)
             for shape, icon in shapes:
                 measure_all = lambda shape=shape: self._request_all(shape)  # noqa: E731
-                self._all[shape] = context.button(f"Measure all {shape}s", measure_all, icon, visible=False)
+                self._all[shape] = context.button(
+                    f"Measure all {shape}s", measure_all, icon, visible=False
+                )
         for choice in (self._result, self._model):
             choice.on_change(context.callback(self._refresh))
 
@@ -100,14 +114,20 @@ class VerifyPanel(StepPanel):
             for folder in (self._result_folder, self._table_folder):
                 change(folder, visible=bool(rows))
             labels = {row.name: row.label for row in rows}
-            self._result.offer([(name, display_name(name, label)) for name, label in labels.items()])
+            self._result.offer(
+                [(name, display_name(name, label)) for name, label in labels.items()]
+            )
             if new := [name for name in labels if name not in self._measured]:
                 if self._measured:  # show what was just measured
                     self._result.choose(new[-1])
                 self._measured = tuple(labels)
             self._table.set(records_html(rows))
             file = next((each for each in session.exports if each.name == TABLE), None)
-            self._file.set("" if file is None else paragraph(link(self._context.offer(file.path), f"Download {TABLE}")))
+            self._file.set(
+                ""
+                if file is None
+                else paragraph(link(self._context.offer(file.path), f"Download {TABLE}"))
+            )
             self._refresh()
 
     def draw_preview(self, preview: PreviewView) -> None:
@@ -151,7 +171,9 @@ class VerifyPanel(StepPanel):
             self._model.offer([(model, model) for model in models], models[-1])
             self._figures.set(records_html([view], named=False))
             context, key = self._context, (name, view.record.summary())
-            self._painter.request("maps", key, lambda: _draw_maps(context.session, view), self._maps.set)
+            self._painter.request(
+                "maps", key, lambda: _draw_maps(context.session, view), self._maps.set
+            )
             model = self._model.value
             self._painter.request(
                 "cloud",
@@ -164,7 +186,9 @@ class VerifyPanel(StepPanel):
         """Draw a cloud coloured by the error of a model, with its legend."""
         self._cloud, model, shape = cloud, *_ = made
         limit = error_limit(list(cloud.errors.values()))
-        self._scene.cloud(LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error"))
+        self._scene.cloud(
+            LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error")
+        )
         self._scene.show(LAYER, self._visible)
         title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
@@ -176,7 +200,9 @@ class VerifyPanel(StepPanel):
         """Request the verification of captures as a plane or sphere."""
         radius = float(self._radius.value)
         if names and names[0]:
-            self._operator.verify(list(names), shape, radius if shape == "sphere" and radius > 0 else None)
+            self._operator.verify(
+                list(names), shape, radius if shape == "sphere" and radius > 0 else None
+            )
 
     def _request_all(self, shape: Shape) -> None:
         """Request the verification of all captures of a shape that have none yet."""
@@ -194,10 +220,13 @@ def _list_unverified(session: SessionView) -> list[ScanView]:
 
 
 def shape_of(scan: ScanView) -> str:
-    """Return "plane", "sphere" or "scan": a capture's purpose, or what the name of a recorded one suggests."""
+    """Return "plane", "sphere" or "scan": a capture's purpose, or what the name of a recorded one
+    suggests."""
     if scan.purpose != "scan":
         return scan.purpose
-    return next((shape for shape in ("plane", "sphere") if scan.name.lower().startswith(shape)), "scan")
+    return next(
+        (shape for shape in ("plane", "sphere") if scan.name.lower().startswith(shape)), "scan"
+    )
 
 
 def _draw_maps(session: Session, view: Stored[Verification]) -> Figure:

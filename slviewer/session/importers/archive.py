@@ -1,4 +1,5 @@
-"""A zip of captures, unpacked where nothing outside can be touched and no more is written than was announced."""
+"""A zip of captures, unpacked where nothing outside can be touched and no more is written than was
+announced."""
 
 import re
 import shutil
@@ -32,11 +33,11 @@ def unpacked_size(archive: IO[bytes], max_bytes: int = MOST_BYTES) -> int:
 def unpack(
     archive: IO[bytes], folder: Path, progress: Callable[[float], None], max_bytes: int = MOST_BYTES
 ) -> tuple[Path, list[str]]:
-    """Write the images and TOMLs of a zip into an empty folder; returns the folder that holds the captures, and a
-    warning that names the files that are none of these.
+    """Write the images and TOMLs of a zip into an empty folder; returns the folder that holds the
+    captures, and a warning that names the files that are none of these.
 
-    Raises InputError for what is no zip, is damaged or encrypted, takes more than ``max_bytes``, or names a place
-    outside of itself.
+    Raises InputError for what is no zip, is damaged or encrypted, takes more than ``max_bytes``, or
+    names a place outside of itself.
     """
     with _open_zip(archive) as zipped:
         members, others = _select_members(zipped, max_bytes)
@@ -48,12 +49,20 @@ def unpack(
                 with zipped.open(info) as source, open(target, "xb") as out:
                     shutil.copyfileobj(source, out, 1 << 20)
             except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
-                raise InputError(f"{info.filename} in the zip is damaged ({error}): make the zip again") from error
+                raise InputError(
+                    f"{info.filename} in the zip is damaged ({error}): make the zip again"
+                ) from error
             except FileExistsError as error:
-                raise InputError(f"the zip holds {info.filename} twice: make the zip again") from error
+                raise InputError(
+                    f"the zip holds {info.filename} twice: make the zip again"
+                ) from error
             done += info.file_size
             progress(done / max(total, 1))
-    warnings = [f"{join_names(others)} in the zip: neither an image nor a TOML, and not used"] if others else []
+    warnings = (
+        [f"{join_names(others)} in the zip: neither an image nor a TOML, and not used"]
+        if others
+        else []
+    )
     return _innermost_folder(folder), warnings
 
 
@@ -62,18 +71,28 @@ def _open_zip(archive: IO[bytes]) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(archive)
     except (zipfile.BadZipFile, OSError) as error:
-        raise InputError("the file is no zip, or is cut short: put the folder of captures into a zip") from error
+        raise InputError(
+            "the file is no zip, or is cut short: put the folder of captures into a zip"
+        ) from error
 
 
-def _select_members(zipped: zipfile.ZipFile, max_bytes: int) -> tuple[list[zipfile.ZipInfo], list[str]]:
+def _select_members(
+    zipped: zipfile.ZipFile, max_bytes: int
+) -> tuple[list[zipfile.ZipInfo], list[str]]:
     """Return the members of a zip to unpack, and the names of all others."""
     members, others = [], []
     for info in zipped.infolist():
         path = PurePosixPath(info.filename)
-        outside = path.is_absolute() or ".." in path.parts or "\\" in info.filename or _DRIVE.match(info.filename)
+        outside = (
+            path.is_absolute()
+            or ".." in path.parts
+            or "\\" in info.filename
+            or _DRIVE.match(info.filename)
+        )
         if outside or stat.S_ISLNK(info.external_attr >> 16):
             raise InputError(
-                f"{info.filename!r} in the zip leads outside of it: make the zip of plain files and folders"
+                f"{info.filename!r} in the zip leads outside of it: make the zip of plain files and"
+                " folders"
             )
         if info.is_dir() or any(part.startswith((".", "__MACOSX")) for part in path.parts):
             continue
@@ -81,13 +100,16 @@ def _select_members(zipped: zipfile.ZipFile, max_bytes: int) -> tuple[list[zipfi
             others.append(path.name)
             continue
         if info.flag_bits & 1:
-            raise InputError(f"{info.filename} in the zip is encrypted: make the zip without a password")
+            raise InputError(
+                f"{info.filename} in the zip is encrypted: make the zip without a password"
+            )
         members.append(info)
     total = sum(info.file_size for info in members)
     if total > max_bytes or len(members) > MOST_FILES:
         raise InputError(
-            f"the zip holds {len(members)} files of {format_bytes(total)} together: {MOST_FILES} files and "
-            f"{format_bytes(max_bytes)} are allowed; import the folder by its path on the server instead"
+            f"the zip holds {len(members)} files of {format_bytes(total)} together: {MOST_FILES}"
+            f" files and {format_bytes(max_bytes)} are allowed; import the folder by its path on"
+            " the server instead"
         )
     if not members:
         raise InputError("the zip holds no images: put the folder of captures into a zip")
@@ -95,7 +117,8 @@ def _select_members(zipped: zipfile.ZipFile, max_bytes: int) -> tuple[list[zipfi
 
 
 def _innermost_folder(folder: Path) -> Path:
-    """Return the folder itself, or the inner one that alone holds everything, as in a zip of a folder."""
+    """Return the folder itself, or the inner one that alone holds everything, as in a zip of a
+    folder."""
     while not any(layout.recognises(folder) for layout in layouts().values()):
         inside = visible(folder)
         if len(inside) != 1 or not inside[0].is_dir():

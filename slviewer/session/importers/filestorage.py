@@ -22,42 +22,54 @@ _MAX_NUMBERS = 10_000
 
 @dataclass(frozen=True)
 class Storage:
-    """What a file holds at its top level: the ``name`` of the file, and for each key a float64 matrix, or None where
-    the entry is no matrix of numbers."""
+    """What a file holds at its top level: the ``name`` of the file, and for each key a float64
+    matrix, or None where the entry is no matrix of numbers."""
 
     name: str
     entries: dict[str, np.ndarray | None]
 
     def matrix(self, key: str) -> np.ndarray:
-        """The matrix under a key; InputError where it is none, or holds numbers that are not finite."""
+        """The matrix under a key; InputError where it is none, or holds numbers that are not
+        finite."""
         matrix = self.entries[key]
         if matrix is None:
             raise InputError(f"{self.name}: {key} is no matrix of numbers: name the key of one")
         if not np.isfinite(matrix).all():
-            raise InputError(f"{self.name}: {key} holds numbers that are not finite: calibrate again")
+            raise InputError(
+                f"{self.name}: {key} holds numbers that are not finite: calibrate again"
+            )
         return matrix
 
 
 def read_storage(path: Path) -> Storage:
     """The matrices of an OpenCV FileStorage file; InputError where it cannot be read."""
     if not path.is_file():
-        raise InputError(f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)")
+        raise InputError(
+            f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)"
+        )
     try:
         read_file(path, _MAX_BYTES)
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error}): give an OpenCV FileStorage file") from error
+        raise InputError(
+            f"{path} cannot be read ({error}): give an OpenCV FileStorage file"
+        ) from error
     status, output = run_isolated(__name__, str(path.absolute()))
     if status != 0:
         reason = "is no" if status == 1 else "makes OpenCV's parser fail, as it is too large or no"
         raise InputError(
-            f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json): export the calibration again"
+            f"{path.name} {reason} OpenCV FileStorage file (.yml, .xml or .json): export the"
+            " calibration again"
         )
     entries = json.loads(output)
-    return Storage(path.name, {key: None if v is None else np.array(v, np.float64) for key, v in entries.items()})
+    return Storage(
+        path.name,
+        {key: None if v is None else np.array(v, np.float64) for key, v in entries.items()},
+    )
 
 
 def _parse(path: str) -> dict[str, Any]:
-    """Return {key: nested lists of numbers, or None} for the entries of a file. Raises what OpenCV raises."""
+    """Return {key: nested lists of numbers, or None} for the entries of a file. Raises what OpenCV
+    raises."""
     storage = cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
     if not storage.isOpened():
         raise ValueError("no storage")
@@ -71,7 +83,8 @@ def _parse(path: str) -> dict[str, Any]:
 
 
 def _numbers(node: Any) -> list[Any]:
-    """A FileStorage matrix, or numbers in (nested) sequences, as nested lists; ValueError for anything else."""
+    """A FileStorage matrix, or numbers in (nested) sequences, as nested lists; ValueError for
+    anything else."""
 
     def plain(node: Any, depth: int) -> Any:
         """Return a node of numbers or nested sequences as a float or nested lists."""

@@ -55,10 +55,13 @@ class _Gray(_Group, tag="gray"):
     msb_first: bool = True
 
     def frames(self) -> list[Frame]:
-        """Return the frames of the bits in their order, each followed by its inverse if there is one."""
+        """Return the frames of the bits in their order, each followed by its inverse if there is
+        one."""
         pairs = range(self.bits) if self.msb_first else reversed(range(self.bits))
         kinds: tuple[Kind, ...] = ("gray", "inverse") if self.inverse else ("gray",)
-        frames = [Frame(kind, self.axis, bit=bit, bits=self.bits) for bit in pairs for kind in kinds]
+        frames = [
+            Frame(kind, self.axis, bit=bit, bits=self.bits) for bit in pairs for kind in kinds
+        ]
         extra = [Frame("complementary", self.axis)] if self.complementary else []
         return frames + extra if self.msb_first else extra + frames
 
@@ -96,11 +99,12 @@ _AnyGroup = _Phase | _Gray | _Inverse | _Complementary | _White | _Black | _Text
 
 @dataclass(frozen=True)
 class FrameGroup:
-    """One or more images that follow each other: the frames that they show, and how their files are named.
+    """One or more images that follow each other: the frames that they show, and how their files are
+    named.
 
-    `files`: names relative to the capture's folder, or patterns in which * and ? are wildcards and all else, brackets
-    too, is literal. A single pattern stands for all frames of the group, in natural order of the names. None: the
-    TOML orders the files by name.
+    `files`: names relative to the capture's folder, or patterns in which * and ? are wildcards and
+    all else, brackets too, is literal. A single pattern stands for all frames of the group, in
+    natural order of the names. None: the TOML orders the files by name.
     """
 
     where: str
@@ -109,7 +113,8 @@ class FrameGroup:
     exposure_ms: float | None
 
     def select(self, folder: Path) -> list[Path]:
-        """The group's files in a capture's folder, in order; fewer or more than its frames where some are missing."""
+        """The group's files in a capture's folder, in order; fewer or more than its frames where
+        some are missing."""
         assert self.files is not None
         if len(self.files) == 1 and has_wildcard(self.files[0]):
             return match_files(folder, self.files[0])
@@ -127,16 +132,24 @@ class FrameGroup:
 
 
 def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
-    """The `[[frame]]` or the `[[frames]]` tables of the TOML `name`. Raises InputError, saying which is wrong."""
+    """The `[[frame]]` or the `[[frames]]` tables of the TOML `name`. Raises InputError, saying
+    which is wrong."""
     single, groups = data.get("frame"), data.get("frames")
     if single is not None and groups is not None:
-        raise InputError(f"{name} has [[frame]] and [[frames]] tables, and so no order: use one of the two")
+        raise InputError(
+            f"{name} has [[frame]] and [[frames]] tables, and so no order: use one of the two"
+        )
     ordered = data.get("order")
     if ordered not in (None, "name"):
         raise InputError(f'{name}: order is {ordered!r}: use "name", or give each entry its files')
-    key, entries, read = ("frames", groups, _read_group) if single is None else ("frame", single, _read_frame)
+    key, entries, read = (
+        ("frames", groups, _read_group) if single is None else ("frame", single, _read_frame)
+    )
     if not isinstance(entries, list) or not entries:
-        raise InputError(f"{name} names no frames: add a [[frame]] table for each image, or [[frames]] for several")
+        raise InputError(
+            f"{name} names no frames: add a [[frame]] table for each image, or [[frames]] for"
+            " several"
+        )
     parsed = []
     for number, entry in enumerate(entries, 1):
         where = f"{name}, [[{key}]] {number}"
@@ -152,7 +165,8 @@ def has_wildcard(name: str) -> bool:
 
 
 def match_files(folder: Path, pattern: str) -> list[Path]:
-    """The images in a folder, or in the inner folder that the pattern names, whose name matches, in natural order."""
+    """The images in a folder, or in the inner folder that the pattern names, whose name matches, in
+    natural order."""
     *inner, last = pattern.split("/")
     folder = folder.joinpath(*inner)
     if not folder.is_dir():
@@ -170,7 +184,9 @@ def images_by_name(folder: Path) -> list[Path]:
 def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGroup:
     """Read a `[[frame]]` table: one image."""
     if "files" in entry:
-        raise InputError(f"{where}: files belongs to [[frames]]: name the one file of a [[frame]] with file")
+        raise InputError(
+            f"{where}: files belongs to [[frames]]: name the one file of a [[frame]] with file"
+        )
     files = _file_names(where, entry.get("file"), ordered)
     where = f"{where} ({files[0]})" if files else where
     for key in ("kind", "axis"):
@@ -178,7 +194,9 @@ def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
             raise InputError(f"{where}: {key} must be a word in quotes, not {entry[key]!r}")
     try:
         exposure: float | None = msgspec.convert(entry.get("exposure_ms"), _Exposure)
-        frame = Frame.from_dict({key: value for key, value in entry.items() if key != "exposure_ms"})
+        frame = Frame.from_dict(
+            {key: value for key, value in entry.items() if key != "exposure_ms"}
+        )
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: exposure_ms: {error}") from error
     except InputError as error:
@@ -196,8 +214,15 @@ def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGro
     except (msgspec.ValidationError, InputError) as error:
         raise InputError(f"{where}: {error}") from error
     files = _file_names(where, group.files, ordered)
-    if files is not None and not (len(files) == 1 and has_wildcard(files[0])) and len(files) != len(frames):
-        raise InputError(f"{where} names {len(files)} files and describes {len(frames)} images: correct one of them")
+    if (
+        files is not None
+        and not (len(files) == 1 and has_wildcard(files[0]))
+        and len(files) != len(frames)
+    ):
+        raise InputError(
+            f"{where} names {len(files)} files and describes {len(frames)} images: correct one of"
+            " them"
+        )
     return FrameGroup(where, frames, files, group.exposure_ms)
 
 
@@ -205,11 +230,22 @@ def _file_names(where: str, named: Any, ordered: bool) -> tuple[str, ...] | None
     """Return the checked file names of a group; None where the order of names determines them."""
     if ordered:
         if named is not None:
-            raise InputError(f'{where} names files, and order = "name" takes them in order of their names: use one')
+            raise InputError(
+                f'{where} names files, and order = "name" takes them in order of their names:'
+                " use one"
+            )
         return None
     names = [named] if isinstance(named, str) else named
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
-        raise InputError(f'{where} names no file: add its name in quotes, or order = "name" at the top')
+    if (
+        not isinstance(names, list)
+        or not names
+        or not all(isinstance(name, str) and name for name in names)
+    ):
+        raise InputError(
+            f'{where} names no file: add its name in quotes, or order = "name" at the top'
+        )
     if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
-        raise InputError(f'{where}: "{outside[0]}" lies outside of the capture\'s folder: name files inside it')
+        raise InputError(
+            f'{where}: "{outside[0]}" lies outside of the capture\'s folder: name files inside it'
+        )
     return tuple(names)

@@ -26,9 +26,9 @@ bit = 0                  # 0 = most significant
 bits = 7
 ```
 
-A long sequence is shorter in groups, `[[frames]]` in place of `[[frame]]`. The files of a group are one pattern, in
-natural order of the names (2 before 10), or a list. With `order = "name"` at the top no entry names files: all images
-of a folder are taken in natural order of their names.
+A long sequence is shorter in groups, `[[frames]]` in place of `[[frame]]`. The files of a group are
+one pattern, in natural order of the names (2 before 10), or a list. With `order = "name"` at the
+top no entry names files: all images of a folder are taken in natural order of their names.
 
 ```toml
 projector = "1280x800"
@@ -54,8 +54,9 @@ kind = "white"           # one image; so are black, texture, complementary
 files = "white.png"
 ```
 
-A sequence that was taken in several exposures names them: each entry has `exposure_ms`, and every exposure has the same
-frames. They become one capture, in which each pixel comes from the longest exposure that did not saturate it.
+A sequence that was taken in several exposures names them: each entry has `exposure_ms`, and every
+exposure has the same frames. They become one capture, in which each pixel comes from the longest
+exposure that did not saturate it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,7 +66,12 @@ from typing import Any, get_args
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import SEQUENCE_KEYS, PatternSequence, parse_size
-from slviewer.session.importers.frame_groups import FrameGroup, has_wildcard, images_by_name, read_groups
+from slviewer.session.importers.frame_groups import (
+    FrameGroup,
+    has_wildcard,
+    images_by_name,
+    read_groups,
+)
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -84,8 +90,8 @@ _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
 class Description:
     """The content of a TOML that describes every capture of a source.
 
-    `files_order`: index of each stack frame's file among the files of all groups. `gray_origin_given`: whether the TOML
-    states where Gray code 0 begins.
+    `files_order`: index of each stack frame's file among the files of all groups.
+    `gray_origin_given`: whether the TOML states where Gray code 0 begins.
     """
 
     sequence: PatternSequence
@@ -96,18 +102,23 @@ class Description:
     gray_origin_given: bool
 
     def select_files(self, folder: Path) -> tuple[Path, ...]:
-        """Return the files of one capture in the order of its stack; InputError names missing or surplus files."""
+        """Return the files of one capture in the order of its stack; InputError names missing or
+        surplus files."""
         if self.groups[0].files is None:
             matched, count = images_by_name(folder), len(self.files_order)
             if len(matched) != count:
-                raise InputError(f"it holds {len(matched)} images, and {count} are described: add or remove images")
+                raise InputError(
+                    f"it holds {len(matched)} images, and {count} are described: add or remove"
+                    " images"
+                )
         else:
             selected = [group.select(folder) for group in self.groups]
             self._check_selected(selected)
             matched = [file for files in selected for file in files]
             if double := {file.name for file in matched if matched.count(file) > 1}:
                 raise InputError(
-                    f"{join_names(sorted(double))} would show two patterns: correct the patterns of the names"
+                    f"{join_names(sorted(double))} would show two patterns: correct the patterns of"
+                    " the names"
                 )
         return tuple(matched[index] for index in self.files_order)
 
@@ -120,11 +131,13 @@ class Description:
                 continue
             if len(group.files) == 1 and has_wildcard(group.files[0]):
                 raise InputError(
-                    f'{len(files)} files match "{group.files[0]}", and {group.where} describes {len(group.frames)} '
-                    "images: add what is missing, or correct the pattern"
+                    f'{len(files)} files match "{group.files[0]}", and {group.where} describes'
+                    f" {len(group.frames)} images: add what is missing, or correct the pattern"
                 )
             names = {file.name for file in files}
-            missing += [name for name in group.files if has_wildcard(name) or Path(name).name not in names]
+            missing += [
+                name for name in group.files if has_wildcard(name) or Path(name).name not in names
+            ]
         if missing:
             raise InputError(f"it lacks {join_names(missing)}, which the TOML names: add them")
 
@@ -132,45 +145,63 @@ class Description:
         """Return whether a folder holds a named file, or more than half of a capture's images."""
         if self.groups[0].files is None:
             return 2 * len(images_by_name(folder)) > len(self.files_order)
-        names = [name for group in self.groups for name in group.files or () if not has_wildcard(name)]
+        names = [
+            name for group in self.groups for name in group.files or () if not has_wildcard(name)
+        ]
         if any((folder / name).is_file() for name in names):
             return True
         return 2 * sum(len(group.select(folder)) for group in self.groups) > len(self.files_order)
 
 
-def _read(source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None) -> Imports:
+def _read(
+    source: Path, toml: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None
+) -> Imports:
     """Captures named after their folders, all described by the one TOML.
 
-    `projector` is for a TOML that does not say the size. A capture's settings say under `gray_origin_given` whether
-    the TOML did: where not, the sequence carries the default, and the origin is better estimated from the phase.
-    Raises InputError for a TOML that is damaged, incomplete or contradicts itself, and where no capture can be used.
+    `projector` is for a TOML that does not say the size. A capture's settings say under
+    `gray_origin_given` whether the TOML did: where not, the sequence carries the default, and the
+    origin is better estimated from the phase. Raises InputError for a TOML that is damaged,
+    incomplete or contradicts itself, and where no capture can be used.
     """
     described = read_description(toml, projector)
 
     def describe(folder: Path, name: str) -> tuple[ImportableRecording, list[str]]:
-        """Return the recording of a folder, and warnings about files that the TOML does not mention."""
+        """Return the recording of a folder, and warnings about files that the TOML does not
+        mention."""
         files = described.select_files(folder)
         settings: dict[str, Any] = {"gray_origin_given": described.gray_origin_given}
         exposures = described.exposures_ms
         if len(exposures) == 1:
             settings["exposure_ms"], exposures = exposures[0], ()
-        recording = ImportableRecording(name, described.sequence, files, folder, settings, described.channel, exposures)
-        return recording, strangers_warning(folder, sorted(set(images_by_name(folder)) - set(files)))
+        recording = ImportableRecording(
+            name, described.sequence, files, folder, settings, described.channel, exposures
+        )
+        return recording, strangers_warning(
+            folder, sorted(set(images_by_name(folder)) - set(files))
+        )
 
     files = described.groups[0].files
-    first = "images in the order of their names" if files is None else f"{files[0]} and the other files"
+    first = (
+        "images in the order of their names" if files is None else f"{files[0]} and the other files"
+    )
     looks_like = f"{first} of {Path(toml).name}"
     return collect_captures(Path(source), prefix, described.is_capture, looks_like, describe)
 
 
 def read_description(toml: Path, projector: tuple[int, int] | None = None) -> Description:
-    """What a TOML describes; `projector` is for one that does not state the size. Raises InputError."""
+    """What a TOML describes; `projector` is for one that does not state the size. Raises
+    InputError."""
     toml = Path(toml)
     data = read_toml(toml)
     if unknown := sorted(set(data) - _KEYS):
-        raise InputError(f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(_KEYS))}")
+        raise InputError(
+            f"{toml.name} has the unknown entry '{unknown[0]}': use {', '.join(sorted(_KEYS))}"
+        )
     if data.get("channel") not in (None, *get_args(Channel)):
-        raise InputError(f"{toml.name}: channel is {data['channel']!r}: use one of {', '.join(get_args(Channel))}")
+        raise InputError(
+            f"{toml.name}: channel is {data['channel']!r}: use one of"
+            f" {', '.join(get_args(Channel))}"
+        )
     _check_projector(toml, data, projector)
     groups = read_groups(toml.name, data)
     try:
@@ -181,18 +212,23 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
         sequence = PatternSequence.from_dict({**data, **size, "frame": shown})
     except InputError as error:
         raise InputError(f"{toml.name}: {error}") from error
-    return Description(sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data)
+    return Description(
+        sequence, groups, tuple(order), exposures, data.get("channel"), "gray_origin" in data
+    )
 
 
 def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], list[int]]:
-    """The exposures, none where no entry states one, and the frames' indices, one exposure after the other, all in the
-    order of the first."""
+    """The exposures, none where no entry states one, and the frames' indices, one exposure after
+    the other, all in the order of the first."""
     frames = [(frame, group.exposure_ms) for group in groups for frame in group.frames]
     exposures = tuple(dict.fromkeys(exposure for _, exposure in frames if exposure is not None))
     if not exposures:
         return (), list(range(len(frames)))
     if unstated := [frame for frame, exposure in frames if exposure is None]:
-        raise InputError(f"{len(unstated)} of {len(frames)} images state no exposure_ms: add it to all, or to none")
+        raise InputError(
+            f"{len(unstated)} of {len(frames)} images state no exposure_ms: add it to all, or to"
+            " none"
+        )
     wanted = [frame for frame, exposure in frames if exposure == exposures[0]]
     order: list[int] = []
     for each in exposures:
@@ -200,20 +236,28 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
         count = sum(exposure == each for _, exposure in frames)
         if set(there) != set(wanted) or count != len(wanted):
             raise InputError(
-                f"the exposures of {exposures[0]:g} and {each:g} ms show other frames: describe the whole sequence, "
-                "each frame once, in every exposure"
+                f"the exposures of {exposures[0]:g} and {each:g} ms show other frames: describe the"
+                " whole sequence, each frame once, in every exposure"
             )
         order += [there[frame] for frame in wanted]
     return exposures, order
 
 
-def _check_projector(toml: Path, data: Mapping[str, Any], projector: tuple[int, int] | None) -> None:
+def _check_projector(
+    toml: Path, data: Mapping[str, Any], projector: tuple[int, int] | None
+) -> None:
     """Raise InputError where the TOML and the option state different projector sizes."""
-    if "projector" in data and projector is not None and parse_size(data["projector"]) != tuple(projector):
+    if (
+        "projector" in data
+        and projector is not None
+        and parse_size(data["projector"]) != tuple(projector)
+    ):
         raise InputError(
-            f"{toml.name} says that the projector is {data['projector']}, and {projector[0]}x{projector[1]} was given: "
-            "correct the one that is wrong"
+            f"{toml.name} says that the projector is {data['projector']}, and"
+            f" {projector[0]}x{projector[1]} was given: correct the one that is wrong"
         )
 
 
-LAYOUT = FolderLayout("frames", "images and a TOML that describes them", _read, lambda folder: False)
+LAYOUT = FolderLayout(
+    "frames", "images and a TOML that describes them", _read, lambda folder: False
+)

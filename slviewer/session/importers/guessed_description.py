@@ -1,4 +1,5 @@
-"""The `frames` TOML of a folder whose images nobody described, as the images themselves suggest it."""
+"""The `frames` TOML of a folder whose images nobody described, as the images themselves suggest
+it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,8 @@ from slviewer.session.toml import format_value, table_lines
 
 @dataclass(frozen=True)
 class GuessedDescription:
-    """``toml``: the text, whose comments say what supports each entry. ``doubts``: what stays open; empty where the
-    description is sure."""
+    """``toml``: the text, whose comments say what supports each entry. ``doubts``: what stays open;
+    empty where the description is sure."""
 
     toml: str
     doubts: tuple[str, ...]
@@ -25,10 +26,11 @@ class GuessedDescription:
 def guess_toml(
     folder: Path, projector: tuple[int, int] | None = None, channel: Channel | None = None
 ) -> GuessedDescription:
-    """Guess the pattern sequence of a folder's images, in natural order of their names, as a TOML with doubts.
+    """Guess the pattern sequence of a folder's images, in natural order of their names, as a TOML
+    with doubts.
 
-    Of a folder of captures, the first is read. Raises InputError where there are no images, or they cannot belong to
-    one capture (other sizes, damaged).
+    Of a folder of captures, the first is read. Raises InputError where there are no images, or they
+    cannot belong to one capture (other sizes, damaged).
     """
     folder = _capture_folder(expand_user(folder))
     files = images_by_name(folder)
@@ -38,25 +40,34 @@ def guess_toml(
     shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
     other = "; the green of these colour images was read: try --channel red, blue or max"
     hint = other if images.in_colour and channel is None and not any(guess.frames) else ""
-    doubts = tuple(f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts)
+    doubts = tuple(
+        f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts
+    )
     return GuessedDescription(_format_toml(folder, names, guess, shown, projector, doubts), doubts)
 
 
 def _capture_folder(source: Path) -> Path:
-    """Return the source or its first inner folder with three images or more; InputError without one."""
+    """Return the source or its first inner folder with three images or more; InputError without
+    one."""
     if not source.is_dir():
         raise InputError(f"{source} is no folder: give the folder of a capture")
     folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
     for folder in folders:
         if len(images_by_name(folder)) >= 3:
             return folder
-    raise InputError(f"{source} and the folders in it hold fewer than three images: give the folder of a capture")
+    raise InputError(
+        f"{source} and the folders in it hold fewer than three images: give the folder of a capture"
+    )
 
 
 def _format_span(names: list[str], indices: tuple[int, ...]) -> str:
     """Format the names at some indices: "first to last" where they are consecutive, else a list."""
     whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
-    return f"{names[indices[0]]} to {names[indices[-1]]}" if whole else join_names([names[i] for i in indices])
+    return (
+        f"{names[indices[0]]} to {names[indices[-1]]}"
+        if whole
+        else join_names([names[i] for i in indices])
+    )
 
 
 def _format_toml(
@@ -85,7 +96,9 @@ def _format_toml(
     evidence: dict[int, list[str]] = {}
     for image, text in guess.evidence:
         evidence.setdefault(image, []).append(text)
-    doubtful = {image: text for images, text in guess.doubts if len(images) < len(names) for image in images}
+    doubtful = {
+        image: text for images, text in guess.doubts if len(images) < len(names) for image in images
+    }
     for index, (name, frame) in enumerate(zip(names, guess.frames, strict=True)):
         lines += ["", *(f"# {text}" for text in evidence.get(index, []))]
         if index in doubtful:

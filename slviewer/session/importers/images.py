@@ -1,4 +1,5 @@
-"""Image files into one stack, and none of them believed without a look: OpenCV decodes half a file without a word."""
+"""Image files into one stack, and none of them believed without a look: OpenCV decodes half a file
+without a word."""
 
 import re
 import struct
@@ -25,16 +26,22 @@ MAX_PIXELS = 160_000_000
 _THREADS = 4  # decoding releases the interpreter
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_NETPBM = re.compile(rb"P[1-7]" + 2 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,5})\s)?")
+_NETPBM = re.compile(
+    rb"P[1-7]" + 2 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,5})\s)?"
+)
 
 
 @dataclass(frozen=True)
 class FrameImages:
-    """Image files as frames of one channel. ``in_colour``: whether the files hold colours, of which one channel was
-    used. ``full_scale``: the grey level at which their camera clipped, None where neither file nor caller states it."""
+    """Image files as frames of one channel. ``in_colour``: whether the files hold colours, of which
+    one channel was used. ``full_scale``: the grey level at which their camera clipped, None where
+    neither file nor caller states it.
+    """
 
     stack: np.ndarray  # (n, h, w) uint8 or uint16
-    texture: np.ndarray | None  # (h, w, 3) RGB of the frame that was asked for, where it is in colour
+    texture: (
+        np.ndarray | None
+    )  # (h, w, 3) RGB of the frame that was asked for, where it is in colour
     in_colour: bool
     full_scale: int | None
 
@@ -45,11 +52,13 @@ def read_frames(
     channel: Channel = DEFAULT_CHANNEL,
     full_scale: int | None = None,
 ) -> FrameImages:
-    """The frames of image files, and the colours of frame `colour_frame` if it has any; `full_scale` where it is known.
+    """The frames of image files, and the colours of frame `colour_frame` if it has any;
+    `full_scale` where it is known.
 
-    Colour frames are reduced to one channel, by default green: a colour camera samples it most densely, and unlike a
-    mixture it stays linear up to the level at which it saturates, which decoding can see. Raises InputError, naming the
-    file, for an image that is missing, cut short, damaged, of another size or bit depth than the first, or transparent.
+    Colour frames are reduced to one channel, by default green: a colour camera samples it most
+    densely, and unlike a mixture it stays linear up to the level at which it saturates, which
+    decoding can see. Raises InputError, naming the file, for an image that is missing, cut short,
+    damaged, of another size or bit depth than the first, or transparent.
     """
     first = read_image(paths[0])
     try:
@@ -83,9 +92,9 @@ def read_frames(
 def _stated_full_scale(path: Path, stack: np.ndarray) -> int | None:
     """Return the full scale that the first of the files states; None where its format states none.
 
-    A PGM states its largest grey level, which many programs leave at 65535. A PNG may state the number of significant
-    bits: by its standard the upper ones, but programs that leave the bits at the bottom write it too. The tags of a
-    TIFF state the extremes of its own pixels.
+    A PGM states its largest grey level, which many programs leave at 65535. A PNG may state the
+    number of significant bits: by its standard the upper ones, but programs that leave the bits at
+    the bottom write it too. The tags of a TIFF state the extremes of its own pixels.
     """
     data, largest = read_file(path, MAX_IMAGE_BYTES)[:4096], int(stack.max())
     at = data.find(b"sBIT") if data.startswith(_PNG) else -1
@@ -100,11 +109,13 @@ def _stated_full_scale(path: Path, stack: np.ndarray) -> int | None:
     return full_scale if largest <= full_scale else full_scale << (16 - bits)
 
 
-def reduce_channels(image: np.ndarray, channel: Channel, full_scale: int | None = None) -> np.ndarray:
+def reduce_channels(
+    image: np.ndarray, channel: Channel, full_scale: int | None = None
+) -> np.ndarray:
     """(h, w) of a (h, w, 3) BGR image, of its dtype.
 
-    luma is that of ITU-R BT.601, and full scale where one of the channels saturates: the mixture would hide it.
-    ``full_scale`` as in `clip_level`.
+    luma is that of ITU-R BT.601, and full scale where one of the channels saturates: the mixture
+    would hide it. ``full_scale`` as in `clip_level`.
     """
     if channel == "max":
         return image.max(axis=2)
@@ -117,18 +128,22 @@ def reduce_channels(image: np.ndarray, channel: Channel, full_scale: int | None 
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly an image."""
+    """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly
+    an image."""
     try:
         data = read_file(path, MAX_IMAGE_BYTES)
     except OSError as error:
-        raise InputError(f"{_short_path(path)} cannot be read ({error.strerror or error}): check the file") from error
+        raise InputError(
+            f"{_short_path(path)} cannot be read ({error.strerror or error}): check the file"
+        ) from error
     if fault := _describe_fault(data):
         raise InputError(f"{_short_path(path)} is {fault}: copy or record it again")
     width, height = _announced_size(data)
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{_short_path(path)} is {width}x{height} px, and images of up to {MAX_PIXELS / 1e6:.0f} megapixels are "
-            "read: crop it, or record it at a lower resolution"
+            f"{_short_path(path)} is {width}x{height} px, and images of up to"
+            f" {MAX_PIXELS / 1e6:.0f} megapixels are read: crop it, or record it at a lower"
+            " resolution"
         )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -137,10 +152,13 @@ def read_image(path: Path) -> np.ndarray:
     if image is None:
         raise InputError(f"{_short_path(path)} is not a readable image: copy or record it again")
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{_short_path(path)} has pixels of type {image.dtype}: save frames with 8 or 16 bits")
+        raise InputError(
+            f"{_short_path(path)} has pixels of type {image.dtype}: save frames with 8 or 16 bits"
+        )
     if image.ndim == 3 and image.shape[2] != 3:
         raise InputError(
-            f"{_short_path(path)} has {image.shape[2]} channels: save frames in grey or RGB, without alpha"
+            f"{_short_path(path)} has {image.shape[2]} channels: save frames in grey or RGB,"
+            " without alpha"
         )
     return image
 
@@ -149,13 +167,13 @@ def _check_alike(image: np.ndarray, first: np.ndarray, path: Path, first_path: P
     """Raise InputError unless an image has the size, bit depth and channels of the first one."""
     if image.shape[:2] != first.shape[:2]:
         raise InputError(
-            f"{_short_path(path)} is {_format_size(image)} px, {_short_path(first_path)} is {_format_size(first)}: "
-            "all frames of a capture must have one size"
+            f"{_short_path(path)} is {_format_size(image)} px, {_short_path(first_path)} is"
+            f" {_format_size(first)}: all frames of a capture must have one size"
         )
     if image.dtype != first.dtype:
         raise InputError(
-            f"{_short_path(path)} has {8 * image.itemsize} bits, {_short_path(first_path)} has {8 * first.itemsize}: "
-            "all frames of a capture must have one bit depth"
+            f"{_short_path(path)} has {8 * image.itemsize} bits, {_short_path(first_path)} has"
+            f" {8 * first.itemsize}: all frames of a capture must have one bit depth"
         )
 
 
@@ -174,12 +192,15 @@ def _describe_fault(data: bytes) -> str | None:
             *struct.unpack_from("<HI", data, 28),
         )
         row = (abs(width) * bits + 31) // 32 * 4
-        return "cut short" if packed in (0, 3) and len(data) < data_start + row * abs(height) else None
+        return (
+            "cut short" if packed in (0, 3) and len(data) < data_start + row * abs(height) else None
+        )
     return None
 
 
 def _describe_png_fault(data: bytes) -> str | None:
-    """Describe a fault in the chunks of a PNG: each states its length and carries a checksum, and the last is IEND."""
+    """Describe a fault in the chunks of a PNG: each states its length and carries a checksum, and
+    the last is IEND."""
     at, view = len(_PNG), memoryview(data)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
@@ -195,7 +216,8 @@ def _describe_png_fault(data: bytes) -> str | None:
 
 
 def _announced_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) px that the header of an image announces, (0, 0) where it has none that is known."""
+    """Return (width, height) px that the header of an image announces, (0, 0) where it has none
+    that is known."""
     if data.startswith(_PNG) and len(data) >= 24:
         return struct.unpack_from(">II", data, 16)  # type: ignore[return-value]
     if data.startswith(b"BM") and len(data) >= 26:
@@ -228,8 +250,8 @@ def _tiff_size(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Return whether an end-of-image marker follows the scan; one inside a thumbnail, which comes before, does not
-    count."""
+    """Return whether an end-of-image marker follows the scan; one inside a thumbnail, which comes
+    before, does not count."""
     at = 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -246,7 +268,10 @@ def _jpeg_ends(data: bytes) -> bool:
 
 def _is_grey(image: np.ndarray) -> bool:
     """Return whether the three channels of an image (h, w, 3) are equal."""
-    return bool(np.array_equal(image[..., 0], image[..., 1]) and np.array_equal(image[..., 1], image[..., 2]))
+    return bool(
+        np.array_equal(image[..., 0], image[..., 1])
+        and np.array_equal(image[..., 1], image[..., 2])
+    )
 
 
 def _format_size(image: np.ndarray) -> str:
@@ -255,5 +280,6 @@ def _format_size(image: np.ndarray) -> str:
 
 
 def _short_path(path: Path) -> str:
-    """Format a path as the file with the two folders above it: enough to identify it in a source of many captures."""
+    """Format a path as the file with the two folders above it: enough to identify it in a source of
+    many captures."""
     return "/".join(path.parts[-3:])

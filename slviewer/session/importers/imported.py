@@ -23,22 +23,30 @@ class ImportableRecording:
 
     name: str
     sequence: PatternSequence
-    files: tuple[Path, ...]  # one a frame, in the sequence's order; of several exposures one after the other
+    files: tuple[
+        Path, ...
+    ]  # one a frame, in the sequence's order; of several exposures one after the other
     source: Path
     settings: Mapping[str, Any] = field(default_factory=dict)
     channel: Channel | None = None  # of colour frames; None: the default
     exposures_ms: tuple[float, ...] = ()
 
     def read(self) -> NewCapture:
-        """The capture with its frames; InputError where an image cannot be used. `settings["channel"]` states which
-        channel of colour frames was taken."""
+        """The capture with its frames; InputError where an image cannot be used.
+        `settings["channel"]` states which channel of colour frames was taken."""
         channel = self.channel or DEFAULT_CHANNEL
-        shown, middle = _colour_frame(self.sequence), len(self.exposures_ms) // 2 * len(self.sequence.frames)
+        shown, middle = (
+            _colour_frame(self.sequence),
+            len(self.exposures_ms) // 2 * len(self.sequence.frames),
+        )
         colour_frame = None if shown is None else shown + middle
         images = read_frames(self.files, colour_frame, channel, self.sequence.full_scale)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
         sequence = replace(self.sequence, full_scale=images.full_scale)
-        files = [file.relative_to(self.source) if file.is_relative_to(self.source) else file for file in self.files]
+        files = [
+            file.relative_to(self.source) if file.is_relative_to(self.source) else file
+            for file in self.files
+        ]
         return NewCapture(
             self.name, sequence, images.stack, images.texture, str(self.source), settings, self.exposures_ms,
             tuple(file.as_posix() for file in files),
@@ -58,11 +66,14 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Imports:
-    """All captures of a source. Iterating reads them one at a time, so that memory is needed for one."""
+    """All captures of a source. Iterating reads them one at a time, so that memory is needed for
+    one."""
 
     recordings: Sequence[ImportableRecording]
     warnings: Sequence[str]  # files and folders that were not used
-    skipped: Sequence[Skipped] = ()  # captures whose files are missing, double or contradict the layout
+    skipped: Sequence[
+        Skipped
+    ] = ()  # captures whose files are missing, double or contradict the layout
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -75,8 +86,9 @@ class Imports:
 class FolderLayout:
     """How a tool lays its captures out on disk.
 
-    ``read(source, prefix=, projector=, ...)`` reads a source; ``is_capture(folder)``: whether the file names in a
-    folder are those of one capture; ``projector``: its size where none is given, None where the layout implies none.
+    ``read(source, prefix=, projector=, ...)`` reads a source; ``is_capture(folder)``: whether the
+    file names in a folder are those of one capture; ``projector``: its size where none is given,
+    None where the layout implies none.
     """
 
     name: str
@@ -86,7 +98,8 @@ class FolderLayout:
     projector: tuple[int, int] | None = None
 
     def recognises(self, folder: Path) -> bool:
-        """Whether `is_capture` is true; False where it fails, so that one layout does not hide the others."""
+        """Whether `is_capture` is true; False where it fails, so that one layout does not hide the
+        others."""
         try:
             return bool(self.is_capture(folder))
         except Exception:  # whatever a plugin raises; `check_importer` shows it to its author
@@ -103,29 +116,43 @@ def define_layout(
 ) -> FolderLayout:
     """Return a layout whose captures are recognised by their file names alone.
 
-    ``describe(folder, name, projector)`` returns the recording of one folder and warnings; it may have more parameters,
-    which Python passes to `read`;
-    ``needs_projector``: what depends on the projector's size, if anything does.
+    ``describe(folder, name, projector)`` returns the recording of one folder and warnings; it may
+    have more parameters, which Python passes to `read`; ``needs_projector``: what depends on the
+    projector's size, if anything does.
     """
     default = projector
 
     def read(
-        source: Path, *, prefix: str | None = None, projector: tuple[int, int] | None = None, **options: Any
+        source: Path,
+        *,
+        prefix: str | None = None,
+        projector: tuple[int, int] | None = None,
+        **options: Any,
     ) -> Imports:
-        """Return the captures of a source; InputError where the projector's size is needed and not given."""
+        """Return the captures of a source; InputError where the projector's size is needed and not
+        given."""
         size = projector or default
         if size is None and needs_projector:
-            raise InputError(f"{needs_projector} depend on the projector's size: give it with --projector 1280x800")
+            raise InputError(
+                f"{needs_projector} depend on the projector's size: give it with --projector"
+                " 1280x800"
+            )
         return collect_captures(
-            Path(source), prefix, is_capture, holds, lambda folder, name: describe(folder, name, size, **options)
+            Path(source),
+            prefix,
+            is_capture,
+            holds,
+            lambda folder, name: describe(folder, name, size, **options),
         )
 
     return FolderLayout(name, holds, read, is_capture, default)
 
 
-def match_images(folder: Path, pattern: re.Pattern[str]) -> tuple[dict[tuple[int, ...], Path], list[Path]]:
-    """{numbers in its name: image} of a folder's images whose stem matches the pattern, in order of the numbers, and
-    its other entries. Raises InputError where two images have the same numbers."""
+def match_images(
+    folder: Path, pattern: re.Pattern[str]
+) -> tuple[dict[tuple[int, ...], Path], list[Path]]:
+    """{numbers in its name: image} of a folder's images whose stem matches the pattern, in order of
+    the numbers, and its other entries. Raises InputError where two images have the same numbers."""
     images: dict[tuple[int, ...], Path] = {}
     others: list[Path] = []
     for file in sorted(visible(folder)):
@@ -135,31 +162,45 @@ def match_images(folder: Path, pattern: re.Pattern[str]) -> tuple[dict[tuple[int
             continue
         numbers = tuple(int(group) for group in match.groups())
         if numbers in images:
-            raise InputError(f"it holds {images[numbers].name} and {file.name} for one pattern: keep one of them")
+            raise InputError(
+                f"it holds {images[numbers].name} and {file.name} for one pattern: keep one of them"
+            )
         images[numbers] = file
     return dict(sorted(images.items())), others
 
 
-def check_complete(images: Mapping[tuple[int, ...], Path], stem: str, count: int = 0, first: int = 0) -> None:
-    """Raise InputError where images numbered ``first``, ``first`` + 1, ... have gaps, or are fewer than ``count``.
+def check_complete(
+    images: Mapping[tuple[int, ...], Path], stem: str, count: int = 0, first: int = 0
+) -> None:
+    """Raise InputError where images numbered ``first``, ``first`` + 1, ... have gaps, or are fewer
+    than ``count``.
 
     Numbers of missing images are named with as many digits as those that are there.
     """
     if not images and not count:
-        raise InputError(f"it holds no images {stem}{first:02d} and so on: copy or record them again")
+        raise InputError(
+            f"it holds no images {stem}{first:02d} and so on: copy or record them again"
+        )
     end = first + count if count else max(images)[0] + 1
     if missing := [number for number in range(first, end) if (number,) not in images]:
-        written = [run for (n,), file in images.items() for run in re.findall(r"\d+", file.stem) if int(run) == n]
+        written = [
+            run
+            for (n,), file in images.items()
+            for run in re.findall(r"\d+", file.stem)
+            if int(run) == n
+        ]
         digits = min(map(len, written), default=2)
         raise InputError(
-            f"it lacks {stem}{join_names([f'{n:0{digits}d}' for n in missing])}: copy or record them again"
+            f"it lacks {stem}{join_names([f'{n:0{digits}d}' for n in missing])}: copy or record"
+            " them again"
         )
 
 
 def has_images(folder: Path, pattern: re.Pattern[str]) -> bool:
     """Whether a folder exists and contains images whose stem matches the pattern."""
     return folder.is_dir() and any(
-        pattern.fullmatch(entry.stem) and entry.suffix.lower() in IMAGE_SUFFIXES for entry in visible(folder)
+        pattern.fullmatch(entry.stem) and entry.suffix.lower() in IMAGE_SUFFIXES
+        for entry in visible(folder)
     )
 
 
@@ -170,21 +211,29 @@ def collect_captures(
     looks_like: str,
     describe: Callable[[Path, str], tuple[ImportableRecording, list[str]]],
 ) -> Imports:
-    """The captures of a source in counting order: `source` itself if it is one, else the folders right inside it.
+    """The captures of a source in counting order: `source` itself if it is one, else the folders
+    right inside it.
 
-    `describe(folder, name)` returns the recording of one folder and warnings; where it raises InputError, that capture
-    alone is skipped. A folder that is named like the captures beside it and has nothing of one inside is skipped too.
-    Raises InputError where the source holds no captures (they should look like `looks_like`), or none can be used.
+    `describe(folder, name)` returns the recording of one folder and warnings; where it raises
+    InputError, that capture alone is skipped. A folder that is named like the captures beside it
+    and has nothing of one inside is skipped too. Raises InputError where the source holds no
+    captures (they should look like `looks_like`), or none can be used.
     """
     folders, empty, warnings = _capture_folders(source, is_capture, looks_like)
-    recordings, skipped = [], [Skipped(folder.name, f"it holds no frames ({looks_like})") for folder in empty]
+    recordings, skipped = (
+        [],
+        [Skipped(folder.name, f"it holds no frames ({looks_like})") for folder in empty],
+    )
     for folder in folders:
         try:
             recording, more = describe(folder, capture_name(folder, prefix))
         except InputError as error:
             skipped.append(Skipped(folder.name, str(error)))
         except Exception as error:  # a plugin's own fault
-            fault = f"its layout failed, {type(error).__name__}: {error}; report it to the layout's maker"
+            fault = (
+                f"its layout failed, {type(error).__name__}: {error}; report it to the layout's"
+                " maker"
+            )
             skipped.append(Skipped(folder.name, fault))
         else:
             recordings.append(recording)
@@ -201,24 +250,38 @@ def none_usable(skipped: Sequence[Skipped]) -> InputError:
     reasons: dict[str, list[str]] = {}
     for each in skipped:
         reasons.setdefault(each.reason.removeprefix(f"{each.name}: "), []).append(each.name)
-    shown = [f"{join_names(names, 3)}: {reason}" for reason, names in list(reasons.items())[:_MOST_REASONS]]
+    shown = [
+        f"{join_names(names, 3)}: {reason}"
+        for reason, names in list(reasons.items())[:_MOST_REASONS]
+    ]
     more = [f"and {len(reasons) - len(shown)} more reasons"] if len(reasons) > len(shown) else []
-    return InputError(f"none of the {len(skipped)} captures can be imported. " + "; ".join(shown + more))
+    return InputError(
+        f"none of the {len(skipped)} captures can be imported. " + "; ".join(shown + more)
+    )
 
 
 def _capture_folders(
     source: Path, is_capture: Callable[[Path], bool], looks_like: str
 ) -> tuple[list[Path], list[Path], list[str]]:
-    """Capture folders in counting order, folders that are only named like these, and warnings about all others."""
+    """Capture folders in counting order, folders that are only named like these, and warnings about
+    all others."""
     source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     if not source.is_dir():
-        raise InputError(f"{source} is no folder: give the folder of a capture, or a folder of such folders")
+        raise InputError(
+            f"{source} is no folder: give the folder of a capture, or a folder of such folders"
+        )
     if is_capture(source):
         return [source], [], []
-    inner = sorted((entry for entry in visible(source) if entry.is_dir()), key=lambda entry: natural_key(entry.name))
+    inner = sorted(
+        (entry for entry in visible(source) if entry.is_dir()),
+        key=lambda entry: natural_key(entry.name),
+    )
     captures = [folder for folder in inner if is_capture(folder)]
     if not captures:
-        raise InputError(f"{source} holds no captures: {looks_like} was looked for in it and in the folders inside")
+        raise InputError(
+            f"{source} holds no captures: {looks_like} was looked for in it and in the folders"
+            " inside"
+        )
     stems = {_name_pattern(folder) for folder in captures}
     others = [folder for folder in inner if folder not in captures]
     empty = [folder for folder in others if _name_pattern(folder) in stems]
@@ -227,7 +290,8 @@ def _capture_folders(
 
 
 def capture_name(folder: Path, prefix: str | None) -> str:
-    """The folder's name, behind `prefix_` if there is one; InputError where that cannot be a capture's name."""
+    """The folder's name, behind `prefix_` if there is one; InputError where that cannot be a
+    capture's name."""
     return new_name(f"{prefix}_{folder.name}" if prefix else folder.name)
 
 
@@ -244,7 +308,9 @@ def strangers_warning(folder: Path, files: Sequence[Path]) -> list[str]:
     if not files:
         return []
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
-    shown = join_names([file.name for file in (*images, *(file for file in files if file not in images))])
+    shown = join_names(
+        [file.name for file in (*images, *(file for file in files if file not in images))]
+    )
     return [f"{folder.parent.name}/{folder.name}: {shown} left aside: not part of the layout"]
 
 

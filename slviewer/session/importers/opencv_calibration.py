@@ -19,7 +19,14 @@ _SPELLINGS: tuple[tuple[str, ...], ...] = (
     ENTRIES,
     ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),  # sltk
     ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),  # SLStudio
-    ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation"),  # procam-calibration, as it spells it
+    (
+        "cam_int",
+        "cam_dist",
+        "proj_int",
+        "proj_dist",
+        "roration",
+        "translation",
+    ),  # procam-calibration, as it spells it
     ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
     ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
     ("K_cam", "D_cam", "K_proj", "D_proj", "R", "T"),
@@ -30,8 +37,8 @@ _SPELLINGS: tuple[tuple[str, ...], ...] = (
     ("K1", "D1", "K2", "D2", "R", "T"),
     ("K1", "dist1", "K2", "dist2", "R", "T"),
 )
-"""Common names of the entries, each row in the order of `ENTRIES`; a file is taken to use one row as a whole, but for R
-and T."""
+"""Common names of the entries, each row in the order of `ENTRIES`; a file is taken to use one row
+as a whole, but for R and T."""
 _TRANSFORMS = ("R", "T"), ("rotation", "translation"), ("rot", "trans")
 _SIZES = {
     "camera": ("camera_size", "cam_size", "image_size", "imageSize", ("frameWidth", "frameHeight")),
@@ -41,17 +48,23 @@ _SIZES = {
 
 
 def read_matrices(storage: Storage, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-    """The matrices under the file's own `keys`, given in the order of `ENTRIES`, and named by these.
+    """The matrices under the file's own `keys`, given in the order of `ENTRIES`, and named by
+    these.
 
-    K (3, 3) px; D (5,) = (k1, k2, p1, p2, k3); R (3, 3), the nearest rotation to what the file says; T (3,) mm; all
-    float64. R and T map camera to projector. Without `keys`, those of `identify_keys`. Raises InputError where an entry
-    is missing, has another shape, or says what pinhole and Brown distortion with square axes cannot.
+    K (3, 3) px; D (5,) = (k1, k2, p1, p2, k3); R (3, 3), the nearest rotation to what the file
+    says; T (3,) mm; all float64. R and T map camera to projector. Without `keys`, those of
+    `identify_keys`. Raises InputError where an entry is missing, has another shape, or says what
+    pinhole and Brown distortion with square axes cannot.
     """
     keys = identify_keys(storage) if keys is None else keys
     if len(keys) != len(ENTRIES):
-        raise InputError(f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order")
+        raise InputError(
+            f"{len(keys)} keys were given: name those of {' '.join(ENTRIES)}, in this order"
+        )
     if missing := [key for key in keys if key not in storage.entries]:
-        raise InputError(f"{storage.name} has no {', '.join(missing)}: its keys are {_list_keys(storage)}")
+        raise InputError(
+            f"{storage.name} has no {', '.join(missing)}: its keys are {_list_keys(storage)}"
+        )
     matrices = {}
     for entry, key in zip(ENTRIES, keys, strict=True):
         matrices[entry] = _CHECKS[entry[0]](storage.matrix(key), f"{storage.name}: {key}")
@@ -63,18 +76,25 @@ def identify_keys(storage: Storage) -> tuple[str, ...]:
 
     Raises InputError where they are none of these, or where several would do.
     """
-    rows = [(*row[:4], *transform) for row in _SPELLINGS for transform in dict.fromkeys((row[4:], *_TRANSFORMS))]
+    rows = [
+        (*row[:4], *transform)
+        for row in _SPELLINGS
+        for transform in dict.fromkeys((row[4:], *_TRANSFORMS))
+    ]
     matches = list(dict.fromkeys(row for row in rows if set(row) <= set(storage.entries)))
     if len(matches) == 1:
         return matches[0]
     remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {_list_keys(storage)}"
     if matches:
-        raise InputError(f"{storage.name} holds {' and '.join(', '.join(row) for row in matches)}: {remedy}")
+        raise InputError(
+            f"{storage.name} holds {' and '.join(', '.join(row) for row in matches)}: {remedy}"
+        )
     raise InputError(f"the entries of {storage.name} have no names that are known here: {remedy}")
 
 
 def read_sizes(storage: Storage) -> dict[str, tuple[tuple[int, int], str]]:
-    """What a file states as sizes (width, height) px: {"camera" or "projector": (the size, the key that states it)}."""
+    """What a file states as sizes (width, height) px: {"camera" or "projector": (the size, the key
+    that states it)}."""
     sizes = {}
     for device, spellings in _SIZES.items():
         for spelling in spellings:
@@ -99,22 +119,38 @@ def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     if matrix.shape != (3, 3):
         raise InputError(f"{where} has shape {matrix.shape}: a camera matrix is 3x3")
     fx, fy = matrix[0, 0], matrix[1, 1]
-    if fx <= 0 or fy <= 0 or not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-9):
+    if (
+        fx <= 0
+        or fy <= 0
+        or not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-9)
+    ):
         raise InputError(f"{where} is no camera matrix (fx 0 cx, 0 fy cy, 0 0 1): check the key")
     if abs(matrix[0, 1]) > 1e-9 * fx:
-        raise InputError(f"{where} has a skew of {matrix[0, 1]:g}, which is not modelled here: calibrate without skew")
+        raise InputError(
+            f"{where} has a skew of {matrix[0, 1]:g}, which is not modelled here: calibrate without"
+            " skew"
+        )
     return matrix
 
 
 def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the distortion (5,) k1 k2 p1 p2 k3; InputError for other non-zero coefficients."""
     coefficients = matrix.ravel()
-    if max(matrix.shape, default=0) != coefficients.size or coefficients.size not in (4, 5, 8, 12, 14):
-        raise InputError(f"{where} has shape {matrix.shape}: OpenCV's distortion has 4, 5, 8, 12 or 14 coefficients")
+    if max(matrix.shape, default=0) != coefficients.size or coefficients.size not in (
+        4,
+        5,
+        8,
+        12,
+        14,
+    ):
+        raise InputError(
+            f"{where} has shape {matrix.shape}: OpenCV's distortion has 4, 5, 8, 12 or 14"
+            " coefficients"
+        )
     if np.any(coefficients[5:]):
         raise InputError(
-            f"{where} has {coefficients.size} coefficients with rational, prism or tilt terms, which k1 k2 p1 p2 k3 "
-            "cannot represent: calibrate with five coefficients"
+            f"{where} has {coefficients.size} coefficients with rational, prism or tilt terms,"
+            " which k1 k2 p1 p2 k3 cannot represent: calibrate with five coefficients"
         )
     return np.concatenate([coefficients[:5], np.zeros(max(0, 5 - coefficients.size))])
 
@@ -122,13 +158,16 @@ def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:
 def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the rotation (3, 3) nearest to a matrix; InputError where it is far from one."""
     if matrix.shape != (3, 3):
-        raise InputError(f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3")
+        raise InputError(
+            f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3"
+        )
     U, _, Vt = np.linalg.svd(matrix)
     nearest = U @ Vt
     error = np.abs(matrix - nearest).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
         raise InputError(
-            f"{where} is no rotation (off by {error:.2g}, determinant {np.linalg.det(matrix):.3g}): check it"
+            f"{where} is no rotation (off by {error:.2g}, determinant {np.linalg.det(matrix):.3g}):"
+            " check it"
         )
     return nearest
 
@@ -136,7 +175,10 @@ def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
 def _check_translation(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the translation (3,) mm; InputError for another shape or an impossible length."""
     if matrix.shape not in ((3, 1), (1, 3), (3,)):
-        raise InputError(f"{where} has shape {matrix.shape}: the translation from camera to projector has 3 numbers")
+        raise InputError(
+            f"{where} has shape {matrix.shape}: the translation from camera to projector has 3"
+            " numbers"
+        )
     translation: np.ndarray = matrix.ravel()
     length = math.hypot(*translation)
     if not _SHORTEST_BASELINE_MM <= length <= LARGEST_BASELINE_MM:

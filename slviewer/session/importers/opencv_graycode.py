@@ -1,8 +1,9 @@
 """The images of OpenCV's structured_light GrayCodePattern, in the order in which it generates them.
 
-Gray code of every projector column, then row; each bit, most significant first, as the pattern and its inverse; then,
-in most programs, white and black. The images are taken in natural order of their names. Source: opencv_contrib,
-modules/structured_light, src/graycodepattern.cpp and samples/cap_pattern.cpp (`pattern_cam1_im1.png`, ...).
+Gray code of every projector column, then row; each bit, most significant first, as the pattern and
+its inverse; then, in most programs, white and black. The images are taken in natural order of their
+names. Source: opencv_contrib, modules/structured_light, src/graycodepattern.cpp and
+samples/cap_pattern.cpp (`pattern_cam1_im1.png`, ...).
 """
 
 import re
@@ -26,8 +27,9 @@ from slviewer.session.importers.imported import (
 from slviewer.session.names import join_names
 
 _ILLUMINATED, _MOSTLY = 0.25, 0.9
-"""Share of the largest difference from which on a pixel counts; share of these in which white is brighter than black:
-all of them but for a few that something disturbs, and half of them between two stripes."""
+"""Share of the largest difference from which on a pixel counts; share of these in which white is
+brighter than black: all of them but for a few that something disturbs, and half of them between two
+stripes."""
 _SAMPLE = re.compile(r"pattern_(cam\d+_)?(im)?\d+", re.IGNORECASE)
 
 
@@ -38,13 +40,16 @@ def _read(
     projector: tuple[int, int] | None = None,
     files: str | None = None,
 ) -> Imports:
-    """Captures named after their folders. `files` is a pattern of names (* and ? are wildcards) for a folder that holds
-    more than these images, such as those of a second camera.
+    """Captures named after their folders. `files` is a pattern of names (* and ? are wildcards) for
+    a folder that holds more than these images, such as those of a second camera.
 
     A capture is skipped where the number of its images contradicts the projector's size.
     """
     if projector is None:
-        raise InputError("the Gray code of OpenCV depends on the projector's size: give it with --projector 1280x800")
+        raise InputError(
+            "the Gray code of OpenCV depends on the projector's size: give it with --projector"
+            " 1280x800"
+        )
     sequence = gray(projector)
 
     def select(folder: Path) -> list[Path]:
@@ -56,26 +61,36 @@ def _read(
         files = select(folder)
         if len(kinds := {re.sub(r"\d+$", "", file.stem) for file in files}) > 1:
             shown = join_names([f"{kind}N" for kind in sorted(kinds)])
-            raise InputError(f'it holds images named {shown}: choose one with --files "{min(kinds)}*"')
+            raise InputError(
+                f'it holds images named {shown}: choose one with --files "{min(kinds)}*"'
+            )
         shown_sequence = _fit_sequence(sequence, len(files))
         _check_shadow_images(files, shown_sequence)
         recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
-        return recording, strangers_warning(folder, [file for file in images_by_name(folder) if file not in files])
+        return recording, strangers_warning(
+            folder, [file for file in images_by_name(folder) if file not in files]
+        )
 
     def looks_so(folder: Path) -> bool:
         """Return whether a folder holds more than half of the images of a capture."""
         return 2 * len(select(folder)) > len(sequence.frames)
 
     return collect_captures(
-        Path(source), prefix, looks_so, f"the {len(sequence.frames)} images of a Gray code", describe
+        Path(source),
+        prefix,
+        looks_so,
+        f"the {len(sequence.frames)} images of a Gray code",
+        describe,
     )
 
 
 def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
-    """Raise InputError where white and black images are in place of stripes, or the other way round.
+    """Raise InputError where white and black images are in place of stripes, or the other way
+    round.
 
-    A projector of another size may take two images more or less, as many as white and black are. In a pair of the
-    finest stripes the first image is the brighter in half of the places, in white and black everywhere.
+    A projector of another size may take two images more or less, as many as white and black are. In
+    a pair of the finest stripes the first image is the brighter in half of the places, in white and
+    black everywhere.
     """
     first, second = read_frames(files[-2:]).stack.astype(np.int32)
     difference = first - second
@@ -83,11 +98,13 @@ def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
     brighter = float((difference[illuminated] > 0).mean()) if illuminated.any() else 0.5
     ends_in_white = sequence.frames[-1].kind == "black"
     if ends_in_white != (brighter > _MOSTLY):
-        there, expected = ("stripes", "white and black") if ends_in_white else ("white and black", "stripes")
+        there, expected = (
+            ("stripes", "white and black") if ends_in_white else ("white and black", "stripes")
+        )
         width, height = sequence.projector
         raise InputError(
-            f"the last two images show {there}, and {expected} are expected of a {width}x{height} projector: it has "
-            "another size, or images are missing or too many"
+            f"the last two images show {there}, and {expected} are expected of a {width}x{height}"
+            " projector: it has another size, or images are missing or too many"
         )
 
 
@@ -100,9 +117,12 @@ def _fit_sequence(sequence: PatternSequence, images: int) -> PatternSequence:
         return PatternSequence(sequence.projector, sequence.frames[:-2])
     width, height = sequence.projector
     raise InputError(
-        f"it holds {images} images, and the Gray code of a {width}x{height} projector takes {needed}, or {needed - 2} "
-        "without white and black: images are missing or too many, or the projector has another size"
+        f"it holds {images} images, and the Gray code of a {width}x{height} projector takes"
+        f" {needed}, or {needed - 2} without white and black: images are missing or too many, or"
+        " the projector has another size"
     )
 
 
-LAYOUT = FolderLayout("opencv-graycode", "pattern_camN_imN images", _read, lambda folder: has_images(folder, _SAMPLE))
+LAYOUT = FolderLayout(
+    "opencv-graycode", "pattern_camN_imN images", _read, lambda folder: has_images(folder, _SAMPLE)
+)

@@ -1,7 +1,7 @@
 """The procam-calibration layout: `capture_N/graycode_NN.*`.
 
-Gray code of every projector column, then row; each bit, most significant first, as the pattern and its inverse; then
-white, then black.
+Gray code of every projector column, then row; each bit, most significant first, as the pattern and
+its inverse; then white, then black.
 """
 
 import re
@@ -21,18 +21,27 @@ from slviewer.session.importers.imported import (
 _FILE = re.compile(r"graycode_?(\d+)", re.IGNORECASE)
 
 
-def _describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
-    """Return the recording of one folder. The projector's size determines the numbers of bits and of images."""
+def _describe(
+    folder: Path, name: str, projector: tuple[int, int]
+) -> tuple[ImportableRecording, list[str]]:
+    """Return the recording of one folder. The projector's size determines the numbers of bits and
+    of images."""
     images, others = match_images(folder, _FILE)
     sequence = gray(projector)
     check_complete(images, "graycode_")
     if len(images) != len(sequence.frames):
-        fault = "images are missing" if len(images) < len(sequence.frames) else "there are images too many"
-        raise InputError(
-            f"it holds {len(images)} images, and the Gray code of a {projector[0]}x{projector[1]} projector takes "
-            f"{len(sequence.frames)}: {fault}, or the projector has another size"
+        fault = (
+            "images are missing"
+            if len(images) < len(sequence.frames)
+            else "there are images too many"
         )
-    return ImportableRecording(name, sequence, tuple(images.values()), folder), strangers_warning(folder, others)
+        raise InputError(
+            f"it holds {len(images)} images, and the Gray code of a {projector[0]}x{projector[1]}"
+            f" projector takes {len(sequence.frames)}: {fault}, or the projector has another size"
+        )
+    return ImportableRecording(name, sequence, tuple(images.values()), folder), strangers_warning(
+        folder, others
+    )
 
 
 LAYOUT = define_layout(

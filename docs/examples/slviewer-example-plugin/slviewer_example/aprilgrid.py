@@ -1,4 +1,5 @@
-"""Kalibr's AprilGrid as a board: `aprilgrid:6x6:88` has 6x6 tags of 36h11, whose black sides are 88 mm long.
+"""Kalibr's AprilGrid as a board: `aprilgrid:6x6:88` has 6x6 tags of 36h11, whose black sides are 88
+mm long.
 
 Tags are 1.3 sides apart, and numbered from the corner with tag 0. A feature is a corner of a tag.
 """
@@ -29,9 +30,11 @@ def locate_features(board: Board) -> NDArray[np.float64]:
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) * board.pitch_mm
 
 
-def detect_corners(board: Board, image: NDArray[np.uint8]) -> tuple[NDArray[np.float64], np.ndarray]:
-    """Detect the tags in an image (h, w); returns the corners (m, 2) px of those that belong to the board, and their
-    indices."""
+def detect_corners(
+    board: Board, image: NDArray[np.uint8]
+) -> tuple[NDArray[np.float64], np.ndarray]:
+    """Detect the tags in an image (h, w); returns the corners (m, 2) px of those that belong to the
+    board, and their indices."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
@@ -47,7 +50,8 @@ def detect_corners(board: Board, image: NDArray[np.uint8]) -> tuple[NDArray[np.f
             pixels.append(pixel)
     if len(ids) < 4 * 4 and len(ids) < 4 * count:
         raise DetectionError(
-            f"{len(ids) // 4} of {count} tags were detected: bring the whole board into view, in focus and evenly lit"
+            f"{len(ids) // 4} of {count} tags were detected: bring the whole board into view, in"
+            " focus and evenly lit"
         )
     return np.array(pixels, np.float64), np.array(ids)
 

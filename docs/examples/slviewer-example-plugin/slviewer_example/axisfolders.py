@@ -22,8 +22,11 @@ _FILE = re.compile(r"(\d+)")
 _STEPS, _PARTS = 4, (1, 6, 36)
 
 
-def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[ImportableRecording, list[str]]:
-    """Return the recording of one capture's folder, and warnings about files that do not belong to it.
+def describe(
+    folder: Path, name: str, projector: tuple[int, int]
+) -> tuple[ImportableRecording, list[str]]:
+    """Return the recording of one capture's folder, and warnings about files that do not belong to
+    it.
 
     Raises InputError for a capture that is incomplete: it is skipped with that reason.
     """
@@ -37,7 +40,10 @@ def describe(folder: Path, name: str, projector: tuple[int, int]) -> tuple[Impor
             frames += phase_steps(axis, _STEPS, extent / parts)
         files += images.values()
         warnings += strangers_warning(folder / axis, others)
-    return ImportableRecording(name, PatternSequence(projector, tuple(frames)), tuple(files), folder), warnings
+    return (
+        ImportableRecording(name, PatternSequence(projector, tuple(frames)), tuple(files), folder),
+        warnings,
+    )
 
 
 def is_capture(folder: Path) -> bool:

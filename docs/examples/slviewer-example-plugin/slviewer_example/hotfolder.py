@@ -1,7 +1,8 @@
 """A camera and a projector that exchange images with other programs through folders.
 
-The camera suits whatever writes each picture into a folder, such as the tethering program of a still camera, with a
-command that takes one. The projector suits whatever displays a file when it changes.
+The camera suits whatever writes each picture into a folder, such as the tethering program of a
+still camera, with a command that takes one. The projector suits whatever displays a file when it
+changes.
 """
 
 import os
@@ -31,14 +32,18 @@ _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 
 
 class HotfolderCamera(Openable):
-    """Takes the first picture that appears in `folder` after `trigger`, a command that takes one, has been started.
+    """Takes the first picture that appears in `folder` after `trigger`, a command that takes one,
+    has been started.
 
-    Pictures are (height, width) of `size`; green is used of those in colour. `timeout_s`: how long to wait for one.
+    Pictures are (height, width) of `size`; green is used of those in colour. `timeout_s`: how long
+    to wait for one.
     """
 
     dtype = np.dtype(np.uint8)
 
-    def __init__(self, folder: str, size: tuple[int, int], trigger: str = "", timeout_s: float = 10.0) -> None:
+    def __init__(
+        self, folder: str, size: tuple[int, int], trigger: str = "", timeout_s: float = 10.0
+    ) -> None:
         super().__init__("the hot-folder camera")
         self.size = (int(size[0]), int(size[1]))
         self._folder, self._trigger, self._timeout_s = Path(folder), shlex.split(trigger), timeout_s
@@ -46,7 +51,10 @@ class HotfolderCamera(Openable):
     def open(self) -> None:
         """Open the camera. Raises DeviceError if its folder does not exist."""
         if not self._folder.is_dir():
-            raise DeviceError(f"{self._folder} is no folder: create it, or name the one that receives the pictures")
+            raise DeviceError(
+                f"{self._folder} is no folder: create it, or name the one that receives the"
+                " pictures"
+            )
         super().open()
 
     def grab(self, out: np.ndarray) -> None:
@@ -65,8 +73,8 @@ class HotfolderCamera(Openable):
                     return
             time.sleep(0.01)
         raise DeviceError(
-            f"no picture arrived in {self._folder} within {self._timeout_s:g} s: is the program that writes "
-            "them running?"
+            f"no picture arrived in {self._folder} within {self._timeout_s:g} s: is the program"
+            " that writes them running?"
         )
 
     def settings(self) -> CameraSettings:
@@ -88,18 +96,23 @@ class HotfolderCamera(Openable):
         try:
             subprocess.run(self._trigger, check=True, capture_output=True, timeout=self._timeout_s)
         except (OSError, subprocess.SubprocessError) as error:
-            raise DeviceError(f"the trigger {self._trigger[0]} failed ({error}): try it in a terminal") from error
+            raise DeviceError(
+                f"the trigger {self._trigger[0]} failed ({error}): try it in a terminal"
+            ) from error
 
     def _copy(self, path: Path, image: np.ndarray, out: np.ndarray) -> None:
         """Copy the green channel of a picture (h, w, 3) BGR."""
         if image.shape[:2] != out.shape:
             height, width = image.shape[:2]
-            raise DeviceError(f"{path.name} is {width}x{height} px: correct the size of the camera, {self.size}")
+            raise DeviceError(
+                f"{path.name} is {width}x{height} px: correct the size of the camera, {self.size}"
+            )
         out[:] = image[..., 1]
 
 
 class HotfolderProjector(Openable):
-    """Leaves each pattern as `file`, a PNG that another program displays; `settle_s` later it is taken as shown."""
+    """Leaves each pattern as `file`, a PNG that another program displays; `settle_s` later it is
+    taken as shown."""
 
     def __init__(self, file: str, size: tuple[int, int], settle_s: float = 0.2) -> None:
         super().__init__("the hot-folder projector")
@@ -107,7 +120,9 @@ class HotfolderProjector(Openable):
         self._file, self._settle_s = Path(file), settle_s
         self._sequence: PatternSequence | None = None
         if self._file.suffix.lower() != ".png":
-            raise InputError(f"{self._file.name} is no PNG: give the projector a file that ends in .png")
+            raise InputError(
+                f"{self._file.name} is no PNG: give the projector a file that ends in .png"
+            )
 
     def open(self) -> None:
         """Open the projector: dark, nothing loaded."""
@@ -133,7 +148,8 @@ class HotfolderProjector(Openable):
         self._write(np.full((height, width), check_level(grey), np.uint8))
 
     def _write(self, image: np.ndarray) -> None:
-        """Replace the file in one step, so that no half of it is displayed, and wait until it is shown."""
+        """Replace the file in one step, so that no half of it is displayed, and wait until it is
+        shown."""
         done, data = cv2.imencode(".png", image)
         if not done:
             raise DeviceError("the pattern could not be encoded as PNG")
@@ -142,7 +158,9 @@ class HotfolderProjector(Openable):
             part.write_bytes(data.tobytes())
             os.replace(part, self._file)
         except OSError as error:
-            raise DeviceError(f"{self._file} cannot be written ({error.strerror}): choose another file") from error
+            raise DeviceError(
+                f"{self._file} cannot be written ({error.strerror}): choose another file"
+            ) from error
         time.sleep(self._settle_s)
 
 

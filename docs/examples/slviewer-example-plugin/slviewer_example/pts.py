@@ -1,4 +1,5 @@
-"""The PTS format of laser scanners: the number of points, then x y z intensity red green blue, in metres."""
+"""The PTS format of laser scanners: the number of points, then x y z intensity red green blue, in
+metres."""
 
 import io
 from collections.abc import Mapping, Sequence

@@ -30,7 +30,8 @@ class TcpTurntable(Openable):
         except OSError as error:
             super().close()
             raise TurntableError(
-                f"{self.name} does not answer at {self._address[0]}:{self._address[1]} ({error}): is it switched on?"
+                f"{self.name} does not answer at {self._address[0]}:{self._address[1]} ({error}):"
+                " is it switched on?"
             ) from error
 
     def close(self) -> None:
@@ -55,7 +56,9 @@ class TcpTurntable(Openable):
             check()
             while state == "MOVING":
                 if time.monotonic() > end:
-                    raise TurntableError(f"{self.name} is still turning after {self._timeout_s:g} s: is it blocked?")
+                    raise TurntableError(
+                        f"{self.name} is still turning after {self._timeout_s:g} s: is it blocked?"
+                    )
                 check()
                 time.sleep(0.02)
                 state, _ = self._request("WHERE?")
@@ -84,7 +87,13 @@ class TcpTurntable(Openable):
                 raise ValueError(state)
             return state, float(angle)
         except (OSError, ValueError) as error:
-            raise TurntableError(f"{self.name} did not answer {line!r} properly ({error}): check its cable") from error
+            raise TurntableError(
+                f"{self.name} did not answer {line!r} properly ({error}): check its cable"
+            ) from error
 
 
-DRIVER = Driver("tcpturntable", "turntables whose controller takes lines of text over TCP", turntable=TcpTurntable)
+DRIVER = Driver(
+    "tcpturntable",
+    "turntables whose controller takes lines of text over TCP",
+    turntable=TcpTurntable,
+)

@@ -42,10 +42,12 @@ def camera(tmp_path: Path) -> HotfolderCamera:
     cv2.imwrite(str(picture), rng.integers(0, 255, (48, 64)).astype(np.uint8))
     take = tmp_path / "take.py"
     take.write_text(
-        "import pathlib, shutil, time\n"
-        f"shutil.copy({str(picture)!r}, pathlib.Path({str(folder)!r}) / f'{{time.time_ns()}}.png')\n"
+        f"import pathlib, shutil, time\nshutil.copy({str(picture)!r}, pathlib.Path({str(folder)!r})"
+        " / f'{time.time_ns()}.png')\n"
     )
-    return HotfolderCamera(str(folder), (64, 48), shlex.join([sys.executable, str(take)]), timeout_s=30.0)
+    return HotfolderCamera(
+        str(folder), (64, 48), shlex.join([sys.executable, str(take)]), timeout_s=30.0
+    )
 
 
 def test_the_camera_keeps_the_protocol(camera: HotfolderCamera) -> None:
@@ -111,7 +113,9 @@ def draw_aprilgrid(columns: int, rows: int, side_px: int) -> np.ndarray:
     for tag in range(columns * rows):
         row, column = divmod(tag, columns)
         top, left = side_px + row * step, side_px + column * step
-        image[top : top + side_px, left : left + side_px] = cv2.aruco.generateImageMarker(dictionary, tag, side_px)
+        image[top : top + side_px, left : left + side_px] = cv2.aruco.generateImageMarker(
+            dictionary, tag, side_px
+        )
     return image
 
 
@@ -123,10 +127,14 @@ def test_the_board_is_detected_where_it_is() -> None:
     corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
     seen = np.float32([[40, 30], [width - 60, 80], [width - 20, height - 40], [90, height - 70]])
     H = cv2.getPerspectiveTransform(corners, seen)
-    image = cv2.GaussianBlur(cv2.warpPerspective(straight, H, (width, height), borderValue=255), (0, 0), 1.0)
+    image = cv2.GaussianBlur(
+        cv2.warpPerspective(straight, H, (width, height), borderValue=255), (0, 0), 1.0
+    )
     found = detect(board, image)
     assert len(found.ids) == 4 * 20
-    points = board.points[found.ids][:, :2] * 10 + 100 - 0.5  # a tag of 10 mm is 100 px, and its edge is between pixels
+    points = (
+        board.points[found.ids][:, :2] * 10 + 100 - 0.5
+    )  # a tag of 10 mm is 100 px, and its edge is between pixels
     true = cv2.perspectiveTransform(points[None], H)[0]
     error = np.sqrt(np.mean((found.pixels - true) ** 2))
     assert 0.001 < error < 0.3
