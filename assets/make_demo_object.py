@@ -179,7 +179,8 @@ def build() -> tuple[np.ndarray, np.ndarray]:
     for k in range(SIDE_RINGS):
         outer = start + k * n + np.arange(n)
         triangles += [
-            np.stack([inner, outer, inner[following]], 1), np.stack([inner[following], outer, outer[following]], 1)
+            np.stack([inner, outer, inner[following]], 1),
+            np.stack([inner[following], outer, outer[following]], 1)
         ]  # fmt: skip
         inner = outer
     last = np.full(n, start + SIDE_RINGS * n)

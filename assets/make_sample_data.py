@@ -27,7 +27,8 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 
 DATASETS = Path(__file__).parent / "datasets"
-README = """Simulated captures of one camera and one projector, rendered by assets/make_sample_data.py of slviewer.
+README = """Simulated captures of one camera and one projector, rendered by
+assets/make_sample_data.py of slviewer.
 Licence: MIT. Target in poses/: circles:21x16:9. The sphere's radius is 98 mm.
 """
 

@@ -158,8 +158,9 @@ def list_gallery() -> dict[str, str]:
         code = text.partition('"""\n')[2] if text.startswith('"""') else text
         more = more.strip()
         pages[script.stem] = (
-            f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}```python\n{code.strip()}\n```\n\n{{download}}`{script.name}"
-            f" <../examples/{script.name}>`\n"
+            f"# {title.strip('.')}\n\n{more[:1].upper()}{more[1:]}\n\n{picture}"
+            f"```python\n{code.strip()}\n```\n\n"
+            f"{{download}}`{script.name} <../examples/{script.name}>`\n"
         )
     for notebook in sorted((DOCS / "examples").glob("*.ipynb")):
         cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]

@@ -3,12 +3,13 @@ slviewer.
 
 A plugin is an object under an entry point, whose name is the object's ``name``:
 
-=======================  ========================================================================================
+=======================  ===========================================================================
 ``slviewer.drivers``     a `Driver`: factories of cameras, projectors, turntables or whole rigs
 ``slviewer.boards``      a `BoardType`: coordinates of a board's features, and their detection
-``slviewer.importers``   a `FolderLayout`: another program's folders of images, best made by `define_layout`
+``slviewer.importers``   a `FolderLayout`: another program's folders of images, best made by
+                         `define_layout`
 ``slviewer.exporters``   an `Exporter`: a file format for points or meshes
-=======================  ========================================================================================
+=======================  ===========================================================================
 
 The ``check_...`` functions test one as slviewer uses it, for the tests of its package.
 """
@@ -53,10 +54,15 @@ from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board, BoardType
 
 __all__ = [
-    "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver", "Exporter",
-    "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable", "PatternSequence", "PerAxis",
-    "PointSet", "Projector", "Rig", "Turntable", "TurntableError", "check_angle", "check_board", "check_camera",
-    "check_complete", "check_exporter", "check_frame", "check_importer", "check_index", "check_level",
-    "check_projector", "check_sequence", "check_turntable", "define_layout", "gray_bits", "has_images",
+    "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver",
+    "Exporter",
+    "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable",
+    "PatternSequence", "PerAxis",
+    "PointSet", "Projector", "Rig", "Turntable", "TurntableError", "check_angle", "check_board",
+    "check_camera",
+    "check_complete", "check_exporter", "check_frame", "check_importer", "check_index",
+    "check_level",
+    "check_projector", "check_sequence", "check_turntable", "define_layout", "gray_bits",
+    "has_images",
     "match_images", "phase_steps", "render", "strangers_warning",
 ]  # fmt: skip

@@ -25,6 +25,7 @@ import tempfile
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -377,9 +378,8 @@ def run(kills: int, faults: int, seed: int, commands: tuple[str, ...]) -> Counte
             command = commands[number % len(commands)]
             at = rng.randrange(counts[command])
             shutil.copytree(sound, folder)
-            status, text = run_child(
-                folder, command, lambda: Machine(at, code, loses_power=loses_power)
-            )  # noqa: B023
+            machine = partial(Machine, at, code, loses_power=loses_power)
+            status, text = run_child(folder, command, machine)
             wrong = examine(folder, before, command)
             if "Traceback" in text:
                 wrong = wrong or f"traceback: {text.strip().splitlines()[-1]}"

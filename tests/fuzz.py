@@ -46,48 +46,68 @@ time."""
 RIGHT = ("refused", "no effect")
 EVIL_TEXT = "a\x1b[2J\u202eb\x00c"
 VALUES: tuple[Any, ...] = (
-    None, True, 0, -1, 1, 3, 0.5, 1e308, -1e308, float("nan"), float("inf"), float("-inf"), 10**9, 10**30, -(2**63),
-    "", "x", "1e30", EVIL_TEXT, "x" * 5000, "../../etc/passwd", "~nobody/x", [], {}, [[]], [1], [None], {"a": 1},
-    {EVIL_TEXT: EVIL_TEXT}, [1, 2, 3, 4], [[1, 2], [3]], ["x"], ["x", "y"], {"x": {}}, [{}], [float("nan")] * 3,
+    None, True, 0, -1, 1, 3, 0.5, 1e308, -1e308, float("nan"), float("inf"), float("-inf"), 10**9,
+    10**30, -(2**63),
+    "", "x", "1e30", EVIL_TEXT, "x" * 5000, "../../etc/passwd", "~nobody/x", [], {}, [[]], [1],
+    [None], {"a": 1},
+    {EVIL_TEXT: EVIL_TEXT}, [1, 2, 3, 4], [[1, 2], [3]], ["x"], ["x", "y"], {"x": {}}, [{}],
+    [float("nan")] * 3,
 )  # fmt: skip
 ANOTHER_TARGET = "calibrate S --target circles:21x16:8 --models stereo pixelwise"
 """Measures the poses anew, as a number may: its kernels are to be compiled before."""
 COMMANDS = {
     "session": (
-        "inspect S", "report S --out r.html", "reconstruct S object_r1 --out c.ply", "decode S pose_01 --out d.npz",
+        "inspect S", "report S --out r.html", "reconstruct S object_r1 --out c.ply",
+        "decode S pose_01 --out d.npz",
         "measurements S", "measurements S --csv m.csv", "export S calibration --out e.json",
         "verify S object_r1 --shape plane",
         "check S pose_01", "inspect S --check", "validate S", "mesh S merge/1 --out m.stl",
         "merge S object_r1 object_r2 --reference object_r1 --out m.ply",
-        "calibrate S --target circles:21x16:9 --models stereo pixelwise", "measure S object_r1 point --at 160 120",
+        "calibrate S --target circles:21x16:9 --models stereo pixelwise",
+        "measure S object_r1 point --at 160 120",
         "compare S object_r1 part.stl",
         "import opencv-calibration calibration.json S --force", "preflight --capture S object_r1",
-        "edit S object_r1", "region S", "plan S --out p.toml", "align S object_r1 object_r2", "restore S calibration/*",
+        "edit S object_r1", "region S", "plan S --out p.toml", "align S object_r1 object_r2",
+        "restore S calibration/*",
     ),
     "rig": ("capture S new --rig rig.toml --port 0", "preflight --rig rig.toml --port 0"),
     "frames": ("import frames images S2 --sequence frames.toml",),
-    "image": ("import frames images S2 --sequence frames.toml", "detect board.png --target circles:21x16:9"),
-    "opencv": tuple(f"import opencv-calibration calibration.{suffix} S --force" for suffix in ("yml", "xml", "json")),
+    "image": ("import frames images S2 --sequence frames.toml",
+    "detect board.png --target circles:21x16:9"),
+    "opencv": tuple(
+        f"import opencv-calibration calibration.{suffix} S --force"
+        for suffix in ("yml", "xml", "json")
+    ),
     "artefact": ("accept S --artefact sphere.toml",),
     "plan": ("inspect-parts plan.toml S --scan object_r1 --out parts",),
-    "nominal": ("compare S object_r1 part.stl", "compare S object_r1 part.obj", "compare S object_r1 part_2.ply"),
+    "nominal": ("compare S object_r1 part.stl", "compare S object_r1 part.obj",
+    "compare S object_r1 part_2.ply"),
     "number": (
-        "capture S new --rig rig.toml --port # --exposure-ms 10", "capture S new --rig rig.toml --exposure-ms #",
-        "capture S new --rig rig.toml --gain # --port 0", "capture S new --rig rig.toml --region # # # # --port 0",
-        "capture S new --rig rig.toml --exposures-ms 1 # --port 0", "preflight --rig rig.toml --gain # --port 0",
-        "calibrate S --target circles:21x16:9 --models stereo pixelwise --degree # --smoothing polynomial",
+        "capture S new --rig rig.toml --port # --exposure-ms 10",
+        "capture S new --rig rig.toml --exposure-ms #",
+        "capture S new --rig rig.toml --gain # --port 0",
+        "capture S new --rig rig.toml --region # # # # --port 0",
+        "capture S new --rig rig.toml --exposures-ms 1 # --port 0",
+        "preflight --rig rig.toml --gain # --port 0",
+        "calibrate S --target circles:21x16:9 --models stereo pixelwise --degree # "
+        "--smoothing polynomial",
         "validate S --folds #",
         "calibrate S --target circles:#x16:9", "calibrate S --target circles:21x16:#",
-        "reconstruct S object_r1 --out c.ply --depth-range # #", "verify S object_r1 --shape sphere --radius #",
-        "verify S object_r1 --shape plane --range 1 #", "merge S object_r1 object_r2 --start turntable --angle #",
+        "reconstruct S object_r1 --out c.ply --depth-range # #",
+        "verify S object_r1 --shape sphere --radius #",
+        "verify S object_r1 --shape plane --range 1 #",
+        "merge S object_r1 object_r2 --start turntable --angle #",
         "mesh S merge/1 --out m.stl --triangles #", "mesh S merge/1 --out m.stl --smooth #",
         "mesh S merge/1 --out m.stl --fill-holes #", "compare S object_r1 part.stl --tolerance #",
         "compare S object_r1 part.stl --reach #", "measure S object_r1 point --at # #",
         "measure S object_r1 sphere --ball 0 0 500 #", "region S --roi #,#,0,1,0,#",
-        "edit S object_r1 --polygon # 0 10 # 10 10", "edit S object_r1 --part # 120", "edit S object_r1 --undo #",
+        "edit S object_r1 --polygon # 0 10 # 10 10", "edit S object_r1 --part # 120",
+        "edit S object_r1 --undo #",
         "plan S --out p.toml --tolerance #",
-        "measure S object_r1 plane --box # 0 0 1 1 #", "simulate S2 --poses 1 --scale #", "simulate S2 --poses #x",
-        "simulate S2 --poses 1 --scale 0.01 --seed #", "target circles:21x16:# --out t.pdf", "patterns --projector #x#",
+        "measure S object_r1 plane --box # 0 0 1 1 #", "simulate S2 --poses 1 --scale #",
+        "simulate S2 --poses #x",
+        "simulate S2 --poses 1 --scale 0.01 --seed #", "target circles:21x16:# --out t.pdf",
+        "patterns --projector #x#",
         "import opencv-calibration calibration.json S --force --camera #x#",
         "import frames images S2 --sequence frames.toml --projector 96x#",
     ),
@@ -258,7 +278,8 @@ def damage_array(path: Path, rng: random.Random) -> None:
     """Replace a .npy file by another array, or a damaged one."""
     array = np.load(path)
     others = (
-        array.ravel()[:-1], np.full(array.shape, np.nan), np.zeros(0), np.zeros((3, 4)), array[None],
+        array.ravel()[:-1], np.full(array.shape, np.nan), np.zeros(0), np.zeros((3, 4)),
+        array[None],
         np.float64(1),
         np.array(["x", "y"]), np.full(array.shape, 1e308), np.zeros(array.shape, bool),
     )  # fmt: skip

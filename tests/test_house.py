@@ -54,7 +54,7 @@ NUMERIC = PACKAGES[1 : PACKAGES.index("simulation")]
 SOURCES = sorted(
     set((ROOT / "slviewer").rglob("*.py")) - {ROOT / "slviewer/_version.py"}
 )  # a build writes that
-MOST_LINES = 500
+MOST_LINES = 600
 MANY_BRANCHES, MANY_PARAMETERS = 15, 8
 MOST_WITH_MANY_BRANCHES, MOST_WITH_MANY_PARAMETERS = 0, 17
 """Functions that are allowed more; lower these where some are simplified."""

@@ -33,5 +33,6 @@ def test_a_table_is_read_back_and_runs_nothing() -> None:
     ]
     read = list(csv.reader(io.StringIO(format_csv(rows))))
     assert read == [
-        ["name", "value"], ["'=1+1", "-1.5"], ["'@sum", "-2.5"], ['a,"b"', "1e-3"], ["x\\x1b[2J", "nan"], ["'-a", ""],
+        ["name", "value"], ["'=1+1", "-1.5"], ["'@sum", "-2.5"], ['a,"b"', "1e-3"],
+        ["x\\x1b[2J", "nan"], ["'-a", ""],
     ]  # fmt: skip

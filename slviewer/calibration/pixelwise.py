@@ -305,8 +305,10 @@ def _collect_rows(
             )
         plane = planes[o.name]
         _project_onto_plane(
-            smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi), rig.camera.rays(), first, u0,
-            rig.R.copy(), rig.t.copy(), rig.projector.parameters, 0 if depth_axis == "x" else 1, extent,
+            smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi), rig.camera.rays(),
+            first, u0,
+            rig.R.copy(), rig.t.copy(), rig.projector.parameters, 0 if depth_axis == "x" else 1,
+            extent,
             plane.normal, plane.offset, z[i], sums, first - rows.start,
         )  # fmt: skip
     return phases, z, sums
@@ -370,7 +372,8 @@ def _fit_rows(
             yz / zz,
         )
         rms[0], rms[1], rms[2] = (
-            rms_z, np.sqrt(np.maximum(xx - c[3] * xz, 0) / n), np.sqrt(np.maximum(yy - c[4] * yz, 0) / n)
+            rms_z, np.sqrt(np.maximum(xx - c[3] * xz, 0) / n),
+            np.sqrt(np.maximum(yy - c[4] * yz, 0) / n)
         )  # fmt: skip
     missing = ~np.isfinite(c).all(0)
     c[:, missing] = np.nan

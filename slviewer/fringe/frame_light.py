@@ -202,7 +202,8 @@ def equalize_frames(
     out = np.empty((len(chosen), *stack.shape[1:]), np.uint16)
     equalize(
         stack, np.array(chosen), gain[chosen].astype(np.float32), offset[chosen].astype(np.float32),
-        along_rows[chosen].astype(np.float32), along_columns[chosen].astype(np.float32), albedo, scale, out,
+        along_rows[chosen].astype(np.float32), along_columns[chosen].astype(np.float32), albedo,
+        scale, out,
     )  # fmt: skip
     for steps in list_shifts(sequence):
         if places := [k for k, i in enumerate(chosen) if i in steps]:

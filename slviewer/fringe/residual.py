@@ -36,7 +36,8 @@ SMALL_DRIFT = 0.05
 """rms variation of the light up to which a misplaced frame is detected without correcting the light
 first."""
 _CODE_FAULTS: dict[str, Fault] = {
-    "frame-lag": "lag", "frame-order": "swapped", "missing-frame": "dropped", "duplicate-frame": "late"
+    "frame-lag": "lag", "frame-order": "swapped", "missing-frame": "dropped",
+    "duplicate-frame": "late"
 }  # fmt: skip
 
 

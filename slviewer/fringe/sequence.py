@@ -33,7 +33,8 @@ MAX_STEPS = 1000
 MAX_EXTENT = 1 << 16
 """Columns and rows of a projector, px."""
 SEQUENCE_KEYS = (
-    "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels", "full_scale",
+    "projector", "phase_sign", "phase_offset", "gray_origin", "gray_cell_px", "relative", "levels",
+    "full_scale",
     "frame",
 )  # fmt: skip
 """The entries of `PatternSequence.to_dict`, and of a `frames` TOML."""

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Fault = Literal[
-    "late", "early", "swapped", "dropped", "lag", "strange", "exposure-drift", "flicker", "room-light", "gamma"
+    "late", "early", "swapped", "dropped", "lag", "strange", "exposure-drift", "flicker",
+    "room-light", "gamma"
 ]  # fmt: skip
 """Fault of a frame. "late": it shows the pattern before its own; "early": the one after it;
 "swapped": two frames have changed places; "dropped": this frame is missing and those after it come

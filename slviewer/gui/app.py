@@ -351,8 +351,10 @@ def browser_opened(server: SafeServer) -> Iterator[None]:
         with os.fdopen(
             os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8"
         ) as file:
-            file.write(f'<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
-                       f"<title>slviewer</title><script>location.replace({link!r})</script>")  # fmt: skip
+            file.write(
+                '<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
+                f"<title>slviewer</title><script>location.replace({link!r})</script>"
+            )
 
         def open_page() -> None:
             """Open the page, and remove it when its link has been opened or is no longer valid."""

@@ -108,8 +108,8 @@ def inspection_html(seen: InspectionView) -> Html:
                 (name, format_result(wanted, result), Html(f"{format_limits(wanted)}<br>{mark}"))
             )
     scrolled = (
-        "<div"
-        f' style="max-height:{TABLE_PX}px;overflow-y:auto">{table(("", "Value ± U", "Limits"), rows)}</div>'
+        f'<div style="max-height:{TABLE_PX}px;overflow-y:auto">'
+        f"{table(('', 'Value ± U', 'Limits'), rows)}</div>"
     )
     reasons = {
         f"{result.name}: {result.reason}"

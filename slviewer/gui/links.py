@@ -79,4 +79,5 @@ def encode_qr_code(text: str) -> str:
         0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax())
     )  # OpenCV adds some of it
     modules = cv2.copyMakeBorder(modules, *(border,) * 4, cv2.BORDER_CONSTANT, value=255)
-    return f"data:image/png;base64,{base64.b64encode(cv2.imencode('.png', modules)[1].tobytes()).decode()}"
+    png = cv2.imencode(".png", modules)[1].tobytes()
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"

@@ -18,7 +18,8 @@ BY_SCAN = "merged, by scan"
 BY_SIGMA = "merged, uncertainty"
 MERGED = (OWN, BY_SCAN, BY_SIGMA)
 SCAN_COLOURS: tuple[Colour, ...] = (
-    (91, 143, 208), (224, 161, 60), (99, 178, 138), (200, 113, 143), (143, 131, 201), (120, 120, 120),
+    (91, 143, 208), (224, 161, 60), (99, 178, 138), (200, 113, 143), (143, 131, 201),
+    (120, 120, 120),
 )  # fmt: skip
 _GREY: Colour = (150, 150, 150)
 SHOWN = 60_000

@@ -76,7 +76,7 @@ def histogram_chart(preview: PreviewView) -> Html:
     )  # the few bright pixels matter most
     bars = "".join(
         f'<rect x="{4 * k}" y="{40 - 40 * share:.1f}" width="3.4" height="{40 * share:.1f}" '
-        f'fill="{"var(--mantine-color-red-6)" if k == len(shares) - 1 else "var(--mantine-color-blue-5)"}"/>'
+        f'fill="var(--mantine-color-{"red-6" if k == len(shares) - 1 else "blue-5"})"/>'
         for k, share in enumerate(shares)
     )
     axis = "".join(

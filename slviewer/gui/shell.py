@@ -238,10 +238,9 @@ class Shell:
             "blocked": coloured("blocked", "warning"),
         }[step.state]
         title = (
-            "<div"
-            f' style="font-size:1.25rem;font-weight:600">{at + 1}&ensp;{to_html(step.title)}&ensp;'
+            f'<div style="font-size:1.25rem;font-weight:600">{at + 1}&ensp;{to_html(step.title)}'
+            f'&ensp;<span style="font-size:0.8rem">{state}</span>{step_help_link(step.key)}</div>'
         )
-        title += f'<span style="font-size:0.8rem">{state}</span>{step_help_link(step.key)}</div>'
         self._heading.set(
             paragraph(
                 Html(f"{title}<div style='margin-top:0.2em'>{to_html(step.instruction)}</div>")

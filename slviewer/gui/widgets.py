@@ -205,7 +205,10 @@ def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
     """Return a small picture inside HTML; an empty box where there is no JPEG yet."""
     height = round(0.75 * width_px)
     if not jpeg:
-        style = f"width:{width_px}px;height:{height}px;border-radius:4px;background:var(--mantine-color-gray-light)"
+        style = (
+            f"width:{width_px}px;height:{height}px;border-radius:4px;"
+            "background:var(--mantine-color-gray-light)"
+        )
         return Html(f'<div style="{style}"></div>')
     data = base64.b64encode(jpeg).decode()
     style = f"width:{width_px}px;height:{height}px;object-fit:cover;border-radius:4px;display:block"
@@ -217,8 +220,8 @@ def meter(share: float, tone: Tone = "good") -> Html:
     width = 100 * min(max(share, 0.0), 1.0)
     return Html(
         '<div style="height:6px;border-radius:3px;background:var(--mantine-color-gray-light)">'
-        "<div"
-        f' style="height:6px;border-radius:3px;width:{width:.0f}%;background:{_TONES[tone]}"></div></div>'
+        f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:{_TONES[tone]}">'
+        "</div></div>"
     )
 
 
@@ -356,8 +359,8 @@ def colour_bar(
     return paragraph(
         Html(
             f'<div style="display:flex;gap:0.6em;align-items:center"><span>{to_html(low)}</span>'
-            "<div"
-            f' style="flex:1;height:10px;border-radius:3px;background:linear-gradient(90deg,{stops})"></div>'
+            '<div style="flex:1;height:10px;border-radius:3px;'
+            f'background:linear-gradient(90deg,{stops})"></div>'
             f"<span>{to_html(high)}</span></div>"
             + (f'<div style="text-align:center">{to_html(title)}</div>' if title else "")
         )

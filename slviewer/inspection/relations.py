@@ -68,43 +68,52 @@ def _size(feature: Feature) -> float:
 MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
     ("point", "point"): (Meaning("distance", "mm", "between the two points", _distance),),
     ("point", "plane"): (
-        Meaning("height", "mm", "of the point over the plane, positive on the camera's side", _height),
+        Meaning("height", "mm", "of the point over the plane, positive on the camera's side",
+        _height),
     ),
     ("point", "sphere"): (
         Meaning("distance from the centre", "mm", "of the point", _distance),
         Meaning(
-            "distance from the surface", "mm", "of the point, negative inside", lambda p, s: _distance(p, s) - _size(s)
+            "distance from the surface", "mm", "of the point, negative inside", lambda p,
+            s: _distance(p, s) - _size(s)
         ),
     ),
     ("point", "cylinder"): (
         Meaning("distance from the axis", "mm", "of the point", _offset),
         Meaning(
-            "distance from the surface", "mm", "of the point, negative inside", lambda p, c: _offset(p, c) - _size(c)
+            "distance from the surface", "mm", "of the point, negative inside", lambda p,
+            c: _offset(p, c) - _size(c)
         ),
     ),
     ("plane", "plane"): (
         Meaning("angle", "deg", "between the planes, 0 to 90", _angle),
-        Meaning("distance", "mm", "of the middle of each region from the other's plane, the mean of both", _plane_gap),
+        Meaning("distance", "mm",
+                "of the middle of each region from the other's plane, the mean of both",
+                _plane_gap),
     ),
     ("plane", "sphere"): (
         Meaning("height of the centre", "mm", "over the plane", lambda p, s: _height(s, p)),
-        Meaning("gap", "mm", "to the sphere, negative where they cut", lambda p, s: abs(_height(s, p)) - _size(s)),
+        Meaning("gap", "mm", "to the sphere, negative where they cut", lambda p,
+        s: abs(_height(s, p)) - _size(s)),
     ),
     ("plane", "cylinder"): (
         Meaning("angle", "deg", "between the axis and the plane", lambda p, c: 90.0 - _angle(p, c)),
-        Meaning("height of the axis", "mm", "over the plane, in the middle of the cylinder's region",
+        Meaning("height of the axis", "mm",
+        "over the plane, in the middle of the cylinder's region",
                 lambda p, c: _height(c, p)),
     ),
     ("sphere", "sphere"): (
         Meaning("distance of the centres", "mm", "of the two spheres", _distance),
-        Meaning("gap", "mm", "between the spheres", lambda a, b: _distance(a, b) - _size(a) - _size(b)),
+        Meaning("gap", "mm", "between the spheres", lambda a,
+        b: _distance(a, b) - _size(a) - _size(b)),
     ),
     ("sphere", "cylinder"): (
         Meaning("distance from the axis", "mm", "of the sphere's centre", _offset),
     ),
     ("cylinder", "cylinder"): (
         Meaning("angle", "deg", "between the axes, 0 to 90", _angle),
-        Meaning("distance of the axes", "mm", f"the shortest; within {PARALLEL_DEG:g} degrees of parallel, that in the "
+        Meaning("distance of the axes", "mm",
+        f"the shortest; within {PARALLEL_DEG:g} degrees of parallel, that in the "
                 "middle of the regions", _axis_gap),
     ),
 }  # fmt: skip

@@ -7,7 +7,8 @@ CheckVerdict = Literal["good", "warning", "bad", "unknown"]
 """Fit to capture; with reservations; not before it is corrected; could not be determined."""
 
 CheckName = Literal[
-    "screen", "latency", "order", "repeats", "exposure", "gamma", "pixels", "flicker", "ambient", "motion",
+    "screen", "latency", "order", "repeats", "exposure", "gamma", "pixels", "flicker", "ambient",
+    "motion",
     "turntable", "description", "noise", "decoding",
 ]  # fmt: skip
 CHECK_NAMES: tuple[CheckName, ...] = get_args(CheckName)

@@ -164,7 +164,8 @@ def plan_rig(
     Raises InputError for unknown devices and impossible figures.
     """
     for name, value, low, high in (
-        ("distance", distance, 10, 1e5), ("steps", steps, 3, 64), ("reflectance", reflectance, 0.01, 1),
+        ("distance", distance, 10, 1e5), ("steps", steps, 3, 64),
+        ("reflectance", reflectance, 0.01, 1),
         ("ambient", ambient, 0, 5), ("period", 16 if period is None else period, 3, 1000),
     ):  # fmt: skip
         if not low <= value <= high:

@@ -199,7 +199,8 @@ def turn(
         merged = merge_turn(store, settings, part(progress, 0.5, 0.8), warn)
         out = mesh if mesh is not None else store.exports / f"{todo[0].turn}_mesh.ply"
         meshed = mesh_merge(
-            store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model, accept_rejected=accept_rejected,
+            store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model,
+            accept_rejected=accept_rejected,
             progress=part(progress, 0.8, 1.0), warn=warn,
         )  # fmt: skip
     return Turn(captures, merged, meshed)

@@ -171,6 +171,7 @@ class CudaPass(OnePass):
         sigma = self.model.sigma_z(decoded, points)
         light = LightLevels(decoded.noise, scan.light.mean, scan.light.white)
         return PassResult(
-            self.axis, self.model.name, points, decoded.phase, decoded.reason, sigma, decoded.modulation,
+            self.axis, self.model.name, points, decoded.phase, decoded.reason, sigma,
+            decoded.modulation,
             texture(self.sequence, frames), light,
         )  # fmt: skip

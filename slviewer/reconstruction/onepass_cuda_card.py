@@ -91,8 +91,10 @@ class Card:
             light.mean,
         )
         self._sweep[self._grid](
-            self._frames, tuple(np.float32(number) for number in numbers), self._c, self._extra, self._phase,
-            self._reason, self._modulation, self._points, self._sigma_z, self._texture, self._highest,
+            self._frames, tuple(np.float32(number) for number in numbers), self._c, self._extra,
+            self._phase,
+            self._reason, self._modulation, self._points, self._sigma_z, self._texture,
+            self._highest,
         )  # fmt: skip
 
     def repair_spikes(self) -> None:

@@ -116,11 +116,10 @@ class Drift(Record, frozen=True, kw_only=True):
         ))  # fmt: skip
         figures = self.turn_mrad, self.turn_sigma_mrad, shifts, sigmas, self.seen_alone[:3], seen
         rows = [list(row) for row in zip("xyz", *figures, strict=True)]
+        baseline = 1e3 * self.baseline_mm
         notes = [
             f"{self.summary()}.",
-            f"Baseline {1e3 * self.baseline_mm:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace(
-                "-", "−"
-            ),
+            f"Baseline {baseline:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace("-", "−"),
             (
                 "A pan and a shift along x look nearly alike, as do a nod and a shift along y:"
                 " their sum is known far better than each. Detectable: if it is the only change."

@@ -10,8 +10,8 @@ defaults, and leaves checks of values to `__post_init__`::
         origin: NDArray[np.float64]
         up: NDArray[np.float64] | None = None
 
-    data = to_plain(plane)                 # {"origin": [0.0, 0.0, 580.0], "up": None}
-    plane = from_plain(data, CutPlane)     # arrays of the annotated dtype; InputError names what does not fit
+    data = to_plain(plane)              # {"origin": [0.0, 0.0, 580.0], "up": None}
+    plane = from_plain(data, CutPlane)  # arrays of the annotated dtype, else InputError
 
 Records nest: a field may be another dataclass, a tuple, a mapping or an optional of these. Name
 fields after their keys on disk, and no method is needed. Where a published record holds computed

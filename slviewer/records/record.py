@@ -13,7 +13,8 @@ from slviewer.records.table import Column, Table, Value
 RECORDS: dict[str, type["Record"]] = {}
 """The kinds of records by the folder of their results."""
 UNITS = {
-    "mm": ("mm", 3), "mm2": ("mm²", 3), "mm3": ("mm³", 3), "um": ("µm", 1), "px": ("px", 3), "deg": ("°", 4),
+    "mm": ("mm", 3), "mm2": ("mm²", 3), "mm3": ("mm³", 3), "um": ("µm", 1), "px": ("px", 3),
+    "deg": ("°", 4),
     "rad": ("rad", 4), "percent": ("%", 1), "ppm": ("ppm", 1), "s": ("s", 1), "ms": ("ms", 1),
 }  # fmt: skip
 """{last word of a figure's name: (unit, decimals)}."""

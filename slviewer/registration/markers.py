@@ -108,7 +108,8 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
             sigmas.append([one[1] for one in measured if one is not None])
     shape = (len(ids), 4)
     return MeasuredMarkers(
-        np.array(ids, int), np.reshape(corners, (*shape, 3)).astype(float), np.reshape(sigmas, shape).astype(float),
+        np.array(ids, int), np.reshape(corners, (*shape, 3)).astype(float),
+        np.reshape(sigmas, shape).astype(float),
         seen.repeated,
     )  # fmt: skip
 

@@ -252,8 +252,11 @@ class _PoseGraphBuilder:
             if len(steps) == 2:
                 break
         if not steps:
-            raise Refused("overlap", "No two scans in a row register, so that the turntable's axis cannot be found: "
-                          "give the axis, or scan at smaller steps.")  # fmt: skip
+            raise Refused(
+                "overlap",
+                "No two scans in a row register, so that the turntable's axis cannot be found: "
+                "give the axis, or scan at smaller steps.",
+            )
         return fit_turntable_axis(steps, steps_deg)
 
     def _fit_markers(self) -> dict[Pair, MarkerPose]:

@@ -1,15 +1,18 @@
 """Points and meshes for other programs; the suffix selects the format, and files keep the size of
 the object.
 
-=======  ===========================================================================================================
-`.ply`   binary, float32, mm: normals, colours, the expected errors (sigma) and other values of each point
+=======  ===========================================================================================
+`.ply`   binary, float32, mm: normals, colours, the expected errors (sigma) and other values of each
+         point
 `.stl`   binary, mm: triangles alone
 `.obj`   text, mm: colours of the vertices, normals
 `.glb`   binary glTF, whose unit is the metre: vertices are written in metres; colours, normals
-`.3mf`   zipped XML, mm as it states: triangles alone, for printers and CAD (`pip install 'slviewer[cad]'`)
+`.3mf`   zipped XML, mm as it states: triangles alone, for printers and CAD (`pip install
+         'slviewer[cad]'`)
 `.e57`   binary, ASTM E2807, in metres: points and their colours (`pip install 'slviewer[e57]'`)
-`.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most readers would not bear
-=======  ===========================================================================================================
+`.xyz`   text, mm: x y z of a point a line, and its red green blue; no other line, which most
+         readers would not bear
+=======  ===========================================================================================
 
 Plugins add other formats, an `Exporter` each. Files appear whole or not at all. In glTF y points up
 and the viewer looks along -z: its node turns the camera's frame, whose y points down and whose z

@@ -154,7 +154,8 @@ class Renderer:
         width, height = rig.camera.size
         out = np.empty((height, width), np.float32)
         image_light(
-            maps.coordinates[varies or "x"], maps.level, illuminated, np.float32(lamp) * light.table, light.offset,
+            maps.coordinates[varies or "x"], maps.level, illuminated,
+            np.float32(lamp) * light.table, light.offset,
             self._taps, stray, out,
         )  # fmt: skip
         if isinstance(self.scene, ConcaveScene):

@@ -137,7 +137,8 @@ def _detect_violations(
                     _gate_mm(pairs, name, other, view, there), view.spacing, there.spacing
                 )
                 add_votes(
-                    move_points(T, points), gate, there.points, witnesses[other], there.to_pixel, confirming,
+                    move_points(T, points), gate, there.points, witnesses[other], there.to_pixel,
+                    confirming,
                     contradicting,
                 )  # fmt: skip
         violations[name] = np.zeros(mask.shape, bool)

@@ -111,8 +111,10 @@ def face_areas(mesh: Mesh) -> np.ndarray:
 def extent_across(points: np.ndarray) -> float:
     """Return the largest extent in mm of points (n, 3) over 13 directions: their diameter to within
     a few percent."""
-    directions = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1],
-                           [0, 1, -1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], float)  # fmt: skip
+    directions = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1],
+    [1, 0, -1], [0, 1, 1],
+                           [0, 1, -1], [1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]],
+                           float)  # fmt: skip
     along = (
         points.astype(np.float64)
         @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T

@@ -1,14 +1,15 @@
 """Boards and their notation: what features a board has, and their coordinates.
 
-=============================  ================================================================================
+=============================  =====================================================================
 ``circles:21x16:9``            columns x rows of circles : pitch mm
-``acircles:4x11:20``           OpenCV's asymmetric grid: circle j of row i at ((2 j + i % 2) pitch, i pitch)
+``acircles:4x11:20``           OpenCV's asymmetric grid: circle j of row i at ((2 j + i % 2) pitch,
+                               i pitch)
 ``chessboard:9x7:75``          columns x rows of *inner corners* : side of a square in mm
-``charuco:8x6:30``             columns x rows of *squares* : side of a square in mm; then, if they differ from the
-                               defaults, ``:marker mm`` (0.75 of the square) and ``:dictionary``
-                               (DICT_5X5_1000). The layout is OpenCV's since 4.6: the top-left
-                               square is dark
-=============================  ================================================================================
+``charuco:8x6:30``             columns x rows of *squares* : side of a square in mm; then, if they
+                               differ from the defaults, ``:marker mm`` (0.75 of the square) and
+                               ``:dictionary`` (DICT_5X5_1000). The layout is OpenCV's since 4.6:
+                               the top-left square is dark
+=============================  =====================================================================
 
 Plugins add others (`BoardType`).
 """

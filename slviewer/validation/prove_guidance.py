@@ -81,7 +81,8 @@ def prove_guidance(scale: float, seed: int, progress: Progress) -> Proof:
         over_floor = fmean(rms) / fmean(floor)
         seconds = perf_counter() - start
         figures.append(
-            WayFigures(way, rig_seed, len(observations), rms, floor, supported, sum(unmeasured), predicted,
+            WayFigures(way, rig_seed, len(observations), rms, floor, supported, sum(unmeasured),
+            predicted,
                        over_floor, seconds)
         )  # fmt: skip
     return judge_guidance(figures, scale)

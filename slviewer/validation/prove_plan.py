@@ -149,9 +149,8 @@ def _orientation(side: int, rng: np.random.Generator, upright: bool) -> Case:
     if upright:
         points = points[:, [2, 1, 0]]
     kind = "perpendicularity" if upright else "parallelism"
-    measured = orientation_error(
-        kind, fit_feature("plane", points), points, fit_feature("plane", datum)
-    )  # type: ignore[arg-type]
+    fit, flat = fit_feature("plane", points), fit_feature("plane", datum)
+    measured = orientation_error(kind, fit, points, flat)  # type: ignore[arg-type]
     return float(np.ptp(heights)), measured
 
 

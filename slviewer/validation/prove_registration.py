@@ -167,7 +167,8 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     refusals: dict[str, dict[str, str]] = {}
     for what, (wanted, *pair), _ in track(progress, _make_ambiguous_pairs(), 0.95, 0.98):
         reason = _describe_refusal({
-            name: reconstruct_cloud(model, {"x": render_phase(Renderer(rig, scene), name, 900 + len(refusals))})
+            name: reconstruct_cloud(model,
+            {"x": render_phase(Renderer(rig, scene), name, 900 + len(refusals))})
             for name, scene in zip("ab", pair, strict=True)
         })  # fmt: skip
         refusals[what] = {"wanted": wanted, "got": reason}

@@ -137,7 +137,8 @@ def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
 
 
 def measure_errors(
-    renderer: Renderer, preset: Callable[[tuple[int, int]], PatternSequence], model: PerfectModel, seed: int
+    renderer: Renderer, preset: Callable[[tuple[int, int]], PatternSequence], model: PerfectModel,
+    seed: int
 ) -> SequenceErrors:  # fmt: skip
     """Return the errors in depth of one sequence on the renderer's scene, along axis x."""
     sequence = one_axis(preset(renderer.rig.projector.size), "x")

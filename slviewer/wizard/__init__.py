@@ -3,19 +3,21 @@ threads do the work.
 
 `operator.Operator` takes every request. Its parts:
 
-====================  ==================================================================================================
+====================  ==============================================================================
 `*_requests`          the requests, grouped by topic; `requests` turns what they raise into notices
 `engine`              the state behind them, and what a new snapshot requires
 `acquisition`         one thread that owns camera and projector, and never computes
 `preview_watcher`     analyses the latest preview frame: board, brightness, stillness
-`jobs`                one worker that computes, one job after the other; each can be cancelled within a second
+`jobs`                one worker that computes, one job after the other; each can be cancelled
+                      within a second
 `session_reader`      reads poses, calibration, records and measurements from the session's files
 `planner`             computes where the board should be held next
 `steps`               the nine steps, and what each is waiting for
 `snapshot`            what a panel draws; `publisher` builds and publishes it
 `autopilot`           runs the whole wizard on the simulated rig, by the same requests
-`preparation`         compiles the kernels that all this needs, in a process of its own, at the first start
-====================  ==================================================================================================
+`preparation`         compiles the kernels that all this needs, in a process of its own, at the
+                      first start
+====================  ==============================================================================
 
 Nothing is stored outside of the session's files: a session that is opened again continues where it
 was.

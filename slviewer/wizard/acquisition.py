@@ -128,7 +128,8 @@ class Acquisition:
             self._view = RigView(light="white", capture=self._view.capture)
             if rig is not None:
                 self._view = replace(
-                    self._view, state="opening", name=rig.name, camera=rig.camera.size, projector=rig.projector.size,
+                    self._view, state="opening", name=rig.name, camera=rig.camera.size,
+                    projector=rig.projector.size,
                     turntable=rig.turntable.name if rig.turntable is not None else "",
                 )  # fmt: skip
             if self._thread is None and rig is not None:

@@ -48,7 +48,8 @@ def export_file(
         source = f"{MERGED}{name}" if what == "merged-mesh" else name
         path = session.exports / default_file_name(what, name, file_format)
         made = mesh(
-            session, [source], path, plan=plan, texture=texture, white=white, accept_rejected=accepts,
+            session, [source], path, plan=plan, texture=texture, white=white,
+            accept_rejected=accepts,
             progress=progress, warn=warn,
         )  # fmt: skip
         assert made.textured is not None

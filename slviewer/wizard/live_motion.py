@@ -61,7 +61,8 @@ def mask_motion(
     few, many = (extreme(len(shift.indices) for shift in shifts) for extreme in (min, max))
     _mask_moving_pixels(
         frames, indices, begins, signs, modulation, phase, np.float32(harmonic),
-        np.float32(noise[0]), np.float32(noise[1]), np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
+        np.float32(noise[0]), np.float32(noise[1]),
+        np.float32(SIGMAS * np.sqrt(1 / few + 1 / many)),
         np.float32(SIGMAS / np.sqrt(len(finest))), np.float32(PART), points,
     )  # fmt: skip
 

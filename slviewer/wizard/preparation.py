@@ -87,10 +87,8 @@ def prepared_file() -> Path | None:
     if root is None:
         return None
     compiler = f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()}"
-    return (
-        root
-        / f"prepared-{hash_sources(__name__)}-{hashlib.blake2b(compiler.encode(), digest_size=8).hexdigest()}"
-    )
+    made_by = hashlib.blake2b(compiler.encode(), digest_size=8).hexdigest()
+    return root / f"prepared-{hash_sources(__name__)}-{made_by}"
 
 
 def prepare() -> None:

@@ -86,7 +86,8 @@ def make_folders(folder: Path) -> None:
     rig = {
         **{f"K_{name}": [[FOCAL_PX, 0, (w - 1) / 2], [0, FOCAL_PX, (h - 1) / 2], [0, 0, 1]]
            for name, (w, h) in (("camera", CAMERA), ("projector", PROJECTOR))},
-        **{"D_camera": [0.0] * 5, "D_projector": [0.0] * 5, "R": np.eye(3), "T": [BASELINE_MM, 0, 0]},
+        **{"D_camera": [0.0] * 5, "D_projector": [0.0] * 5, "R": np.eye(3),
+        "T": [BASELINE_MM, 0, 0]},
     }  # fmt: skip
     write_calibration(
         folder / "rig.yml", {name: np.array(value, float) for name, value in rig.items()}

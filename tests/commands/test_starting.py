@@ -12,9 +12,11 @@ CODE = """
 import sys
 from slviewer.cli import COMMANDS, main
 
-for arguments in (["--version"], ["--help"], ["import", "p18", "--help"], *([name, "--help"] for name in COMMANDS)):
+helps = ([name, "--help"] for name in COMMANDS)
+for arguments in (["--version"], ["--help"], ["import", "p18", "--help"], *helps):
     assert main(arguments) == 0, arguments
-    heavy = {"numpy", "numba", "scipy", "cv2", "open3d", "viser", "matplotlib", "zarr", "distributed", "fsspec"}
+    heavy = {"numpy", "numba", "scipy", "cv2", "open3d", "viser", "matplotlib", "zarr"}
+    heavy |= {"distributed", "fsspec"}
     assert not heavy & set(sys.modules), (arguments, heavy & set(sys.modules))
 """
 

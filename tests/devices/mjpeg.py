@@ -84,7 +84,8 @@ class _Sender(BaseHTTPRequestHandler):
             if self.server.taken:
                 taken = self.server.wait_for_another(taken)
             jpeg = cv2.imencode(".jpg", self.server.picture)[1].tobytes()
-            head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
+            head = b"--picture\r\nContent-Type: image/jpeg\r\n"
+            head += f"Content-Length: {len(jpeg)}\r\n\r\n".encode()
             clump += head + jpeg + b"\r\n"
             sent += 1
             self.server.sent += 1

@@ -56,7 +56,8 @@ def seen(true: StereoRig, depth: float, name: str = "pose") -> Observation:
     low, high = true.camera.project(X).min(0).astype(int), true.camera.project(X).max(0).astype(int)
     region[low[1] : high[1] + 2, low[0] : high[0] + 2] = True
     return Observation(
-        name, BOARD.points, true.camera.project(X), true.project(X), surfaces, {"x": PERIOD, "y": PERIOD}, SIZE,
+        name, BOARD.points, true.camera.project(X), true.project(X), surfaces,
+        {"x": PERIOD, "y": PERIOD}, SIZE,
         (0, 0, *SIZE), np.packbits(region),
     )  # fmt: skip
 

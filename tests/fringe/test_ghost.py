@@ -55,8 +55,10 @@ def test_the_share_of_the_image_before_is_measured(severity, share):
 
 
 OTHERS = [
-    (None, "mild"), ("vignetting", "severe"), ("gamma", "mild"), ("defocus", "severe"), ("auto-exposure", "mild"),
-    ("room-light", "medium"), ("jpeg", "severe"), ("hot-pixels", "severe"), ("dim-projector", "severe"),
+    (None, "mild"), ("vignetting", "severe"), ("gamma", "mild"), ("defocus", "severe"),
+    ("auto-exposure", "mild"),
+    ("room-light", "medium"), ("jpeg", "severe"), ("hot-pixels", "severe"),
+    ("dim-projector", "severe"),
 ]  # fmt: skip
 
 

@@ -116,7 +116,10 @@ def button(page: Page, name: str) -> Locator:
 STILL = """quiet => new Promise(done => {
   const end = () => { watcher.disconnect(); done(); };
   let timer = setTimeout(end, quiet);
-  const watcher = new MutationObserver(() => { clearTimeout(timer); timer = setTimeout(end, quiet); });
+  const watcher = new MutationObserver(() => {
+    clearTimeout(timer);
+    timer = setTimeout(end, quiet);
+  });
   watcher.observe(document.body, { childList: true, subtree: true });
   setTimeout(end, 12 * quiet);
 })"""
@@ -182,9 +185,12 @@ def capture_pose(page: Page, name: str) -> None:
     expect(pose_row(page, name, "good")).to_be_visible(timeout=PATIENCE_MS)
 
 
-CUT_LABELS = """() => [...document.querySelectorAll("button, label, th, td, [role=tab], span, p, div")]
-    .filter(e => e.offsetParent && [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()))
-    .filter(e => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).overflowX !== "visible")
+CUT_LABELS = """() =>
+    [...document.querySelectorAll("button, label, th, td, [role=tab], span, p, div")]
+    .filter(e => e.offsetParent)
+    .filter(e => [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()))
+    .filter(e => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1)
+    .filter(e => getComputedStyle(e).overflowX !== "visible")
     .map(e => e.textContent.trim())"""
 BROKEN_LABELS = """() => [...document.querySelectorAll("label, button, th, [role=tab], span, div")]
     .filter(e => e.offsetParent && e.childNodes.length === 1 && e.firstChild.nodeType === 3)

@@ -38,7 +38,8 @@ class Operation:
 BALL = """kind = "sphere"
 name = "ball"
 certificate = "K 1"
-calibrated = {diameter_mm = 196.0, diameter_U_mm = 0.01, form_mm = 0.01, form_U_mm = 0.01, temperature_C = 20.0, \
+calibrated = {diameter_mm = 196.0, diameter_U_mm = 0.01, form_mm = 0.01, form_U_mm = 0.01, \
+temperature_C = 20.0, \
 expansion_ppm_K = 0.0, expansion_U_ppm_K = 0.0}
 measured = {temperature_C = 20.0, temperature_U_K = 0.1, captures = ["sphere_3"]}
 limits = {form_mm = 5.0}
@@ -54,7 +55,8 @@ OPERATIONS = {
     "accept": Operation(
         ("accept", "SESSION", "--artefact", "BALL"),
         lambda session: sl.accept(session, find_ball(session)),
-        lambda operator: operator.run("accept", artefact=find_ball(operator.session.folder)),  # type: ignore[union-attr]
+        lambda operator: operator.run("accept", artefact=find_ball(operator.session.folder)),
+        # type: ignore[union-attr]
         ("acceptance/1",),
         "sphere_3",
     ),

@@ -339,9 +339,12 @@ def test_how_good_a_calibration_is() -> None:
     }
     three = (0.0, 0.1, 0.0)
     drift = Drift(
-        capture="plane_01", axes=("x",), verdict="recalibrate", reasons=("the board seems too large",), turn_mrad=three,
-        turn_sigma_mrad=three, shift_mm=three, shift_sigma_mm=three, baseline_mm=0.0, baseline_sigma_mm=0.1,
-        scale_ppm=420.0, scale_sigma_ppm=66.0, across_px=None, across_sigma_px=None, misfit_px=0.02, chance=0.01,
+        capture="plane_01", axes=("x",), verdict="recalibrate",
+        reasons=("the board seems too large",), turn_mrad=three,
+        turn_sigma_mrad=three, shift_mm=three, shift_sigma_mm=three, baseline_mm=0.0,
+        baseline_sigma_mm=0.1,
+        scale_ppm=420.0, scale_sigma_ppm=66.0, across_px=None, across_sigma_px=None,
+        misfit_px=0.02, chance=0.01,
         seen_alone=(0.1,) * 6, unseen=(), time="2026-11-22T10:00:00+00:00",
     )  # fmt: skip
     balls = {

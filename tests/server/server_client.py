@@ -112,7 +112,8 @@ class Browser:
 
     def raw_request(self, path: str = "") -> bytes:
         """The bytes of a request, to be sent by hand."""
-        return f"GET {self.path}{path} HTTP/1.1\r\nHost: {self.host}\r\nCookie: {self.cookie}\r\n\r\n".encode()
+        lines = f"GET {self.path}{path} HTTP/1.1", f"Host: {self.host}", f"Cookie: {self.cookie}"
+        return "\r\n".join([*lines, "", ""]).encode()
 
     def open(
         self, path: str = "", origin: str | None = "own", host: str | None = None

@@ -16,7 +16,8 @@ WORKER = """async () => {
     postMessage("ready");
     Atomics.wait(shared, 0, 0);
     for (let i = 0; i < 20; i++)
-      postMessage(i === 7 ? {type: "closed"} : {type: "message_batch", messages: [2 * i, 2 * i + 1]});
+      postMessage(i === 7 ? {type: "closed"}
+        : {type: "message_batch", messages: [2 * i, 2 * i + 1]});
     Atomics.store(shared, 1, 1);
   };`;
   const worker = new Worker(URL.createObjectURL(new Blob([text])));
@@ -36,7 +37,8 @@ WORKER = """async () => {
   Atomics.store(shared, begin, 1);
   Atomics.notify(shared, begin);
   const end = performance.now() + HANG_MS;
-  while (!Atomics.load(shared, sent) && performance.now() < end); // the page is busy until the worker has sent all
+  // the page is busy until the worker has sent all
+  while (!Atomics.load(shared, sent) && performance.now() < end);
   await done;
   return { arrived, failed };
 }""".replace("HANG_MS", f"{1000 * HANG_S:.0f}")

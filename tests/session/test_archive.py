@@ -29,7 +29,8 @@ def unpack(data: io.BytesIO, folder: Path, **limits: int) -> tuple[Path, list[st
 def test_images_and_tomls_are_unpacked_and_the_rest_is_named(tmp_path: Path) -> None:
     data = zipped(
         {
-            "set/scan_1/a.png": b"1", "set/scan_2/a.png": b"22", "set/frames.toml": b"", "set/notes.txt": b"x",
+            "set/scan_1/a.png": b"1", "set/scan_2/a.png": b"22", "set/frames.toml": b"",
+            "set/notes.txt": b"x",
             "set/run.sh": b"x", "__MACOSX/set/._a.png": b"x", "set/.DS_Store": b"x",
         }
     )  # fmt: skip

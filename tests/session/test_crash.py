@@ -38,7 +38,9 @@ def save_until_killed(height, at):
         frames = np.full((24, height, 640), 7, np.uint8)
         for i in range(10000):
             frames[:] = i % 251
-            session.save_capture(f"new_{i % 20}", "scan", sequence, frames, source=str(i), force=True)
+            session.save_capture(
+                f"new_{i % 20}", "scan", sequence, frames, source=str(i), force=True
+            )
             session.save_result("calibration/stereo", {"i": i}, {"z": np.full((height, 640), i)})
 
 for line in sys.stdin:

@@ -136,7 +136,8 @@ def test_sltk_names_say_axis_bit_and_negative(tmp_path):
         for place in reversed(range(bits)):
             for negative in (0, 1):
                 pattern = bit_of(at, place)
-                name = f"1481{50 + number}.5_[{axis:02d}-{place:02d}-{negative:02d}_{number:02d}]_img.png"
+                place_and_number = f"{axis:02d}-{place:02d}-{negative:02d}_{number:02d}"
+                name = f"1481{50 + number}.5_[{place_and_number}]_img.png"
                 write(tmp_path / "scan" / name, 1 - pattern if negative else pattern)
                 number += 1
     write(tmp_path / "scan" / "preview.png", U / COLUMNS)

@@ -19,8 +19,10 @@ from slviewer.target.board import Board
 BOARD = Board.parse("circles:21x16:9")
 
 TABLE_1 = {  # R1, R2, R3 in percent, from the Letter
-    "plane_01": (100, 0, 0), "plane_02": (91.2, 8.8, 0), "plane_03": (0, 100, 0), "plane_04": (0, 100, 0),
-    "plane_05": (0, 47.6, 52.4), "plane_06": (0, 0.7, 99.3), "plane_07": (0, 0, 100), "plane_08": (0, 0, 100),
+    "plane_01": (100, 0, 0), "plane_02": (91.2, 8.8, 0), "plane_03": (0, 100, 0),
+    "plane_04": (0, 100, 0),
+    "plane_05": (0, 47.6, 52.4), "plane_06": (0, 0.7, 99.3), "plane_07": (0, 0, 100),
+    "plane_08": (0, 0, 100),
     "plane_09": (2.1, 97.9, 0), "plane_10": (0, 87, 13),
 }  # fmt: skip
 

@@ -20,7 +20,8 @@ from slviewer.geometry.vectors import box_middle, lengths
 
 DEPTHS = (0.0, 0.2, 0.45, 0.75, 1.1, 1.45)
 """Candidate depths, from nearest (0) to farthest (1) recommended depth, and beyond it."""
-TILTS_DEG = ((0, 0), (16, 0), (-16, 0), (0, 16), (0, -16), (22, 22), (22, -22), (-22, 22), (-22, -22), (32, 0),
+TILTS_DEG = ((0, 0), (16, 0), (-16, 0), (0, 16), (0, -16), (22, 22), (22, -22), (-22, 22),
+(-22, -22), (32, 0),
              (-32, 0), (0, 32), (0, -32))  # fmt: skip
 """Candidate tilts about x and y."""
 DIRECTIONS = tuple((x, y) for x, y in product((-1.0, 0.0, 1.0), repeat=2))

@@ -89,7 +89,8 @@ class Sums(NamedTuple):
 def allocate_workspace():
     """Return a workspace of zeros."""
     return Workspace(
-        np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)), np.zeros((2, 9)), np.zeros((2, 9)), np.zeros((2, 2)),
+        np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)), np.zeros((2, 9)), np.zeros((2, 9)),
+        np.zeros((2, 2)),
         np.zeros((3, HEIGHT_TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
     )  # fmt: skip
 
@@ -123,7 +124,9 @@ def normal_equations(
     with ThreadPoolExecutor(len(shares)) as threads:
         list(
             threads.map(
-                lambda poses, A, b: _accumulate(*model, data, *residuals, *weights, at, order, poses, A, b),
+                lambda poses, A, b: _accumulate(
+                    *model, data, *residuals, *weights, at, order, poses, A, b
+                ),
                 shares, matrices, right,
             )
         )  # fmt: skip
@@ -266,7 +269,8 @@ def _accumulate(
     """
     work, row = allocate_workspace(), np.zeros((2, ROW))
     sums = Sums(
-        np.zeros((4, ROW)), np.zeros(4), np.zeros(4), np.zeros((ROW, ROW)), np.zeros(ROW), dense_columns(at)
+        np.zeros((4, ROW)), np.zeros(4), np.zeros(4), np.zeros((ROW, ROW)), np.zeros(ROW),
+        dense_columns(at)
     )  # fmt: skip
     for i in poses:
         for c in range(HEIGHT):

@@ -74,7 +74,8 @@ class CalibratePanel(StepPanel):
             self._use = Choice(gui, "Model", "Used for scans and verifications")
             self._compare = context.button(
                 "Compare models", operator.compare_models, viser.Icon.SCALE,
-                hint="Cross-validation: measures each pose by calibrations without it; takes a minute or more",
+                hint="Cross-validation: measures each pose by calibrations without it; "
+                "takes a minute or more",
             )  # fmt: skip
             self._comparison = Text(gui)
             self._splined = Text(gui)

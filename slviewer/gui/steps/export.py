@@ -374,8 +374,8 @@ class ExportPanel(StepPanel):
             for export in sorted(exports, key=_rank_export)
         ]
         return Html(
-            "<div"
-            f' style="max-height:{LIST_PX}px;overflow-y:auto">{table(("File", "Size", ""), rows)}</div>'
+            f'<div style="max-height:{LIST_PX}px;overflow-y:auto">'
+            f"{table(('File', 'Size', ''), rows)}</div>"
         )
 
     def _result_text(self, export: ExportView) -> str:

@@ -43,8 +43,8 @@ farther away."""
 def coverage_chart(coverage: Coverage) -> Html:
     """Return three small charts side by side; a field is full once GOAL_POSES poses cover it."""
     depths = "".join(
-        "<div"
-        f' style="display:flex;align-items:center;gap:0.4em">{_draw_field(n, 44, 15)}<span>{name}</span></div>'
+        f'<div style="display:flex;align-items:center;gap:0.4em">{_draw_field(n, 44, 15)}'
+        f"<span>{name}</span></div>"
         for name, n in zip(("near", "middle", "far"), coverage.depths, strict=True)
     )
     tilts = np.full((3, 3), -1)
@@ -52,8 +52,8 @@ def coverage_chart(coverage: Coverage) -> Html:
         tilts[place] = n
     near, far = coverage.range_mm
     charts = "".join(
-        "<div><div"
-        f' style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}</div>{chart}</div>'
+        f'<div><div style="color:var(--mantine-color-dimmed);margin-bottom:0.2em">{to_html(title)}'
+        f"</div>{chart}</div>"
         for title, chart in (
             ("Image", _draw_grid(coverage.cells)),
             (f"Depth, {near:.0f}–{far:.0f} mm", depths),
@@ -116,7 +116,8 @@ class PosesPanel(StepPanel):
         self._countdown = Text(gui)
         self._other_object = Text(gui)
         self._place = context.button(
-            "Place board", operator.place_at_suggestion, viser.Icon.TARGET_ARROW, "cyan", visible=False,
+            "Place board", operator.place_at_suggestion, viser.Icon.TARGET_ARROW, "cyan",
+            visible=False,
             hint="Moves the simulated board to the suggested pose",
         )  # fmt: skip
         self._capture = context.button(
@@ -138,7 +139,8 @@ class PosesPanel(StepPanel):
         self._accuracy = Text(gui)
         self._wanted = gui.add_number(
             "Sigma, mm", 0.0, min=0.0, max=10.0, step=0.001,
-            hint="Goal: predicted 3D standard deviation at which no further pose is suggested; 0: the default",
+            hint="Goal: predicted 3D standard deviation at which no further pose is suggested; "
+            "0: the default",
         )  # fmt: skip
         self._wanted_value = SessionValue(self._wanted)
         self._wanted.on_update(

@@ -152,8 +152,10 @@ class ScanPanel(StepPanel):
                 viser.Icon.ARROW_BACK_UP,
             )
             self._support = context.button(
-                "Remove support", lambda: operator.remove_support(*self._shown_scans()), viser.Icon.TABLE_MINUS,
-                hint="Deletes the plane that the object stands on, and all below it; Undo edit brings it back",
+                "Remove support", lambda: operator.remove_support(*self._shown_scans()),
+                viser.Icon.TABLE_MINUS,
+                hint="Deletes the plane that the object stands on, and all below it; "
+                "Undo edit brings it back",
             )  # fmt: skip
             self._view = Choice(gui, "3D view")
             self._colour = gui.add_dropdown("Colour", COLOURS)

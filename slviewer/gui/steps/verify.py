@@ -2,6 +2,7 @@
 capture."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import viser
@@ -83,14 +84,10 @@ class VerifyPanel(StepPanel):
             )
             self._all: dict[Shape, viser.GuiButtonHandle] = {}
             for shape, icon in shapes:
-                measure = lambda shape=shape: self._request_verification(
-                    [self._recorded.value], shape
-                )  # noqa: E731
-                context.button(f"Measure {shape}", measure, icon)
+                context.button(f"Measure {shape}", partial(self._request_recorded, shape), icon)
             for shape, icon in shapes:
-                measure_all = lambda shape=shape: self._request_all(shape)  # noqa: E731
                 self._all[shape] = context.button(
-                    f"Measure all {shape}s", measure_all, icon, visible=False
+                    f"Measure all {shape}s", partial(self._request_all, shape), icon, visible=False
                 )
         for choice in (self._result, self._model):
             choice.on_change(context.callback(self._refresh))
@@ -203,6 +200,10 @@ class VerifyPanel(StepPanel):
             self._operator.verify(
                 list(names), shape, radius if shape == "sphere" and radius > 0 else None
             )
+
+    def _request_recorded(self, shape: Shape) -> None:
+        """Request a verification of the chosen capture."""
+        self._request_verification([self._recorded.value], shape)
 
     def _request_all(self, shape: Shape) -> None:
         """Request the verification of all captures of a shape that have none yet."""

@@ -2,18 +2,24 @@
 
 ```toml
 projector = "912x1140"   # width x height, px; not needed where only the phase is wanted
-phase_sign = 1           # optional, like the next: step k of n shows cos(phi + phase_sign 2 pi k / n + phase_offset)
+phase_sign = 1           # optional, like the next: step k of n shows
+                         # cos(phi + phase_sign 2 pi k / n + phase_offset)
 phase_offset = 0.0       # rad; this and the others may differ by axis: {x = 0.0, y = 1.57}
 gray_origin = -0.5       # projector px at which Gray code 0 begins
-gray_cell_px = 18.0      # width of the cells that the Gray bits number; by default the longest period, or 1 px without
-relative = false         # true: steps alone whose periods do not cover the projector; the phase is not absolute
-full_scale = 4095        # grey level at which a camera of more than 8 bits clips; by default as the files state it
+gray_cell_px = 18.0      # width of the cells that the Gray bits number; by default the longest
+                         # period, or 1 px without
+relative = false         # true: steps alone whose periods do not cover the projector; the
+                         # phase is not absolute
+full_scale = 4095        # grey level at which a camera of more than 8 bits clips; by default as
+                         # the files state it
 channel = "green"        # of colour images: red, green (the default), blue, luma or max
 
 [[frame]]                # one image
-file = "00.png"          # relative to the capture's folder; * and ? are wildcards, brackets are plain characters
+file = "00.png"          # relative to the capture's folder; * and ? are wildcards, brackets are
+                         # plain characters
 kind = "phase"           # phase, gray, inverse, complementary, white, black, texture
-axis = "x"               # x varies along projector columns, y along rows; none for white, black, texture
+axis = "x"               # x varies along projector columns, y along rows; none for white,
+                         # black, texture
 step = 0                 # phase: step of steps, at a period in projector px
 steps = 4
 period_px = 18.0

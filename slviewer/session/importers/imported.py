@@ -48,7 +48,8 @@ class ImportableRecording:
             for file in self.files
         ]
         return NewCapture(
-            self.name, sequence, images.stack, images.texture, str(self.source), settings, self.exposures_ms,
+            self.name, sequence, images.stack, images.texture, str(self.source), settings,
+            self.exposures_ms,
             tuple(file.as_posix() for file in files),
         )  # fmt: skip
 
