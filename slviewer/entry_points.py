@@ -42,8 +42,9 @@ class PluginGroup(Generic[T]):
     def plugins(self) -> tuple[Plugin, ...]:
         """All of them, in order of their names, imported when this is first read.
 
-        One has a ``problem`` where its import fails, it is no instance of ``kind``, its ``name`` is
-        not the entry point's, or the name is one of ``built_in`` or of a plugin before it.
+        One has a ``problem`` where its import fails, it is not an instance of ``kind``, its
+        ``name`` is not the entry point's, or the name is one of ``built_in`` or of a plugin before
+        it.
         """
         plugins: list[Plugin] = []
         for entry in sorted(

@@ -65,7 +65,7 @@ def producer_files(producer: str | None = None) -> list[str]:
     if producer is not None:
         if not (producer.endswith(".cti") and Path(producer).is_file()):
             raise InputError(
-                f"{producer} is no GenTL producer: give the path of a .cti file of your camera's"
+                f"{producer} is not a GenTL producer: give the path of a .cti file of your camera's"
                 " software"
             )
         return [str(Path(producer).resolve())]

@@ -135,14 +135,14 @@ class GcodeTurntable(Openable):
         if (limits := self.limits_deg) is not None:
             if not (len(limits) == 2 and limits[0] < limits[1]):
                 raise InputError(
-                    f"limits_deg = {list(limits)} are no limits: give two, the lower one first"
+                    f"limits_deg = {list(limits)} are not limits: give two, the lower one first"
                 )
             self.limits_deg = float(limits[0]), float(limits[1])
         super().__init__(f"the turntable at {self.port}")
         self._clock = self.timing.clock
         self._serial: Any = None
         self._buffer = b""
-        self._unreadable = 0  # bytes that are no text, since it was opened
+        self._unreadable = 0  # bytes that are not text, since it was opened
         self._is_marlin = False
 
     def _start(self) -> None:

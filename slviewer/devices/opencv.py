@@ -50,8 +50,8 @@ class OpenCVCamera(Openable):
     `size` is (width, height) px, which a webcam is switched to; without it, it is the one in use,
     or the source must answer now. The settings are made when it is opened, None leaves one as it
     is: exposure in ms, gain and focus in the camera's own units, white balance in K. `timing`: how
-    long pictures are waited for. A gain in the camera's own units is no factor on the grey levels:
-    `settings` does not report it and `apply` does not set it.
+    long pictures are waited for. A gain in the camera's own units is not a factor on the grey
+    levels: `settings` does not report it and `apply` does not set it.
 
     Raises InputError for invalid options, DeviceError for a source that does not answer.
     """
@@ -77,7 +77,7 @@ class OpenCVCamera(Openable):
             for value in (self.gain, self.focus, self.white_balance)
         ):
             raise InputError(
-                "a gain, a focus or a white balance that is no number cannot be set: give one"
+                "a gain, a focus or a white balance that is not a number cannot be set: give one"
             )
         super().__init__(describe_source(source))
         if wanted is None and source in _IN_USE:
@@ -235,7 +235,7 @@ def _check_source(source: int | str) -> int | str:
         or (isinstance(source, int) and source < 0)
     ):
         raise InputError(
-            f"{source!r} is no camera: give a webcam's number, a video file, or an address"
+            f"{source!r} is not a camera: give a webcam's number, a video file, or an address"
         )
     return source
 

@@ -45,7 +45,7 @@ def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatab
     count, shapes = len(pairs), {z.shape for z, _ in pairs}
     if len(shapes) > 1:
         raise InputError(
-            f"captures of {' and '.join(map(str, shapes))} pixels are no repetition of one another"
+            f"captures of {' and '.join(map(str, shapes))} pixels do not repeat each other"
         )
     if count < LEAST_CAPTURES:
         raise InputError(

@@ -13,8 +13,8 @@ MIN_RULE, MIN_COMMON, MIN_RISING = 0.5, 0.5, 0.5
 """Shares of the code edges below which the description fails: a wrong one gives no more than
 chance. Correct ones gave 0.93 and more, also for a cluttered scene in room light."""
 MIN_OPPOSED = 0.8
-"""Share below which two images are no bit and inverse: images of other patterns are alike at half
-of the pixels."""
+"""Share below which two images are not a bit and its inverse: images of other patterns are alike at
+half of the pixels."""
 SURE = 0.75
 """Shares that a hypothesis must exceed to be reported."""
 MIN_LEVEL = 0.4

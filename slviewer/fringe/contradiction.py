@@ -11,7 +11,7 @@ class Contradiction:
 
     ``cause``: one of a fixed set of labels; ``message``: what was observed and what to do;
     ``axis``: None for both; ``value``: the value that fits instead of the described one, in the
-    unit of the message, None where it is no number.
+    unit of the message, None where it is not a number.
     """
 
     cause: str

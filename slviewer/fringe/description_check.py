@@ -3,7 +3,7 @@ order that fits.
 
 A hypothesis is accepted if it passes a test that the description fails: code edges obey the Gray
 code, have one phase of the fringes, and the phase rises with the code; each fringe period predicts
-the next finer one; coordinates are inside the projector and are no mirror image of the scene.
+the next finer one; coordinates are inside the projector and are not a mirror image of the scene.
 """
 
 from dataclasses import dataclass, replace

@@ -17,9 +17,9 @@ LEAST_PATTERN = 0.05
 """Standard deviation of the pattern as a share of the contrast; below it images are evenly
 illuminated, or blurred."""
 DECIDED, SHARP = 0.2, 0.5
-"""Distance from the middle, as a share of the contrast, from which a pixel is no edge; and share of
-such pixels in an image whose stripes are not blurred: blurred ones of two patterns may look
-alike."""
+"""Distance from the middle, as a share of the contrast, from which a pixel is not an edge; and
+share of such pixels in an image whose stripes are not blurred: blurred ones of two patterns may
+look alike."""
 FEWEST_EDGES = 30
 EVEN = 0.25
 """Mean distance from the middle, as a share of the contrast, of an image that is white (above) or

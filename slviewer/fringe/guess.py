@@ -93,11 +93,12 @@ def guess_sequence(stack: np.ndarray, projector: Size | None = None) -> Guess:
 
     ``projector``: (width, height) px where it is known. Periods in projector px follow from the
     images only where Gray code numbers the projector's pixels; else only their ratios do, and the
-    finest period is set to 16 px. Raises InputError for an array that is no stack.
+    finest period is set to 16 px. Raises InputError for an array that is not a stack.
     """
     if stack.ndim != 3 or len(stack) < 3:
         raise InputError(
-            f"a stack of shape {stack.shape} is no capture: give three or more images of one size"
+            f"a stack of shape {stack.shape} is not a capture: give three or more images of one"
+            " size"
         )
     sample = sample_frames(stack, list(range(len(stack))))
     reader = BlockReader(sample)

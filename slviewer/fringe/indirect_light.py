@@ -1,11 +1,11 @@
 """Pixels whose frames contradict a single reflection: light reached them by way of other surfaces
 or the material too.
 
-Where one reflection alone lights a pixel, every Gray bit that is no edge there has the same black
-and the same white, and the fringes span as much of the white light as they do elsewhere. Light from
-other surfaces, or scattered in the material, follows wide stripes, so that bits differ, and
-averages over narrow ones, so that the fringes are weak for their white light (Nayar et al., "Fast
-separation of direct and global components", SIGGRAPH 2006).
+Where one reflection alone lights a pixel, every Gray bit that is not an edge there has the same
+black and the same white, and the fringes span as much of the white light as they do elsewhere.
+Light from other surfaces, or scattered in the material, follows wide stripes, so that bits differ,
+and averages over narrow ones, so that the fringes are weak for their white light (Nayar et al.,
+"Fast separation of direct and global components", SIGGRAPH 2006).
 
 Light that comes from less than a stripe away can be seen by its weak fringes alone, and where
 nearly all of the image is like that, by nothing.

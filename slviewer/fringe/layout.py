@@ -70,7 +70,8 @@ class Layout:
 
     @property
     def numbers_cells(self) -> bool:
-        """Whether Gray bits beside phase shifts number cells that are no single shift's periods."""
+        """Whether Gray bits beside phase shifts number cells that are not a single shift's
+        periods."""
         return bool(self.shifts and self.gray) and not self.numbers_periods
 
     @property
@@ -129,7 +130,7 @@ def check_stack(sequence: PatternSequence, stack: np.ndarray) -> None:
     if not isinstance(stack, np.ndarray):
         sizes = sorted({np.shape(frame) for frame in stack})
         raise InputError(
-            f"the frames are no single array (their shapes: {sizes}): stack frames of one size"
+            f"the frames are not one array (their shapes: {sizes}): stack frames of one size"
         )
     if stack.ndim != 3 or 0 in stack.shape:
         raise InputError(

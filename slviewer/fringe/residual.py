@@ -194,7 +194,7 @@ def _compare_frames(frames: _Frames, layout: Layout) -> FrameResiduals:
 
 
 def _detect_code_faults(frames: _Frames, axis: Axis) -> list[Suspect]:
-    """Return a suspect for each contradiction in the order of the frames that are no phase steps.
+    """Return a suspect for each contradiction in the order of the frames that are not phase steps.
 
     Phase steps are included only if all frames are late by the same number of images.
     """

@@ -130,7 +130,7 @@ class Frame:
             numbers["period_px"] = convert(data.get("period_px", 0.0), float, strict=False)
         except ValidationError as error:
             raise InputError(
-                f"a {data['kind']} frame has an entry that is no number ({error}): correct it"
+                f"a {data['kind']} frame has an entry that is not a number ({error}): correct it"
             ) from error
         values = {name: value for name, value in numbers.items() if name in _FIELDS.get(kind, ())}
         return cls(kind=kind, axis=axis, **values)  # type: ignore[arg-type]
@@ -408,10 +408,10 @@ def parse_size(text: Any) -> Size:
         width, height = convert(parts, Size, strict=False)
     except ValidationError as error:
         raise InputError(
-            f"'{text}' is no size: write width and height in px like 912x1140"
+            f"'{text}' is not a size: write width and height in px like 912x1140"
         ) from error
     if not (1 <= width <= MAX_EXTENT and 1 <= height <= MAX_EXTENT):
-        raise InputError(f"'{text}' is no size: write width and height in px like 912x1140")
+        raise InputError(f"'{text}' is not a size: write width and height in px like 912x1140")
     return width, height
 
 

@@ -27,8 +27,8 @@ class Lens:
     coefficients, or more of which the rest are zero, are accepted. ``size``: (width, height) px.
     The arrays are kept as read-only float64 copies.
 
-    Raises InputError for matrices that are no pinhole, and for distortion models other than
-    Brown's.
+    Raises InputError for matrices that are not those of a pinhole, and for distortion models other
+    than Brown's.
     """
 
     K: np.ndarray

@@ -36,7 +36,7 @@ class SplineSurface:
     """A trend plus a tensor-product uniform cubic B-spline over ``trend.box``.
 
     ``coefficients``: (ny + 3, nx + 3) for ny x nx cells. NaN outside the box; in cells without
-    samples it continues smoothly from its neighbours, which is no measurement: mask those.
+    samples it continues smoothly from its neighbours, which is not a measurement: mask those.
     """
 
     trend: Polynomial2D

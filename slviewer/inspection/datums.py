@@ -35,7 +35,9 @@ def datum_frame(features: Sequence[Feature]) -> np.ndarray:
     elif tertiary.kind != "plane":
         towards = tertiary.place - secondary.place
     else:
-        raise InputError("The secondary datum is no plane, but the tertiary is one: exchange them.")
+        raise InputError(
+            "The secondary datum is not a plane, but the tertiary is one: exchange them."
+        )
     across = towards - (towards @ z) * z
     if not np.linalg.norm(across) > MIN_SINE * np.linalg.norm(towards):
         raise InputError("The secondary datum fixes no direction in the primary: choose another.")

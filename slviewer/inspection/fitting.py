@@ -28,7 +28,7 @@ MAX_EXCLUDED_SHARE = 0.4
 """Share of a region that may lie off the shape; beyond it the region holds something else."""
 MAX_RMS_RISE = 0.005
 """Distance from a plane (1 sigma), as a share of the region's size, from which on a region that
-bends is no plane."""
+bends is not a plane."""
 RIVAL_RATIO = 2.0
 """Another shape must leave this many times less before a region is said to hold that one
 instead."""

@@ -77,7 +77,7 @@ def _check_place(values: object) -> np.ndarray:
     finite."""
     vector = np.asarray(values, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InputError(f"{values!r} is no place: give x, y and z in mm.")
+        raise InputError(f"{values!r} is not a place: give x, y and z in mm.")
     return vector
 
 

@@ -66,7 +66,7 @@ def _array(kind: Any, value: Any) -> Any:
     """Convert to an array of the dtype that a field is annotated with, of the values' own where it
     names none."""
     if kind is not np.ndarray and getattr(kind, "__origin__", None) is not np.ndarray:
-        raise NotImplementedError(f"{kind} is no type of records")
+        raise NotImplementedError(f"{kind} is not a type of records")
     dtype = next(iter(get_args(get_args(kind)[1])), None) if get_args(kind) else None
     array = np.asarray(value, None if dtype is Any else dtype)
     if array.dtype.kind not in "biuf":

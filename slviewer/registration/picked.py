@@ -28,7 +28,7 @@ def fit_picked_start(
     p, q = np.asarray(scan_points, dtype=np.float64), np.asarray(reference_points, dtype=np.float64)
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
         raise InputError(
-            f"Picked points of shapes {p.shape} and {q.shape} are no pairs: pick as many on both"
+            f"Picked points of shapes {p.shape} and {q.shape} are not pairs: pick as many on both"
             " scans."
         )
     if len(p) < LEAST_PICKS:

@@ -22,8 +22,8 @@ def listen(host: str, port: int, resolve_s: float = RESOLVE_SECONDS) -> Listener
     """
     if not host or not 0 <= port <= 65535:
         raise SlviewerError(
-            f"{host or 'An empty host'}:{port} is no address to serve at: try 127.0.0.1 and port"
-            " 8080."
+            f"{host or 'An empty host'}:{port} is not an address to serve at: try 127.0.0.1 and"
+            " port 8080."
         )
     family, address = _resolve(host, port, resolve_s)
     sock = Listener(family, socket.SOCK_STREAM)

@@ -48,7 +48,7 @@ def load_tokens(path: Path) -> dict[Role, str]:
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(
-            f"{path} is no TOML file with tokens, such as operate = '...': {error}."
+            f"{path} is not a TOML file with tokens, such as operate = '...': {error}."
         ) from error
     if (
         not given

@@ -95,6 +95,6 @@ def _open_offer(offer: Offer) -> BinaryIO:
                 return file
             file.close()
     raise InputError(
-        f"{offer.path.name} can't be offered for download: it is no file inside"
+        f"{offer.path.name} can't be offered for download: it is not a file inside"
         f" {offer.within.name}."
     )

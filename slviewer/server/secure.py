@@ -61,7 +61,7 @@ class Serving:
         for name in self.names:
             if not _NAME.fullmatch(name):
                 raise UsageError(
-                    f"{name!r} is no host name as browsers send it: give one of letters, digits,"
+                    f"{name!r} is not a host name as browsers send it: give one of letters, digits,"
                     " '-' and '.', with its port if that is another one, and other letters as"
                     " xn--…"
                 )

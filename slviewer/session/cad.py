@@ -84,7 +84,7 @@ def _parse(file_format: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 if __name__ == "__main__":
     limit_process()
     answer = os.dup(1)
-    os.dup2(2, 1)  # what the parsers print is no part of the answer
+    os.dup2(2, 1)  # what the parsers print is not part of the answer
     found = _parse(sys.argv[1], sys.stdin.buffer.read())
     content = io.BytesIO()
     np.savez(content, vertices=found[0], faces=found[1])

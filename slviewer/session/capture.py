@@ -324,8 +324,8 @@ def read_stored_captures(folders: Iterable[Path]) -> tuple[list[Capture], dict[s
             )
         elif not (folder / "capture.json").is_file():
             faults[folder.name] = (
-                f"{folder} is no capture (it holds no capture.json): restore the file, or move it"
-                " away"
+                f"{folder} is not a capture (it holds no capture.json): restore the file, or move"
+                " it away"
             )
         else:
             try:

@@ -106,7 +106,7 @@ def _write_entry(storage: Any, key: str, value: Any) -> None:
         matrix = np.asarray(value)
         if matrix.ndim not in (1, 2) or matrix.dtype.kind not in "iuf":
             raise InputError(
-                f"{key} is no number, word or matrix: an OpenCV file cannot hold it, write .json"
+                f"{key} is not a number, word or matrix: an OpenCV file cannot hold it, write .json"
                 " instead"
             )
         # a vector as a column: OpenCV's own files hold T so, and D is read either way

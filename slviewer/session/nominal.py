@@ -146,8 +146,8 @@ def _read_bytes(path: Path) -> bytes:
     read."""
     if path.suffix.lower() not in FORMATS:
         raise SessionError(
-            f"{path.name} is no nominal model that can be read: give an STL, PLY, OBJ, STEP or 3MF"
-            " file"
+            f"{path.name} is not a nominal model that can be read: give an STL, PLY, OBJ, STEP or"
+            " 3MF file"
         )
     try:
         return read_file(path, MAX_BYTES)
@@ -169,7 +169,7 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # from memory, so that other files that it may name are not opened; unprocessed, or
-            # points that are no numbers would be dropped
+            # points that are not numbers would be dropped
             mesh: Any = trimesh.load(
                 io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False
             )
@@ -197,7 +197,7 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
 def _check_triangles(
     name: str, vertices: np.ndarray, faces: np.ndarray, max_triangles: int
 ) -> None:
-    """Raise SessionError where vertices and faces are no triangles, too many, or reach beyond what
+    """Raise SessionError where vertices and faces are not triangles, too many, or reach beyond what
     is read."""
     if (
         vertices.ndim != 2
@@ -213,7 +213,7 @@ def _check_triangles(
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     if not np.isfinite(vertices).all():
         raise SessionError(
-            f"{name} holds points that are no numbers (NaN or infinite): export the model again"
+            f"{name} holds points that are not numbers (NaN or infinite): export the model again"
         )
 
 

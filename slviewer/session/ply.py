@@ -101,7 +101,7 @@ def read_ply(path: str | Path) -> Ply:
     lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(
-            f"{path} is no binary little-endian PLY: only files that slviewer wrote can be read"
+            f"{path} is not a binary little-endian PLY: only files that slviewer wrote can be read"
             " back."
         )
     with decoding(path, InputError):
@@ -137,7 +137,7 @@ def _parse_ply(path: Path, data: bytes, end: int, lines: list[list[str]]) -> Ply
     vertices = np.frombuffer(data[start:middle], dtype=vertex)
     faces = np.frombuffer(data[middle:], dtype=FACE)
     if (faces["count"] != 3).any():
-        raise InputError(f"{path} has faces that are no triangles: triangulate it first.")
+        raise InputError(f"{path} has faces that are not triangles: triangulate it first.")
     return _parse_content(vertices, faces["vertices"].copy() if "face" in counts else None)
 
 
@@ -156,7 +156,7 @@ def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
-    """Raise InputError for faces that are no triangles between ``count`` points."""
+    """Raise InputError for faces that are not triangles between ``count`` points."""
     if (
         faces.ndim != 2
         or faces.shape[1] != 3

@@ -49,7 +49,7 @@ def open_regular(path: Path) -> BinaryIO:
     )
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(f"it is no regular file: {path}")
+            raise OSError(f"it is not a regular file: {path}")
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -142,7 +142,7 @@ def _check_values(data: Any) -> Any:
             elif kind is int and not -_MAX_INTEGER <= value < _MAX_INTEGER:
                 raise ValueError("an integer of more than 64 bits")
             elif kind is str and not value.isascii() and _LONE_SURROGATE.search(value):
-                raise ValueError("text that is no Unicode")
+                raise ValueError("text that is not Unicode")
         if not inner:
             return data
         level = inner

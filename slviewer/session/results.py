@@ -56,7 +56,7 @@ def check_result(
     meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """The arrays as plain NumPy arrays; InputError for names that cannot be files or values that
-    are no arrays."""
+    are not arrays."""
     if reserved := _RESERVED & set(meta):
         raise InputError(
             f"meta holds {sorted(reserved)}, which the session writes itself: use other keys"

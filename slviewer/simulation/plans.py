@@ -51,7 +51,7 @@ def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
     the rig's seed and do not depend on its scale. Raises `InputError` for a board too large for
     that.
     """
-    smooth = np.zeros((0, 6))  # what is in view is no matter of tenths of a pixel
+    smooth = np.zeros((0, 6))  # what is in view is not a matter of tenths of a pixel
     camera, projector = (
         replace(rig.camera, scale=1.0, waves=smooth),
         replace(rig.projector, waves=smooth),

@@ -139,7 +139,7 @@ class Board:
         known = _DICTIONARY.fullmatch(self.dictionary)
         if not known:
             raise InputError(
-                f"'{self.dictionary}' is no marker dictionary of OpenCV's 4x4 to 7x7 families: "
+                f"'{self.dictionary}' is not a marker dictionary of OpenCV's 4x4 to 7x7 families: "
                 "write for example 'charuco:8x6:30:22.5:DICT_5X5_1000'"
             )
         needed = self.columns * self.rows // 2

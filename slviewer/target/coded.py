@@ -165,7 +165,8 @@ def draw_marker_sheet(notation: str) -> Drawing:
     if match := re.fullmatch(r"mat:(\d{1,3}(?:\.\d{1,2})?)", notation):
         return _draw_mat(float(match[1]))
     raise InputError(
-        f"{notation!r} is no sheet of markers: write markers:0-23:20 (numbers, mm) or mat:16 (mm)"
+        f"{notation!r} is not a sheet of markers: write markers:0-23:20 (numbers, mm) or mat:16"
+        " (mm)"
     )
 
 

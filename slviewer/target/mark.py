@@ -142,7 +142,7 @@ def _measure_profile(
     where cut off.
 
     The paper's level is the quantile of the outer rings that differs least from the dot, so that an
-    edge is no dot.
+    edge is not a dot.
     """
     angles = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)

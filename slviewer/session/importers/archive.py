@@ -36,8 +36,8 @@ def unpack(
     """Write the images and TOMLs of a zip into an empty folder; returns the folder that holds the
     captures, and a warning that names the files that are none of these.
 
-    Raises InputError for what is no zip, is damaged or encrypted, takes more than ``max_bytes``, or
-    names a place outside of itself.
+    Raises InputError for what is not a zip, is damaged or encrypted, takes more than ``max_bytes``,
+    or names a place outside of itself.
     """
     with _open_zip(archive) as zipped:
         members, others = _select_members(zipped, max_bytes)
@@ -72,7 +72,7 @@ def _open_zip(archive: IO[bytes]) -> zipfile.ZipFile:
         return zipfile.ZipFile(archive)
     except (zipfile.BadZipFile, OSError) as error:
         raise InputError(
-            "the file is no zip, or is cut short: put the folder of captures into a zip"
+            "the file is not a zip, or is cut short: put the folder of captures into a zip"
         ) from error
 
 

@@ -23,7 +23,7 @@ _MAX_NUMBERS = 10_000
 @dataclass(frozen=True)
 class Storage:
     """What a file holds at its top level: the ``name`` of the file, and for each key a float64
-    matrix, or None where the entry is no matrix of numbers."""
+    matrix, or None where the entry is not a matrix of numbers."""
 
     name: str
     entries: dict[str, np.ndarray | None]
@@ -33,7 +33,7 @@ class Storage:
         finite."""
         matrix = self.entries[key]
         if matrix is None:
-            raise InputError(f"{self.name}: {key} is no matrix of numbers: name the key of one")
+            raise InputError(f"{self.name}: {key} is not a matrix of numbers: name the key of one")
         if not np.isfinite(matrix).all():
             raise InputError(
                 f"{self.name}: {key} holds numbers that are not finite: calibrate again"
@@ -45,7 +45,7 @@ def read_storage(path: Path) -> Storage:
     """The matrices of an OpenCV FileStorage file; InputError where it cannot be read."""
     if not path.is_file():
         raise InputError(
-            f"{path} is no file: give an OpenCV FileStorage file (.yml, .xml or .json)"
+            f"{path} is not a file: give an OpenCV FileStorage file (.yml, .xml or .json)"
         )
     try:
         read_file(path, _MAX_BYTES)
@@ -74,7 +74,7 @@ def _parse(path: str) -> dict[str, Any]:
     if not storage.isOpened():
         raise ValueError("no storage")
     entries: dict[str, Any] = {}
-    for key in storage.root().keys():  # noqa: SIM118 (a FileNode is no dict)
+    for key in storage.root().keys():  # noqa: SIM118 (a FileNode is not a dict)
         try:
             entries[key] = _numbers(storage.getNode(key))
         except (ValueError, cv2.error):

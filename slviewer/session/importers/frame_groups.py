@@ -154,7 +154,7 @@ def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
     for number, entry in enumerate(entries, 1):
         where = f"{name}, [[{key}]] {number}"
         if not isinstance(entry, Mapping):
-            raise InputError(f"{where} is no table: write [[{key}]] above its entries")
+            raise InputError(f"{where} is not a table: write [[{key}]] above its entries")
         parsed.append(read(where, entry, ordered is not None))
     return tuple(parsed)
 

@@ -50,7 +50,7 @@ def _capture_folder(source: Path) -> Path:
     """Return the source or its first inner folder with three images or more; InputError without
     one."""
     if not source.is_dir():
-        raise InputError(f"{source} is no folder: give the folder of a capture")
+        raise InputError(f"{source} is not a folder: give the folder of a capture")
     folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
     for folder in folders:
         if len(images_by_name(folder)) >= 3:

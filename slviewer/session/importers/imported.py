@@ -269,7 +269,7 @@ def _capture_folders(
     source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     if not source.is_dir():
         raise InputError(
-            f"{source} is no folder: give the folder of a capture, or a folder of such folders"
+            f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
         )
     if is_capture(source):
         return [source], [], []

@@ -36,7 +36,7 @@ def detect_layout(source: Path) -> str:
     source = expand_user(source)
     if not source.is_dir():
         raise InputError(
-            f"{source} is no folder: give the folder of a capture, or a folder of such folders"
+            f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
         )
     if find_description(source) is not None:
         return "frames"

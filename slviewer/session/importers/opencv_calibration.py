@@ -124,7 +124,7 @@ def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
         or fy <= 0
         or not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-9)
     ):
-        raise InputError(f"{where} is no camera matrix (fx 0 cx, 0 fy cy, 0 0 1): check the key")
+        raise InputError(f"{where} is not a camera matrix (fx 0 cx, 0 fy cy, 0 0 1): check the key")
     if abs(matrix[0, 1]) > 1e-9 * fx:
         raise InputError(
             f"{where} has a skew of {matrix[0, 1]:g}, which is not modelled here: calibrate without"
@@ -166,8 +166,8 @@ def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
     error = np.abs(matrix - nearest).max()
     if error > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
         raise InputError(
-            f"{where} is no rotation (off by {error:.2g}, determinant {np.linalg.det(matrix):.3g}):"
-            " check it"
+            f"{where} is not a rotation (off by {error:.2g}, determinant"
+            f" {np.linalg.det(matrix):.3g}): check it"
         )
     return nearest
 
