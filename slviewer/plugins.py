@@ -47,7 +47,7 @@ from slviewer.session.importers.imported import (
     define_layout,
     has_images,
     match_images,
-    strangers_warning,
+    unknown_files_warning,
 )
 from slviewer.session.mesh_files import Exporter
 from slviewer.surface.shapes import Mesh, PointSet
@@ -55,14 +55,10 @@ from slviewer.target.board import Board, BoardType
 
 __all__ = [
     "Board", "BoardType", "Camera", "CameraSettings", "DetectionError", "DeviceError", "Driver",
-    "Exporter",
-    "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable",
-    "PatternSequence", "PerAxis",
-    "PointSet", "Projector", "Rig", "Turntable", "TurntableError", "check_angle", "check_board",
-    "check_camera",
-    "check_complete", "check_exporter", "check_frame", "check_importer", "check_index",
-    "check_level",
-    "check_projector", "check_sequence", "check_turntable", "define_layout", "gray_bits",
-    "has_images",
-    "match_images", "phase_steps", "render", "strangers_warning",
+    "Exporter", "FolderLayout", "Frame", "ImportableRecording", "InputError", "Mesh", "Openable",
+    "PatternSequence", "PerAxis", "PointSet", "Projector", "Rig", "Turntable", "TurntableError",
+    "check_angle", "check_board", "check_camera", "check_complete", "check_exporter", "check_frame",
+    "check_importer", "check_index", "check_level", "check_projector", "check_sequence",
+    "check_turntable", "define_layout", "gray_bits", "has_images", "match_images", "phase_steps",
+    "render", "unknown_files_warning",
 ]  # fmt: skip

@@ -175,7 +175,7 @@ def main() -> int:
         max(each[k] for each in used) - (0, before[k])[k in (0, 3)] for k in range(4)
     )
     print(
-        f"{crowd.made} connections of strangers, at most {max(held)} open at once, in"
+        f"{crowd.made} unauthenticated connections, at most {max(held)} open at once, in"
         f" {options.seconds:g} s: the operator's page came in {max(waited):.2f} s at most"
         f" ({alone:.2f} s without them), {len(waited)} of {len(waited)} times; the server's memory"
         f" {growth:+.1f} MB, {files} files, {threads} threads at most, {lines} lines of log"

@@ -14,8 +14,8 @@ RESOLVE_SECONDS = 1.5
 
 
 def listen(host: str, port: int, resolve_s: float = RESOLVE_SECONDS) -> Listener:
-    """A TCP socket listening at exactly this address, with limits for strangers; port 0 takes any
-    free one.
+    """A TCP socket listening at exactly this address, with limits for unauthenticated clients; port
+    0 takes any free one.
 
     A name server has `resolve_s` to answer. Raises SlviewerError at the latest then, where the port
     is in use or the address is not this machine's.

@@ -1,4 +1,5 @@
-"""Limits of what strangers may use up: connections, bytes of a request, lines of the log."""
+"""Limits of what unauthenticated clients may use up: connections, bytes of a request, lines of the
+log."""
 
 import contextlib
 import ipaddress
@@ -15,15 +16,15 @@ from slviewer.server.access import Refusal, Role
 
 logger = logging.getLogger("slviewer.server")
 
-STRANGERS, STRANGERS_PER_ADDRESS = 256, 128
+MAX_UNAUTHENTICATED, MAX_UNAUTHENTICATED_PER_ADDRESS = 256, 128
 """Connections without a valid cookie, in all and from one address; beyond, the oldest one is
 closed."""
 CONNECTIONS: dict[Role, int] = {"operate": 64, "watch": 64, "project": 16, "camera": 16}
 """Connections with the cookie of a role; beyond, another one is refused."""
 ACCEPTED_AT_ONCE = 4
-"""Connections accepted before those that are open are served again: about eight turns of the event
-loop serve a request, and its connection must not give way to others before, of the crowd's address
-though it may be."""
+"""Connections accepted before those that are open are served again. About eight turns of the event
+loop serve a request, and until then its connection must not be closed for another one, even if it
+comes from the busiest address."""
 _CLOSING = 32
 _LOG_SECONDS = 60.0
 
@@ -32,14 +33,16 @@ class Listener(socket.socket):
     """A listening socket that hands out a limited number of connections without a valid cookie.
 
     A browser sends its request at once, so that the oldest connection that has not is closed for a
-    new one, of the address that has most of them. What is handed out counts as a stranger's until
-    `admit` is called for its address.
+    new one, of the address that has most of them. What is handed out counts as unauthenticated
+    until `admit` is called for its address.
     """
 
-    def __init__(self, *args: Any, strangers: int = STRANGERS, **options: Any) -> None:
+    def __init__(
+        self, *args: Any, unauthenticated: int = MAX_UNAUTHENTICATED, **options: Any
+    ) -> None:
         super().__init__(*args, **options)
-        self._max_strangers = strangers
-        self._strangers: dict[Any, _Accepted] = {}
+        self._max_unauthenticated = unauthenticated
+        self._unauthenticated: dict[Any, _Accepted] = {}
         self._counts = Counter[str]()
         self._closing: dict[Any, float] = {}
         self._batch = 0
@@ -64,10 +67,10 @@ class Listener(socket.socket):
         return accepted, peer
 
     def count(self, accepted: "_Accepted", peer: Any) -> None:
-        """Count a connection from this socket address as a stranger's, and close another one where
-        it is too many."""
+        """Count a connection from this socket address as unauthenticated, and close another one
+        where it is too many."""
         accepted.listener, accepted.peer, accepted.group = self, peer, address_group(peer[0])
-        self._strangers[peer] = accepted
+        self._unauthenticated[peer] = accepted
         self._counts[accepted.group] += 1
         self._make_room()
 
@@ -82,7 +85,7 @@ class Listener(socket.socket):
 
         Returns it; None where it is not among them.
         """
-        accepted = self._strangers.pop(peer, None)
+        accepted = self._unauthenticated.pop(peer, None)
         if accepted is not None:
             self._counts[accepted.group] -= 1
             self._counts += Counter()  # without addresses that have none
@@ -91,10 +94,13 @@ class Listener(socket.socket):
     def _make_room(self) -> None:
         """Close the oldest connection of the busiest address where there are too many."""
         busiest, count = self._counts.most_common(1)[0]
-        if count <= STRANGERS_PER_ADDRESS and len(self._strangers) <= self._max_strangers:
+        if (
+            count <= MAX_UNAUTHENTICATED_PER_ADDRESS
+            and len(self._unauthenticated) <= self._max_unauthenticated
+        ):
             return
         oldest = self.admit(
-            next(peer for peer, one in self._strangers.items() if one.group == busiest)
+            next(peer for peer, one in self._unauthenticated.items() if one.group == busiest)
         )
         assert oldest is not None
         self._closing[oldest.peer] = time.monotonic()

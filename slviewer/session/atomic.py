@@ -360,9 +360,9 @@ def _move_away(target: Path, old_to: Path | None) -> None:
     if old_to is not None:
         move(target, old_to)
         return
-    doomed = _staging_path(target, "tmp")
-    rename(target, doomed)
-    discard(doomed)
+    to_delete = _staging_path(target, "tmp")
+    rename(target, to_delete)
+    discard(to_delete)
 
 
 def _staging_path(target: Path, state: str) -> Path:

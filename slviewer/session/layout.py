@@ -62,14 +62,14 @@ def new_folder(path: str | Path, is_windows: bool = _IS_WINDOWS) -> tuple[Path, 
     try:
         existed = folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        strangers = [entry.name for entry in folder.iterdir() if not _is_leftover(entry)]
+        unknown = [entry.name for entry in folder.iterdir() if not _is_leftover(entry)]
     except OSError as error:
         raise SessionError(
             f"{folder} cannot be made ({error}): choose a folder that you may write to"
         ) from error
-    if strangers:
+    if unknown:
         raise SessionError(
-            f"{folder} holds other things ({strangers[0]}): choose a new or an empty folder for the"
+            f"{folder} holds other things ({unknown[0]}): choose a new or an empty folder for the"
             " session"
         )
     return folder, not existed

@@ -14,7 +14,7 @@ from slviewer.server import limits
 from slviewer.server.connection import REQUEST_BYTES
 from slviewer.server.limits import (
     CONNECTIONS,
-    STRANGERS_PER_ADDRESS,
+    MAX_UNAUTHENTICATED_PER_ADDRESS,
     Listener,
     OncePerSecond,
     address_group,
@@ -57,8 +57,8 @@ def test_a_crowd_of_strangers_keeps_nobody_out(server, operator, crowd, caplog, 
     client = operator.client()
     slider = server.viser.gui.add_slider("gain", 0, 10, 1, 5)
     with caplog.at_level(logging.INFO):
-        opened = crowd(3 * STRANGERS_PER_ADDRESS, said)
-        assert until(lambda: sum(map(is_open, opened)) <= STRANGERS_PER_ADDRESS)
+        opened = crowd(3 * MAX_UNAUTHENTICATED_PER_ADDRESS, said)
+        assert until(lambda: sum(map(is_open, opened)) <= MAX_UNAUTHENTICATED_PER_ADDRESS)
         assert operator.get().status == 200 and Browser(server, None).get("/").status == 200
         client.set(slider, 7)
         assert until(lambda: slider.value == 7)
@@ -88,7 +88,7 @@ def test_each_role_has_so_many_connections():
 
 def test_the_busiest_address_makes_room(monkeypatch):
     closed = []
-    with Listener(socket.AF_INET, socket.SOCK_STREAM, strangers=4) as listener:
+    with Listener(socket.AF_INET, socket.SOCK_STREAM, unauthenticated=4) as listener:
         for number, address in enumerate(
             ["192.0.2.1", "192.0.2.1", "192.0.2.1", "192.0.2.2", "192.0.2.3"]
         ):

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser
 from slviewer.errors import SlviewerError, UsageError
 from slviewer.server import credentials
 from slviewer.server.credentials import TlsCertificate, self_made_certificate
-from slviewer.server.limits import STRANGERS_PER_ADDRESS
+from slviewer.server.limits import MAX_UNAUTHENTICATED_PER_ADDRESS
 from slviewer.server.secure import SafeServer, Serving, serve
 
 
@@ -96,7 +96,7 @@ def test_the_pages_work_encrypted(browser: Browser, served: SafeServer) -> None:
 def test_whoever_begins_no_handshake_keeps_nobody_out(served, certificate):
     crowd = [
         socket.create_connection(("127.0.0.1", served.port))
-        for _ in range(3 * STRANGERS_PER_ADDRESS)
+        for _ in range(3 * MAX_UNAUTHENTICATED_PER_ADDRESS)
     ]
     assert ask(served, certificate, "/").status == 200
     for one in crowd:

@@ -84,7 +84,7 @@ from slviewer.session.importers.imported import (
     ImportableRecording,
     Imports,
     collect_captures,
-    strangers_warning,
+    unknown_files_warning,
 )
 from slviewer.session.names import join_names
 from slviewer.session.reading import read_toml
@@ -182,7 +182,7 @@ def _read(
         recording = ImportableRecording(
             name, described.sequence, files, folder, settings, described.channel, exposures
         )
-        return recording, strangers_warning(
+        return recording, unknown_files_warning(
             folder, sorted(set(images_by_name(folder)) - set(files))
         )
 

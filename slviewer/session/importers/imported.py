@@ -304,7 +304,7 @@ def visible(folder: Path) -> list[Path]:
         raise InputError(f"{folder} cannot be listed ({error}): check its permissions") from error
 
 
-def strangers_warning(folder: Path, files: Sequence[Path]) -> list[str]:
+def unknown_files_warning(folder: Path, files: Sequence[Path]) -> list[str]:
     """A warning that names files which the layout does not know, as a list of one, or of none."""
     if not files:
         return []

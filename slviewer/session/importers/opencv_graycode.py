@@ -22,7 +22,7 @@ from slviewer.session.importers.imported import (
     Imports,
     collect_captures,
     has_images,
-    strangers_warning,
+    unknown_files_warning,
 )
 from slviewer.session.names import join_names
 
@@ -67,7 +67,7 @@ def _read(
         shown_sequence = _fit_sequence(sequence, len(files))
         _check_shadow_images(files, shown_sequence)
         recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
-        return recording, strangers_warning(
+        return recording, unknown_files_warning(
             folder, [file for file in images_by_name(folder) if file not in files]
         )
 

@@ -17,7 +17,7 @@ from slviewer.session.importers.imported import (
     check_complete,
     define_layout,
     match_images,
-    strangers_warning,
+    unknown_files_warning,
     visible,
 )
 from slviewer.session.names import join_names
@@ -60,7 +60,7 @@ def _describe(
                 f"folder {folder.name} holds {join_names(extra)}, beyond the p18 layout's F00 to"
                 " F26: move them away, or describe the frames in a TOML"
             )
-        warnings += strangers_warning(folder, others)
+        warnings += unknown_files_warning(folder, others)
         files += list(images.values())[:_CODED]
         frames += phase_steps(axis, _STEPS, _PERIOD_PX) + gray_bits(axis, _BITS)
         if texture is None and (textures := list(images.values())[_CODED:]):

@@ -15,7 +15,7 @@ from slviewer.session.importers.imported import (
     define_layout,
     has_images,
     match_images,
-    strangers_warning,
+    unknown_files_warning,
 )
 
 _FILE = re.compile(r"graycode_?(\d+)", re.IGNORECASE)
@@ -39,9 +39,9 @@ def _describe(
             f"it holds {len(images)} images, and the Gray code of a {projector[0]}x{projector[1]}"
             f" projector takes {len(sequence.frames)}: {fault}, or the projector has another size"
         )
-    return ImportableRecording(name, sequence, tuple(images.values()), folder), strangers_warning(
-        folder, others
-    )
+    return ImportableRecording(
+        name, sequence, tuple(images.values()), folder
+    ), unknown_files_warning(folder, others)
 
 
 LAYOUT = define_layout(

@@ -27,7 +27,7 @@ from slviewer.session.importers.imported import (
     define_layout,
     has_images,
     match_images,
-    strangers_warning,
+    unknown_files_warning,
 )
 from slviewer.session.names import join_names
 
@@ -61,9 +61,9 @@ def _describe(
     images, others = match_images(folder, _FILE)
     check_complete(images, "frameSeq_")
     sequence = _identify_sequence(projector, len(images), codec, axis)
-    return ImportableRecording(name, sequence, tuple(images.values()), folder), strangers_warning(
-        folder, others
-    )
+    return ImportableRecording(
+        name, sequence, tuple(images.values()), folder
+    ), unknown_files_warning(folder, others)
 
 
 def _identify_sequence(

@@ -15,7 +15,7 @@ from slviewer.session.importers.imported import (
     define_layout,
     has_images,
     match_images,
-    strangers_warning,
+    unknown_files_warning,
 )
 
 _FILE = re.compile(r".*\[(0?[01])-(\d+)-(0?[01])_(\d+)\].*")
@@ -40,7 +40,7 @@ def _describe(
     ]
     sequence = PatternSequence(projector, tuple(frames))
     files = tuple(images[numbers] for numbers in ordered)
-    return ImportableRecording(name, sequence, files, folder), strangers_warning(folder, others)
+    return ImportableRecording(name, sequence, files, folder), unknown_files_warning(folder, others)
 
 
 LAYOUT = define_layout(

@@ -15,7 +15,7 @@ from slviewer.plugins import (
     has_images,
     match_images,
     phase_steps,
-    strangers_warning,
+    unknown_files_warning,
 )
 
 _FILE = re.compile(r"(\d+)")
@@ -39,7 +39,7 @@ def describe(
         for parts in _PARTS:
             frames += phase_steps(axis, _STEPS, extent / parts)
         files += images.values()
-        warnings += strangers_warning(folder / axis, others)
+        warnings += unknown_files_warning(folder / axis, others)
     return (
         ImportableRecording(name, PatternSequence(projector, tuple(frames)), tuple(files), folder),
         warnings,
