@@ -169,7 +169,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 )
             with Operator(session) as operator:
                 operator.wait_until_idle(HANG_S)
-    assert json.loads(found.read_text())["poses_used"], "the worker that made it failed"
+    assert json.loads(found.read_text())["calibration"], "the worker that made it failed"
     return folder
 
 

@@ -333,9 +333,7 @@ def examine(folder: Path, before: tuple[set[str], dict[str, str]], command: str)
     if lost := before[0] - captures:
         return f"lost: {', '.join(sorted(lost))}"
     new = {name for name in calibration if calibration[name] != before[1].get(name)}
-    if calibration != before[1] and calibration.keys() - new - {
-        "calibration/verdict"
-    }:  # which names its calibration
+    if calibration != before[1] and calibration.keys() - new:
         return (
             f"mixed calibration: {', '.join(sorted(new))} new,"
             f" {', '.join(sorted(calibration.keys() - new))} old"

@@ -14,12 +14,12 @@ from slviewer.calibration.diagnosis.rules import (
     MAX_FOCAL_UNCERTAINTY,
     MIN_TILT_DEG,
 )
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.soundness import check_pose_count
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import largest_angle_deg, move_points
 from slviewer.geometry.vectors import rms_length
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection
 
@@ -55,7 +55,7 @@ class CameraCalibration:
             "focal_sigma_px": list(self.focal_sigma_px),
             "pictures": dict(self.picture_rms_px),
             "excluded": dict(self.excluded),
-            "verdict": self.verdict.to_json(),
+            "verdict": self.verdict,
         }
 
     def text(self) -> str:

@@ -23,6 +23,7 @@ from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
+from slviewer.records.calibration import AxisFit, PixelwiseFit
 
 PLANE_PIXELS = 30_000
 """Approximate number of pixels in a pose's plane fit; the phase is smooth, and more pixels do not
@@ -105,6 +106,17 @@ class PixelwiseModel:
         """Return the median of the pixels' RMS residuals in z, x and y."""
         z, x, y = (float(np.nanmedian(r)) for r in self.fits[axis].rms_mm)
         return {"z": z, "x": x, "y": y}
+
+    def describe(self) -> PixelwiseFit:
+        """Return the figures of the fits, medians over the pixels."""
+        axes = {}
+        for axis, fit in self.fits.items():
+            fitted = np.isfinite(fit.coefficients[0])
+            poses = float(np.median(fit.poses[fitted]))
+            axes[str(axis)] = AxisFit(
+                float(fitted.mean()), poses, *self.median_rms_mm(axis).values()
+            )
+        return PixelwiseFit(axes)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return named arrays for saving."""

@@ -19,6 +19,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
 from slviewer.geometry.vectors import finite_rows, lengths, rms_length
+from slviewer.records.calibration import StereoFit, describe_stereo
 from slviewer.records.plain import from_plain, to_plain
 
 MIN_FEATURES = 12
@@ -116,6 +117,10 @@ class StereoModel:
         data: dict[str, Any] = to_plain(replace(self, residuals_px={}))
         del data["residuals_px"]
         return {_SAVED_KEYS.get(name, name): value for name, value in data.items()}
+
+    def describe(self) -> StereoFit:
+        """Return the figures of the fit."""
+        return from_plain(describe_stereo(self.to_dict()), StereoFit)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "StereoModel":

@@ -20,8 +20,8 @@ CALIBRATED = (
         "camera_only",
         bool,
         False,
-        "Calibrate the camera's lens alone, from pictures of the board; the session stays as"
-        " it is.",
+        "Calibrate the camera's lens alone, from pictures of the board in the session, or in a"
+        " folder in its place; the session stays as it is.",
     ),
     Option(
         "out",
@@ -56,7 +56,7 @@ def run_calibrate(calibrate: Callable[..., Any], arguments: dict[str, Any]) -> N
         from slviewer.pipeline.validate import validate
 
         compared = call(validate, session=arguments["session"], models=arguments["models"])
-        data["validation"] = compared.to_json()
+        data |= compared.to_json()
         terminal.print_result(compared.text())
     if not camera_only:
         from slviewer.pipeline.models import describe_default_model

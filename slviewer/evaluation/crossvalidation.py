@@ -7,15 +7,12 @@ without stretching.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
-from slviewer.evaluation.render import Row, render
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
@@ -23,7 +20,7 @@ from slviewer.geometry.rigid import fit_rigid, move_points
 from slviewer.geometry.shapes import fit_plane
 from slviewer.geometry.vectors import finite_rows, rms, rms_length
 from slviewer.reconstruction.reconstruct import Model
-from slviewer.records.plain import to_plain
+from slviewer.records.model_comparison import HeldOutError, HeldOutPose, ModelComparison
 
 FOLDS = 5
 LEAST_POSES = 5
@@ -31,88 +28,6 @@ LEAST_POSES = 5
 LEAST_FEATURES = 12
 BETTER = 0.98
 """A model must bring the error down to this share of a simpler one's to be recommended instead."""
-
-
-@dataclass(frozen=True)
-class HeldOutPose:
-    """Errors of one model on one pose that was not used to fit it.
-
-    ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of
-    the features from the board laid over them, flatness, shape and scale included. ``scale_ppm``:
-    how much too long the board's own spacings come out. ``camera_px``, ``projector_px``: what
-    ``board_mm`` amounts to in the images, RMS.
-    """
-
-    plane_mm: float
-    board_mm: float
-    scale_ppm: float
-    camera_px: float
-    projector_px: float
-    pixels: int
-    depth_mm: float
-
-
-@dataclass(frozen=True)
-class CrossValidation:
-    """``poses``: {model: {pose: its errors}}, every model over the same pixels. ``folds``: poses
-    held out together. ``failed``: {model: why it could not be fitted to some fold}."""
-
-    poses: Mapping[str, Mapping[str, HeldOutPose]]
-    folds: tuple[tuple[str, ...], ...]
-    failed: Mapping[str, str]
-
-    @property
-    def models(self) -> tuple[str, ...]:
-        """Those that could be judged, the simplest first."""
-        return tuple(self.poses)
-
-    def rms(self, model: str, figure: str) -> float:
-        """Root mean square over the poses of one figure of `HeldOut`."""
-        return rms([getattr(pose, figure) for pose in self.poses[model].values()])
-
-    @property
-    def recommended(self) -> str:
-        """The model with the least error on boards that it was not made from, of nearly equal ones
-        the simpler."""
-        chosen = self.models[0]
-        for model in self.models[1:]:
-            if self.rms(model, "board_mm") < BETTER * self.rms(chosen, "board_mm"):
-                chosen = model
-        return chosen
-
-    def text(self) -> str:
-        """Return a report for the terminal: a line per model."""
-        table: list[Row] = [
-            {
-                "model": model,
-                "plane RMS mm": self.rms(model, "plane_mm"),
-                "board RMS mm": self.rms(model, "board_mm"),
-                "scale ppm": f"{self.rms(model, 'scale_ppm'):.0f}",
-                "camera px": self.rms(model, "camera_px"),
-                "projector px": self.rms(model, "projector_px"),
-            }
-            for model in self.models
-        ]
-        count = len(next(iter(self.poses.values())))
-        lines = [
-            (
-                f"{count} poses, each measured by calibrations made from the others"
-                f" ({len(self.folds)} folds):"
-            ),
-            render(table),
-            f"recommended: {self.recommended}",
-        ]
-        return "\n".join(
-            [*lines, *(f"{model} is not judged: {why}" for model, why in self.failed.items())]
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """The fields, the recommended model and each model's figures over all poses."""
-        figures = ("plane_mm", "board_mm", "scale_ppm", "camera_px", "projector_px")
-        models = {
-            model: {figure: self.rms(model, figure) for figure in figures} for model in self.models
-        }
-        return {"recommended": self.recommended, "models": models, **to_plain(self)}
 
 
 def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
@@ -198,7 +113,7 @@ def gather_results(
     measured: Sequence[Mapping[str, Mapping[str, HeldOutPose]]],
     folds: tuple[tuple[str, ...], ...],
     failed: Mapping[str, str],
-) -> CrossValidation:
+) -> ModelComparison:
     """Combine the results of the folds, {pose: {model: ...}}; models in the order of ``names``.
 
     Raises InputError where no model could be judged.
@@ -218,7 +133,27 @@ def gather_results(
         raise InputError(
             f"no model could be made without some of the poses ({why}): capture more poses"
         )
-    return CrossValidation(poses, folds, dict(failed))
+    models = {model: _average_errors(list(of_poses.values())) for model, of_poses in poses.items()}
+    return ModelComparison(
+        recommended=_recommend(models), models=models, poses=poses, folds=folds, failed=dict(failed)
+    )
+
+
+def _average_errors(errors: Sequence[HeldOutPose]) -> HeldOutError:
+    """Return the root mean square of each figure over some poses."""
+    return HeldOutError(
+        *(rms([getattr(each, name) for each in errors]) for name in HeldOutError.__struct_fields__)
+    )
+
+
+def _recommend(models: Mapping[str, HeldOutError]) -> str:
+    """Return the model with the least error on boards, of nearly equal ones the simplest, which
+    comes first."""
+    chosen, *others = models
+    for model in others:
+        if models[model].board_mm < BETTER * models[chosen].board_mm:
+            chosen = model
+    return chosen
 
 
 def _interpolate(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.gui.help_links import help_link
-from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, report_table, to_html
-from slviewer.report.quality import splined_table
-from slviewer.wizard.snapshot import CalibrationView, SplinedView
+from slviewer.gui.widgets import Html, Tone, alert, coloured, paragraph, to_html
+from slviewer.records.model_comparison import ModelComparison
+from slviewer.records.verdict import Finding, Verdict
+from slviewer.wizard.snapshot import CalibrationView
 
 _LEVELS: dict[str, tuple[Tone, str, str]] = {
     "good": ("good", "Good", "no problems detected."),
@@ -18,9 +18,6 @@ _MARKS: dict[Tone, str] = {
     "warning": '<path d="M10 4.5v7M10 15v.2"/>',
     "error": '<path d="M6 6l8 8M14 6l-8 8"/>',
 }
-MIN_WEIGHT = 0.7
-"""Undisturbed poses have weights of 0.8 or more in the joint adjustment; those below this are
-listed."""
 
 
 def verdict_html(
@@ -50,7 +47,7 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
     """List the poses that the verdict or the joint adjustment names, each once."""
     names = [name for finding in verdict.findings for name in finding.poses] if verdict else []
     if calibration is not None and calibration.splined is not None:
-        names += calibration.splined.summary["left_out"]
+        names += calibration.splined.left_out
     return tuple(dict.fromkeys(names))
 
 
@@ -68,7 +65,7 @@ def exclusions_html(calibration: CalibrationView) -> Html:
     if calibration.splined is not None:
         lines += [
             f"{name}, in the splined model only: it {why}"
-            for name, why in calibration.splined.summary["left_out"].items()
+            for name, why in calibration.splined.left_out.items()
         ]
     if not lines:
         return note
@@ -81,8 +78,9 @@ def exclusions_html(calibration: CalibrationView) -> Html:
     )
 
 
-def model_choice_html(calibration: CalibrationView) -> Html:
-    """Describe which model is used, and why; empty where there is only one."""
+def model_choice_html(calibration: CalibrationView, compared: ModelComparison | None) -> Html:
+    """Describe which model is used, and why, by their comparison if there is one; empty where there
+    is one model."""
     if calibration.chosen and calibration.chosen != calibration.recommended:
         return alert(
             f"{calibration.chosen} is used (your choice); {calibration.recommended} is"
@@ -91,30 +89,15 @@ def model_choice_html(calibration: CalibrationView) -> Html:
         )
     if len(calibration.models) < 2:
         return Html("")
-    if calibration.comparison is None:
+    if compared is None:
         why = "default; compare the models to confirm it."
-    elif calibration.recommended in calibration.comparison.models:
+    elif calibration.recommended in compared.models:
         why = "smallest error on held-out boards."
     else:
         why = "default."
     return paragraph(
         Html(f"{coloured(calibration.best, 'good', bold=True)} is used: {to_html(why)}")
     )
-
-
-def splined_html(splined: SplinedView) -> Html:
-    """Return a table of the joint adjustment, and poses with a low weight or turned by 180
-    degrees."""
-    named = {
-        f"Weights below {MIN_WEIGHT:g}": [
-            f"{name} {min(pair):.2f}"
-            for name, pair in splined.weights.items()
-            if min(pair) < MIN_WEIGHT
-        ],
-        "Board turned by 180°, corrected": splined.turned,
-    }
-    notes = [f"{title}: {', '.join(names)}." for title, names in named.items() if names]
-    return report_table(splined_table(splined.summary)) + "".join(paragraph(note) for note in notes)
 
 
 def _format_finding(finding: Finding) -> str:

@@ -3,39 +3,44 @@
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
-from slviewer.calibration.diagnosis.verdict import Verdict, judge_splined
+from slviewer.calibration.diagnosis.verdict import judge_splined
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, InputError
+from slviewer.errors import CalibrationRejected, InputError, SessionError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.calibration_verdict import (
     calibrate_poses_with_evidence,
     calibrate_with_evidence,
     rejection_error,
-    save_rejected,
     save_verdict,
 )
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
+    Model,
     ModelName,
     available_models,
+    describe_model,
     preferred_model,
-    save_fitted,
-    save_stereo,
+    save_compiled,
+    save_model,
     trash_models,
     warn_if_frame_changed,
 )
-from slviewer.pipeline.open_session import SessionLike, match_names, opened, opened_or_made
+from slviewer.pipeline.open_session import SessionLike, match_names, opened_or_made
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import Judged, read_pose
+from slviewer.pipeline.stored_records import load_record
+from slviewer.records.calibration import ModelCalibration
+from slviewer.records.verdict import Verdict
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
@@ -46,106 +51,10 @@ Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], M]
 
 
 @dataclass(frozen=True)
-class CalibrationResult:
-    """The models that ``calibrate`` fitted, and its verdict. A model that was not fitted is
-    None."""
-
-    stereo: StereoModel
-    pixelwise: PixelwiseModel | None
-    splined: SplinedModel | None = None
-    verdict: Verdict = field(default_factory=Verdict)
-
-    @property
-    def best(self) -> StereoModel | PixelwiseModel | SplinedModel:
-        """The most accurate of the models: splined, else pixelwise, else stereo."""
-        return self.splined or self.pixelwise or self.stereo
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the published values of ``calibrate --json``."""
-        rig = self.stereo.rig
-        models: dict[str, Any] = {
-            "stereo": {
-                "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
-                "K_camera": rig.camera.K.tolist(),
-                "D_camera": rig.camera.D.tolist(),
-                "K_projector": rig.projector.K.tolist(),
-                "D_projector": rig.projector.D.tolist(),
-                "R": rig.R.tolist(),
-                "T": rig.t.tolist(),
-            }
-        }
-        if self.pixelwise is not None:
-            models["pixelwise"] = {
-                "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.axes[0]),
-                "axes": {axis: self.pixelwise.median_rms_mm(axis) for axis in self.pixelwise.axes},
-            }
-        if self.splined is not None:
-            models["splined"] = self.splined.summary()
-        return {
-            "models": models,
-            "poses_used": list(self.stereo.poses),
-            "poses_left_out": dict(self.stereo.excluded),
-            "verdict": self.verdict.to_json(),
-        }
-
-    def text(self) -> str:
-        """Return the result as a report for the terminal."""
-        s = self.stereo
-        rms, total = s.reprojection_rms_px, len(s.poses) + len(s.excluded)
-        fc, fp = s.rig.camera.K, s.rig.projector.K
-        sigma = s.focal_sigma_px
-        near, far = s.depth_range_mm or (np.nan, np.nan)
-        lines = [
-            f"poses: {len(s.poses)} of {total} used, boards at {near:.0f}-{far:.0f} mm",
-            *(f"  excluded: {name}: {why}" for name, why in s.excluded.items()),
-            (
-                f"stereo: reprojection RMS camera {rms['camera']:.3f} px, projector"
-                f" {rms['projector']:.3f} px, stereo {rms['stereo']:.3f} px"
-            ),
-            (
-                f"  camera focal length {fc[0, 0]:.1f}, {fc[1, 1]:.1f} px (+-"
-                f" {sigma['camera']:.1f}); projector {fp[0, 0]:.1f}, {fp[1, 1]:.1f} px (+-"
-                f" {sigma['projector']:.1f}); baseline {s.baseline_mm:.2f} mm"
-            ),
-        ]
-        if s.features_excluded:
-            lines.append(f"  {s.features_excluded} features excluded beyond 6 robust sigma")
-        if self.pixelwise is not None:
-            for axis in self.pixelwise.axes:
-                fit = self.pixelwise.fits[axis]
-                fitted = np.isfinite(fit.coefficients[0])
-                fit_rms = self.pixelwise.median_rms_mm(axis)
-                lines.append(
-                    f"pixelwise {axis}: {100 * fitted.mean():.1f} % of the pixels fitted, in"
-                    f" {np.median(fit.poses[fitted]):.0f} poses (median); fit RMS z"
-                    f" {fit_rms['z']:.3f}, x {fit_rms['x']:.3f}, y {fit_rms['y']:.3f} mm (median)"
-                )
-        if self.splined is not None:
-            lines.append(self.splined.text())
-        lines.append(self.verdict.text())
-        return "\n".join(lines)
-
-
-def calibrate(
-    session: SessionLike,
-    target: str,
-    *,
-    models: Sequence[ModelName] = (),
-    poses: Sequence[str] = (),
-    exclude: Sequence[str] = (),
-    smoothing: SmoothingKind = "spline",
-    degree: int = 5,
-    cells_across: int | None = None,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> CalibrationResult:
-    """Calibrate from the session's target poses, and report whether the calibration is good, and if
-    not, why.
-
-    One that is rejected ends with status 3; it is stored to be inspected, and not used.
+class CalibrateSettings:
+    """How target poses are calibrated.
 
     Args:
-        session: Session folder; with --camera-only also a folder of pictures of the board.
         target: circles:21x16:9 (columns x rows : pitch mm), acircles:..., chessboard:9x7:75 (inner
             corners : square mm), charuco:....
         models: Which models to fit; by default stereo, which is always made, the Letter's
@@ -157,75 +66,99 @@ def calibrate(
         degree: Degree of the polynomial, with --smoothing polynomial.
 
     ``cells_across``: cells of each of the splined model's displacement fields across its image, by
-    default 26.
+    default 26. ``replace_all``: move the session's models that are not made anew to its trash, also
+    where they are of the same poses and settings.
+    """
+
+    UNRECORDED: ClassVar = ("replace_all",)
+    target: str
+    models: Sequence[ModelName] = ()
+    poses: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    smoothing: SmoothingKind = "spline"
+    degree: int = 5
+    cells_across: int | None = None
+    replace_all: bool = False
+
+    @property
+    def step_2(self) -> Smoothing:
+        """The Letter's step 2."""
+        return Smoothing(self.smoothing, self.degree)
+
+    @property
+    def method(self) -> "CalibrateSettings":
+        """The settings without the choice of models and poses."""
+        return replace(self, models=(), poses=(), exclude=(), replace_all=False)
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The models that were fitted, and the verdict on them. A model that was not fitted is None."""
+
+    stereo: StereoModel
+    pixelwise: PixelwiseModel | None = None
+    splined: SplinedModel | None = None
+    verdict: Verdict = field(default_factory=Verdict)
+
+    @property
+    def best(self) -> Model:
+        """The most accurate of the models: splined, else pixelwise, else stereo."""
+        return self.splined or self.pixelwise or self.stereo
+
+    @property
+    def models(self) -> list[Model]:
+        """The models that were fitted, the simplest first."""
+        return [model for model in (self.stereo, self.pixelwise, self.splined) if model is not None]
+
+    @property
+    def is_rejected(self) -> bool:
+        """Whether the verdict rejects the calibration."""
+        return self.verdict.level == "rejected"
+
+
+@operation("calibrate", ModelCalibration, CalibrateSettings)
+def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCalibration]]:
+    """Calibrate from the session's target poses, and report whether the calibration is good, and if
+    not, why.
+
+    One that is rejected ends with status 3; it is stored to be inspected, and not used.
 
     A pose that cannot be used is excluded with the reason. The verdict is saved beside the models.
     Raises CalibrationRejected with its reason: then stereo alone is stored to be inspected, and
     used only where the operator accepts that; where none could be made at all, what the session
     held stays.
     """
-    board = Board.parse(target)
-    models = models or DEFAULT_MODELS
-    step_2 = Smoothing(smoothing, degree)
-    with opened(session, write=True) as store:
-        excluded = store.excluded()
-        before = preferred_model(store) if available_models(store) else ""
-        captures, faults = store.read_captures()
-        for fault in faults.values():
-            warn(f"not used: {fault}")
-        names = [capture.name for capture in captures if capture.role == "calibration"]
-        if not names:
-            raise InputError(
-                f"{store.folder} holds no target poses: import some with --role calibration, or"
-                " capture them first"
-            )
-        excluded_poses = {
-            name: f"excluded by the operator: {why}"
-            for name, why in excluded.items()
-            if name in names
-        }
-        excluded_poses |= _reasons_to_exclude(names, poses, exclude)
-        names = [name for name in names if name not in excluded_poses]
-        if not names:
-            raise InputError("every target pose is excluded: include some again")
-        diagnosed = calibrate_with_evidence(
-            store, names, board, step_2, excluded_poses, part(progress, 0, 0.65)
+    store, board = job.store, Board.parse(settings.target)
+    if not store.is_writable:
+        raise SessionError(
+            f"Cannot calibrate: {store.folder} is open for reading only. Close what writes to it."
         )
-        if diagnosed.stereo is None:
-            save_verdict(store, diagnosed.verdict, names)
-            raise rejection_error(diagnosed.verdict, is_saved=False)
-        stereo = diagnosed.stereo
-        settings = {
-            "target": str(board),
-            "smoothing": smoothing,
-            "degree": degree,
-            "models": list(models),
-        }
-        if cells_across is not None:
-            settings["cells_across"] = cells_across
-        if diagnosed.verdict.level == "rejected":
-            save_rejected(store, stereo, settings, diagnosed.verdict, names)
-            raise rejection_error(diagnosed.verdict, is_saved=True)
-        fitting = part(progress, 0.66, 0.97)
-        result = _fit_models(diagnosed, models, fitting, warn, excluded_poses, cells_across)
-        if result.verdict.level == "rejected":
-            save_rejected(store, stereo, settings, result.verdict, names)
-            raise rejection_error(result.verdict, is_saved=True)
-        progress(0.97, "saving")
-        inputs = store.input_hashes(*stereo.poses)
-        with store.together():
-            if _changes_calibration(
-                store, inputs, settings
-            ):  # what is not made anew would be of another calibration
-                trash_models(
-                    store,
-                    [name for name in available_models(store) if getattr(result, name) is None],
-                )
-            _save_models(store, result, inputs, settings)
-            save_verdict(store, result.verdict, names)
-        warn_if_frame_changed(store, before, warn)
-        progress(1.0, "calibrated")
-    return result
+    before = preferred_model(store) if available_models(store) else ""
+    names, excluded = _choose_poses(store, settings, job.warn)
+    reading = part(job.progress, 0, 0.65)
+    diagnosed = calibrate_with_evidence(store, names, board, settings.step_2, excluded, reading)
+    if diagnosed.stereo is None:
+        save_verdict(store, diagnosed.verdict, names)
+        raise rejection_error(diagnosed.verdict, is_saved=False)
+    result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
+    job.progress(0.97, "saving")
+    inputs = store.input_hashes(*result.stereo.poses)
+    with store.together():
+        if (
+            result.is_rejected
+            or settings.replace_all
+            or _changes_calibration(store, inputs, settings)
+        ):
+            made = {model.name for model in result.models}  # others would be of another calibration
+            trash_models(store, [name for name in available_models(store) if name not in made])
+        for model in result.models:
+            yield describe_model(model, result.verdict if model is result.stereo else None, inputs)
+            save_compiled(store, model)
+        save_verdict(store, result.verdict, names)
+    if result.is_rejected:
+        raise rejection_error(result.verdict, is_saved=True)
+    warn_if_frame_changed(store, before, job.warn)
+    job.progress(1.0, "calibrated")
 
 
 def calibrate_frames(
@@ -234,9 +167,8 @@ def calibrate_frames(
     target: str,
     *,
     models: Sequence[str] = (),
-    smoothing: str = "spline",
+    smoothing: SmoothingKind = "spline",
     degree: int = 5,
-    cells_across: int | None = None,
     progress: Progress = ignore_progress,
     warn: Warn = ignore_warnings,
 ) -> CalibrationResult:
@@ -246,7 +178,8 @@ def calibrate_frames(
     ``sequence``. ``target`` and the options as in ``calibrate``. Raises CalibrationRejected with
     the reason where the poses make no sound calibration.
     """
-    board, step_2 = Board.parse(target), Smoothing(smoothing, degree)
+    settings = CalibrateSettings(target, models, smoothing=smoothing, degree=degree)
+    board = Board.parse(target)
     if not poses:
         raise InputError(
             "no target pose was given: capture the board in at least three positions and tilts"
@@ -259,18 +192,15 @@ def calibrate_frames(
             pose = DecodedPose(
                 name, sequence, frames, phases, texture_8bit(sequence, frames), board
             )
-            yield read_pose(pose, step_2, examine=True)
+            yield read_pose(pose, settings.step_2, examine=True)
 
     diagnosed = calibrate_poses_with_evidence(
         read(), len(poses), sequence, board, {}, part(progress, 0, 0.65)
     )
-    if diagnosed.stereo is None or diagnosed.verdict.level == "rejected":
+    if diagnosed.stereo is None:
         raise rejection_error(diagnosed.verdict, is_saved=False)
-    fitting = part(progress, 0.66, 1.0)
-    result = _fit_models(
-        diagnosed, models or DEFAULT_MODELS, fitting, warn, cells_across=cells_across
-    )
-    if result.verdict.level == "rejected":
+    result = _fit_models(diagnosed, settings, part(progress, 0.66, 1.0), warn)
+    if result.is_rejected:
         raise rejection_error(result.verdict, is_saved=False)
     return result
 
@@ -280,49 +210,64 @@ def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
     it held before are moved to its trash."""
     with opened_or_made(session) as store, store.together():
         trash_models(store, available_models(store))
-        _save_models(store, result, {}, {})
+        for model in result.models:
+            save_model(store, model, result.verdict if model is result.stereo else None)
+
+
+def _choose_poses(
+    store: Session, settings: CalibrateSettings, warn: Warn
+) -> tuple[list[str], dict[str, str]]:
+    """Return the target poses to calibrate from, and {pose: why} of those that are excluded."""
+    captures, faults = store.read_captures()
+    for fault in faults.values():
+        warn(f"not used: {fault}")
+    names = [capture.name for capture in captures if capture.role == "calibration"]
+    if not names:
+        raise InputError(
+            f"{store.folder} holds no target poses: import some with --role calibration, or capture"
+            " them first"
+        )
+    excluded = {
+        name: f"excluded by the operator: {why}"
+        for name, why in store.excluded().items()
+        if name in names
+    }
+    excluded |= _reasons_to_exclude(names, settings.poses, settings.exclude)
+    names = [name for name in names if name not in excluded]
+    if not names:
+        raise InputError("every target pose is excluded: include some again")
+    return names, excluded
 
 
 def _changes_calibration(
-    store: Session, inputs: Mapping[str, str], settings: Mapping[str, Any]
+    store: Session, inputs: Mapping[str, str], settings: CalibrateSettings
 ) -> bool:
     """Return whether the session's models belong to a calibration from other captures or settings,
     if any."""
     if "stereo" not in available_models(store):
         return True
-    meta = store.load_result("calibration/stereo", only=())[0]
-    before, now = ({**each, "models": ()} for each in (meta.get("settings", {}), settings))
-    return meta["inputs"] != dict(inputs) or before != now
-
-
-def _save_models(
-    store: Session,
-    result: CalibrationResult,
-    inputs: Mapping[str, str],
-    settings: Mapping[str, Any],
-) -> None:
-    """Save the stereo model with its verdict, and each other model that was fitted."""
-    save_stereo(store, result.stereo, inputs, settings, result.verdict)
-    for model in (result.pixelwise, result.splined):
-        if model is not None:
-            save_fitted(store, model, inputs, settings)
+    before = load_record(store, ModelCalibration, "stereo")
+    if not before.settings or before.inputs != dict(inputs):
+        return True
+    return CalibrateSettings(**before.settings).method != settings.method
 
 
 def _fit_models(
     diagnosed: DiagnosedCalibration,
-    models: Sequence[str],
+    settings: CalibrateSettings,
     progress: Progress,
     warn: Warn,
     excluded: Container[str] = (),
-    cells_across: int | None = None,
 ) -> CalibrationResult:
-    """Fit the models that follow from an accepted stereo calibration; return them with the verdict
-    on all.
+    """Fit the models that follow from a stereo calibration; return them with the verdict on all:
+    stereo alone where that rejects them.
 
     Warns of poses that were excluded, but for those ``excluded`` before, and of what is doubtful.
     """
     stereo = diagnosed.stereo
     assert stereo is not None
+    if diagnosed.verdict.level == "rejected":
+        return CalibrationResult(stereo, verdict=diagnosed.verdict)
     if diagnosed.warning:
         warn(diagnosed.warning)
     for name, why in stereo.excluded.items():
@@ -331,7 +276,7 @@ def _fit_models(
     for finding in diagnosed.verdict.findings:
         if finding.severity == "doubtful":
             warn(finding.text())
-    result = _fit_after_stereo(models, stereo, diagnosed.observations, progress, warn, cells_across)
+    result = _fit_after_stereo(stereo, diagnosed.observations, settings, progress, warn)
     verdict = (
         judge_splined(diagnosed.verdict, result.splined.bundle.noise)
         if result.splined
@@ -340,7 +285,11 @@ def _fit_models(
     for finding in verdict.findings:
         if finding not in diagnosed.verdict.findings:
             warn(finding.text())
-    return replace(result, verdict=verdict)
+    return (
+        CalibrationResult(stereo, verdict=verdict)
+        if verdict.level == "rejected"
+        else replace(result, verdict=verdict)
+    )
 
 
 def _reasons_to_exclude(
@@ -359,15 +308,15 @@ def _reasons_to_exclude(
 
 
 def _fit_after_stereo(
-    models: Sequence[str],
     stereo: StereoModel,
     observations: Sequence[Observation],
+    settings: CalibrateSettings,
     progress: Progress,
     warn: Warn,
-    cells_across: int | None = None,
 ) -> CalibrationResult:
     """Fit the models that follow from stereo; one that cannot be fitted is a warning, and stops no
     other."""
+    models = settings.models or DEFAULT_MODELS
 
     def fit(name: str, calibrate_model: Fit[M], start: float, end: float, doing: str) -> M | None:
         """Fit one model if it is requested; None, with a warning, where it cannot be fitted."""
@@ -383,7 +332,7 @@ def _fit_after_stereo(
 
     pixelwise_end = 0.0 if "pixelwise" not in models else 0.33 if "splined" in models else 1.0
     pixelwise = fit("pixelwise", calibrate_pixelwise, 0.0, pixelwise_end, "pixel-wise fit")
-    fit_splined = partial(calibrate_splined, cells_across=cells_across)
+    fit_splined = partial(calibrate_splined, cells_across=settings.cells_across)
     splined = fit("splined", fit_splined, pixelwise_end, 1.0, "joint adjustment")
     for name, why in splined.bundle.excluded.items() if splined else ():
         warn(f"{name} is excluded from the splined model: it {why}")

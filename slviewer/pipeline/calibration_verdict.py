@@ -3,21 +3,19 @@ used."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.rules import judge_evidence
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation, Smoothing
-from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
-from slviewer.pipeline.models import VERDICT, available_models, save_stereo, trash_models
+from slviewer.pipeline.models import VERDICT
 from slviewer.pipeline.poses import Judged, read_stored_poses
-from slviewer.records.plain import from_plain
+from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.verdict import Verdict
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
@@ -81,25 +79,10 @@ def describe_period_conflict(sequence: PatternSequence) -> str:
     return ""
 
 
-def save_rejected(
-    store: Session,
-    stereo: StereoModel,
-    settings: Mapping[str, Any],
-    verdict: Verdict,
-    poses: Sequence[str],
-) -> None:
-    """Save a rejected calibration from these poses for inspection; the models before it are moved
-    to the trash."""
-    with store.together():
-        trash_models(store, available_models(store))
-        save_stereo(store, stereo, store.input_hashes(*stereo.poses), settings, verdict)
-        save_verdict(store, verdict, poses)
-
-
 def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
     """Save the verdict on an attempt to calibrate from these poses, whether or not it succeeded."""
     store.save_result(
-        VERDICT, {"verdict": verdict.to_json(), "inputs": store.input_hashes(*poses)}, {}
+        VERDICT, {"verdict": to_plain(verdict), "inputs": store.input_hashes(*poses)}, {}
     )
 
 

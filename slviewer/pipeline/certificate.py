@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -21,13 +21,10 @@ import msgspec
 import numpy as np
 
 from slviewer import __version__
-from slviewer.calibration.pixelwise import PixelwiseModel
-from slviewer.calibration.splined.model import SplinedModel
-from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, SlviewerError
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.compare import compare_surface
 from slviewer.pipeline.feedback import Progress, ignore_progress, ignore_warnings
 from slviewer.pipeline.measured_surface import MERGED, Place, load_surface
@@ -39,12 +36,13 @@ from slviewer.pipeline.measurements import (
     add_section,
     load_measurements,
 )
-from slviewer.pipeline.models import MODELS, available_models, load_model, load_stereo_if_complete
+from slviewer.pipeline.models import MODELS, available_models
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.scale import load_scale_correction
 from slviewer.pipeline.stored_records import list_records, load_record
+from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain
 from slviewer.records.table import Column, Table
@@ -165,11 +163,8 @@ def make_certificate(store: Session) -> Certificate:
 
 
 def collect_figures(store: Session) -> Figures:
-    """Return the figures of the calibrations, records and measurements that are fresh."""
+    """Return the figures of the records and measurements that are fresh."""
     figures: Figures = {}
-    for name in available_models(store):
-        if store.state_of(f"calibration/{name}") == "fresh":
-            figures[f"calibration/{name}"] = _calibration_figures(store, name)
     for kind in RECORDS.values():
         for each in list_records(store, kind):
             if not each.stale and (of_record := each.record.figures()):
@@ -243,29 +238,6 @@ def _software() -> dict[str, str]:
     return {"slviewer": __version__, "python": platform.python_version()} | {
         name: version(name) for name in PACKAGES
     }
-
-
-def _calibration_figures(store: Session, name: str) -> dict[str, float]:
-    """Return the figures of one of the session's calibrations."""
-    model = load_model(store, name)
-    if isinstance(model, PixelwiseModel):
-        return {
-            f"median RMS in z along {axis}, mm": float(np.nanmedian(f.rms_mm[0]))
-            for axis, f in model.fits.items()
-        }
-    if name == "splined":
-        assert isinstance(model, SplinedModel)
-        summary = model.summary()
-        noise = {f"noise {place}, px": value for place, value in summary["noise_px"].items()}
-        return noise | {
-            f"residuals over noise {axis}": v for axis, v in summary["residuals_over_noise"].items()
-        }
-    stereo = load_stereo_if_complete(store)
-    assert stereo is not None
-    figures = {
-        f"reprojection RMS {device}, px": rms for device, rms in stereo.reprojection_rms_px.items()
-    }
-    return figures | {"baseline, mm": stereo.baseline_mm}
 
 
 def _measurement_figures(measured: Measurement) -> dict[str, float]:
@@ -353,11 +325,8 @@ def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> Non
     """Calibrate a session from the frames with the settings of another's calibration, and take over
     its scale."""
     models = available_models(store)
-    stereo, meta = (
-        load_stereo_if_complete(store),
-        store.load_result("calibration/stereo", only=())[0],
-    )
-    if stereo is None or "settings" not in meta:
+    record = load_record(store, ModelCalibration, "stereo")
+    if not isinstance(record.fit, StereoFit) or not record.settings:
         why |= {
             f"calibration/{name}": "it was imported: its figures are not from the session's frames"
             for name in models
@@ -366,7 +335,7 @@ def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> Non
             saved, arrays = store.load_result(f"calibration/{name}")
             fresh.save_result(f"calibration/{name}", _without_own(saved), arrays)
     else:
-        _repeat_calibration(stereo, meta["settings"], models, fresh, why)
+        _repeat_calibration(record.fit, record.settings, models, fresh, why)
     for model in available_models(fresh):
         if (applied := load_scale_correction(store, model)) is not None:
             inputs = fresh.input_hashes(f"calibration/{model}")
@@ -379,7 +348,7 @@ def _without_own(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _repeat_calibration(
-    stereo: StereoModel,
+    stereo: StereoFit,
     settings: Mapping[str, Any],
     models: Sequence[str],
     fresh: Session,
@@ -394,14 +363,9 @@ def _repeat_calibration(
         if name not in excluded and name in fresh.taken_names()
     ]
     with _note_failure(why, *(f"calibration/{name}" for name in models)):
-        calibrate(
-            fresh,
-            settings["target"],
-            models=[name for name in MODELS if name in models],
-            poses=poses,
-            smoothing=settings["smoothing"],
-            degree=settings["degree"],
-            cells_across=settings.get("cells_across"),
+        chosen = [name for name in MODELS if name in models]
+        calibrate.run(
+            fresh, replace(CalibrateSettings(**settings), models=chosen, poses=poses, exclude=())
         )
 
 
@@ -417,7 +381,7 @@ def _run_again(
     runs: dict[tuple[str, bytes], list[str]] = {}
     for result in certificate.figures:
         kind, _, name = result.partition("/")
-        if kind not in RECORDS:
+        if kind not in RECORDS or kind == ModelCalibration.kind:
             continue
         with _note_failure(why, result):
             record = load_record(store, RECORDS[kind], name)

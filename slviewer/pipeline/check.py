@@ -13,13 +13,15 @@ from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.observe import Smoothing, observe
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
+from slviewer.pipeline.calibrate import CalibrateSettings
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
 from slviewer.pipeline.models import load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import next_number
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.stored_records import list_records
+from slviewer.pipeline.stored_records import list_records, load_record
 from slviewer.reconstruction.axis_agreement import check_sizes
+from slviewer.records.calibration import ModelCalibration
 from slviewer.records.drift import Drift
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -113,5 +115,4 @@ def load_drift_history(store: Session) -> list[Drift]:
 
 def _calibration_smoothing(store: Session) -> Smoothing:
     """The smoothing of the calibration's own poses."""
-    settings = store.load_result("calibration/stereo", only=())[0]["settings"]
-    return Smoothing(settings["smoothing"], settings["degree"])
+    return CalibrateSettings(**load_record(store, ModelCalibration, "stereo").settings).step_2

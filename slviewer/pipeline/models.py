@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError
-from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.records.plain import from_plain
+from slviewer.pipeline.operation import Found
+from slviewer.pipeline.stored_records import load_record, read_record, save_record
+from slviewer.records.calibration import ModelCalibration
+from slviewer.records.model_comparison import ModelComparison
+from slviewer.records.verdict import Verdict
 from slviewer.session.reading import decoding
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -27,8 +29,7 @@ Model = StereoModel | PixelwiseModel | SplinedModel
 ModelName = str
 """stereo, pixelwise or splined."""
 MODELS = ("stereo", "pixelwise", "splined")
-VERDICT = "calibration/verdict"
-VALIDATION = "calibration/validation"
+VERDICT = "verdict/1"
 POSES_FOR_PIXELWISE = 8
 """With fewer poses a pixel's own fit is noisier than what it corrects, and stereo is the better
 default."""
@@ -44,34 +45,41 @@ _RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Mod
 }
 
 
-def save_stereo(
-    store: Session,
-    model: StereoModel,
-    inputs: Mapping[str, str],
-    settings: Mapping[str, Any],
-    verdict: Verdict | None = None,
-) -> None:
-    """Replace the session's stereo calibration; a verdict that rejects it stays with it."""
-    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
-    if verdict is not None:
-        meta["verdict"] = verdict.to_json()
-    store.save_result(
-        "calibration/stereo", meta, {f"residuals_{n}": r for n, r in model.residuals_px.items()}
+def describe_model(
+    model: Model, verdict: Verdict | None = None, inputs: Mapping[str, str] | None = None
+) -> Found[ModelCalibration]:
+    """Return the record of a model and its arrays; ``inputs``: {pose that it was made from: its
+    hash}."""
+    if isinstance(model, StereoModel):
+        arrays = {f"residuals_{name}": residuals for name, residuals in model.residuals_px.items()}
+    else:
+        arrays = model.to_arrays()
+    record = ModelCalibration(
+        model=model.to_dict(), fit=model.describe(), verdict=verdict, inputs=dict(inputs or {})
     )
+    return Found(model.name, record, arrays)
 
 
-def save_fitted(
+def save_model(
     store: Session,
-    model: PixelwiseModel | SplinedModel,
-    inputs: Mapping[str, str],
-    settings: Mapping[str, Any],
+    model: Model,
+    verdict: Verdict | None = None,
+    inputs: Mapping[str, str] | None = None,
 ) -> None:
     """Replace the session's calibration of this kind."""
-    meta = {"model": model.to_dict(), "inputs": dict(inputs), "settings": dict(settings)}
-    result = f"calibration/{model.name}"
-    store.save_result(result, meta, model.to_arrays())
+    found = describe_model(model, verdict, inputs)
+    save_record(store, found.name, found.record, found.arrays)
+    save_compiled(store, model)
+
+
+def save_compiled(store: Session, model: Model) -> None:
+    """Compile a splined model that was stored, and store that too."""
     if isinstance(model, SplinedModel):
-        _restore_or_compile(store, model, store.input_hashes(result)[result])
+        _restore_or_compile(
+            store,
+            model,
+            store.input_hashes(f"calibration/{model.name}")[f"calibration/{model.name}"],
+        )
 
 
 def available_models(store: Session) -> tuple[str, ...]:
@@ -270,7 +278,7 @@ def _recommend(store: Session) -> tuple[str, str]:
     there = available_models(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    compared = load_validation(store)
+    compared = load_comparison(store)
     if compared is not None and compared.recommended in there:
         return compared.recommended, "recommended by the comparison on held-out poses"
     for name in ("splined", "pixelwise"):
@@ -321,11 +329,11 @@ def explain_board(notation: str) -> str:
     return ""
 
 
-def load_validation(store: Session) -> CrossValidation | None:
+def load_comparison(store: Session) -> ModelComparison | None:
     """How the session's calibrations compare on poses that they were not made from; None where they
-    were not compared them as they are now."""
+    were not compared as they are now."""
     return store.decode_fresh(
-        VALIDATION, lambda meta, _: from_plain(meta["validation"], CrossValidation), only=()
+        "validation/1", lambda meta, _: read_record(ModelComparison, meta), only=()
     )
 
 
@@ -334,12 +342,8 @@ def rejection_reason(store: Session) -> str:
     judged."""
     if "stereo" not in available_models(store):
         return ""
-    verdict = store.decode_result(
-        "calibration/stereo",
-        lambda meta, _: from_plain(meta["verdict"], Verdict) if meta.get("verdict") else Verdict(),
-        only=(),
-    )
-    return verdict.reason if verdict.level == "rejected" else ""
+    verdict = load_record(store, ModelCalibration, "stereo").verdict
+    return verdict.reason if verdict is not None and verdict.level == "rejected" else ""
 
 
 def check_accepted(store: Session, accept_rejected: bool = False) -> None:

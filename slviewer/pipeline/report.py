@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
-from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
@@ -24,16 +22,15 @@ from slviewer.pipeline.models import (
     load_residuals,
     load_stereo,
     load_stereo_if_complete,
-    load_validation,
     preferred_model,
     recommended_model,
 )
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.stored_records import list_records, load_arrays, name_records
+from slviewer.pipeline.stored_records import list_records, load_arrays, load_record, name_records
+from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
-from slviewer.records.plain import from_plain
 from slviewer.records.verification import Verification
 from slviewer.report.data import (
     CalibrationFigures,
@@ -112,11 +109,7 @@ def _collect_data(store: Session) -> SessionData:
     ]
     excluded = store.excluded()
     verdict = load_last_verdict(store)
-    judged = (
-        store.load_result("calibration/stereo", only=())[0].get("verdict")
-        if stereo is not None
-        else None
-    )
+    judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
     records, outdated = _collect_records(store)
     region = load_region(store)
     return SessionData(
@@ -127,9 +120,7 @@ def _collect_data(store: Session) -> SessionData:
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
-        verdict_of_calibration=verdict is not None
-        and judged is not None
-        and from_plain(judged, Verdict) == verdict,
+        verdict_of_calibration=verdict is not None and verdict == judged,
         models=_load_models(store),
         region="" if region is None else region.text(),
         edits=[
@@ -147,22 +138,17 @@ def _load_pixel_fits(store: Session) -> list[PixelFitView]:
         return []
     model = load_model(store, "pixelwise")
     assert isinstance(model, PixelwiseModel)
-    return [PixelFitView(axis, fit.rms_mm, fit.poses) for axis, fit in model.fits.items()]
+    return [PixelFitView(axis, fit.rms_mm) for axis, fit in model.fits.items()]
 
 
 def _load_models(store: Session) -> ModelsView | None:
-    """Return the session's calibrations and their comparison; None where there is no
-    calibration."""
+    """Return which of the session's calibrations is used; None where there is no calibration."""
     there = available_models(store)
     if not there:
         return None
-    splined = load_model(store, "splined") if "splined" in there else None
-    assert splined is None or isinstance(splined, SplinedModel)
     return ModelsView(
         used=preferred_model(store),
         recommended=recommended_model(store),
-        comparison=load_validation(store),
-        splined=None if splined is None else splined.summary(),
         scales={name: words for name in there if (words := describe_scale(store, name))},
     )
 

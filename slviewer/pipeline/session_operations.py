@@ -1,17 +1,24 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
-from slviewer.pipeline.calibrate import calibrate
 from slviewer.pipeline.compare import compare
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
 from slviewer.pipeline.inspect import inspect
 from slviewer.pipeline.measure import measure
 from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.operations import accept, align, check, merge, reconstruct, verify
+from slviewer.pipeline.operations import (
+    accept,
+    align,
+    calibrate,
+    check,
+    merge,
+    reconstruct,
+    validate,
+    verify,
+)
 from slviewer.pipeline.plan import plan
 from slviewer.pipeline.report import report
 from slviewer.pipeline.stored_records import load_arrays
-from slviewer.pipeline.validate import validate
 from slviewer.session.store import Session
 
 
@@ -28,7 +35,7 @@ class SessionOperations(Session):
 
     accept = accept.accept
     align = align.align
-    calibrate = calibrate
+    calibrate = calibrate.calibrate
     check = check.check
     compare = compare
     edit_scan = edit_scan
@@ -42,5 +49,5 @@ class SessionOperations(Session):
     reconstruct = reconstruct.reconstruct
     report = report
     set_region = set_region
-    validate = validate
+    validate = validate.validate
     verify = verify.verify

@@ -60,7 +60,10 @@ def load_arrays(session: SessionLike, result: str) -> dict[str, np.ndarray]:
 
 
 def captures_of(name: str, record: Record) -> list[str]:
-    """Return the captures that a record is of: what it is named after, or what it was made from."""
+    """Return the captures that a record is of, if any: what it is named after, or what it was made
+    from."""
+    if not record.is_of_captures:
+        return []
     return [each for each in record.inputs if "/" not in each] if name.isdecimal() else [name]
 
 

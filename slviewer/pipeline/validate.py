@@ -1,7 +1,9 @@
 """Each calibration measured on target poses that it was not made from."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from slviewer.calibration.centres import move_to_centres
@@ -12,16 +14,13 @@ from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected, InputError, UsageError
 from slviewer.evaluation.crossvalidation import (
     FOLDS,
-    CrossValidation,
-    HeldOutPose,
     gather_results,
     measure_held_out,
     split_folds,
 )
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
+from slviewer.pipeline.feedback import Progress, ignore_progress, part, stage
 from slviewer.pipeline.models import (
     MODELS,
-    VALIDATION,
     ModelName,
     available_models,
     load_stereo,
@@ -29,9 +28,10 @@ from slviewer.pipeline.models import (
     warn_if_frame_changed,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.poses import load_observations
 from slviewer.reconstruction.reconstruct import Model
+from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 
 Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], Model]
 FITS: dict[str, Fit] = {
@@ -42,56 +42,57 @@ FITS: dict[str, Fit] = {
 """How each model is made from the poses that stereo was made from."""
 
 
-def validate(
-    session: SessionLike,
-    *,
-    models: Sequence[ModelName] = (),
-    folds: int = FOLDS,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> CrossValidation:
-    """Measure target poses with calibrations made without them, and recommend the best model.
+@dataclass(frozen=True)
+class ValidateSettings:
+    """How models are compared.
 
     Args:
-        session: Session folder, calibrated.
         models: Which models to compare; by default all there are. The recommended one is used where
             none is named.
         folds: Into how many parts the poses are split, each excluded once.
+    """
+
+    models: Sequence[ModelName] = ()
+    folds: int = FOLDS
+
+
+@operation("validate", ModelComparison, ValidateSettings)
+def validate(job: Job, settings: ValidateSettings) -> Iterator[Found[ModelComparison]]:
+    """Measure target poses with calibrations made without them, and recommend the best model.
 
     Nothing is decoded again: the session stores what it needs of the poses. The result stays in the
-    session as ``calibration/validation``.
+    session as ``validation/1``.
     """
-    with opened(session, write=True) as store:
-        stereo = load_stereo(store)
-        if not stereo.poses:
-            raise InputError(
-                "this calibration was made elsewhere, without target poses: calibrate here to"
-                " cross-validate"
-            )
-        names = [name for name in MODELS if name in (models or available_models(store))]
-        if not names:
-            raise UsageError(f"no model is called {', '.join(models)}: use {', '.join(MODELS)}")
-        warn_if_stale(store, warn)
-        observations = load_observations(store, list(stereo.poses))
-        if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
-            raise InputError(
-                f"the session no longer holds the observations of {', '.join(missing)}: run"
-                " `slviewer calibrate` again"
-            )
-        validated = cross_validate(
-            move_to_centres(observations, stereo), stereo, names, folds, progress
+    store = job.store
+    stereo = load_stereo(store)
+    if not stereo.poses:
+        raise InputError(
+            "this calibration was made elsewhere, without target poses: calibrate here to"
+            " cross-validate"
         )
-        for model, why in validated.failed.items():
-            warn(f"{model} is not judged: {why}")
-        judged = [
-            f"calibration/{name}" for name in validated.models if name in available_models(store)
-        ]
-        inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
-        before = preferred_model(store)
-        store.save_result(VALIDATION, {"validation": validated.to_json(), "inputs": inputs}, {})
-        warn_if_frame_changed(store, before, warn)
-        progress(1.0, "validated")
-    return validated
+    names = [name for name in MODELS if name in (settings.models or available_models(store))]
+    if not names:
+        raise UsageError(
+            f"no model is called {', '.join(settings.models)}: use {', '.join(MODELS)}"
+        )
+    warn_if_stale(store, job.warn)
+    observations = load_observations(store, list(stereo.poses))
+    if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
+        raise InputError(
+            f"the session no longer holds the observations of {', '.join(missing)}: run `slviewer"
+            " calibrate` again"
+        )
+    compared = cross_validate(
+        move_to_centres(observations, stereo), stereo, names, settings.folds, job.progress
+    )
+    for model, why in compared.failed.items():
+        job.warn(f"{model} is not judged: {why}")
+    judged = [f"calibration/{name}" for name in compared.models if name in available_models(store)]
+    inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
+    before = preferred_model(store)
+    yield Found("1", msgspec.structs.replace(compared, inputs=inputs))
+    warn_if_frame_changed(store, before, job.warn)
+    job.progress(1.0, "validated")
 
 
 def cross_validate(
@@ -100,7 +101,7 @@ def cross_validate(
     models: Sequence[str],
     folds: int = FOLDS,
     progress: Progress = ignore_progress,
-) -> CrossValidation:
+) -> ModelComparison:
     """Cross-validate models on observations, with circles at their centres, and their stereo
     calibration."""
     depths = {o.name: float(np.median(_board_depths(o, stereo))) for o in observations}

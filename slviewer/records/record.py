@@ -48,6 +48,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     kind: ClassVar[str] = ""
     title: ClassVar[str] = ""
     is_history: ClassVar[bool] = False  # also records of before are of interest
+    is_of_captures: ClassVar[bool] = True  # and not shown once these are deleted
     operation: str = ""
     settings: dict[str, Any] = {}
     inputs: dict[str, str] = {}

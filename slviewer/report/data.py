@@ -11,10 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.records.record import Record
+from slviewer.records.verdict import Verdict
 from slviewer.report.page import Figure
 from slviewer.session.measurements import Measurement
 
@@ -193,12 +192,10 @@ class CalibrationFigures:
 
 @dataclass(frozen=True, eq=False)
 class PixelFitView:
-    """The pixel-wise fits of one axis: ``rms_mm`` (3, h, w) in z, x, y; ``poses`` (h, w) that each
-    pixel saw."""
+    """The pixel-wise fits of one axis: ``rms_mm`` (3, h, w) in z, x, y."""
 
     axis: str
     rms_mm: np.ndarray
-    poses: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,15 +209,11 @@ class RecordsView:
 
 @dataclass(frozen=True, eq=False)
 class ModelsView:
-    """The models of a session: the one that is ``used`` and the one ``recommended``; their
-    ``comparison`` on poses left out, None where nobody compared them; ``splined`` as
-    ``Bundle.summary`` gives it, None where there is none; ``scales``: {model: what correction of
-    scale was applied, in words}."""
+    """The models of a session: the one that is ``used`` and the one ``recommended``; ``scales``:
+    {model: what correction of scale was applied, in words}."""
 
     used: str
     recommended: str
-    comparison: CrossValidation | None = None
-    splined: Mapping[str, Any] | None = None
     scales: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -325,33 +325,12 @@ def _parameters_section(stereo: StereoModel) -> Section:
 
 
 def _pixel_fits_section(data: SessionData) -> Section:
-    """The section about the pixel-wise fits: table by axis, RMS maps and the curves of one
-    pixel."""
-    columns = [
-        Column("axis", align="left"),
-        Column("pixels fitted", "%"),
-        Column("poses a pixel, median"),
-    ]
-    columns += [Column(f"RMS in {name}", "mm") for name in "zxy"]
-    rows: list[list[str | Cell]] = []
-    for fit in data.pixel_fits:
-        fitted = np.isfinite(fit.rms_mm[0])
-        medians = [float(np.median(rms[fitted])) if fitted.any() else np.nan for rms in fit.rms_mm]
-        poses = float(np.median(fit.poses[fitted])) if fitted.any() else np.nan
-        rows.append(
-            [
-                fit.axis,
-                format_number(100 * fitted.mean(), 1),
-                format_number(poses, 0),
-                *(format_number(m) for m in medians),
-            ]
-        )
-    table = Table(columns, rows, "Fits by captured axis (median over the pixels)")
+    """The section about the pixel-wise fits: RMS maps of each axis."""
     return Section(
         "Pixel-wise model",
         "Each camera pixel's own rational function from phase to depth, and lines from depth to x"
         " and y.",
-        [table, *(rms_maps(fit.rms_mm, fit.axis) for fit in data.pixel_fits)],
+        [rms_maps(fit.rms_mm, fit.axis) for fit in data.pixel_fits],
     )
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 from slviewer import __version__
 from slviewer.errors import SessionError
 from slviewer.session.atomic import disk_errors, replace_json
+from slviewer.session.names import safe_path
 from slviewer.session.reading import expand_user, read_json
+from slviewer.session.result_types import RENAMED
 
 _IS_WINDOWS = sys.platform == "win32"
 _LONGEST_FOLDER = 120
@@ -43,6 +45,17 @@ def session_folder(path: str | Path) -> Path:
             " update slviewer"
         )
     return folder
+
+
+def locate_result(root: Path, name: str) -> Path:
+    """Return the folder of a result under ``root``, also of one that an older version named
+    otherwise.
+
+    Raises InputError for an unsafe name.
+    """
+    folder = root / safe_path(name)
+    former = next((root / old for old, today in RENAMED.items() if today == name), folder)
+    return former if former.is_dir() and not folder.is_dir() else folder
 
 
 def new_folder(path: str | Path, is_windows: bool = _IS_WINDOWS) -> tuple[Path, bool]:

@@ -60,35 +60,19 @@ class _Imported(TypedDict):
 
 
 class _Stereo(ResultMeta, total=False):
-    """`calibration/stereo`: computed (``model``, ``settings``), or imported with its source and
-    sizes."""
+    """What `calibration/stereo` holds where it was imported: the file that it is from, and the
+    sizes stated there."""
 
-    model: dict[str, Any]
-    settings: dict[str, Any]
-    verdict: dict[str, Any] | None
     imported: _Imported
     source: str
     camera: Size | None
     projector: Size | None
 
 
-class _Fitted(ResultMeta, total=False):
-    """`calibration/pixelwise` and `calibration/splined`."""
-
-    model: dict[str, Any]
-    settings: dict[str, Any]
-
-
 class _Verdict(ResultMeta, total=False):
-    """`calibration/verdict`."""
+    """`verdict/1`, on the last attempt to calibrate."""
 
     verdict: dict[str, Any]
-
-
-class _Validation(ResultMeta, total=False):
-    """`calibration/validation`."""
-
-    validation: dict[str, Any]
 
 
 class _Compiled(ResultMeta, total=False):
@@ -189,10 +173,7 @@ class _Scale(ResultMeta, total=False):
 
 _TYPES: dict[str, Any] = {
     "calibration/stereo": _Stereo,
-    "calibration/pixelwise": _Fitted,
-    "calibration/splined": _Fitted,
-    "calibration/verdict": _Verdict,
-    "calibration/validation": _Validation,
+    "verdict": _Verdict,
     "compiled/splined": _Compiled,
     "poses": _Pose,
     "evidence": _Evidence,
@@ -204,9 +185,14 @@ _TYPES: dict[str, Any] = {
 }
 
 
+RENAMED = {"calibration/validation": "validation/1", "calibration/verdict": "verdict/1"}
+"""{name of a result in sessions of version 0.2: its name today}."""
+
+
 def check_meta(name: str, meta: Mapping[str, Any]) -> None:
     """Raise InputError, which names the entry, unless ``meta`` is what a result of this name
     holds."""
+    name = RENAMED.get(name, name)
     from_plain(meta, _TYPES.get(name) or _TYPES.get(name.partition("/")[0]) or ResultMeta)
     if (kind := RECORDS.get(name.partition("/")[0])) is not None:
         from_plain(kind.upgrade(meta), kind)

@@ -23,15 +23,15 @@ from slviewer.session.atomic import to_json, write_bytes, write_synced_json
 from slviewer.session.layout import inner_folders
 from slviewer.session.names import safe_path
 from slviewer.session.reading import decoding, open_regular, read_file, read_json
-from slviewer.session.result_types import Meta, check_meta
+from slviewer.session.result_types import RENAMED, Meta, check_meta
 
 _ARRAY_FOLDER = "arrays"
 _RESERVED = {"hash", "arrays", "checksums"}
 MAX_ARRAY_BYTES = 1 << 33
 
 
-def list_results(root: Path) -> list[str]:
-    """Names of the results under `root`, parts joined by `/`, in no order."""
+def list_results(root: Path) -> set[str]:
+    """Names of the results under `root`, parts joined by `/`."""
 
     def under(folder: Path) -> list[str]:
         """Return the names of the results in a folder and below."""
@@ -39,7 +39,7 @@ def list_results(root: Path) -> list[str]:
             return [folder.relative_to(root).as_posix()]
         return [name for inner in inner_folders(folder) for name in under(folder / inner)]
 
-    return under(root)
+    return {RENAMED.get(name, name) for name in under(root)}
 
 
 def check_place(root: Path, name: str) -> None:

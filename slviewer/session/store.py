@@ -339,7 +339,7 @@ class Session(Decisions):
     def _result_folder(self, name: str) -> Path:
         """Return the folder of a result, where `together` has staged it; InputError for an unsafe
         name."""
-        target = self.folder / "results" / safe_path(name)
+        target = layout.locate_result(self.folder / "results", name)
         return target if self._together is None else self._together.folder_for(target)
 
     def result_names(self) -> list[str]:

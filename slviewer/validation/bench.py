@@ -25,7 +25,7 @@ from slviewer.fringe.presets import multifrequency, p18
 from slviewer.fringe.reference import decode_reference
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.fringe.threshold import fringe_mean
-from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.open_session import opened
@@ -312,7 +312,9 @@ def _time_calibration(scale: float, progress: Progress) -> list[Row]:
         session = Path(folder) / "session"
         simulate(session, scale=scale, progress=part(progress, 0.0, 0.5))
         whole = median(
-            lambda: calibrate(session, TARGET, progress=part(progress, 0.5, 0.9)), 1, warm=False
+            lambda: calibrate.run(session, CalibrateSettings(TARGET), part(progress, 0.5, 0.9)),
+            1,
+            warm=False,
         )
         with opened(session) as store:
             stereo = load_stereo(store)

@@ -13,7 +13,6 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.poses import FEW_POSES
-from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.calibration.observe import Smoothing
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
@@ -22,6 +21,7 @@ from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import Judged, read_pose
+from slviewer.records.verdict import Cause
 from slviewer.simulation.boards import BoardShape, Pose, printed_board
 from slviewer.simulation.hostile_frames import delay_frames, drop_frame, show_instead
 from slviewer.simulation.plans import rotation, target_poses

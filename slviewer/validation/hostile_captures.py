@@ -16,7 +16,7 @@ from slviewer.fringe.description_check import check_description
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.operation import Job
@@ -161,7 +161,9 @@ class HostileBench:
     def calibrate(self, session: Path, report: CaseReport) -> None:
         """Calibrate the session's target poses; the report gets the verdict's causes."""
         try:
-            calibrate(session, str(BOARD), models=self.models, warn=report.warnings.append)
+            calibrate.run(
+                session, CalibrateSettings(str(BOARD), self.models), warn=report.warnings.append
+            )
         finally:
             with Session.open(session) as store:
                 verdict = load_last_verdict(store)

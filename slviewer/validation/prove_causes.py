@@ -7,9 +7,9 @@ from functools import partial
 from time import perf_counter
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
-from slviewer.calibration.diagnosis.verdict import Cause
 from slviewer.evaluation.render import Row
 from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.records.verdict import Cause
 from slviewer.simulation.boards import BoardShape
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
-from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergeSettings, merge_scans
-from slviewer.pipeline.models import load_models
+from slviewer.pipeline.models import load_model, load_models, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
@@ -58,13 +59,12 @@ def reproduce(
     elif quick:
         raise UsageError(f"--quick is --scale {QUICK_SCALE:g}: give one of both")
     _simulate(session, scale, seed, part(progress, 0.0, 0.4))
-    calibration = calibrate(
-        session, TARGET, models=MODELS, progress=part(progress, 0.4, 0.65), warn=warn
-    )
-    assert calibration.pixelwise is not None
+    calibrate.run(session, CalibrateSettings(TARGET, MODELS), part(progress, 0.4, 0.65), warn)
     with Session.open(session) as store:
         names = store.capture_names("scan")
-        observations = load_observations(store, list(calibration.stereo.poses))
+        stereo, pixelwise = load_stereo(store), load_model(store, "pixelwise")
+        observations = load_observations(store, list(stereo.poses))
+    assert isinstance(pixelwise, PixelwiseModel)
     planes, spheres = (
         [n for n in names if n.startswith("plane_")],
         [n for n in names if n.startswith("sphere_")],
@@ -79,8 +79,8 @@ def reproduce(
         merged = merge_scans(Job(store, part(progress, 0.82, 0.9)), settings)
     result = Reproduction(
         quick=quick,
-        stereo=calibration.stereo,
-        pixelwise=calibration.pixelwise,
+        stereo=stereo,
+        pixelwise=pixelwise,
         planes=flat,
         spheres=balls,
         spacings_mm=_compare_spacings(session, balls),

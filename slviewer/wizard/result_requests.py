@@ -8,7 +8,7 @@ from typing import Any
 from slviewer.errors import InputError
 from slviewer.pipeline.align import FOLDER as PLACEMENTS
 from slviewer.pipeline.align import AlignSettings, align, remove_placement
-from slviewer.pipeline.calibrate import CalibrationResult
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.export import What, check_export, formats
 from slviewer.pipeline.models import (
     ModelName,
@@ -19,6 +19,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct
+from slviewer.pipeline.validate import ValidateSettings, validate
 from slviewer.pipeline.verify import VerifySettings, verify
 from slviewer.records.verification import Shape
 from slviewer.session.names import clean_label
@@ -67,18 +68,15 @@ class ResultRequests(RequestHandler):
 
     @request("Calibrating")
     def calibrate(self) -> None:
-        """Calibrate from the poses that are not excluded."""
+        """Calibrate every model that the included poses allow; others go to the trash."""
         engine, target = self._engine, self._engine.reader.target()
         if not target:
             raise InputError("choose the target first")
-        calibrate = partial(
-            tasks.calibrate_session, engine.store, target, warn=self._warner("calibration")
-        )
-
-        def done(result: CalibrationResult) -> None:
-            """Report the result of the calibration, and mark the session as changed."""
-            engine.notices.add(*tasks.describe_calibration(result))
-            engine.publisher.mark_changed(session=True)
+        models = ["stereo", "pixelwise"]
+        if missing := tasks.missing_for_splined(engine.store):
+            self._warner("calibration")(f"no splined model: {missing}")
+        else:
+            models.append("splined")
 
         def failed(error: BaseException) -> None:
             """Report why the calibration failed, and mark the session as changed."""
@@ -87,16 +85,14 @@ class ResultRequests(RequestHandler):
                 session=True
             )  # a rejected calibration is saved, to be inspected
 
-        engine.jobs.submit("Calibrating", calibrate, done, failed=failed)
+        settings = CalibrateSettings(target, models, replace_all=True)
+        self._run("Calibrating", calibrate, settings, "calibration", failed)
 
     @request("Comparing the models")
     def compare_models(self) -> None:
         """Cross-validate the models on the target poses; the best one is then recommended, and
         used."""
-        compare = partial(
-            tasks.compare_models, self._engine.store, warn=self._warner("calibration")
-        )
-        self._submit("Comparing the models", compare, tasks.describe_comparison)
+        self._run("Comparing the models", validate, ValidateSettings(), "calibration")
 
     @request("Choosing the model")
     def choose_model(self, name: str) -> None:

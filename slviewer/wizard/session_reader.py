@@ -3,17 +3,17 @@ again the same."""
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import outline_px
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import DamagedError, InputError
+from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.presets import PRESETS
 from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.calibration_verdict import load_last_verdict
@@ -23,8 +23,8 @@ from slviewer.pipeline.models import (
     available_models,
     explain_board,
     find_target,
+    load_model,
     load_stereo_if_complete,
-    load_validation,
     preferred_model,
     recommended_model,
     rejection_reason,
@@ -43,7 +43,6 @@ from slviewer.session.names import join_names, natural_key
 from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard.calibration_views import load_fit_rms, load_splined
 from slviewer.wizard.export_files import list_exports
 from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.planner import Planner
@@ -182,9 +181,7 @@ class SessionReader:
         records = self._read_records(inputs)
         of_scan = {name: [each for each in records if each.name == name] for name in scans}
         verdict = self._attempt("the verdict", lambda: load_last_verdict(session), None)
-        of_calibration = calibration is not None and _is_verdict_of(
-            verdict, self._load_meta("calibration/stereo")
-        )
+        judged = None if calibration is None else self._load_record("calibration/stereo").verdict
         return SessionView(
             folder=session.folder,
             target=target,
@@ -196,7 +193,7 @@ class SessionReader:
             or (plan.usual_mm if plan else 0.0),
             calibration=calibration,
             verdict=verdict,
-            verdict_of_calibration=of_calibration,
+            verdict_of_calibration=verdict is not None and verdict == judged,
             records=records,
             scans=tuple(self._read_scan(captures[name], of_scan[name], inputs) for name in scans),
             measurements=self._attempt(
@@ -418,35 +415,41 @@ class SessionReader:
         )
         if stereo is None:
             return None
-        fit_rms: Mapping[str, Mapping[str, float]] | None = {}
-        splined = None
-        if "pixelwise" in models:
-            fit_rms = self._get_cached(
-                ("pixelwise", hashes["pixelwise"]), lambda: load_fit_rms(session)
-            )
-        if "splined" in models:
-            splined = self._get_cached(
-                ("splined", hashes["splined"]), lambda: load_splined(session)
-            )
-        foreign = ""
-        if fit_rms is None or ("splined" in models and splined is None):
-            foreign = "it was saved by another version of slviewer: calibrate again"
+        fits = {model: self._load_fit(model) for model in models if model != "stereo"}
+        foreign = (
+            "it was saved by another version of slviewer: calibrate again"
+            if None in fits.values()
+            else ""
+        )
         return CalibrationView(
             stereo=stereo,
             models=models,
             best=preferred_model(session),
             stale=foreign
             or self._describe_changes(self._load_meta("calibration/stereo")["inputs"], captures),
-            fit_rms_mm=fit_rms or {},
+            pixelwise=fits.get("pixelwise"),
             recommended=recommended_model(session),
             chosen=str(decided) if (decided := session.valid_decision("model")) in models else "",
             rejected=rejection_reason(session),
             is_pinned=accepts_rejected(session),
-            splined=splined,
-            comparison=load_validation(session),
+            splined=fits.get("splined"),
             scales={model: words for model in models if (words := describe_scale(session, model))},
             missing="" if "splined" in models or not stereo.poses else missing_for_splined(session),
         )
+
+    def _load_fit(self, model: str) -> Any:
+        """Load the figures of a model's fit; None where another version saved a model that cannot
+        be read."""
+        record = self._load_record(f"calibration/{model}")
+
+        def describe() -> Any:
+            """Return the figures of the model itself: version 0.2 stored none."""
+            with suppress(SessionError):
+                return load_model(self.session, model).describe()
+            return None
+
+        hashed = self._load_meta(f"calibration/{model}")["hash"]
+        return record.fit or self._get_cached(("fit", hashed), describe)
 
     def _describe_changes(self, inputs: Mapping[str, str], captures: Mapping[str, Capture]) -> str:
         """Describe which poses of a calibration were retaken, deleted or excluded since; empty
@@ -467,9 +470,10 @@ class SessionReader:
 
         def read(result: str) -> Stored[Any] | None:
             """Read one record by its result name; None where a capture of it is gone."""
-            (kind, _, name), meta = result.partition("/"), self._load_meta(result)
-            record = self._get_cached(
-                ("record", meta["hash"]), lambda: read_record(RECORDS[kind], meta)
+            name, meta, record = (
+                result.partition("/")[2],
+                self._load_meta(result),
+                self._load_record(result),
             )
             if not set(captures_of(name, record)) <= set(inputs.captures):
                 return None
@@ -560,6 +564,11 @@ class SessionReader:
         """Return the `meta` of a result, empty where there is none."""
         return self._load_meta(name) if self.session.has_result(name) else {}
 
+    def _load_record(self, result: str) -> Any:
+        """Load a record by its result name; cached by content hash."""
+        kind, meta = RECORDS[result.partition("/")[0]], self._load_meta(result)
+        return self._get_cached(("record", meta["hash"]), lambda: read_record(kind, meta))
+
     def _load_meta(self, result: str) -> dict[str, Any]:
         """Load the `meta` of a result, without its arrays."""
         return self.session.load_result(result, only=())[0]
@@ -588,9 +597,3 @@ def _make_features(
 def _has_changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
     """Whether any name of `used` is missing from `now` or has another value there."""
     return any(now.get(name) != value for name, value in used.items())
-
-
-def _is_verdict_of(verdict: Verdict | None, meta: Mapping[str, Any]) -> bool:
-    """Whether the verdict is the one saved with a calibration's `meta`."""
-    saved = meta.get("verdict")
-    return verdict is not None and saved is not None and from_plain(saved, Verdict) == verdict

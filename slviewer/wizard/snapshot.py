@@ -8,21 +8,21 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
 from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
-from slviewer.evaluation.crossvalidation import CrossValidation
 from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.stored_records import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
+from slviewer.records.calibration import PixelwiseFit, SplinedFit
 from slviewer.records.merge import Merge
 from slviewer.records.placement import Placement
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
+from slviewer.records.verdict import Verdict
 from slviewer.registration.refusal import Reason
 from slviewer.session.capture import TurnStep
 from slviewer.session.inspection_plan import Characteristic
@@ -142,40 +142,28 @@ class PoseView:
     thumbnail: bytes = field(repr=False)
 
 
-@dataclass(frozen=True)
-class SplinedView:
-    """Results of the joint adjustment: `SplinedModel.summary`, the weight 0 ... 1 of each pose in
-    camera and projector, and the `turned` poses, numbered from the board's other end.
-    """
-
-    summary: Mapping[str, Any]
-    weights: Mapping[str, tuple[float, float]]
-    turned: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
     """The session's calibration: the `stereo` model, and what is known of the others.
 
-    `stale` names what changed since, empty where nothing did. `fit_rms_mm`: {axis: {z, x, y: median
-    mm}} of the pixel-wise fit, empty where there is none. `best` is the model in use, `recommended`
-    the one that would be if the operator had not `chosen` one (empty: he has not). `rejected` is
-    the reason why the calibration was, empty where it was not; `is_pinned`: it is used all the
-    same. `scales`: {model: the correction of scale applied, in words}. `missing`: what the poses
-    lack for the splined model, empty where they allow it.
+    `stale` names what changed since, empty where nothing did. `pixelwise`, `splined`: their fits,
+    None where there is no such model. `best` is the model in use, `recommended` the one that would
+    be if the operator had not `chosen` one (empty: he has not). `rejected` is the reason why the
+    calibration was, empty where it was not; `is_pinned`: it is used all the same. `scales`: {model:
+    the correction of scale applied, in words}. `missing`: what the poses lack for the splined
+    model, empty where they allow it.
     """
 
     stereo: StereoModel
     models: tuple[str, ...]
     best: str
     stale: str = ""
-    fit_rms_mm: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    pixelwise: PixelwiseFit | None = None
     recommended: str = ""
     chosen: str = ""
     rejected: str = ""
     is_pinned: bool = False
-    splined: SplinedView | None = None
-    comparison: CrossValidation | None = None
+    splined: SplinedFit | None = None
     scales: Mapping[str, str] = field(default_factory=dict)
     missing: str = ""
 

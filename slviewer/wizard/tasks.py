@@ -5,15 +5,12 @@ compared with each other by a job of their own (`engine`), which no cloud waits 
 """
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.evaluation.crossvalidation import CrossValidation
-from slviewer.pipeline.calibrate import CalibrationResult, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.merge import MergeSettings
-from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected, available_models
+from slviewer.pipeline.models import POSES_FOR_PIXELWISE, accepts_rejected
 from slviewer.pipeline.operation import Findings
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
-from slviewer.pipeline.validate import validate
 from slviewer.records.merge import Merge
 from slviewer.session.scan_edits import load_edits
 from slviewer.session.store import Session
@@ -21,36 +18,6 @@ from slviewer.surface.selection import select_support
 from slviewer.wizard.export_files import export_file
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.result_views import used_points, whole_cloud
-from slviewer.wizard.snapshot import Level
-
-
-def calibrate_session(
-    session: Session, target: str, report: Reporter, warn: Warn
-) -> CalibrationResult:
-    """Calibrate every model that the included poses allow; models that they no longer allow go to
-    the trash."""
-    guarded = session.guarded(report.saving)
-    models = ["stereo", "pixelwise"]
-    if missing := missing_for_splined(session):
-        warn(f"no splined model: {missing}")
-    else:
-        models.append("splined")
-    made = calibrate(guarded, target, models=models, progress=report, warn=warn)
-    for name in available_models(session):
-        if getattr(made, name) is None:
-            guarded.trash_result(f"calibration/{name}")
-    return made
-
-
-def describe_calibration(made: CalibrationResult) -> tuple[Level, str]:
-    """Describe a calibration result in one sentence: (level, text)."""
-    rms = made.stereo.reprojection_rms_px["stereo"]
-    text = f"calibrated from {len(made.stereo.poses)} poses: reprojection RMS {rms:.3f} px"
-    return (
-        ("good", text)
-        if made.verdict.level == "good"
-        else ("warning", f"{text}; doubtful: {made.verdict.reason}")
-    )
 
 
 def missing_for_splined(session: Session) -> str:
@@ -67,20 +34,6 @@ def missing_for_splined(session: Session) -> str:
         f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and"
         " capture more"
     )
-
-
-def compare_models(session: Session, report: Reporter, warn: Warn) -> CrossValidation:
-    """Cross-validate the models on poses they were not calibrated from, and save the comparison."""
-    return validate(session.guarded(report.saving), progress=report, warn=warn)
-
-
-def describe_comparison(compared: CrossValidation) -> str:
-    """Describe the comparison of the models in one sentence: held-out errors, and the recommended
-    model."""
-    figures = ", ".join(
-        f"{model} {compared.rms(model, 'board_mm'):.3f} mm" for model in compared.models
-    )
-    return f"held-out error of the models: {figures}; {compared.recommended} is recommended"
 
 
 def remove_support(

@@ -14,12 +14,12 @@ from slviewer.calibration.diagnosis.evidence import AxisEvidence, Evidence, Pose
 from slviewer.calibration.diagnosis.frames import fit_mean_turn, gamma_from_harmonic
 from slviewer.calibration.diagnosis.numbering import describe_misnumbering
 from slviewer.calibration.diagnosis.rules import judge_evidence
-from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
 from slviewer.calibration.observe import Observation
 from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.suspect import Suspect
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.verdict import CAUSES, Finding, Verdict
 
 TRUE = rig()
 UPRIGHT = ((1.5, 0.1), (-0.1, 3.0))
@@ -229,6 +229,6 @@ def test_evidence_and_verdicts_survive_saving() -> None:
         ]
     )
     assert verdict.causes == ("moved", "gamma") and verdict.level == "rejected"
-    assert from_plain(json.loads(json.dumps(verdict.to_json())), Verdict) == verdict
+    assert from_plain(json.loads(json.dumps(to_plain(verdict))), Verdict) == verdict
     assert missing_facts(verdict.text(), "rejected", "it", "hold it") == []
     assert len(set(CAUSES)) == len(CAUSES)

@@ -14,7 +14,7 @@ from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.pipeline.export import export
-from slviewer.pipeline.models import frame_of, save_fitted, save_stereo, warn_if_frame_changed
+from slviewer.pipeline.models import frame_of, save_model, warn_if_frame_changed
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.store import Session
@@ -78,10 +78,10 @@ def test_the_exported_file_is_the_models_own_and_names_its_frame(
     stereo, splined = models
     warned: list[str] = []
     with Session.create(tmp_path / "session") as store:
-        save_stereo(store, stereo, {}, {})
+        save_model(store, stereo)
         warn_if_frame_changed(store, "stereo", warned.append)
         assert not warned
-        save_fitted(store, splined, {f"pose_{i:02d}": "" for i in range(9)}, {})
+        save_model(store, splined, inputs={f"pose_{i:02d}": "" for i in range(9)})
         warn_if_frame_changed(store, "stereo", warned.append)
         assert len(warned) == 1 and frame_of(store, "splined") in warned[0]
         assert (

@@ -17,7 +17,7 @@ from slviewer.calibration.diagnosis.evidence import (
 )
 from slviewer.calibration.diagnosis.ripple import Ripple, measure_ripple
 from slviewer.calibration.diagnosis.solution import measure_solution
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict, judge_splined
+from slviewer.calibration.diagnosis.verdict import judge_splined
 from slviewer.calibration.observe import Observation, Samples
 from slviewer.calibration.splined.residual_noise import Noise, estimate_noise
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
@@ -26,6 +26,7 @@ from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import p18, phase_steps
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.calibrate import calibrate
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.store import Session
 from slviewer.simulation.boards import printed_board
 from slviewer.simulation.plans import target_poses
@@ -143,7 +144,8 @@ def test_a_gamma_of_two_in_a_dark_room_is_named(tmp_path) -> None:
             session.save_capture(
                 f"pose_{i}", "calibration", sequence, frames, source="simulated", board=board
             )
-    verdict = calibrate(tmp_path / "session", str(board), models=("stereo",)).verdict
+    verdict = calibrate(tmp_path / "session", str(board), models=("stereo",)).only.verdict
+    assert verdict is not None
     assert verdict.level == "doubtful" and "gamma" in verdict.causes
 
 

@@ -27,6 +27,7 @@ from slviewer.errors import InputError
 from slviewer.inspection.relations import distance
 from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
+from slviewer.records.table import render_text
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.validation.prove_uncertainty import (
@@ -128,12 +129,12 @@ def test_the_frame_would_overstate_it(model) -> None:
 
 @pytest.mark.computes
 def test_the_volume_is_summed_up_before_anything_is_scanned(model) -> None:
-    figures = model.summary()["sigma_volume_mm"]
+    figures = model.describe().sigma_volume_mm
     assert figures == summarise_volume_sigma(model.bundle)
-    assert 0.001 < figures["median"] < figures["p95"] < figures["worst"]
-    assert 0.5 < figures["supported"] < 1 and figures["axis"] == "x"
-    shown = f"{figures['median']:.4f} mm", f"{figures['p95']:.4f} mm", f"{figures['worst']:.3f} mm"
-    assert missing_facts(model.text(), *shown) == []
+    assert 0.001 < figures.median < figures.p95 < figures.worst
+    assert 0.5 < figures.supported < 1 and figures.axis == "x"
+    shown = f"{figures.median:.4f}", f"{figures.p95:.4f} mm", f"{figures.worst:.3f} mm"
+    assert missing_facts(render_text(model.describe().table()), *shown) == []
 
 
 def test_a_smooth_field_goes_on_farther_than_independent_differences_do() -> None:

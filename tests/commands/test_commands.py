@@ -32,21 +32,21 @@ def calibrated(recorded: Path) -> dict:
 
 
 def test_calibrate_reports_what_its_contract_says(calibrated: dict) -> None:
-    stereo = calibrated["models"]["stereo"]
-    assert set(stereo) >= {
-        "reprojection_rms_px",
-        "K_camera",
-        "D_camera",
-        "K_projector",
-        "D_projector",
-        "R",
-        "T",
+    models = calibrated["calibration"]
+    fit, rig = models["stereo"]["fit"], models["stereo"]["model"]["rig"]
+    assert 0.01 < fit["reprojection_rms_px"]["stereo"] < 0.3
+    assert np.linalg.norm(rig["t"]) == pytest.approx(180, abs=1.5) == fit["baseline_mm"]
+    K = rig["projector"]["K"]
+    assert K[1][1] / K[0][0] == pytest.approx(2, abs=0.02)
+    assert set(models["pixelwise"]["fit"]["axes"]["x"]) == {
+        "fitted",
+        "poses",
+        "z_mm",
+        "x_mm",
+        "y_mm",
     }
-    assert 0.01 < stereo["reprojection_rms_px"]["stereo"] < 0.3
-    assert np.linalg.norm(stereo["T"]) == pytest.approx(180, abs=1.5)
-    assert stereo["K_projector"][1][1] / stereo["K_projector"][0][0] == pytest.approx(2, abs=0.02)
-    assert set(calibrated["models"]["pixelwise"]["fit_rms_mm"]) == {"z", "x", "y"}
-    assert len(calibrated["poses_used"]) == 8 and calibrated["poses_left_out"] == {}
+    assert models["splined"]["fit"]["noise_px"]["camera"] < 0.03
+    assert len(fit["poses"]) == 8 and fit["excluded"] == {}
 
 
 def test_verify_a_plane_inside_and_a_sphere(
@@ -231,16 +231,19 @@ def test_calibrate_names_an_excluded_pose_and_does_not_use_it(
 def test_a_calibration_made_elsewhere_reconstructs_the_same(
     calibrated: dict, session: Path, run: Run, tmp_path: Path
 ) -> None:
-    stereo = calibrated["models"]["stereo"]
-    names = ["K_camera", "D_camera", "K_projector", "D_projector", "R", "T"]
+    rig = calibrated["calibration"]["stereo"]["model"]["rig"]
+    lenses = {
+        f"my_{key}_{device}": rig[device][key] for device in ("camera", "projector") for key in "KD"
+    }
+    matrices = {**lenses, "my_R": rig["R"], "my_T": rig["t"]}
     write_calibration(
-        tmp_path / "rig.yml", {f"my_{name}": np.array(stereo[name]) for name in names}
+        tmp_path / "rig.yml", {name: np.array(values) for name, values in matrices.items()}
     )
     frames = Session.open(session).load_capture("object_r2").frames
     with Session.create(tmp_path / "other") as other:
         sequence = Session.open(session).load_capture("object_r2").sequence
         other.save_capture("part", "scan", sequence, frames, source="test")
-    keys = [f"my_{name}" for name in names]
+    keys = list(matrices)
     status, _, error = run(
         "import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *keys
     )
@@ -255,7 +258,12 @@ def test_a_calibration_made_elsewhere_reconstructs_the_same(
     difference = np.abs(np.load(tmp_path / "other.npy") - np.load(tmp_path / "own.npy"))
     assert np.nanmax(difference) < 1e-3 and np.isfinite(difference[..., 2]).sum() > 10_000
     status, _, error = run(
-        "import", "opencv-calibration", tmp_path / "rig.yml", tmp_path / "other", "--keys", *names
+        "import",
+        "opencv-calibration",
+        tmp_path / "rig.yml",
+        tmp_path / "other",
+        "--keys",
+        *(key.removeprefix("my_") for key in keys),
     )
     assert status == 1 and "my_K_camera" in error
 

@@ -12,8 +12,6 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.evaluation.crossvalidation import (
     LEAST_POSES,
-    CrossValidation,
-    HeldOutPose,
     gather_results,
     measure_held_out,
     split_folds,
@@ -22,7 +20,10 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.rig import StereoRig
-from slviewer.records.plain import from_plain
+from slviewer.pipeline.stored_records import read_record
+from slviewer.records.model_comparison import HeldOutPose, ModelComparison
+from slviewer.records.plain import to_plain
+from slviewer.records.table import render_text
 from slviewer.target.board import Board
 
 SIZE, PERIOD = (200, 150), 18.0
@@ -161,11 +162,13 @@ def test_it_survives_saving_and_says_what_failed() -> None:
     found = gather_results(
         ("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"}
     )
-    assert found.rms("stereo", "board_mm") == pytest.approx(np.sqrt(0.1))
+    assert found.models["stereo"].board_mm == pytest.approx(np.sqrt(0.1))
     assert found.recommended == "stereo"
+    (table,) = ModelComparison.tables({"1": found})
     assert (
-        missing_facts(found.text(), found.recommended, "pixelwise", found.failed["pixelwise"]) == []
+        missing_facts(render_text(table), found.recommended, "pixelwise", found.failed["pixelwise"])
+        == []
     )
-    assert from_plain(json.loads(json.dumps(found.to_json())), CrossValidation) == found
+    assert read_record(ModelComparison, json.loads(json.dumps(to_plain(found)))) == found
     with raises(InputError, "stereo", "why"):
         gather_results(("stereo",), [], (), {"stereo": "why"})

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import get_args
 
 from slviewer import wizard
-from slviewer.calibration.diagnosis.verdict import CAUSES, Finding, Verdict
 from slviewer.fringe.phase import Reason as PixelReason
 from slviewer.fringe.suspect import Fault
 from slviewer.gui.calibration_html import verdict_html
@@ -15,6 +14,7 @@ from slviewer.gui.help_links import FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link
 from slviewer.gui.merge_html import merge_failure_html
 from slviewer.gui.rig_check import checks_table
 from slviewer.pipeline.check_results import CHECK_NAMES, Check, Preflight
+from slviewer.records.verdict import CAUSES, Finding, Verdict
 from slviewer.registration.refusal import Reason as Refusal
 from slviewer.server.help_pages import HelpPages, docs_folder
 from slviewer.wizard.steps import STEPS

@@ -30,20 +30,20 @@ from wizard_page import (
     wait_until_still,
 )
 
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
-from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
+from slviewer.evaluation.crossvalidation import gather_results
 from slviewer.gui.app import App
 from slviewer.gui.calibration_html import named_poses, verdict_html
 from slviewer.gui.inputs import display_name
 from slviewer.gui.pictures import Painter
 from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import shape_of
-from slviewer.gui.widgets import colour_range, records_html, report_table
+from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.stored_records import Stored
+from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
-from slviewer.report.quality import comparison_table
 from slviewer.server.secure import Serving
 from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
@@ -128,16 +128,16 @@ def test_models_are_compared_on_request_and_comparison_can_be_cancelled(
     expect(page.get_by_text("pixelwise is recommended").first).to_be_visible()
     session = engine.snapshot().session
     assert session is not None and session.calibration is not None
-    compared = session.calibration.comparison
-    assert compared is not None and len(compared.poses["stereo"]) == 8 and not compared.failed
-    rms = {model: compared.rms(model, "plane_mm") for model in compared.models}
-    assert 0.01 < rms["pixelwise"] < rms["stereo"] < 1
+    (found,) = session.list_records(ModelComparison)
+    compared = found.record
+    assert not found.stale and len(compared.poses["stereo"]) == 8 and not compared.failed
+    assert 0.01 < compared.models["pixelwise"].plane_mm < compared.models["stereo"].plane_mm < 1
 
     again.click()
     button(page, "Cancel").click()
     expect(page.get_by_text("Comparing the models: cancelled").first).to_be_visible()
     expect(again).to_be_enabled()
-    assert engine.wait_until_idle(PATIENCE_S).calibration.comparison == compared  # type: ignore[union-attr]
+    assert engine.wait_until_idle(PATIENCE_S).session.list_records(ModelComparison) == [found]  # type: ignore[union-attr]
     assert errors == []
 
 
@@ -463,12 +463,16 @@ def test_no_label_is_cut_beside_results(measured: tuple[Page, Operator, list[str
 
 
 def test_comparison_and_verdict_as_html() -> None:
-    poses = {
-        m: {"pose_1": HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)}
-        for m, p in (("stereo", 0.2), ("splined", 0.02))
+    measured = {
+        "pose_1": {
+            m: HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)
+            for m, p in (("stereo", 0.2), ("splined", 0.02))
+        }
     }
-    compared = CrossValidation(poses, (("pose_1",),), {"pixelwise": "too <few> poses"})
-    html = report_table(comparison_table(compared, "splined"))
+    compared = gather_results(
+        ("stereo", "splined"), [measured], (("pose_1",),), {"pixelwise": "too <few> poses"}
+    )
+    html = records_html([Stored("1", "1", compared)])
     assert (
         re.search(r"font-weight:600\">0&#46;020", html)
         and "<few>" not in html

@@ -11,12 +11,18 @@ import pytest
 from copies import copy_session
 from facts import missing_facts
 
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.observe import Smoothing
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.calibration_verdict import load_last_verdict, save_rejected
-from slviewer.pipeline.models import available_models, load_stereo, rejection_reason
+from slviewer.pipeline.calibration_verdict import load_last_verdict, save_verdict
+from slviewer.pipeline.models import (
+    available_models,
+    load_stereo,
+    rejection_reason,
+    save_model,
+    trash_models,
+)
 from slviewer.pipeline.poses import load_judged
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.validation.faulty_captures import BOARD, FaultBench
@@ -74,12 +80,14 @@ def test_a_verdict_is_told_and_kept(session: Path, tmp_path: Path, run: Run) -> 
         "calibrate", session, "--target", BOARD, "--models", "stereo", "--json", out
     )
     assert status == 0 and not missing_facts(text, "good")
-    assert json.loads(out.read_text())["verdict"] == {"level": "good", "findings": []}
+    assert json.loads(out.read_text())["calibration"]["stereo"]["verdict"] == {
+        "level": "good",
+        "findings": [],
+    }
     assert not missing_facts(run("inspect", session)[1], "verdict", "good")
     with Session.open(session) as store:
         assert (
-            store.state_of("calibration/verdict") == "fresh"
-            and store.state_of("evidence/pose_01") == "fresh"
+            store.state_of("verdict/1") == "fresh" and store.state_of("evidence/pose_01") == "fresh"
         )
         assert rejection_reason(store) == ""
 
@@ -90,7 +98,11 @@ def test_a_rejected_calibration_is_refused_by_every_command(
     finding = Finding("fringe-period", "rejected", "the period differs", "set period_px = 16")
     with Session.open(session, write=True) as store:
         stereo = load_stereo(store)
-        save_rejected(store, stereo, {}, Verdict((finding,)), tuple(stereo.poses))
+        verdict = Verdict((finding,))
+        with store.together():
+            trash_models(store, available_models(store))
+            save_model(store, stereo, verdict, store.input_hashes(*stereo.poses))
+            save_verdict(store, verdict, tuple(stereo.poses))
         verdict = load_last_verdict(store)
         assert (
             verdict is not None

@@ -22,7 +22,7 @@ from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.compare import compare
 from slviewer.pipeline.export import export, formats
 from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.models import save_fitted, save_stereo
+from slviewer.pipeline.models import save_model
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.ply import read_ply, write_ply
@@ -100,8 +100,8 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
             depths,
             {"camera": 1.0},
         )
-        save_stereo(store, stereo, {}, {})
-        save_fitted(store, pixelwise(), {}, {})
+        save_model(store, stereo)
+        save_model(store, pixelwise())
         points = seen()
         z = points[..., 2]
         sigma = np.where(np.isfinite(z), np.float32(0.02), np.nan).astype(np.float32)

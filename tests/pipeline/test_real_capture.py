@@ -45,14 +45,16 @@ def kamino(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("board", ["9x7", "7x9"])
 def test_it_calibrates_as_well_as_plain_opencv(kamino: Path, board: str) -> None:
     found = json.loads((kamino.parent / f"{board}.json").read_text())
-    rms = found["models"]["stereo"]["reprojection_rms_px"]
+    rms = found["calibration"]["stereo"]["fit"]["reprojection_rms_px"]
     assert (
         0.05 < rms["camera"] <= 0.40
         and 0.05 < rms["projector"] <= 0.30
         and 0.05 < rms["stereo"] <= 0.35
     )
-    assert found["models"]["stereo"]["K_projector"][0][0] == pytest.approx(1890, abs=25)
-    assert len(found["poses_used"]) == 5
+    assert found["calibration"]["stereo"]["model"]["rig"]["projector"]["K"][0][0] == pytest.approx(
+        1890, abs=25
+    )
+    assert len(found["calibration"]["stereo"]["fit"]["poses"]) == 5
 
 
 @pytest.mark.slow

@@ -6,14 +6,19 @@ from pathlib import Path
 
 import pytest
 
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError
+from slviewer.pipeline.calibrate import CalibrateSettings
 from slviewer.pipeline.stored_records import Stored, load_record, name_records
+from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.drift import Drift
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
+from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.placement import Placement
 from slviewer.records.plain import to_plain
 from slviewer.records.reconstruction import Reconstruction
+from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, centre_distances_mm
 from slviewer.session.store import Session
 
@@ -99,13 +104,35 @@ def test_places_and_drift_checks_keep_their_figures(session: Session) -> None:
     assert all(plain[key] == value for key, value in kept.items() if key != "calibration")
 
 
+def test_a_comparison_of_models_keeps_its_figures_under_another_name(session: Session) -> None:
+    old, found = as_stored("calibration/validation"), load_record(session, ModelComparison, "1")
+    kept = old["validation"]
+    assert isinstance(kept, dict) and found.inputs == old["inputs"]
+    assert found.settings == {"models": ["stereo", "pixelwise", "splined"], "folds": 5}
+    plain = json.loads(json.dumps(to_plain(found)))
+    assert all(plain[key] == value for key, value in kept.items())
+
+
+def test_a_stereo_calibration_keeps_its_figures_and_can_be_repeated(session: Session) -> None:
+    old, found = as_stored("calibration/stereo"), load_record(session, ModelCalibration, "stereo")
+    model, fit = old["model"], found.fit
+    assert isinstance(model, dict) and isinstance(fit, StereoFit) and found.verdict == Verdict()
+    assert fit == StereoModel.from_dict(model).describe() and found.inputs == old["inputs"]
+    assert fit.reprojection_rms_px == model["reprojection_rms_px"] and list(fit.poses) == list(
+        model["poses"]
+    )
+    assert CalibrateSettings(**found.settings) == CalibrateSettings(
+        "circles:21x16:9", ["stereo", "pixelwise", "splined"]
+    )
+
+
 def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None:
     for result in session.result_names():
         kind, _, name = result.partition("/")
         record = load_record(session, RECORDS[kind], name)
         table, *_ = RECORDS[kind].tables({name: record})
         assert record.summary() and table.rows and table.columns[0].title
-        assert record.figures() or kind == "placement"
+        assert record.figures() or kind in ("placement", "validation")
 
 
 def test_records_of_one_label_are_all_named(session: Session) -> None:

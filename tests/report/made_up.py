@@ -340,7 +340,7 @@ def session_data(width: int = 1600) -> SessionData:
         name="Vase <script>alert(1)</script>",
         captures=captures,
         calibration=CalibrationFigures(stereo, residuals),
-        pixel_fits=[PixelFitView("x", rms_maps(width), np.full((height, width), 17, np.uint16))],
+        pixel_fits=[PixelFitView("x", rms_maps(width))],
         records=[RecordsView(Verification, planes, maps)],
         warnings=[
             "the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"

@@ -10,13 +10,15 @@ import pytest
 from facts import missing_facts
 from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
 
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.crossvalidation import CrossValidation, HeldOutPose
+from slviewer.evaluation.crossvalidation import gather_results
 from slviewer.pipeline.stored_records import read_record
 from slviewer.records.acceptance import AcceptanceTest
+from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
 from slviewer.records.drift import Drift
+from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.table import Cell, Table
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.data import CalibrationFigures, ModelsView, PlaneRow, RecordsView, SpacingRow
 from slviewer.report.page import Figure, PageNotice, Section, write_page
@@ -272,22 +274,21 @@ def test_how_good_a_calibration_is() -> None:
         ]
     )
     held = {"stereo": 0.2, "splined": 0.02}
-    compared = CrossValidation(
-        {
-            m: {"pose_01": HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0)}
-            for m, mm in held.items()
-        },
-        (("pose_01",),),
-        {},
-    )
-    splined = {
-        "noise_px": {"camera": 0.01, "x": 0.011, "y": 0.012},
-        "local_distortion_rms_px": {"camera": 0.1, "projector": 0.12},
-        "board_height_mm": [-0.02, 0.08],
-        "board_offsets_rms_mm": 0.01,
-        "cells_lit": {"camera": 0.98, "projector": 0.6},
-        "left_out": {"pose_09": "contradicts the other poses"},
+    measured = {
+        "pose_01": {m: HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0) for m, mm in held.items()}
     }
+    compared = gather_results(tuple(held), [measured], (("pose_01",),), {})
+    splined = SplinedFit(
+        steps=6,
+        residuals_over_noise={"x": 1.0, "y": 1.1},
+        noise_px={"camera": 0.01, "x": 0.011, "y": 0.012},
+        local_distortion_rms_px={"camera": 0.1, "projector": 0.12},
+        board_height_mm=(-0.02, 0.08),
+        board_offsets_rms_mm=0.01,
+        cells_lit={"camera": 0.98, "projector": 0.6},
+        sigma_volume_mm=VolumeSigma(0.01, 0.03, 0.7, (399.0, 0.0, 794.0), 0.9, (426.0, 794.0), "x"),
+        left_out={"pose_09": "contradicts the other poses"},
+    )
     sides = {"within_95_mm": (-0.034, -0.026), "within_997_mm": (-0.036, -0.024)}
     figure = {
         "property": "sphere spacing",
@@ -360,15 +361,15 @@ def test_how_good_a_calibration_is() -> None:
     data = dataclasses.replace(
         session_data(WIDTH),
         verdict=verdict,
-        models=ModelsView(
-            "stereo", "splined", compared, splined, {"splined": "scale corrected by +300 ppm"}
-        ),
+        models=ModelsView("stereo", "splined", {"splined": "scale corrected by +300 ppm"}),
         records=[
             RecordsView(
                 AcceptanceTest,
                 {"1": read_record(AcceptanceTest, {"accepted": found, "time": "2026-11-21"})},
             ),
+            RecordsView(ModelCalibration, {"splined": ModelCalibration(fit=splined)}),
             RecordsView(Drift, {"1": drift}),
+            RecordsView(ModelComparison, {"1": compared}),
             RecordsView(Verification, balls),
         ],
     )

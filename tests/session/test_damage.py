@@ -10,7 +10,7 @@ from facts import missing_facts, raises
 
 from slviewer.errors import CalibrationRejected, DamagedError, InputError, SessionError
 from slviewer.pipeline import poses
-from slviewer.pipeline.calibrate import calibrate
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.frame_check import load_or_save_check
 from slviewer.pipeline.inspect import inspect
 from slviewer.session.store import Session
@@ -193,7 +193,7 @@ def test_a_calibration_names_what_it_does_not_use(untidy):
     warnings = []
     untidy.close()
     with pytest.raises((CalibrationRejected, InputError)):
-        calibrate(untidy.folder, "circles:7x5:20", warn=warnings.append)
+        calibrate.run(untidy.folder, CalibrateSettings("circles:7x5:20"), warn=warnings.append)
     assert any(missing_facts(warning, "captures/pose_2/capture.json") == [] for warning in warnings)
 
 

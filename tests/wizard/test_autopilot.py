@@ -19,6 +19,7 @@ from small_fields import fit_few_cells
 from wizard_events import HANG_S, SPARING, list_texts
 
 from slviewer.errors import Cancelled
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.merge import MergeSettings, merge
 from slviewer.pipeline.operation import Operation
 from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct
@@ -26,7 +27,7 @@ from slviewer.pipeline.verify import VerifySettings, verify
 from slviewer.records.verification import Verification
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
-from slviewer.wizard import result_views, tasks
+from slviewer.wizard import result_views
 from slviewer.wizard.autopilot import TARGET, Autopilot
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.operator import Operator
@@ -109,9 +110,9 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
         session.verdict is not None and session.verdict_of_calibration and not calibration.refused
     )
     splined = calibration.splined
-    assert splined is not None and splined.summary["noise_px"]["x"] < 0.03
-    assert splined.summary["cells_lit"]["camera"] > 0.8
-    assert set(splined.weights) == set(calibration.stereo.poses) and not splined.summary["left_out"]
+    assert splined is not None and splined.noise_px["x"] < 0.03
+    assert splined.cells_lit["camera"] > 0.8
+    assert set(splined.weights) == set(calibration.stereo.poses) and not splined.left_out
     found = {each.name: each.record.models for each in session.list_records(Verification)}
     plane, sphere = found["plane_01"], found["sphere_01"]
     assert plane["splined"].rms_mm < plane["pixelwise"].rms_mm < plane["stereo"].rms_mm < 0.5  # type: ignore[operator]
@@ -187,12 +188,12 @@ def run_guarded(
     [
         pytest.param(
             "calibrate.calibrate_pixelwise",
-            lambda store, r: tasks.calibrate_session(store, TARGET, r, print),
+            run_guarded(calibrate, CalibrateSettings(TARGET)),
             marks=pytest.mark.slow,
         ),
         pytest.param(
             "poses.observe",
-            lambda store, r: tasks.calibrate_session(store, TARGET, r, print),
+            run_guarded(calibrate, CalibrateSettings(TARGET)),
             marks=pytest.mark.slow,
         ),
         (

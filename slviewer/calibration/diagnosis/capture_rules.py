@@ -17,11 +17,11 @@ from slviewer.calibration.diagnosis.poses import (
     rate_severity,
     was_refused,
 )
-from slviewer.calibration.diagnosis.verdict import CAUSES, Cause, Finding, Severity
 from slviewer.calibration.observe import AXES
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import unit_vectors
+from slviewer.records.verdict import CAUSES, Cause, Finding, Severity
 
 MAX_SATURATED = 0.12
 REJECTED_SATURATED = 0.3

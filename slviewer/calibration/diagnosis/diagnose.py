@@ -12,11 +12,11 @@ from slviewer.calibration.diagnosis.numbering import describe_misnumbering, reco
 from slviewer.calibration.diagnosis.poses import motion_limit_px, reason_to_exclude
 from slviewer.calibration.diagnosis.rules import judge_evidence
 from slviewer.calibration.diagnosis.solution import measure_solution
-from slviewer.calibration.diagnosis.verdict import Verdict
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.soundness import MIN_POSES, nominal_tilt_spread_deg
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected
+from slviewer.records.verdict import Verdict
 from slviewer.target.board import Board
 
 

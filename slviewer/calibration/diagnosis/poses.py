@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence, ExcludedPose, PoseEvidence
-from slviewer.calibration.diagnosis.verdict import Cause, Finding, Severity
 from slviewer.fringe.suspect import LIGHT_FAULTS
+from slviewer.records.verdict import Cause, Finding, Severity
 
 COMMON_SHARE = 0.5
 """Least share of the poses with which a fault counts as common to all."""

@@ -20,9 +20,9 @@ from slviewer.calibration.diagnosis.capture_rules import (
 )
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.poses import FEW_POSES, diagnose_single_poses
-from slviewer.calibration.diagnosis.verdict import Finding, Verdict
 from slviewer.calibration.soundness import MIN_POSES, MIN_TILT_SPREAD_DEG
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
+from slviewer.records.verdict import Finding, Verdict
 
 MIN_TILT_DEG = 12.0
 MAX_FOCAL_UNCERTAINTY = 0.02

@@ -32,6 +32,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import check_map
 from slviewer.geometry.vectors import rms
+from slviewer.records.calibration import SplinedFit, VolumeSigma
 
 NEAR, FAR = 0.7, 1.4
 """Of the nearest and the farthest calibrated depth: between them points are measured."""
@@ -218,14 +219,14 @@ class SplinedModel:
         )
 
     @cached_property
-    def sigma_volume(self) -> dict[str, Any]:
+    def sigma_volume(self) -> VolumeSigma:
         """Uncertainty of the working volume, as ``uncertainty.summarise_volume_sigma`` returns
         it."""
         return summarise_volume_sigma(self.bundle)
 
-    def summary(self) -> dict[str, Any]:
-        """Return the figures of ``text`` as plain values for JSON."""
-        bundle = self.bundle
+    def describe(self) -> SplinedFit:
+        """Return the figures of the adjustment."""
+        bundle, noise = self.bundle, self.bundle.noise
         fields = {
             device: rms(part.coefficients[:, 1:-1, 1:-1])
             for device, part in (
@@ -234,69 +235,21 @@ class SplinedModel:
             )
         }
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
-        return {
-            "steps": bundle.steps,
-            "residuals_over_noise": {"x": bundle.noise.ratio[0], "y": bundle.noise.ratio[1]},
-            "noise_px": {
-                "camera": bundle.noise.camera_px,
-                "x": bundle.noise.sample_px[0],
-                "y": bundle.noise.sample_px[1],
+        illuminated = {"camera": bundle.camera_poses > 0, "projector": bundle.projector_poses > 0}
+        return SplinedFit(
+            steps=bundle.steps,
+            residuals_over_noise=dict(zip(AXES, noise.ratio, strict=True)),
+            noise_px={"camera": noise.camera_px, **dict(zip(AXES, noise.sample_px, strict=True))},
+            local_distortion_rms_px=fields,
+            board_height_mm=(float(height.min()), float(height.max())),
+            board_offsets_rms_mm=rms(bundle.state.offsets),
+            cells_lit={device: float(np.mean(cells)) for device, cells in illuminated.items()},
+            sigma_volume_mm=self.sigma_volume,
+            weights={
+                name: (fit.camera_trust, fit.projector_trust) for name, fit in bundle.fits.items()
             },
-            "local_distortion_rms_px": fields,
-            "board_height_mm": [float(height.min()), float(height.max())],
-            "board_offsets_rms_mm": rms(bundle.state.offsets),
-            "cells_lit": {
-                "camera": float(np.mean(bundle.camera_poses > 0)),
-                "projector": float(np.mean(bundle.projector_poses > 0)),
-            },
-            "sigma_volume_mm": self.sigma_volume,
-            "left_out": dict(bundle.excluded),
-            "turned": list(bundle.half_turned_poses),
-        }
-
-    def text(self) -> str:
-        """Return a report of several lines for the terminal."""
-        bundle, s = self.bundle, self.summary()
-        noise, local, illuminated = s["noise_px"], s["local_distortion_rms_px"], s["cells_lit"]
-        low, high = s["board_height_mm"]
-        sigma = s["sigma_volume_mm"]
-        half_turned = bundle.half_turned_poses
-        near, far = sigma["depths_mm"]
-        u, v, z = sigma["worst_at"]
-        return "\n".join(
-            [
-                (
-                    f"splined: residuals camera {noise['camera']:.4f} px, projector x"
-                    f" {noise['x']:.4f}, y {noise['y']:.4f} px (robust;"
-                    f" {max(bundle.noise.ratio):.1f} times the predicted noise), after {s['steps']}"
-                    " steps"
-                ),
-                (
-                    f"  local distortion {local['camera']:.3f} px RMS in the camera, "
-                    f"{local['projector']:.3f} px in the projector"
-                ),
-                (
-                    f"  board: height {low:+.4f} ... {high:+.4f} mm, features misplaced by "
-                    f"{s['board_offsets_rms_mm']:.4f} mm RMS"
-                ),
-                *(
-                    [
-                        f"  board turned by 180 degrees in {', '.join(half_turned)}: numbered as in"
-                        " the others"
-                    ]
-                    * bool(half_turned)
-                ),
-                (
-                    f"  illuminated by target poses: {100 * illuminated['camera']:.0f} % of the"
-                    f" camera's cells, {100 * illuminated['projector']:.0f} % of the projector's"
-                ),
-                (
-                    f"  3D uncertainty at {near:.0f}-{far:.0f} mm, rigid motion apart (1 sigma):"
-                    f" median {sigma['median']:.4f} mm and 95 % below {sigma['p95']:.4f} mm over"
-                    f" the {100 * sigma['supported']:.0f} % that the poses support; worst"
-                    f" {sigma['worst']:.3f} mm, at pixel ({u:.0f}, {v:.0f}) and {z:.0f} mm"
-                ),
-            ]
+            left_out=dict(bundle.excluded),
+            turned=tuple(bundle.half_turned_poses),
         )
 
     def to_dict(self) -> dict[str, Any]:

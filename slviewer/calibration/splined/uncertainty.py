@@ -10,7 +10,6 @@ prediction by a factor estimated from the fields' supported part: ``persistence_
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import prange
@@ -32,6 +31,7 @@ from slviewer.calibration.splined.volume import (
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
+from slviewer.records.calibration import VolumeSigma
 
 NODES = (21, 16, 11)
 """Nodes of the map across, down, and in depth: interpolation errors stay below 10 to 20 %, and a
@@ -158,30 +158,26 @@ def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
     return max(1.0, float(np.sqrt(together / max(each, 1e-300))))
 
 
-def summarise_volume_sigma(bundle: Bundle) -> dict[str, Any]:
-    """Summarise the 3D uncertainty of the working volume's points.
-
-    ``median``, ``p95`` mm over the points that target poses support; ``worst`` mm of all, and
-    ``worst_at`` (u, v, z); ``supported``: share of supported points in the common view of camera
-    and projector; ``depths_mm``; ``axis``: the projector axis of the measurement.
-    """
+def summarise_volume_sigma(bundle: Bundle) -> VolumeSigma:
+    """Summarise the 3D uncertainty of the working volume's points."""
     rig = bundle.state.rig
     volume = working_volume(rig, bundle.depth_range_mm)
     axis = select_depth_axis(rig, volume)
     fitted = _select_fitted(bundle, volume)
     sigma = volume_sigmas(bundle, axis, volume)
     worst = int(np.argmax(sigma))
-    return {
-        "median": float(np.median(sigma[fitted])),
-        "p95": float(np.percentile(sigma[fitted], 95)),
-        "worst": float(sigma[worst]),
-        "worst_at": [*volume.pixels[worst].tolist(), float(volume.z[worst])],
-        "supported": float(
+    u, v = map(float, volume.pixels[worst])
+    return VolumeSigma(
+        median=float(np.median(sigma[fitted])),
+        p95=float(np.percentile(sigma[fitted], 95)),
+        worst=float(sigma[worst]),
+        worst_at=(u, v, float(volume.z[worst])),
+        supported=float(
             np.mean(volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0))
         ),
-        "depths_mm": [float(volume.z.min()), float(volume.z.max())],
-        "axis": axis,
-    }
+        depths_mm=(float(volume.z.min()), float(volume.z.max())),
+        axis=axis,
+    )
 
 
 def _select_fitted(bundle: Bundle, volume: Volume) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Step 4: calibrate the models from the good poses, and inspect the residuals of poses and
 pixels."""
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -11,7 +12,6 @@ from slviewer.gui.calibration_html import (
     exclusions_html,
     model_choice_html,
     named_poses,
-    splined_html,
     verdict_html,
 )
 from slviewer.gui.inputs import Choice, SessionValue, change, scan_options
@@ -23,16 +23,18 @@ from slviewer.gui.widgets import (
     coloured,
     paint,
     paragraph,
+    records_html,
     report_table,
     table,
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.model_comparison import ModelComparison
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures, PixelCurve
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure
-from slviewer.report.quality import comparison_table
 from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import lens_rows, rig_rows
 from slviewer.target.board import Board
@@ -121,10 +123,12 @@ class CalibratePanel(StepPanel):
                 label=label,
             )
             self._draw_verdict(session, calibration)
-            self._draw_models(calibration, busy)
+            self._draw_models(
+                session.list_records(ModelComparison) if session else [], calibration, busy
+            )
             change(self._poses_folder, visible=bool(calibration and calibration.stereo.poses))
             change(self._parameters_folder, visible=calibration is not None)
-            change(self._pixels_folder, visible=bool(calibration and calibration.fit_rms_mm))
+            change(self._pixels_folder, visible=bool(calibration and calibration.pixelwise))
             self._summary.set(_summary(calibration) if calibration else "")
             if session is None or calibration is None:
                 return
@@ -132,10 +136,16 @@ class CalibratePanel(StepPanel):
                 pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")
             ]
             self._pose.offer([(name, name) for name in names], worst(calibration))
-            self._axis.offer([(axis, axis) for axis in calibration.fit_rms_mm])
+            self._axis.offer(
+                [(axis, axis) for axis in calibration.pixelwise.axes]
+                if calibration.pixelwise
+                else []
+            )
             clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
             self._over.offer([("", "none"), *clouds])
-            self._fits.set(_fits(calibration))
+            self._fits.set(
+                report_table(calibration.pixelwise.table()) if calibration.pixelwise else ""
+            )
             if not self._pixel_chosen:
                 self._pixel_chosen = True
                 u, v = np.round(calibration.stereo.rig.camera.K[:2, 2]).astype(int)
@@ -165,7 +175,12 @@ class CalibratePanel(StepPanel):
         change(self._named, visible=bool(names))
         self._exclusions.set(exclusions_html(calibration) if calibration else "")
 
-    def _draw_models(self, calibration: CalibrationView | None, busy: bool) -> None:
+    def _draw_models(
+        self,
+        found: Sequence[Stored[ModelComparison]],
+        calibration: CalibrationView | None,
+        busy: bool,
+    ) -> None:
         """Show the choice and the comparison of the models, where there are several."""
         several = (
             calibration is not None
@@ -175,7 +190,8 @@ class CalibratePanel(StepPanel):
         change(self._models_folder, visible=several)
         if calibration is None or not several:
             return
-        self._choice_note.set(model_choice_html(calibration))
+        compared = next((each.record for each in found if not each.stale), None)
+        self._choice_note.set(model_choice_html(calibration, compared))
         options = [("", f"{calibration.recommended} (recommended)")]
         self._use.offer(
             options + [(model, model) for model in calibration.models], calibration.chosen
@@ -183,14 +199,11 @@ class CalibratePanel(StepPanel):
         if calibration.chosen != self._chosen:
             self._chosen = calibration.chosen
             self._use.choose(calibration.chosen)
-        compared = calibration.comparison
         label = "Compare models" if compared is None else "Compare again"
         change(self._compare, disabled=busy or bool(calibration.stale), label=label)
-        self._comparison.set(
-            "" if compared is None else report_table(comparison_table(compared, calibration.best))
-        )
+        self._comparison.set(records_html(found))
         if calibration.splined is not None:
-            self._splined.set(splined_html(calibration.splined))
+            self._splined.set(report_table(calibration.splined.table()))
         else:
             self._splined.write(
                 f"No splined model: {calibration.missing}." if calibration.missing else "", "dim"
@@ -231,7 +244,7 @@ class CalibratePanel(StepPanel):
                 self._parameters.set,
             )
             axis = cast(Axis, self._axis.value)
-            if axis not in calibration.fit_rms_mm:
+            if calibration.pixelwise is None or axis not in calibration.pixelwise.axes:
                 return
             self._painter.request(
                 "maps",
@@ -468,15 +481,6 @@ def _summary(calibration: CalibrationView) -> Html:
     rows.append(("Model in use", "none: rejected" if calibration.refused else calibration.best))
     rows += [(model, words) for model, words in calibration.scales.items()]
     return table(("Calibration", ""), rows)
-
-
-def _fits(calibration: CalibrationView) -> Html:
-    """Return a table of the pixel-wise fits: median RMS in mm by axis."""
-    rows = [
-        (f"Axis {axis}", *(f"{medians[name]:.3f}" for name in "zxy"))
-        for axis, medians in calibration.fit_rms_mm.items()
-    ]
-    return table(("Median RMS of the fits", "z, mm", "x, mm", "y, mm"), rows)
 
 
 def _parameters(details: CalibrationFigures) -> Html:

@@ -1,0 +1,316 @@
+"""How well calibrations fit the target poses that they were made from."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import dist
+from typing import Any, ClassVar
+
+import msgspec
+
+from slviewer.records.record import Count, Record, Share
+from slviewer.records.table import Column, Table, Value
+from slviewer.records.verdict import Verdict
+
+MIN_WEIGHT = 0.7
+"""Undisturbed poses have weights of 0.8 or more in the joint adjustment; those below this are
+listed."""
+
+
+class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
+    """The ``poses`` used, and why others are ``excluded``; RMS residuals of "camera", "projector"
+    and "stereo", both together; focal lengths in x and y with their standard deviations, by device;
+    the nearest and the farthest board.
+    """
+
+    poses: tuple[str, ...]
+    excluded: dict[str, str]
+    reprojection_rms_px: dict[str, float]
+    focal_px: dict[str, tuple[float, float]]
+    focal_sigma_px: dict[str, float]
+    baseline_mm: float
+    depth_range_mm: tuple[float, float] | None = None
+    features_excluded: Count = 0
+
+    def summary(self) -> str:
+        """Return the number of poses and the reprojection error in one sentence."""
+        if not self.poses:
+            return f"made elsewhere, baseline {self.baseline_mm:.2f} mm"
+        rms = self.reprojection_rms_px.get("stereo", float("nan"))
+        return f"calibrated from {len(self.poses)} poses: reprojection RMS {rms:.3f} px"
+
+    def figures(self) -> dict[str, float]:
+        """Return the reprojection errors and the baseline."""
+        errors = {
+            f"reprojection RMS {device}, px": rms
+            for device, rms in self.reprojection_rms_px.items()
+        }
+        return {**errors, "baseline, mm": self.baseline_mm}
+
+    def table(self) -> Table:
+        """Return the figures of both devices, and notes on poses and features."""
+        devices = ("camera", "projector")
+        columns = [Column("quantity", align="left"), *map(Column, devices), Column("both")]
+        rms, focal = (
+            self.reprojection_rms_px,
+            [self.focal_px.get(device, (None, None)) for device in devices],
+        )
+        rows: list[list[Value]] = [
+            ["reprojection RMS, px", *map(rms.get, devices), rms.get("stereo")],
+            ["focal length x, px", *(x for x, _ in focal), None],
+            ["focal length y, px", *(y for _, y in focal), None],
+            [
+                "standard deviation of the focal length, px",
+                *map(self.focal_sigma_px.get, devices),
+                None,
+            ],
+            ["baseline, mm", None, None, self.baseline_mm],
+        ]
+        near, far = self.depth_range_mm or (float("nan"), float("nan"))
+        used, total = len(self.poses), len(self.poses) + len(self.excluded)
+        notes = (
+            [f"{used} of {total} poses used, boards at {near:.0f} to {far:.0f} mm."]
+            if used
+            else ["Made elsewhere."]
+        )
+        notes += [f"Excluded: {name}: {why}." for name, why in self.excluded.items()]
+        if self.features_excluded:
+            notes.append(f"{self.features_excluded} features excluded beyond 6 robust sigma.")
+        return Table(columns, rows, "Stereo", notes)
+
+
+class AxisFit(msgspec.Struct, frozen=True):
+    """The pixels' fits to the phases of one axis: the share that are ``fitted``, and medians over
+    these: of the ``poses`` that a pixel saw, and of the RMS residuals."""
+
+    fitted: Share
+    poses: float
+    z_mm: float
+    x_mm: float
+    y_mm: float
+
+
+class PixelwiseFit(msgspec.Struct, frozen=True, tag="pixelwise"):
+    """The pixel-wise fits by captured axis."""
+
+    axes: dict[str, AxisFit]
+
+    def summary(self) -> str:
+        """Return the RMS in depth in one sentence."""
+        return "fit RMS in z " + ", ".join(
+            f"{fit.z_mm:.3f} mm ({axis})" for axis, fit in self.axes.items()
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return the RMS in depth."""
+        return {f"median RMS in z along {axis}, mm": fit.z_mm for axis, fit in self.axes.items()}
+
+    def table(self) -> Table:
+        """Return a line for each axis."""
+        columns = [
+            Column("axis", align="left"),
+            Column("pixels fitted", "%", digits=1),
+            Column("poses a pixel", digits=0),
+            *(Column(f"RMS in {name}", "mm") for name in "zxy"),
+        ]
+        rows: list[list[Value]] = [
+            [axis, 100 * fit.fitted, fit.poses, fit.z_mm, fit.x_mm, fit.y_mm]
+            for axis, fit in self.axes.items()
+        ]
+        return Table(columns, rows, "Pixel-wise fits by captured axis (median over the pixels)")
+
+
+class VolumeSigma(msgspec.Struct, frozen=True):
+    """The 3D standard deviation of points of the working volume, rigid motion apart: ``median`` and
+    ``p95``, mm, over those that target poses support; ``worst`` of all, mm, at ``worst_at`` (u px,
+    v px, z mm); ``supported``: share of supported points in the common view; ``axis``: of the
+    projector, by which it is measured."""
+
+    median: float
+    p95: float
+    worst: float
+    worst_at: tuple[float, float, float]
+    supported: Share
+    depths_mm: tuple[float, float]
+    axis: str
+
+
+class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
+    """The joint adjustment. Residuals by "camera" and the projector's axes "x" and "y":
+    ``noise_px``, and ``residuals_over_noise``, times their predicted noise. ``cells_lit``: share of
+    each device's cells that target poses illuminated. ``weights`` of each pose in camera and
+    projector, 0 to 1. ``left_out``: {pose: why}; ``turned``: poses numbered from the board's other
+    end."""
+
+    steps: Count
+    residuals_over_noise: dict[str, float]
+    noise_px: dict[str, float]
+    local_distortion_rms_px: dict[str, float]
+    board_height_mm: tuple[float, float]
+    board_offsets_rms_mm: float
+    cells_lit: dict[str, Share]
+    sigma_volume_mm: VolumeSigma
+    weights: dict[str, tuple[float, float]] = {}
+    left_out: dict[str, str] = {}
+    turned: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """Return the residuals in one sentence."""
+        return "residuals " + ", ".join(
+            f"{place} {px:.4f} px" for place, px in self.noise_px.items()
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return the residuals, in px and over their predicted noise."""
+        noise = {f"noise {place}, px": px for place, px in self.noise_px.items()}
+        return noise | {
+            f"residuals over noise {axis}": ratio
+            for axis, ratio in self.residuals_over_noise.items()
+        }
+
+    def table(self) -> Table:
+        """Return the results of the adjustment, and notes on its poses."""
+        noise, local, covered, sigma = (
+            self.noise_px,
+            self.local_distortion_rms_px,
+            self.cells_lit,
+            self.sigma_volume_mm,
+        )
+        low, high = self.board_height_mm
+        near, far = sigma.depths_mm
+        u, v, z = sigma.worst_at
+        rows = [
+            ["Residual noise, camera", f"{noise['camera']:.4f} px"],
+            ["Residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
+            ["Residuals over predicted noise", f"{max(self.residuals_over_noise.values()):.1f}"],
+            [
+                "Local distortion, camera / projector",
+                f"{local['camera']:.3f} / {local['projector']:.3f} px RMS",
+            ],
+            ["Board height, peak to valley", f"{high - low:.3f} mm"],
+            ["Board feature offsets", f"{self.board_offsets_rms_mm:.4f} mm RMS"],
+            [
+                "Covered, camera / projector",
+                f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %",
+            ],
+            ["Supported volume", f"{100 * sigma.supported:.0f} % at {near:.0f} to {far:.0f} mm"],
+            ["3D uncertainty there, median / 95 %", f"{sigma.median:.4f} / {sigma.p95:.4f} mm"],
+            ["Worst uncertainty", f"{sigma.worst:.3f} mm at pixel ({u:.0f}, {v:.0f}), {z:.0f} mm"],
+        ]
+        named = {
+            f"Weights below {MIN_WEIGHT:g}": [
+                f"{name} {min(pair):.2f}"
+                for name, pair in self.weights.items()
+                if min(pair) < MIN_WEIGHT
+            ],
+            "Board turned by 180°, corrected": self.turned,
+        }
+        notes = [
+            "Pixels outside the calibrated region are masked. Uncertainty: one sigma, rigid motion"
+            " apart."
+        ]
+        notes += [f"{title}: {', '.join(names)}." for title, names in named.items() if names]
+        notes += [
+            f"{name} is excluded from the splined model: it {why}."
+            for name, why in self.left_out.items()
+        ]
+        columns = [Column("quantity", align="left"), Column("value")]
+        return Table(columns, rows, f"Joint adjustment (splined), {self.steps} steps", notes)
+
+
+class ModelCalibration(Record, frozen=True, kw_only=True):
+    """Each model, and how well it fits the target poses that it was made from.
+
+    ``model``: its parameters, as the model's ``to_dict`` returns them; ``verdict``: of the stereo
+    model, on all. ``fit`` is None for other models than stereo that version 0.2 made.
+
+    Arrays: of stereo ``residuals_<pose>`` (n, 4) px, of the others what their ``to_arrays``
+    returns.
+    """
+
+    kind: ClassVar[str] = "calibration"
+    title: ClassVar[str] = "Models"
+    is_of_captures: ClassVar[bool] = False
+    model: dict[str, Any] = {}
+    fit: StereoFit | PixelwiseFit | SplinedFit | None = None
+    verdict: Verdict | None = None
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Add the figures of a stereo calibration that was imported, or made by version 0.2, and
+        the operation."""
+        if isinstance(imported := meta.get("imported"), Mapping):
+            return {**meta, "fit": _describe_imported(imported)}
+        if "fit" in meta or "settings" not in meta:
+            return meta
+        model = meta.get("model", {})
+        return {
+            **meta,
+            "operation": "calibrate",
+            "fit": describe_stereo(model) if "rig" in model else None,
+        }
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the verdict finds nothing."""
+        return self.verdict is None or self.verdict.level == "good"
+
+    def summary(self) -> str:
+        """Return the main figures, and the verdict where it is not good, in one sentence."""
+        words = "made by version 0.2" if self.fit is None else self.fit.summary()
+        return (
+            words
+            if self.verdict is None or self.is_good
+            else f"{words}; {self.verdict.level}: {self.verdict.reason}"
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return the figures of the fit."""
+        return {} if self.fit is None else self.fit.figures()
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "ModelCalibration"]) -> list[Table]:  # type: ignore[override]
+        """Return a table of each model, the simplest first."""
+        order = (StereoFit, PixelwiseFit, SplinedFit)
+        fitted = [(each, each.fit) for each in found.values() if each.fit is not None]
+        fitted.sort(key=lambda pair: order.index(type(pair[1])))
+        return [each._make_table(fit.table()) for each, fit in fitted]
+
+    def _make_table(self, of_fit: Table) -> Table:
+        verdict = (
+            []
+            if self.verdict is None
+            else [f"{line.strip()}." for line in self.verdict.text().splitlines()]
+        )
+        return replace(of_fit, notes=[*of_fit.notes, *verdict])
+
+
+def _describe_imported(matrices: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of imported matrices in plain values."""
+    lenses = {device: matrices[f"K_{device}"] for device in ("camera", "projector")}
+    t = [value[0] if isinstance(value, list) else value for value in matrices["T"]]
+    return {
+        "type": "stereo",
+        "poses": (),
+        "excluded": {},
+        "reprojection_rms_px": {},
+        "focal_px": {device: (K[0][0], K[1][1]) for device, K in lenses.items()},
+        "focal_sigma_px": {},
+        "baseline_mm": dist(t, (0, 0, 0)),
+    }
+
+
+def describe_stereo(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of a stereo model in plain values, as its ``to_dict`` returns it."""
+    rig = model["rig"]
+    return {
+        "type": "stereo",
+        "poses": list(model["poses"]),
+        "excluded": model["left_out"],
+        "focal_px": {
+            device: (rig[device]["K"][0][0], rig[device]["K"][1][1])
+            for device in ("camera", "projector")
+        },
+        "baseline_mm": dist(rig["t"], (0, 0, 0)),
+        "features_excluded": model.get("features_set_aside", 0),
+        **{key: model[key] for key in ("reprojection_rms_px", "focal_sigma_px", "depth_range_mm")},
+    }

@@ -1,0 +1,108 @@
+"""How well each calibration measures target poses that it was not made from."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+
+from slviewer.records.record import Count, Record
+from slviewer.records.table import Cell, Column, Table, Value
+
+
+class HeldOutError(msgspec.Struct, frozen=True):
+    """Errors of one model on boards that were not used to fit it, RMS where they are of several
+    poses.
+
+    ``plane_mm``: RMS distance of the board's pixels from their plane. ``board_mm``: RMS distance of
+    the features from the board laid over them, flatness, shape and scale included. ``scale_ppm``:
+    how much too long the board's own spacings come out. ``camera_px``, ``projector_px``: what
+    ``board_mm`` amounts to in the images, RMS.
+    """
+
+    plane_mm: float
+    board_mm: float
+    scale_ppm: float
+    camera_px: float
+    projector_px: float
+
+
+class HeldOutPose(HeldOutError, frozen=True):
+    """Errors of one model on one pose, from so many ``pixels``."""
+
+    pixels: Count
+    depth_mm: float
+
+
+class ModelComparison(Record, frozen=True, kw_only=True):
+    """Target poses, each measured by calibrations that were made without it, all over the same
+    pixels.
+
+    ``models``: errors over all poses, the simplest model first; ``poses``: {model: {pose: its
+    errors}}; ``folds``: poses held out together; ``failed``: {model: why it could not be fitted to
+    some fold}; ``recommended``: the model with the least error on boards, of nearly equal ones the
+    simplest.
+    """
+
+    kind: ClassVar[str] = "validation"
+    title: ClassVar[str] = "Comparison of models"
+    recommended: str
+    models: Annotated[dict[str, HeldOutError], msgspec.Meta(min_length=1)]
+    poses: dict[str, dict[str, HeldOutPose]]
+    folds: tuple[tuple[str, ...], ...]
+    failed: dict[str, str] = {}
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Convert a record of version 0.2, whose figures were one entry."""
+        if not isinstance(old := meta.get("validation"), Mapping):
+            return meta
+        settings = {"models": list(old.get("models", {})), "folds": len(old.get("folds", ()))}
+        inputs = meta.get("inputs", {})
+        return {**old, "inputs": inputs, "operation": "validate", "settings": settings}
+
+    def summary(self) -> str:
+        """Return the error of each model on boards, and the recommended model, in one sentence."""
+        errors = ", ".join(f"{model} {each.board_mm:.3f} mm" for model, each in self.models.items())
+        return f"held-out error of the models: {errors}; {self.recommended} is recommended"
+
+    def figures(self) -> dict[str, float]:
+        """Return none: to repeat it, every model is fitted again to each fold, which takes
+        minutes."""
+        return {}
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "ModelComparison"]) -> list[Table]:  # type: ignore[override]
+        """Return a table of the errors with a line for each model; the least ones are marked."""
+        return [each._make_table() for each in found.values()]
+
+    def _make_table(self) -> Table:
+        columns = [
+            Column("model", align="left"),
+            Column("plane", "mm", digits=4),
+            Column("board", "mm", digits=4),
+            Column("scale", "ppm", digits=0),
+            Column("camera", "px"),
+            Column("projector", "px"),
+        ]
+        rows: list[list[Value | Cell]] = []
+        for model, each in self.models.items():
+            row: list[Value | Cell] = [Cell(model, "strong" if model == self.recommended else "")]
+            for figure in HeldOutError.__struct_fields__:
+                value = getattr(each, figure)
+                least = min(getattr(other, figure) for other in self.models.values())
+                is_compared = (
+                    figure in ("plane_mm", "board_mm", "camera_px") and len(self.models) > 1
+                )
+                row.append(Cell(value, "better" if is_compared and value == least else ""))
+            rows.append(row)
+        count = len(next(iter(self.poses.values())))
+        notes = [
+            (
+                f"{count} poses, each measured by calibrations without it ({len(self.folds)}"
+                " folds). Plane: distance of the board's features from their plane; board: from"
+                " their true positions."
+            ),
+            f"Recommended: {self.recommended}.",
+            *(f"{model} could not be compared: {why}." for model, why in self.failed.items()),
+        ]
+        return Table(columns, rows, "RMS on held-out poses", notes)

@@ -1,0 +1,95 @@
+"""Verdict on a calibration: good, doubtful or rejected, with causes and remedies."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import msgspec
+
+Level = Literal["good", "doubtful", "rejected"]
+Severity = Literal["note", "doubtful", "rejected"]
+"""note: repaired already, as by excluding a pose; doubtful: may be used with care; rejected: must
+not be used."""
+Cause = Literal[
+    "frame-lag",
+    "missing-frame",
+    "frame-order",
+    "bit-order",
+    "step-order",
+    "phase-offset",
+    "gray-origin",
+    "gray-cell",
+    "dark",
+    "saturation",
+    "axes-swapped",
+    "axis-reversed",
+    "fringe-period",
+    "projector-size",
+    "unreadable",
+    "board-size",
+    "board-numbering",
+    "moved",
+    "outlier",
+    "gamma",
+    "too-few-poses",
+    "parallel-poses",
+    "empty-corner",
+    "uncertain",
+    "residuals",
+]
+CAUSES: tuple[Cause, ...] = get_args(Cause)
+"""From root causes to their consequences: a finding may explain those of later causes."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A detected fault: its cause and severity, the observation (``sentence``), the ``remedy``, and
+    the poses."""
+
+    cause: Cause
+    severity: Severity
+    sentence: str
+    remedy: str
+    poses: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """Return observation and remedy in one line."""
+        return f"{self.sentence}: {self.remedy}"
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """The findings, the root cause first; without any, the calibration is good. ``level``: severity
+    of the worst finding; a verdict with notes only is good."""
+
+    findings: tuple[Finding, ...] = ()
+    level: Level = "good"
+
+    def __post_init__(self) -> None:
+        worst = self.findings[0].severity if self.findings else "note"
+        msgspec.structs.force_setattr(self, "level", "good" if worst == "note" else worst)
+
+    @classmethod
+    def of(cls, findings: Iterable[Finding]) -> "Verdict":
+        """Return the verdict of findings sorted by severity, the worst first, then by cause, root
+        causes first."""
+        severities = get_args(Severity)
+        ranked = sorted(
+            findings, key=lambda f: (-severities.index(f.severity), CAUSES.index(f.cause))
+        )
+        return cls(tuple(ranked))
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """The cause of each finding."""
+        return tuple(finding.cause for finding in self.findings)
+
+    @property
+    def reason(self) -> str:
+        """The root cause and its remedy; empty without findings."""
+        return self.findings[0].text() if self.findings else ""
+
+    def text(self) -> str:
+        """Return a report of several lines for the terminal."""
+        lines = [f"verdict: {self.level}"]
+        lines += [f"  {finding.severity}: {finding.text()}" for finding in self.findings]
+        return "\n".join(lines)
