@@ -6,8 +6,9 @@ from slviewer.pipeline import (
     check,
     merge,
     reconstruct,
+    run_plan,
     verify,
 )  # each registers its own
 from slviewer.pipeline.operation import OPERATIONS
 
-__all__ = ["OPERATIONS", "accept", "align", "check", "merge", "reconstruct", "verify"]
+__all__ = ["OPERATIONS", "accept", "align", "check", "merge", "reconstruct", "run_plan", "verify"]

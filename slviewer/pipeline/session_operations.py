@@ -7,7 +7,7 @@ from slviewer.pipeline.export import export
 from slviewer.pipeline.inspect import inspect
 from slviewer.pipeline.measure import measure
 from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.operations import accept, align, check, merge, reconstruct, verify
+from slviewer.pipeline.operations import accept, align, check, merge, reconstruct, run_plan, verify
 from slviewer.pipeline.plan import plan
 from slviewer.pipeline.report import report
 from slviewer.pipeline.stored_records import load_arrays
@@ -41,6 +41,7 @@ class SessionOperations(Session):
     plan = plan
     reconstruct = reconstruct.reconstruct
     report = report
+    run_plan = run_plan.run_plan
     set_region = set_region
     validate = validate
     verify = verify.verify

@@ -9,6 +9,7 @@ import pytest
 from slviewer.errors import DamagedError
 from slviewer.pipeline.stored_records import Stored, load_record, name_records
 from slviewer.records.drift import Drift
+from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
 from slviewer.records.placement import Placement
@@ -97,6 +98,15 @@ def test_places_and_drift_checks_keep_their_figures(session: Session) -> None:
     )
     plain = json.loads(json.dumps(to_plain(drift)))
     assert all(plain[key] == value for key, value in kept.items() if key != "calibration")
+
+
+def test_inspections_keep_their_decisions(session: Session) -> None:
+    old, found = as_stored("inspection/1"), load_record(session, Inspection, "1")
+    assert [found.plan, found.inputs] == [old["plan"], old["inputs"]]
+    plain = json.loads(json.dumps(to_plain(found)))
+    assert plain["characteristic"] == old["characteristic"] and plain["parts"] == old["parts"]
+    assert found.count_parts() == {"pass": 0, "fail": 1, "undecided": 1} and not found.is_good
+    assert found.figures()["object_r1 angle deg"] == 90.61
 
 
 def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None:
