@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from slviewer.pipeline.models import load_calibration
     from slviewer.pipeline.reconstruct import reconstruct
     from slviewer.pipeline.report import report
+    from slviewer.pipeline.run_plan import run_plan
     from slviewer.pipeline.session_operations import SessionOperations as Session
     from slviewer.pipeline.simulate import simulate
     from slviewer.pipeline.stored_records import load_arrays
@@ -153,6 +154,7 @@ _EXPORTS = {
     "reconstruct": "pipeline.reconstruct",
     "reconstruct_cloud": "reconstruction.reconstruct",
     "report": "pipeline.report",
+    "run_plan": "pipeline.run_plan",
     "save_calibration": "pipeline.calibrate",
     "simulate": "pipeline.simulate",
     "simulated_rig": "devices.simulated",
@@ -172,8 +174,8 @@ __all__ = [
     "evaluate_sphere", "export", "fuse_clouds", "gray", "import_captures", "letter_rig",
     "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
     "multifrequency", "one_axis", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
-    "reconstruct_cloud", "report", "save_calibration", "simulate", "simulated_rig", "texture",
-    "verify", "write_ply",
+    "reconstruct_cloud", "report", "run_plan", "save_calibration", "simulate", "simulated_rig",
+    "texture", "verify", "write_ply",
 ]  # fmt: skip
 
 

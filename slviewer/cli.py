@@ -158,6 +158,9 @@ COMMANDS = Commands(
             options=JSON,
             names={"scans": "scan"},
         ),
+        "run-plan": _define_command(
+            "pipeline.run_plan:run_plan", "session", "plan", options=JSON, names={"scans": "scan"}
+        ),
         "export": _define_command(
             "pipeline.export:export",
             "session",

@@ -74,6 +74,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "wait_s": (1, LARGEST),
 }
 """Of the numbers that a command takes, by its parameter, where they are narrower."""
+SETTINGS_OF = {"operation": 2, "takes_settings": 0}
+"""Which argument of a decorator names the settings of the function."""
 JSON = (Option("json", Path | None, None, "Write the result to this file too."),)
 
 
@@ -105,18 +107,18 @@ def read_command(
         doc = doc.partition("\n\n")[0]
     shown = re.findall(r"^ {4}(\w+):", doc, re.MULTILINE)
     parameters = []
-    for argument, default in accepted:
+    for argument, default, place in accepted:
         if argument.arg not in shown:
             continue
         assert argument.annotation is not None
-        kind = _terminal_type(_evaluate(argument.annotation, module))
+        kind = _terminal_type(_evaluate(argument.annotation, place))
         if defaults.get(argument.arg, ...) is None:
             kind = kind | None
         if argument.arg in positional:
             kind = Annotated[kind, tyro.conf.Positional]
         if argument.arg in names:
             kind = Annotated[kind, tyro.conf.arg(name=names[argument.arg])]
-        value = inspect.Parameter.empty if default is None else _evaluate(default, module)
+        value = inspect.Parameter.empty if default is None else _evaluate(default, place)
         value = defaults.get(argument.arg, value)
         parameters.append(_make_parameter(argument.arg, kind, value))
     for each in options:
@@ -224,44 +226,52 @@ def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
 
 
-def _read_arguments(
-    definition: ast.FunctionDef, module: str
-) -> tuple[str, list[tuple[ast.arg, ast.expr | None]]]:
-    """Return the docstring of a function and its parameters; of an operation both are those of its
-    settings."""
-    doc, settings = ast.get_docstring(definition) or "", _find_settings(definition, module)
-    if settings is None:
-        return doc, _list_arguments(definition)
-    _, _, described = (ast.get_docstring(settings) or "").partition("Args:\n")
-    accepted = [(ast.arg("session", ast.Name("SessionLike")), None), *_list_fields(settings)]
-    return f"{doc}\n\nArgs:\n    session: Session folder.\n{described}", accepted
+Argument = tuple[ast.arg, ast.expr | None, str]
+"""A parameter, its default, None where it has none, and the module in which both are evaluated."""
 
 
-def _find_settings(definition: ast.FunctionDef, module: str) -> ast.ClassDef | None:
-    """Return the class of the settings of an operation, as its decorator names it; None for other
-    functions."""
+def _read_arguments(definition: ast.FunctionDef, module: str) -> tuple[str, list[Argument]]:
+    """Return the docstring of a function and its parameters; where it has settings, both are those
+    of the settings."""
+    doc = ast.get_docstring(definition) or ""
     for decorator in definition.decorator_list:
-        if (
-            isinstance(decorator, ast.Call)
-            and isinstance(decorator.func, ast.Name)
-            and decorator.func.id == "operation"
-        ):
-            name = decorator.args[2]
+        made_by = (
+            decorator.func.id
+            if isinstance(decorator, ast.Call) and isinstance(decorator.func, ast.Name)
+            else ""
+        )
+        if made_by in SETTINGS_OF:
+            assert isinstance(decorator, ast.Call)
+            name = decorator.args[SETTINGS_OF[made_by]]
             assert isinstance(name, ast.Name)
-            settings = _read_definitions(module)[name.id]
-            assert isinstance(settings, ast.ClassDef)
-            return settings
-    return None
+            described, fields = _read_settings(name.id, module)
+            if made_by == "operation":
+                described = f"    session: Session folder.\n{described}"
+                fields.insert(0, (ast.arg("session", ast.Name("SessionLike")), None, module))
+            return f"{doc}\n\nArgs:\n{described}", fields
+    return doc, [(*argument, module) for argument in _list_arguments(definition)]
 
 
-def _list_fields(settings: ast.ClassDef) -> list[tuple[ast.arg, ast.expr | None]]:
-    """List the fields of a dataclass with their defaults, None where they have none."""
+def _read_settings(name: str, module: str) -> tuple[str, list[Argument]]:
+    """Return what a dataclass of settings and its bases describe of their fields, and these
+    fields."""
+    settings = _read_definitions(module)[name]
+    if isinstance(settings, ast.ImportFrom):
+        assert settings.module is not None
+        return _read_settings(name, settings.module)
+    assert isinstance(settings, ast.ClassDef)
+    described, _, rest = (
+        (ast.get_docstring(settings) or "").partition("Args:\n")[2].partition("\n\n")
+    )
+    nodes = [node for node in settings.body if isinstance(node, ast.AnnAssign)]
     fields = [
-        node
-        for node in settings.body
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+        (ast.arg(ast.unparse(node.target), node.annotation), node.value, module) for node in nodes
     ]
-    return [(ast.arg(node.target.id, node.annotation), node.value) for node in fields]  # type: ignore[union-attr]
+    for base in settings.bases:
+        inherited, further = _read_settings(ast.unparse(base), module)
+        described = "\n".join(filter(None, (described, inherited.partition("\n\n")[0])))
+        fields += further
+    return f"{described}\n\n{rest}", fields
 
 
 def _list_arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | None]]:

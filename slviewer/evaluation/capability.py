@@ -2,25 +2,14 @@
 intervals."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2, norm
 
+from slviewer.records.inspection import Capability
+
 CONFIDENCE = 0.95
 MIN_PARTS = 3
-
-
-@dataclass(frozen=True)
-class Capability:
-    """Of ``parts`` values of this ``mean`` and standard deviation ``sigma``: ``cp`` (None for a
-    single limit) and ``cpk``, each with the ends of its 95 % confidence interval."""
-
-    parts: int
-    mean: float
-    sigma: float
-    cp: tuple[float, float, float] | None
-    cpk: tuple[float, float, float]
 
 
 def process_capability(

@@ -7,12 +7,12 @@ from slviewer.errors import InputError
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, link, paragraph, table
-from slviewer.inspection.parts import CharacteristicResult
-from slviewer.pipeline.inspect_parts import RULE
+from slviewer.pipeline.inspect_parts import FILES
+from slviewer.pipeline.stored_records import Stored
 from slviewer.records.acceptance import Decision
-from slviewer.session.inspection_plan import OWN_PLAN, Characteristic
-from slviewer.wizard.measure_requests import PARTS
-from slviewer.wizard.snapshot import InspectionView, Snapshot
+from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
+from slviewer.session.inspection_plan import OWN_PLAN
+from slviewer.wizard.snapshot import Snapshot
 
 SHOWN, ALL = "shown", "all"
 TONES: dict[Decision, Tone] = {"pass": "good", "fail": "error", "undecided": "warning"}
@@ -66,15 +66,15 @@ class InspectionInputs:
         every = [(ALL, f"all {len(self._scans)} scans")] if len(self._scans) > 1 else []
         self._parts.offer([(SHOWN, "the surface shown"), *every], SHOWN)
         change(self._run, disabled=snapshot.is_busy or not session.plans)
-        seen = session.inspection
-        self._result.set("" if seen is None else inspection_html(seen))
-        files = [each for each in session.exports if each.name in PARTS]
+        runs = session.list_records(Inspection)
+        self._result.set(inspection_html(runs[-1]) if runs else "")
+        files = [each for each in session.exports if each.name in FILES]
         self._files.set(
             "".join(
                 paragraph(link(self._context.offer(each.path), f"Download {each.name}"))
                 for each in files
             )
-            if seen is not None
+            if runs
             else ""
         )
 
@@ -86,17 +86,17 @@ class InspectionInputs:
         self._context.operator.run_plan(self._plan.value, *parts)
 
 
-def inspection_html(seen: InspectionView) -> Html:
+def inspection_html(run: Stored[Inspection]) -> Html:
     """Return how many parts pass, and a table of their characteristics with limits and
     decisions."""
-    counts = {decision: sum(part.decision == decision for part in seen.parts) for decision in TONES}
+    seen, counts = run.record, run.record.count_parts()
     said = ", ".join(
         coloured(f"{n} {decision}", TONES[decision], bold=True)
         for decision, n in counts.items()
         if n
     )
     html = paragraph(Html(f"{coloured(seen.plan, 'plain', bold=True)}: {said}"))
-    if seen.stale:
+    if run.stale:
         html += alert("Out of date: a scan has changed since; run the plan again.", "warning")
     rows: list[tuple[object, ...]] = []
     for part in seen.parts:
@@ -124,9 +124,7 @@ def inspection_html(seen: InspectionView) -> Html:
         notes += paragraph(
             coloured("Some U hold no part of the calibration's uncertainty: it is unknown.", "dim")
         )
-    return Html(
-        html + scrolled + notes + paragraph(coloured(f"{RULE[:1].upper()}{RULE[1:]}.", "dim"))
-    )
+    return Html(html + scrolled + notes + paragraph(coloured(RULE, "dim")))
 
 
 def format_result(wanted: Characteristic, result: CharacteristicResult) -> Html:

@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slviewer.gui.scene import Colour, ViewerScene
+from slviewer.gui.scene import Colour, Stroke, ViewerScene
 from slviewer.gui.widgets import Html, Tone, coloured, paragraph, thumbnail, to_html
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PoseView
@@ -83,17 +83,17 @@ class PoseBoards:
             )
             if self._drawn.get(name) != key:
                 self._drawn[name] = key
-                self._scene.board(
+                picture = self._scene.board(
                     self._layer,
                     name,
                     pose.T_camera_board,
                     board.outline(),
-                    COLOURS[pose.state],
+                    Stroke(COLOURS[pose.state], 4.0 if name == chosen else 2.0),
                     picture=rectified(pose, board, camera),
                     label=name.removeprefix("pose_"),
-                    on_click=lambda _event, name=name: self._chosen(name),  # type: ignore[misc]
-                    width_px=4.0 if name == chosen else 2.0,
                 )
+                if picture is not None:
+                    picture.on_click(lambda _event, name=name: self._chosen(name))
 
 
 def rectified(pose: PoseView, board: Board, camera: tuple[int, int] | None) -> np.ndarray | None:

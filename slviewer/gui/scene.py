@@ -6,6 +6,7 @@ An object replaces that of the same name. Every method may be called from any th
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,14 @@ SHOWN_POINTS = 150_000
 """Points of one cloud that are sent to a browser: software rendering still moves them smoothly."""
 _FRUSTUM_MM = 60.0
 _FLOOR_MM = 260.0
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """How lines are drawn."""
+
+    colour: Colour
+    width_px: float = 2.0
 
 
 class ViewerScene:
@@ -105,18 +114,17 @@ class ViewerScene:
         name: str,
         T_camera_board: np.ndarray,
         outline: np.ndarray,
-        colour: Colour,
+        stroke: Stroke,
         *,
         picture: np.ndarray | None = None,
         label: str = "",
-        on_click: Callable[[Any], None] | None = None,
-        width_px: float = 2.0,
-    ) -> None:
+    ) -> Any:
         """Draw a board's outline (4, 3) mm at T_camera_board (4, 4), with its picture (h, w, 3) and
         name, if given.
 
         The outline's corners go from the board's first feature along its first row and back around,
-        as `Board.outline` gives them; the picture's rows run along the board's.
+        as `Board.outline` gives them; the picture's rows run along the board's. Returns the handle
+        of the picture, for clicks on it, None without one.
         """
         path = self._make_path(layer, name)
         wxyz, position = _split_pose(T_camera_board)
@@ -126,24 +134,22 @@ class ViewerScene:
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1).astype(np.float32)
         nodes.append(
             self._api.add_line_segments(
-                f"{path}/outline", sides, colour, thickness=width_px, thickness_units="screen"
+                f"{path}/outline",
+                sides,
+                stroke.colour,
+                thickness=stroke.width_px,
+                thickness_units="screen",
             )
         )
-        middle = outline.mean(axis=0)
+        image = None
         if picture is not None:
             # rows of viser's images go up; the board's y goes down
             turned = tf.SO3.from_x_radians(np.pi).wxyz
-            size = np.ptp(outline, axis=0)
+            width, height = map(float, np.ptp(outline, axis=0)[:2])
+            middle = outline.mean(axis=0)
             image = self._api.add_image(
-                f"{path}/picture",
-                picture,
-                float(size[0]),
-                float(size[1]),
-                wxyz=turned,
-                position=middle,
+                f"{path}/picture", picture, width, height, wxyz=turned, position=middle
             )
-            if on_click is not None:
-                image.on_click(on_click)
             nodes.append(image)
         if label:
             nodes.append(
@@ -156,6 +162,7 @@ class ViewerScene:
                 )
             )
         self._store_nodes(layer, name, nodes)
+        return image
 
     def gizmo(
         self,

@@ -6,7 +6,7 @@ import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,9 @@ from slviewer.pipeline.batch_tasks import (
     verification_file,
     write_verification,
 )
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress
 from slviewer.pipeline.models import ModelName
+from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.records.verification import Shape, Verification
 
 INSTALL_COMMAND = "pip install 'slviewer[batch]'"
@@ -108,24 +109,9 @@ class Batch:
         return "\n".join([*blocks, f"{good} captures done, {len(failed)} failed"])
 
 
-def batch(
-    sessions: Sequence[str | Path],
-    do: Do,
-    *,
-    captures: Sequence[str] = (),
-    model: ModelName | None = None,
-    shape: Shape | None = None,
-    radius: float | None = None,
-    accept_rejected: bool = False,
-    scheduler: str | None = None,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> Batch:
-    """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask
-    cluster.
-
-    What it makes is what each command makes alone, in each session's exports. A capture that fails
-    is named in the end, with status 1, and stops no other.
+@dataclass(frozen=True)
+class BatchSettings(Callbacks):
+    """Of which sessions, what is done with which captures, and where.
 
     Args:
         sessions: Session folders that all workers see, or addresses such as s3://bucket/session.
@@ -143,22 +129,52 @@ def batch(
     again by another. Raises SlviewerError without ``distributed``, or where no scheduler answers or
     it has no workers.
     """
-    if do == "verify" and shape is None:
-        raise UsageError(
-            "what the captures show is not known: give --shape plane or --shape sphere"
-        )
-    if do != "verify" and (shape is not None or radius is not None):
-        raise UsageError(f"--shape and --radius belong to --do verify, not to --do {do}")
-    addresses = list(dict.fromkeys(absolute_address(session) for session in sessions))
-    if not addresses:
-        raise UsageError("no session named: give the folders or addresses of one or more")
-    task = Task(do, secrets.token_hex(4), model, shape, radius, accept_rejected)
+
+    sessions: Sequence[str | Path]
+    do: Do
+    _: KW_ONLY
+    captures: Sequence[str] = ()
+    model: ModelName | None = None
+    shape: Shape | None = None
+    radius: float | None = None
+    accept_rejected: bool = False
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.do == "verify" and self.shape is None:
+            raise UsageError(
+                "what the captures show is not known: give --shape plane or --shape sphere"
+            )
+        if self.do != "verify" and (self.shape is not None or self.radius is not None):
+            raise UsageError(f"--shape and --radius belong to --do verify, not to --do {self.do}")
+        if not self.sessions:
+            raise UsageError("no session named: give the folders or addresses of one or more")
+
+
+@takes_settings(BatchSettings)
+def batch(settings: BatchSettings) -> Batch:
+    """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask
+    cluster.
+
+    What it makes is what each command makes alone, in each session's exports. A capture that fails
+    is named in the end, with status 1, and stops no other.
+    """
+    progress, warn, scheduler = settings.progress, settings.warn, settings.scheduler
+    addresses = list(dict.fromkeys(absolute_address(session) for session in settings.sessions))
+    task = Task(
+        settings.do,
+        secrets.token_hex(4),
+        settings.model,
+        settings.shape,
+        settings.radius,
+        settings.accept_rejected,
+    )
     progress(0.0, f"looking into {len(addresses)} sessions")
     try:
         with _start_cluster() if scheduler is None else connect(scheduler) as client:
+            captures = tuple(settings.captures)
             listing = {
-                address: (list_captures, address, tuple(captures), task.version)
-                for address in addresses
+                address: (list_captures, address, captures, task.version) for address in addresses
             }
             plans = _gather_results(client, listing, ignore_progress, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}

@@ -2,10 +2,10 @@
 does."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -25,11 +25,12 @@ from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.exposure_check import warn_of_exposure
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
+from slviewer.pipeline.feedback import Warn, ignore_warnings, part
 from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
-from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
+from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
+from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.pipeline.suggest_exposure import (
     BUDGET_S,
     MAX_SUGGESTED,
@@ -51,27 +52,42 @@ Purpose = Literal["pose", "scan", "plane", "sphere"]
 """What a capture is made for: all but target poses are scans."""
 
 
-def capture(
-    session: Path | str,
-    name: str,
-    rig: RigLike,
-    *,
-    role: Role = "calibration",
-    board: str | None = None,
-    patterns: str | None = None,
-    exposure_ms: float | None = None,
-    exposures_ms: Sequence[float] = (),
-    gain: float | None = None,
-    auto_exposure: bool = False,
-    region: tuple[int, int, int, int] | None = None,
-    budget_s: float = BUDGET_S,
-    force: bool = False,
-    set_up: SetUp = set_up,
-    progress: Progress = ignore_progress,
-    say: Callable[[str], None] = ignore_warnings,
-    warn: Warn = ignore_warnings,
-) -> Capture:
-    """Capture with a rig, without the wizard.
+@dataclass(frozen=True, kw_only=True)
+class RigSettings(Callbacks):
+    """How a rig captures.
+
+    Args:
+        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light
+            themselves); by default the session's, else complementary.
+        exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
+        exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the
+            longest that does not clip it.
+        gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
+
+    ``set_up`` makes the devices of a choice of rig.
+    """
+
+    patterns: str | None = None
+    exposure_ms: float | None = None
+    exposures_ms: Sequence[float] = ()
+    gain: float | None = None
+    set_up: SetUp = set_up
+
+    def __post_init__(self) -> None:
+        if self.exposure_ms is not None and self.exposures_ms:
+            raise InputError("the exposure was given in several ways: give one, or several")
+        _ = self.exposures
+
+    @property
+    def exposures(self) -> list[float]:
+        """The exposures of each frame, ms, ascending; empty for the one that the camera is set
+        to."""
+        return check_exposures(self.exposures_ms) if self.exposures_ms else []
+
+
+@dataclass(frozen=True)
+class CaptureSettings(RigSettings):
+    """What is captured, and how.
 
     Args:
         session: Session folder; made if it does not exist.
@@ -79,12 +95,6 @@ def capture(
         rig: A TOML file that describes the rig, or the name of one that `slviewer devices` lists.
         role: calibration for a target pose, scan for anything else.
         board: What the target is, circles:21x16:9 and the like; by default as the session knows it.
-        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light
-            themselves); by default the session's, else complementary.
-        exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
-        exposures_ms: Two or more exposures for shiny and dark parts; each pixel is used from the
-            longest that does not clip it.
-        gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
         auto_exposure: Choose one to four exposures, and the gain, that measure as much of the scene
             as possible.
         region: With --auto-exposure: x, y, width and height, px, of the part of the image that
@@ -96,40 +106,57 @@ def capture(
     others; `say` with the exposures that were chosen. Raises InputError, DeviceError, SessionError,
     and whatever `progress` raises before the capture is saved; nothing is saved then.
     """
-    if (exposure_ms is not None) + bool(exposures_ms) + auto_exposure > 1:
-        raise InputError(
-            "the exposure was given in several ways: give one, several, or let it be chosen"
-        )
-    exposures = check_exposures(exposures_ms) if exposures_ms else []
-    target = None if board is None else Board.parse(board)
+
+    session: Path | str
+    name: str
+    rig: RigLike
+    _: KW_ONLY
+    role: Role = "calibration"
+    board: str | None = None
+    auto_exposure: bool = False
+    region: tuple[int, int, int, int] | None = None
+    budget_s: float = BUDGET_S
+    force: bool = False
+    say: Callable[[str], None] = ignore_warnings
+
+    def __post_init__(self) -> None:
+        if (self.exposure_ms is not None) + bool(self.exposures_ms) + self.auto_exposure > 1:
+            raise InputError(
+                "the exposure was given in several ways: give one, several, or let it be chosen"
+            )
+        super().__post_init__()
+
+
+@takes_settings(CaptureSettings)
+def capture(settings: CaptureSettings) -> Capture:
+    """Capture with a rig, without the wizard."""
+    name, progress, warn = settings.name, settings.progress, settings.warn
+    target = None if settings.board is None else Board.parse(settings.board)
     new_name(name)
-    with opened_or_made(session) as store:
-        if name in store.taken_names() and not force:
+    with opened_or_made(settings.session) as store:
+        if name in store.taken_names() and not settings.force:
             raise InputError(
                 f"there is a capture {name!r} already: choose another name, or replace it with"
                 " --force"
             )
-        choice = load_rig(rig, store)
+        choice = load_rig(settings.rig, store)
         target = target or (Board.parse(known) if (known := store.decision("target")) else None)
-        camera_settings(choice, exposure_ms, gain)  # refused before anything is opened
-        patterns = choose_patterns(store, choice, patterns)
-        progress(0.0, "opening the devices")
-        bench = set_up(choice, target)
-        sequence = choose_sequence(bench, patterns)
-        most = MAX_SUGGESTED if auto_exposure else max(1, len(exposures))
+        bench, sequence = set_up_rig(store, choice, target, settings)
+        exposures = settings.exposures
+        most = MAX_SUGGESTED if settings.auto_exposure else max(1, len(exposures))
         check_space(store, bench.rig.camera, len(sequence.frames) * most, name)
-        begin = 0.3 if auto_exposure else 0.0
+        begin = 0.3 if settings.auto_exposure else 0.0
         with bench.rig.opened() as devices:
-            set_camera(devices, choice, exposure_ms, gain, warn)
-            if auto_exposure:
+            set_camera(devices, choice, settings)
+            if settings.auto_exposure:
                 suggested = suggest_exposure(
                     devices,
                     sequence,
-                    budget_s=budget_s,
-                    region=region,
+                    budget_s=settings.budget_s,
+                    region=settings.region,
                     progress=part(progress, 0.0, begin),
                 )
-                say(suggested.text())
+                settings.say(suggested.text())
                 exposures = apply_suggestion(devices, suggested)
             captured = capture_with_texture(
                 devices,
@@ -145,53 +172,76 @@ def capture(
             ):
                 warn(note)
         progress(0.95, "saving")
-        if role == "calibration":
-            saved = save_frames(store, name, "pose", captured, board=target, force=force)
+        if settings.role == "calibration":
+            saved = save_frames(store, name, "pose", captured, board=target, force=settings.force)
         else:
-            saved = save_frames(store, name, "scan", captured, force=force)
+            saved = save_frames(store, name, "scan", captured, force=settings.force)
         _check_saved(store, saved, captured, warn)
     progress(1.0, "captured")
     return saved
 
 
+def set_up_rig(
+    store: Session, choice: Choice, target: Board | None, settings: RigSettings
+) -> tuple[RigSetup, PatternSequence]:
+    """Return the devices of a choice, not opened yet, and the sequence that they capture. What the
+    settings or the choice state wrongly is refused before."""
+    _camera_settings(choice, settings)
+    patterns = choose_patterns(store, choice, settings.patterns)
+    settings.progress(0.0, "opening the devices")
+    bench = settings.set_up(choice, target)
+    return bench, choose_sequence(bench, patterns)
+
+
 def _check_saved(store: Session, saved: Capture, captured: CapturedFrames, warn: Warn) -> None:
     """Warn where the frames of a saved capture contradict each other, or are too bright or too
     dark."""
-    name, sequence = saved.name, captured.sequence
     try:
         for sentence in save_check(store, saved).warnings():
-            warn(f"{name}: {sentence}")
-        if not captured.exposures_ms:  # of several, each is meant to be wrong somewhere
-            phases = decode_frames(name, sequence, captured.frames)
-            warn_of_exposure(name, sequence, captured.frames, phases, warn)
+            warn(f"{saved.name}: {sentence}")
     except SlviewerError as error:  # it is saved, and can be looked at later
-        warn(f"{name} is saved, and its frames could not be checked: {error}")
+        warn(f"{saved.name} is saved, and its frames could not be checked: {error}")
+    warn_of_captured(saved.name, captured, warn)
 
 
-def set_camera(
-    rig: Rig, choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None, warn: Warn
-) -> None:
+def warn_of_captured(name: str, captured: CapturedFrames | Capture, warn: Warn) -> None:
+    """Warn where captured frames are too bright or too dark; of several exposures each is meant to
+    be so somewhere."""
+    if captured.exposures_ms:
+        return
+    frames = captured.frames
+    try:
+        phases = decode_frames(name, captured.sequence, frames)
+    except SlviewerError as error:
+        warn(f"{name} is saved, and its exposure could not be checked: {error}")
+    else:
+        warn_of_exposure(name, captured.sequence, frames, phases, warn)
+
+
+def set_camera(rig: Rig, choice: Choice, settings: RigSettings) -> None:
     """Set the open rig's camera to the requested values, else to those of its choice; warns of
     those refused or changed."""
-    wanted = applied = camera_settings(choice, exposure_ms, gain)
+    wanted = applied = _camera_settings(choice, settings)
     with report_driver_faults(rig.camera):
         if wanted != CameraSettings():
             applied = rig.camera.apply(wanted)
         notes = (*list_notes(rig.camera), *list_changed_settings(rig.camera, wanted, applied))
     for note in notes:
-        warn(note)
+        settings.warn(note)
 
 
-def camera_settings(
-    choice: Mapping[str, Any], exposure_ms: float | None, gain: float | None
-) -> CameraSettings:
+def _camera_settings(choice: Choice, settings: RigSettings) -> CameraSettings:
     """Return the requested settings, else those of the choice. Raises InputError for impossible
     ones."""
-    exposure_ms = choice.get("exposure_ms") if exposure_ms is None else exposure_ms
-    return CameraSettings(exposure_ms, choice.get("gain") if gain is None else gain)
+    exposure_ms = (
+        choice.get("exposure_ms") if settings.exposure_ms is None else settings.exposure_ms
+    )
+    return CameraSettings(
+        exposure_ms, choice.get("gain") if settings.gain is None else settings.gain
+    )
 
 
-def choose_patterns(store: Session, choice: Mapping[str, Any], patterns: str | None) -> str:
+def choose_patterns(store: Session, choice: Choice, patterns: str | None) -> str:
     """Return the name of the sequence to show, by default the session's. Raises InputError for an
     unknown one, unless the rig plays back its own."""
     patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)

@@ -2,7 +2,7 @@
 brought back."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,6 +14,7 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.models import ModelName, check_accepted
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scan_edits import OFF, parse_region
+from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
 from slviewer.surface.point_edits import Edit, make_edit
@@ -61,27 +62,9 @@ class ScanEdits:
         return "\n".join(lines)
 
 
-def edit_scan(
-    session: SessionLike,
-    scan: str,
-    *,
-    polygon: Sequence[float] = (),
-    part: Sequence[int] = (),
-    support: bool = False,
-    margin: float | None = None,
-    invert: bool = False,
-    undo: int = 0,
-    redo: int = 0,
-    model: ModelName | None = None,
-    accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> ScanEdits:
-    """Delete points of a scan, undo and redo that, or list what was deleted; the scan itself stays
-    as it was captured.
-
-    What is deleted is not used by reconstruct, merge, mesh, measure and export, with any later
-    calibration too.
+@dataclass(frozen=True)
+class EditSettings(Callbacks):
+    """Which points of a scan are deleted, or which edits are undone.
 
     Args:
         session: Session folder.
@@ -98,47 +81,94 @@ def edit_scan(
         model: Which calibration to select points by; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
     """
-    chosen = sum((bool(polygon), bool(part), support))
-    if chosen + bool(undo) + bool(redo) > 1:
-        raise UsageError("do one thing at a time: --polygon, --part, --support, --undo or --redo")
-    if (invert and not chosen) or (margin is not None and not support):
-        raise UsageError(
-            "--invert needs --polygon, --part or --support, and --margin needs --support"
-        )
-    if not chosen and not undo and not redo:
-        with opened(session) as store:
-            store.load_capture(scan)
-            return ScanEdits(scan, *list_edits(store, scan))
-    with opened(session, write=True) as store:
-        if not chosen:
-            change_history(store, scan, undo=undo, redo=redo)
-            return ScanEdits(scan, *list_edits(store, scan))
-        check_accepted(store, accept_rejected)
-        cloud = scan_cloud(store, scan, model, progress, warn, accept_rejected)
-        plane = None
-        if support:
-            (plane, selected), what = select_support(cloud.points, cloud.sigma_z, margin), SUPPORT
-        elif part:
-            if len(part) != 2:
-                raise UsageError(
-                    f"--part has {len(part)} numbers: give u v of one pixel, such as --part 180 150"
-                )
-            selected, what = select_connected(cloud.points, (part[0], part[1])), "connected part"
-        else:
-            if len(polygon) % 2 or len(polygon) < 6:
-                raise UsageError(
-                    f"--polygon has {len(polygon)} numbers: give u v of three or more pixels"
-                )
-            selected, what = (
-                select_polygon(cloud.sigma_z.shape, np.reshape(polygon, (-1, 2))),
-                "polygon",
+
+    session: SessionLike
+    scan: str
+    _: KW_ONLY
+    polygon: Sequence[float] = ()
+    part: Sequence[int] = ()
+    support: bool = False
+    margin: float | None = None
+    invert: bool = False
+    undo: int = 0
+    redo: int = 0
+    model: ModelName | None = None
+    accept_rejected: bool = False
+
+    def __post_init__(self) -> None:
+        if self.selections + bool(self.undo) + bool(self.redo) > 1:
+            raise UsageError(
+                "do one thing at a time: --polygon, --part, --support, --undo or --redo"
             )
-        if invert:
-            selected, what, plane = ~selected, f"all but {what}", None
-        delete_points(store, [Selection(scan, cloud.points, selected, plane)], what)
-        remaining = int(np.count_nonzero(cloud.mask & ~selected))
-        progress(1.0, "edited")
+        if (self.invert and not self.selections) or (self.margin is not None and not self.support):
+            raise UsageError(
+                "--invert needs --polygon, --part or --support, and --margin needs --support"
+            )
+        if self.part and len(self.part) != 2:
+            raise UsageError(
+                f"--part has {len(self.part)} numbers: give u v of one pixel, such as --part"
+                " 180 150"
+            )
+        if self.polygon and (len(self.polygon) % 2 or len(self.polygon) < 6):
+            raise UsageError(
+                f"--polygon has {len(self.polygon)} numbers: give u v of three or more pixels"
+            )
+
+    @property
+    def selections(self) -> int:
+        """In how many ways points are selected."""
+        return sum((bool(self.polygon), bool(self.part), self.support))
+
+
+@takes_settings(EditSettings)
+def edit_scan(settings: EditSettings) -> ScanEdits:
+    """Delete points of a scan, undo and redo that, or list what was deleted; the scan itself stays
+    as it was captured.
+
+    What is deleted is not used by reconstruct, merge, mesh, measure and export, with any later
+    calibration too.
+    """
+    scan, undo, redo, remaining = settings.scan, settings.undo, settings.redo, None
+    with opened(settings.session, write=bool(settings.selections or undo or redo)) as store:
+        if settings.selections:
+            remaining = _delete_selected(store, settings)
+            settings.progress(1.0, "edited")
+        elif undo or redo:
+            change_history(store, scan, undo=undo, redo=redo)
+        else:
+            store.load_capture(scan)
         return ScanEdits(scan, *list_edits(store, scan), remaining)
+
+
+def _delete_selected(store: Session, settings: EditSettings) -> int:
+    """Delete what the settings select of a scan; returns how many points remain."""
+    check_accepted(store, settings.accept_rejected)
+    cloud = scan_cloud(
+        store,
+        settings.scan,
+        settings.model,
+        settings.progress,
+        settings.warn,
+        settings.accept_rejected,
+    )
+    plane = None
+    if settings.support:
+        (plane, selected), what = (
+            select_support(cloud.points, cloud.sigma_z, settings.margin),
+            SUPPORT,
+        )
+    elif settings.part:
+        u, v = settings.part
+        selected, what = select_connected(cloud.points, (u, v)), "connected part"
+    else:
+        selected, what = (
+            select_polygon(cloud.sigma_z.shape, np.reshape(settings.polygon, (-1, 2))),
+            "polygon",
+        )
+    if settings.invert:
+        selected, what, plane = ~selected, f"all but {what}", None
+    delete_points(store, [Selection(settings.scan, cloud.points, selected, plane)], what)
+    return int(np.count_nonzero(cloud.mask & ~selected))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Files for other programs, of everything that a session holds. The wizard's step Export and the
 command call this."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,11 +13,12 @@ from slviewer.pipeline.export_documents import (
     write_table,
 )
 from slviewer.pipeline.export_shapes import DescribedShape, merge_name, merge_shape, scan_shape
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scan_edits import refuse_region
+from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import (
     IN_WORDS,
@@ -133,22 +134,9 @@ def default_file_name(what: What, name: str, file_format: str) -> str:
     return f"{stems.get(what, what)}.{file_format}"
 
 
-def export(
-    session: SessionLike,
-    what: What,
-    name: str = "",
-    *,
-    out: Path | str | None = None,
-    file_format: str = "",
-    model: ModelName | None = None,
-    plan: MeshingPlan | None = None,
-    roi: str = "",
-    accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> Exported:
-    """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57),
-    calibration, poses.
+@dataclass(frozen=True)
+class ExportSettings(Callbacks):
+    """What is written, and to which file.
 
     Args:
         session: Session folder.
@@ -172,11 +160,30 @@ def export(
 
     The file is written whole or not at all.
     """
-    with opened(session) as store:
-        chosen = file_format.lower().removeprefix(".")
+
+    session: SessionLike
+    what: What
+    name: str = ""
+    _: KW_ONLY
+    out: Path | str | None = None
+    file_format: str = ""
+    model: ModelName | None = None
+    plan: MeshingPlan | None = None
+    roi: str = ""
+    accept_rejected: bool = False
+
+
+@takes_settings(ExportSettings)
+def export(settings: ExportSettings) -> Exported:
+    """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57),
+    calibration, poses."""
+    what, roi, accept_rejected = settings.what, settings.roi, settings.accept_rejected
+    progress, warn = settings.progress, settings.warn
+    with opened(settings.session) as store:
+        chosen = settings.file_format.lower().removeprefix(".")
         check_export(what, chosen or formats(what)[0])
-        name = _resolve_name(store, what, name)
-        target = _output_path(store, what, name, out, chosen)
+        name = _resolve_name(store, what, settings.name)
+        target = _output_path(store, what, name, settings.out, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accept_rejected)
         if what not in (
@@ -186,9 +193,14 @@ def export(
             "merged-mesh",
         ):  # reading a merge warns by itself
             warn_if_stale(store, warn)
-        plan, making = (plan or MeshingPlan()) if "mesh" in what else None, part(progress, 0, 0.8)
+        plan, making = (
+            (settings.plan or MeshingPlan()) if "mesh" in what else None,
+            part(progress, 0, 0.8),
+        )
         if what in ("cloud", "mesh"):
-            shape = scan_shape(store, name, model, plan, making, warn, accept_rejected, roi)
+            shape = scan_shape(
+                store, name, settings.model, plan, making, warn, accept_rejected, roi
+            )
             words = _write_shape(shape, target, progress)
         elif what in ("merge", "merged-mesh"):
             refuse_region(f"merge/{name}", roi)
@@ -198,7 +210,7 @@ def export(
             words = "report"
         else:
             progress(0.1, f"writing {target.name}")
-            words = _write_document(store, what, name, target, model)
+            words = _write_document(store, what, name, target, settings.model)
     progress(1.0, "exported")
     return Exported(target, target.stat().st_size, words)
 

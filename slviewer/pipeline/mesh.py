@@ -1,7 +1,7 @@
 """From captures, or from a stored merge, to a mesh in a file."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,14 @@ import numpy as np
 from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
+from slviewer.pipeline.feedback import ignore_progress, part, stage
 from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Findings, Job, show_found
 from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
+from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.pipeline.stored_records import load_record
 from slviewer.pipeline.white_balance import balance, measure_white
 from slviewer.reconstruction.cloud import Cloud
@@ -61,24 +62,9 @@ class MeshResult:
         return "\n".join([*lines, f"-> {self.out}"])
 
 
-def mesh(
-    session: SessionLike,
-    names: Sequence[str] = (),
-    out: Path | str | None = None,
-    *,
-    plan: MeshingPlan | None = None,
-    texture: int | None = None,
-    white: str = "",
-    model: ModelName | None = None,
-    start: StartKind = "features",
-    angle: float | None = None,
-    roi: str = "",
-    accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> MeshResult:
-    """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or
-    .glb.
+@dataclass(frozen=True)
+class MeshSettings(Callbacks):
+    """What is meshed, how, and into which file.
 
     Args:
         session: Session folder.
@@ -99,57 +85,92 @@ def mesh(
             camera's frame (x right, y down, z away), a TOML file, or off; by default the session's.
             A merge was cut when it was made.
         accept_rejected: Use the calibration although its verdict rejects it.
+    """
+
+    session: SessionLike
+    names: Sequence[str] = ()
+    out: Path | str | None = None
+    _: KW_ONLY
+    plan: MeshingPlan | None = None
+    texture: int | None = None
+    white: str = ""
+    model: ModelName | None = None
+    start: StartKind = "features"
+    angle: float | None = None
+    roi: str = ""
+    accept_rejected: bool = False
+
+    def __post_init__(self) -> None:
+        sources = self.sources
+        if not sources:
+            raise UsageError("nothing was named: name one scan, several to merge, or a merge")
+        if len(sources) > 1 and any(name.startswith(MERGED) for name in sources):
+            raise UsageError("a merge is meshed by itself: name one merge, or scans")
+        if len(sources) > 1 and self.plan is not None and self.plan.method == "grid":
+            raise UsageError(
+                "the method grid joins the pixels of one scan: name one, or use poisson or volume"
+            )
+        if self.out is not None:
+            suffix = Path(self.out).suffix.lower()
+            check_export("mesh", suffix.removeprefix("."))
+            if self.texture is not None and suffix not in (".glb", ".obj"):
+                raise UsageError(
+                    f"{Path(self.out).name} holds no texture: end its name in .glb or .obj"
+                )
+        if self.white and self.texture is None:
+            raise UsageError("--white balances the colours of a texture: give --texture too")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The scans, or the merge, each once."""
+        return tuple(dict.fromkeys(self.names))
+
+
+@takes_settings(MeshSettings)
+def mesh(settings: MeshSettings) -> MeshResult:
+    """Make a mesh of a scan, or of several that are merged, and write it as .ply, .stl, .obj or
+    .glb.
 
     ``merge/`` alone is the session's last merge. The points of merged scans are written next to the
     mesh.
     """
-    sources = tuple(dict.fromkeys(names))
-    plan = plan or MeshingPlan()
-    _check_request(sources, plan, out, texture, white)
+    sources, texture = settings.sources, settings.texture
+    progress, warn, accept_rejected = settings.progress, settings.warn, settings.accept_rejected
+    plan = settings.plan or MeshingPlan()
     if texture is not None and plan.triangles is None:
         plan = replace(plan, triangles=TEXTURED_TRIANGLES)
     merged = None
-    with opened(session) as store:
+    with opened(settings.session) as store:
         check_accepted(store, accept_rejected)
-        gains = measure_white(store, white) if white else None
+        gains = measure_white(store, settings.white) if settings.white else None
         suffix = ".ply" if texture is None else ".glb"
-        path = (
-            Path(out)
-            if out is not None
-            else store.exports / f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
-        )
+        file_name = f"{'_'.join(sources).replace('/', '_')}_mesh{suffix}"
+        path = store.exports / file_name if settings.out is None else Path(settings.out)
         path.parent.mkdir(parents=True, exist_ok=True)
         before = part(progress, 0, 0.5)
         shape: Cloud | PointSet
         if len(sources) > 1:
-            points = path.with_name(f"{path.stem}_points.ply")
-            settings = MergeSettings(
-                sources,
-                sources[0],
-                points,
-                model,
-                start,
-                angle,
-                roi=roi,
-                accept_rejected=accept_rejected,
-            )
-            merged = merge_scans(Job(store, before, warn), settings)
+            merging = MergeSettings(
+                sources, sources[0], path.with_name(f"{path.stem}_points.ply"), settings.model,
+                settings.start, settings.angle, roi=settings.roi, accept_rejected=accept_rejected,
+            )  # fmt: skip
+            merged = merge_scans(Job(store, before, warn), merging)
             shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGED):
-            refuse_region(sources[0], roi)
+            refuse_region(sources[0], settings.roi)
             name = merge_name(store, sources[0].removeprefix(MERGED))
             shape = merged_points(store, name, warn)
             restrictions = tuple(load_record(store, Merge, name).restrictions)
         else:
             warn_if_stale(store, warn)
-            shape = scan_cloud(store, sources[0], model, before, warn, accept_rejected, roi)
-            restrictions = restriction_notes(store, sources, resolve_region(store, roi))
-        if texture is not None:
-            clouds, poses = _textured_scans(
-                store, sources, shape, merged, model, warn, accept_rejected
+            shape = scan_cloud(
+                store, sources[0], settings.model, before, warn, accept_rejected, settings.roi
             )
+            restrictions = restriction_notes(store, sources, resolve_region(store, settings.roi))
+        if texture is not None:
+            clouds, poses = _textured_scans(store, settings, shape, merged)
             rig = load_stereo(store).rig
-    merging = None if merged is None else show_found(merged.found)
+    made = None if merged is None else show_found(merged.found)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
     notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
     textured = None
@@ -169,43 +190,11 @@ def mesh(
         progress(0.95, f"writing {path.name}")
         write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
-    return MeshResult(meshed, sources, path, merging, textured)
-
-
-def _check_request(
-    sources: Sequence[str],
-    plan: MeshingPlan,
-    out: Path | str | None,
-    texture: int | None,
-    white: str,
-) -> None:
-    """Raise UsageError for scans and merges that cannot be meshed so, InputError for a file that
-    cannot hold it."""
-    if not sources:
-        raise UsageError("nothing was named: name one scan, several to merge, or a merge")
-    if len(sources) > 1 and any(name.startswith(MERGED) for name in sources):
-        raise UsageError("a merge is meshed by itself: name one merge, or scans")
-    if len(sources) > 1 and plan.method == "grid":
-        raise UsageError(
-            "the method grid joins the pixels of one scan: name one, or use poisson or volume"
-        )
-    if out is not None:
-        suffix = Path(out).suffix.lower()
-        check_export("mesh", suffix.removeprefix("."))
-        if texture is not None and suffix not in (".glb", ".obj"):
-            raise UsageError(f"{Path(out).name} holds no texture: end its name in .glb or .obj")
-    if white and texture is None:
-        raise UsageError("--white balances the colours of a texture: give --texture too")
+    return MeshResult(meshed, sources, path, made, textured)
 
 
 def _textured_scans(
-    store: Session,
-    sources: Sequence[str],
-    shape: Cloud | PointSet,
-    merged: MergedScans | None,
-    model: ModelName | None,
-    warn: Warn,
-    accept_rejected: bool,
+    store: Session, settings: MeshSettings, shape: Cloud | PointSet, merged: MergedScans | None
 ) -> tuple[Mapping[str, Cloud], Mapping[str, np.ndarray]]:
     """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's
     frame."""
@@ -213,16 +202,19 @@ def _textured_scans(
         return {
             name: merged.clouds[name] for name in merged.fused.names
         }, merged.alignment.T_reference_scan
+    (source,) = settings.sources
     if isinstance(shape, Cloud):
-        return {sources[0]: shape}, {sources[0]: np.eye(4)}
-    made = load_record(store, Merge, merge_name(store, sources[0].removeprefix(MERGED)))
+        return {source: shape}, {source: np.eye(4)}
+    made = load_record(store, Merge, merge_name(store, source.removeprefix(MERGED)))
     placed = {
         name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()
     }
     placed |= {made.reference: np.eye(4)}
-    used = made.model or model
+    used = made.model or settings.model
     clouds = {  # what lies outside of the region still hides the surface from a scan
-        name: scan_cloud(store, name, used, ignore_progress, warn, accept_rejected, OFF)
+        name: scan_cloud(
+            store, name, used, ignore_progress, settings.warn, settings.accept_rejected, OFF
+        )
         for name in made.scans
     }
     return clouds, placed

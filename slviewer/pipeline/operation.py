@@ -14,6 +14,7 @@ import numpy as np
 
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened_to_save
+from slviewer.pipeline.settings import describe
 from slviewer.pipeline.stored_records import save_record
 from slviewer.records.plain import to_plain
 from slviewer.records.record import Record
@@ -68,6 +69,11 @@ class Findings(dict[str, R]):
         (record,) = self.values()
         return record
 
+    @property
+    def failure(self) -> str:
+        """Why the command ends with status 1; empty where it ends with 0."""
+        return "; ".join(filter(None, (each.failure for each in self.values())))
+
     def to_json(self) -> dict[str, Any]:
         """Return the records as they are stored: {kind: {name: record}}."""
         return {self.kind.kind: dict(self)}
@@ -114,7 +120,7 @@ class Operation(Generic[P, S, R]):
         self.__signature__ = inspect.Signature(
             [session, *parameters], return_annotation=Findings[R]
         )
-        self.__doc__ = f"{inspect.getdoc(function)}\n\n{inspect.getdoc(settings)}"
+        self.__doc__ = describe(function, settings)
 
     def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:
         """Run the operation on a session with these settings, and return what it found."""

@@ -7,6 +7,7 @@ from slviewer.pipeline import (  # each registers its own
     check,
     merge,
     reconstruct,
+    run_plan,
     validate,
     verify,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "check",
     "merge",
     "reconstruct",
+    "run_plan",
     "validate",
     "verify",
 ]

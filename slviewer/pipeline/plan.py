@@ -15,11 +15,11 @@ from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.measurements import load_feature, load_measurements
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.part_inspection import fit_to_nominal
+from slviewer.records.inspection import Characteristic
 from slviewer.records.plain import from_plain
 from slviewer.session.inspection_plan import (
     KINDS,
     Alignment,
-    Characteristic,
     Plan,
     PlanFeature,
     PlanRegion,

@@ -1,8 +1,9 @@
 """Plan a rig: what a camera and a projector will measure at a distance, from their data sheets."""
 
+import math
 import re
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from slviewer.evaluation.rig_plan import (
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose, blank_board
@@ -127,24 +128,9 @@ class PlannedRig:
         return found
 
 
-def plan_rig(
-    camera: str,
-    projector: str,
-    distance: float,
-    *,
-    baseline: float | None = None,
-    lens: float | None = None,
-    steps: int = 8,
-    period: float | None = None,
-    reflectance: float = 1.0,
-    ambient: float = 0.06,
-    check: bool = False,
-    progress: Progress = ignore_progress,
-) -> PlannedRig:
-    """Predict field, depth range, fringe period and noise of a camera and a projector before they
-    are mounted.
-
-    The noise is that of a single point; errors of the calibration are not included.
+@dataclass(frozen=True)
+class RigPlanSettings(Callbacks):
+    """The devices of a rig, and how they are used.
 
     Args:
         camera: webcam-1080p, global-shutter-2mp, machine-vision-5mp, or its size and width of view:
@@ -163,28 +149,61 @@ def plan_rig(
 
     Raises InputError for unknown devices and impossible figures.
     """
-    for name, value, low, high in (
-        ("distance", distance, 10, 1e5), ("steps", steps, 3, 64),
-        ("reflectance", reflectance, 0.01, 1),
-        ("ambient", ambient, 0, 5), ("period", 16 if period is None else period, 3, 1000),
-    ):  # fmt: skip
-        if not low <= value <= high:
-            raise InputError(f"{name} = {value:g} is impossible: give {low:g} to {high:g}")
-    planned_camera, camera_text = _read_camera(camera, lens)
-    planned_projector, projector_text = _read_projector(projector)
-    between = distance * np.tan(np.radians(ANGLE_DEG)) if baseline is None else baseline
-    if not 1 <= between <= 3 * distance:
-        raise InputError(
-            f"a baseline of {between:g} mm is impossible at {distance:g} mm: give 1 to"
-            f" {3 * distance:g} mm"
+
+    camera: str
+    projector: str
+    distance: float
+    _: KW_ONLY
+    baseline: float | None = None
+    lens: float | None = None
+    steps: int = 8
+    period: float | None = None
+    reflectance: float = 1.0
+    ambient: float = 0.06
+    check: bool = False
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("distance", 10, 1e5), ("steps", 3, 64), ("reflectance", 0.01, 1), ("ambient", 0, 5),
+            ("period", 3, 1000),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{name} = {value:g} is impossible: give {low:g} to {high:g}")
+        if not 1 <= self.baseline_mm <= 3 * self.distance:
+            raise InputError(
+                f"a baseline of {self.baseline_mm:g} mm is impossible at {self.distance:g} mm: give"
+                f" 1 to {3 * self.distance:g} mm"
+            )
+
+    @property
+    def baseline_mm(self) -> float:
+        """The baseline, or the one for the usual angle."""
+        return (
+            math.tan(math.radians(ANGLE_DEG)) * self.distance
+            if self.baseline is None
+            else self.baseline
         )
-    light = PlannedLight(steps, reflectance, ambient)
-    plan = predict_rig(planned_camera, planned_projector, distance, float(between), light, period)
+
+
+@takes_settings(RigPlanSettings)
+def plan_rig(settings: RigPlanSettings) -> PlannedRig:
+    """Predict field, depth range, fringe period and noise of a camera and a projector before they
+    are mounted.
+
+    The noise is that of a single point; errors of the calibration are not included.
+    """
+    camera, camera_text = _read_camera(settings.camera, settings.lens)
+    projector, projector_text = _read_projector(settings.projector)
+    light = PlannedLight(settings.steps, settings.reflectance, settings.ambient)
+    plan = predict_rig(
+        camera, projector, settings.distance, settings.baseline_mm, light, settings.period
+    )
     planned = PlannedRig(camera_text, projector_text, plan, light)
-    if not check:
+    if not settings.check:
         return planned
-    progress(0.05, "simulating the rig before a plane")
-    measured, expected = _simulate_plane(planned_camera, planned_projector, plan, light)
+    settings.progress(0.05, "simulating the rig before a plane")
+    measured, expected = _simulate_plane(camera, projector, plan, light)
     return replace(planned, measured=measured, expected=expected)
 
 

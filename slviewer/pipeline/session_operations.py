@@ -13,6 +13,7 @@ from slviewer.pipeline.operations import (
     check,
     merge,
     reconstruct,
+    run_plan,
     validate,
     verify,
 )
@@ -48,6 +49,7 @@ class SessionOperations(Session):
     plan = plan
     reconstruct = reconstruct.reconstruct
     report = report
+    run_plan = run_plan.run_plan
     set_region = set_region
     validate = validate.validate
     verify = verify.verify

@@ -5,12 +5,12 @@ before it stay, and the missing steps can be captured later.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from slviewer.devices.capture import capture_with_texture, check_exposures
+from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.errors import (
     Cancelled,
@@ -22,12 +22,13 @@ from slviewer.errors import (
 )
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import (
+    RigSettings,
     check_space,
-    choose_patterns,
-    choose_sequence,
     depth_axis,
     save_frames,
     set_camera,
+    set_up_rig,
+    warn_of_captured,
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergeSettings, StartKind
@@ -37,8 +38,9 @@ from slviewer.pipeline.mesh import mesh as mesh_merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.operation import Findings
-from slviewer.pipeline.rig_choice import RigSetup, SetUp, set_up
+from slviewer.pipeline.rig_choice import RigSetup
 from slviewer.pipeline.rig_presets import RigLike, load_rig
+from slviewer.pipeline.settings import takes_settings
 from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused
@@ -83,31 +85,9 @@ class Turn:
         )
 
 
-def turn(
-    session: Path | str,
-    rig: RigLike,
-    *,
-    steps: int = STEPS,
-    range_deg: float = FULL_TURN_DEG,
-    name: str | None = None,
-    resume: bool = False,
-    merge: bool = True,
-    mesh: Path | str | None = None,
-    patterns: str | None = None,
-    exposure_ms: float | None = None,
-    exposures_ms: Sequence[float] = (),
-    gain: float | None = None,
-    model: ModelName | None = None,
-    accept_rejected: bool = False,
-    set_up: SetUp = set_up,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> Turn:
-    """Scan an object all round on the rig's turntable, merge the scans, and close them to a
-    watertight mesh.
-
-    Each scan is saved before the table turns on; a turn that was cancelled or failed can be
-    resumed.
+@dataclass(frozen=True)
+class TurnSettings(RigSettings):
+    """What is scanned all round, and what is made of the scans.
 
     Args:
         session: Session folder.
@@ -122,45 +102,55 @@ def turn(
         merge: Whether to merge the scans and mesh the merge; --no-merge captures only.
         mesh: File of the mesh, .ply, .stl, .obj or .glb; by default a .ply in the session's
             exports.
-        patterns: p18, complementary, gray, multifrequency or micro (for surfaces that light
-            themselves); by default the session's, else complementary.
-        exposure_ms: Exposure of the camera; by default the rig's, else what the camera is set to.
-        exposures_ms: Two or more exposures for shiny and dark parts.
-        gain: Gain of the camera, as a factor; by default the rig's, else what the camera is set to.
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
     Raises InputError, DeviceError, SessionError, and whatever `progress` raises; what was captured
     stays.
     """
-    if mesh is not None and not merge:
-        raise UsageError("a mesh is made of the merged scans: give --mesh or --no-merge, not both")
-    if exposure_ms is not None and exposures_ms:
-        raise InputError("the exposure was given in several ways: give one, or several")
-    exposures = check_exposures(exposures_ms) if exposures_ms else []
-    with opened_or_made(session) as store:
-        if merge:  # refused before anything turns
-            check_accepted(store, accept_rejected)
-            load_model(store, model)
-        todo = (
-            missing_steps(store, name)
-            if resume
-            else plan_turn(name or next_turn(store), steps, range_deg)
-        )
-        if taken := set(store.taken_names()).intersection(step.name for step in todo):
-            raise InputError(
-                f"there is a capture {min(taken)!r} already: choose another name, or resume the"
-                " turn"
+
+    session: Path | str
+    rig: RigLike
+    _: KW_ONLY
+    steps: int = STEPS
+    range_deg: float = FULL_TURN_DEG
+    name: str | None = None
+    resume: bool = False
+    merge: bool = True
+    mesh: Path | str | None = None
+    model: ModelName | None = None
+    accept_rejected: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mesh is not None and not self.merge:
+            raise UsageError(
+                "a mesh is made of the merged scans: give --mesh or --no-merge, not both"
             )
-        choice = load_rig(rig, store)
+
+
+@takes_settings(TurnSettings)
+def turn(settings: TurnSettings) -> Turn:
+    """Scan an object all round on the rig's turntable, merge the scans, and close them to a
+    watertight mesh.
+
+    Each scan is saved before the table turns on; a turn that was cancelled or failed can be
+    resumed.
+    """
+    model, progress, warn = settings.model, settings.progress, settings.warn
+    exposures, accepts = settings.exposures, settings.accept_rejected
+    with opened_or_made(settings.session) as store:
+        if settings.merge:  # refused before anything turns
+            check_accepted(store, accepts)
+            load_model(store, model)
+        todo = _list_steps(store, settings)
+        turn_name = todo[0].turn
+        choice = load_rig(settings.rig, store)
         if choice.get("driver") == "replay":
             raise InputError("a recording cannot be turned: choose a rig with a turntable")
-        patterns = choose_patterns(store, choice, patterns)
-        progress(0.0, "opening the devices")
-        bench = set_up(choice, None)
+        bench, sequence = set_up_rig(store, choice, None, settings)
         require_turntable(bench.rig)
         place_object(bench)
-        sequence = choose_sequence(bench, patterns)
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
         check_space(
@@ -170,7 +160,7 @@ def turn(
             "the turn",
         )
         with bench.rig.opened() as devices:
-            set_camera(devices, choice, exposure_ms, gain, warn)
+            set_camera(devices, choice, settings)
 
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step."""
@@ -181,29 +171,45 @@ def turn(
                     progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
                 )
                 save_frames(store, step.name, "scan", captured, turn_step=step)
+                warn_of_captured(step.name, captured, warn)
 
             capture_turn(
                 devices,
                 todo,
                 capture_step,
-                recorded_steps(store, todo[0].turn),
+                recorded_steps(store, turn_name),
                 part(progress, 0, 0.5),
                 warn,
             )
-        names = [step.name for step in recorded_steps(store, todo[0].turn)]
+        names = [step.name for step in recorded_steps(store, turn_name)]
         captures = tuple(map(store.load_capture, names))
-        if not merge:
+        if not settings.merge:
             progress(1.0, "captured")
             return Turn(captures)
-        settings = MergeSettings(names, names[0], model=model, accept_rejected=accept_rejected)
-        merged = merge_turn(store, settings, part(progress, 0.5, 0.8), warn)
-        out = mesh if mesh is not None else store.exports / f"{todo[0].turn}_mesh.ply"
+        merging = MergeSettings(names, names[0], model=model, accept_rejected=accepts)
+        merged = merge_turn(store, merging, part(progress, 0.5, 0.8), warn)
+        out = (
+            settings.mesh if settings.mesh is not None else store.exports / f"{turn_name}_mesh.ply"
+        )
         meshed = mesh_merge(
             store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model,
-            accept_rejected=accept_rejected,
+            accept_rejected=accepts,
             progress=part(progress, 0.8, 1.0), warn=warn,
         )  # fmt: skip
     return Turn(captures, merged, meshed)
+
+
+def _list_steps(store: Session, settings: TurnSettings) -> list[TurnStep]:
+    """Return the steps to capture. Raises InputError where a capture has the name of one."""
+    if settings.resume:
+        steps = missing_steps(store, settings.name)
+    else:
+        steps = plan_turn(settings.name or next_turn(store), settings.steps, settings.range_deg)
+    if taken := set(store.taken_names()).intersection(step.name for step in steps):
+        raise InputError(
+            f"there is a capture {min(taken)!r} already: choose another name, or resume the turn"
+        )
+    return steps
 
 
 def plan_turn(name: str, steps: int = STEPS, range_deg: float = FULL_TURN_DEG) -> list[TurnStep]:

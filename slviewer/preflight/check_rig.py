@@ -7,7 +7,7 @@ from pathlib import Path
 
 from slviewer.devices.protocols import Rig, report_driver_faults
 from slviewer.errors import DeviceError
-from slviewer.pipeline.capture import set_camera
+from slviewer.pipeline.capture import RigSettings, set_camera
 from slviewer.pipeline.check_results import Check, CheckName, Preflight
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -63,7 +63,7 @@ def check_rig(
     with set_up(choice, None).rig.opened() as devices:
         with report_driver_faults(devices.camera):
             before = devices.camera.settings()
-        set_camera(devices, choice, exposure_ms, gain, warn)
+        set_camera(devices, choice, RigSettings(exposure_ms=exposure_ms, gain=gain, warn=warn))
         try:
             return preflight(devices, progress=progress)
         finally:  # a camera may keep what it was checked with

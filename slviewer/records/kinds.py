@@ -1,9 +1,10 @@
-"""All kinds of records: whoever looks one up imports them from here."""
+"""All kinds of records: whoever looks one up imports them from here; each registers its own."""
 
 from slviewer.records import (  # each registers its own
     acceptance,
     calibration,
     drift,
+    inspection,
     merge,
     model_comparison,
     placement,
@@ -17,6 +18,7 @@ __all__ = [
     "acceptance",
     "calibration",
     "drift",
+    "inspection",
     "merge",
     "model_comparison",
     "placement",

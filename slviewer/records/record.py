@@ -79,6 +79,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         """Whether what was found needs no attention."""
         return True
 
+    @property
+    def failure(self) -> str:
+        """Why a command that found this ends with status 1; empty where it ends with 0."""
+        return ""
+
     def summary(self) -> str:
         """Return the figures in one sentence."""
         columns = [(figure_column(name), value) for name, value in self.figures().items()]

@@ -233,8 +233,8 @@ class NewCapture:
     name: str
     sequence: PatternSequence
     frames: np.ndarray
-    texture: np.ndarray | None
-    source: str
+    texture: np.ndarray | None = None
+    source: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     exposures_ms: Sequence[float] = ()
     files: tuple[str, ...] = ()

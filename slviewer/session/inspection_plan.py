@@ -9,9 +9,9 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
-from slviewer.inspection.quantities import Unit
 from slviewer.inspection.regions import Region
 from slviewer.inspection.relations import MEANINGS
+from slviewer.records.inspection import Characteristic
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.reading import read_toml
@@ -100,37 +100,6 @@ class PlanFeature:
 
 
 @dataclass(frozen=True)
-class Characteristic:
-    """What is measured and judged: its ``kind``, the names of its ``features`` (the second is the
-    datum), ``nominal`` value and limits ``lower`` and ``upper`` in ``unit``, as absolute values, of
-    which one or both may be absent.
-    """
-
-    name: str
-    kind: str
-    features: tuple[str, ...]
-    nominal: float | None = None
-    lower: float | None = None
-    upper: float | None = None
-    unit: Unit = "mm"
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"there is no kind {self.kind!r}: choose one of {', '.join(KINDS)}")
-        if len(self.features) != KINDS[self.kind]:
-            raise ValueError(
-                f"a {self.kind} takes {KINDS[self.kind]} features, not {len(self.features)}"
-            )
-        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
-            raise ValueError(
-                f"the lower limit {self.lower:g} of {self.name} is not below the upper"
-                f" {self.upper:g}"
-            )
-        if self.unit != ("deg" if self.kind == "angle" else "mm"):
-            raise ValueError(f"a {self.kind} is not measured in {self.unit!r}")
-
-
-@dataclass(frozen=True)
 class Alignment:
     """From scans to part coordinates: "none" (parts lie in a fixture), "best fit" to the
     ``nominal`` model, or "3-2-1" by three ``datums``, features' names, which are looked for from
@@ -177,6 +146,15 @@ class Plan:
                 raise ValueError(
                     f"each {what} needs a name of its own, and there must be one:"
                     f" {', '.join(names)}"
+                )
+        for each in self.characteristic:
+            if each.kind not in KINDS:
+                raise ValueError(
+                    f"there is no kind {each.kind!r}: choose one of {', '.join(KINDS)}"
+                )
+            if len(each.features) != KINDS[each.kind]:
+                raise ValueError(
+                    f"a {each.kind} takes {KINDS[each.kind]} features, not {len(each.features)}"
                 )
         known = {each.name for each in self.feature}
         asked = {name for each in self.characteristic for name in each.features} | set(

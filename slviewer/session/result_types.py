@@ -8,7 +8,7 @@ An entry may be absent, as older versions had fewer: reading one that is needed 
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, Required, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 
@@ -155,14 +155,6 @@ class _Measurement(ResultMeta, total=False):
     of: list[str]
 
 
-class _Inspection(ResultMeta, total=False):
-    """`inspection/*`."""
-
-    plan: Required[str]
-    characteristic: Required[list[dict[str, Any]]]
-    parts: Required[list[dict[str, Any]]]
-
-
 class _Scale(ResultMeta, total=False):
     """`scale/*`."""
 
@@ -180,7 +172,6 @@ _TYPES: dict[str, Any] = {
     "trust": _FrameCheck,
     "edits": _Edits,
     "measurements": _Measurement,
-    "inspection": _Inspection,
     "scale": _Scale,
 }
 

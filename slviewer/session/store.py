@@ -1,7 +1,7 @@
 """A session: the folder that holds captures, results and decisions, and the only access to it."""
 
 import contextlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, get_args
@@ -198,15 +198,12 @@ class Session(Decisions):
         sequence: PatternSequence,
         frames: np.ndarray,
         *,
-        source: str,
-        texture: np.ndarray | None = None,
-        settings: Mapping[str, Any] | None = None,
         board: object | None = None,
-        exposures_ms: Sequence[float] = (),
         force: bool = False,
+        **details: Any,
     ) -> Capture:
-        """Save frames (n, h, w), uint8 or uint16, in the order of the sequence, with an optional
-        colour texture.
+        """Save frames (n, h, w), uint8 or uint16, in the order of the sequence. ``details``: as of
+        `NewCapture`.
 
         Of two or more `exposures_ms`, the frames are (k n, h, w): the whole sequence in the first,
         then in the second.
@@ -215,8 +212,9 @@ class Session(Decisions):
         use (unless `force`, which moves the old capture to the trash) or frames that do not fit,
         SessionError where the disk refuses.
         """
-        capture = NewCapture(name, sequence, frames, texture, source, settings or {}, exposures_ms)
-        return self.save_captures([capture], role, board=board, force=force)[0]
+        return self.save_captures(
+            [NewCapture(name, sequence, frames, **details)], role, board=board, force=force
+        )[0]
 
     def save_captures(
         self,

@@ -20,7 +20,7 @@ from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.devices.protocols import CameraSettings
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
-from slviewer.pipeline.capture import measure_space
+from slviewer.pipeline.capture import measure_space, warn_of_captured
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.frame_check import load_check, load_or_save_check
 from slviewer.pipeline.poses import read_stored_poses
@@ -356,6 +356,11 @@ class Engine:
             if is_new:
                 for sentence in load_or_save_check(session, capture).warnings():
                     self.notices.add("warning", f"{capture.name}: {sentence}", "frames")
+                warn_of_captured(
+                    capture.name,
+                    capture,
+                    lambda text: self.notices.add("warning", text, "check-exposure"),
+                )
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
         """Read the features of a target pose, examine its frames, and save both; the next pose is

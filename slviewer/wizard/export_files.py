@@ -2,7 +2,6 @@
 
 from slviewer.pipeline.export import What, default_file_name, export
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import accepts_rejected
 from slviewer.session.store import Session
@@ -17,45 +16,60 @@ def export_file(
     name: str,
     file_format: str,
     plan: MeshingPlan | None,
-    texture: int | None,
     report: Reporter,
     warn: Warn,
-    white: str = "",
 ) -> str:
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the
-    file's name.
-
-    ``texture``: side of the image of a mesh, px, None for a mesh without one; ``white``: its white
-    balance.
-    """
-    accepts, progress = accepts_rejected(session), report.within(0, 0.98)
-    if texture is None:
-        with session.guarded(report.saving).staged_export(
-            default_file_name(what, name, file_format)
-        ) as path:
-            exported = export(
-                session,
-                what,
-                name,
-                out=path,
-                plan=plan,
-                accept_rejected=accepts,
-                progress=progress,
-                warn=warn,
-            )
-        words = exported.words
-    else:
-        source = f"{MERGED}{name}" if what == "merged-mesh" else name
-        path = session.exports / default_file_name(what, name, file_format)
-        made = mesh(
-            session, [source], path, plan=plan, texture=texture, white=white,
-            accept_rejected=accepts,
-            progress=progress, warn=warn,
-        )  # fmt: skip
-        assert made.textured is not None
-        words = f"{made.meshed.text().splitlines()[0]}; {made.textured.text()}"
+    file's name."""
+    with session.guarded(report.saving).staged_export(
+        default_file_name(what, name, file_format)
+    ) as path:
+        exported = export(
+            session,
+            what,
+            name,
+            out=path,
+            plan=plan,
+            accept_rejected=accepts_rejected(session),
+            progress=report.within(0, 0.98),
+            warn=warn,
+        )
     report(1.0, "exported")
-    return f"{path.name} is ready to download: {words}"
+    return f"{path.name} is ready to download: {exported.words}"
+
+
+def export_textured(
+    session: Session,
+    source: str,
+    file_name: str,
+    plan: MeshingPlan | None,
+    texture: int,
+    white: str,
+    report: Reporter,
+    warn: Warn,
+) -> str:
+    """Write the mesh of a scan or a merge with a texture, as `pipeline.mesh.mesh` does; returns a
+    sentence that begins with the file's name.
+
+    ``texture``: side of its image, px; ``white``: its white balance.
+    """
+    made = mesh(
+        session,
+        [source],
+        session.exports / file_name,
+        plan=plan,
+        texture=texture,
+        white=white,
+        accept_rejected=accepts_rejected(session),
+        progress=report.within(0, 0.98),
+        warn=warn,
+    )
+    assert made.textured is not None
+    report(1.0, "exported")
+    return (
+        f"{file_name} is ready to download: {made.meshed.text().splitlines()[0]};"
+        f" {made.textured.text()}"
+    )
 
 
 def list_exports(session: Session) -> tuple[ExportView, ...]:

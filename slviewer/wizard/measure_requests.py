@@ -4,7 +4,6 @@ model."""
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Concatenate, ParamSpec
 
@@ -13,14 +12,9 @@ from slviewer.evaluation.render import format_count
 from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline import measurements
 from slviewer.pipeline.compare import NominalComparison, compare_surface
-from slviewer.pipeline.inspect_parts import (
-    Inspection,
-    inspect_surfaces,
-    save_inspection,
-    write_inspection,
-)
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
+from slviewer.pipeline.run_plan import RunPlanSettings, run_plan
 from slviewer.session import atomic
 from slviewer.session.atomic import rename
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
@@ -39,8 +33,6 @@ from slviewer.wizard.surfaces import Surfaces
 
 P = ParamSpec("P")
 TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
-PARTS = ("parts.html", "parts.csv")
-"""The report and the table of a run of a plan."""
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
@@ -148,44 +140,12 @@ class MeasureRequests(RequestHandler):
         if not surfaces:
             raise InputError("no scan to inspect: reconstruct one in the step Scan first")
 
-        def work(report: Reporter) -> Inspection:
-            """Inspect all parts, write the report, and save the results."""
-            read = read_plan(store.folder / plan)
-            if read.alignment.nominal is not None:
-                own = store.folder / NOMINALS / Path(read.alignment.nominal).name
-                read = (
-                    replace(read, alignment=replace(read.alignment, nominal=str(own)))
-                    if own.is_file()
-                    else read
-                )
-            inputs = dict[str, str]()
-
-            def load(name: str) -> MeasuredSurface:
-                """Load the surface of a part."""
-                surface = self._surfaces.load(store, name)
-                inputs.update(surface.inputs)
-                return surface
-
-            sources = [(name, lambda _, name=name: load(name)) for name in surfaces]
-            inspection = inspect_surfaces(read, sources, report.within(0, 0.95))  # type: ignore[arg-type]
-            with atomic.staged_folder(store.exports / PARTS[0], 0) as folder:
-                written = write_inspection(inspection, folder)
-                report.saving()
-                for path in written.files:
-                    rename(path, store.exports / path.name)
-            atomic.discard(folder)
-            save_inspection(store.guarded(report.saving), inspection, inputs)
-            report(1.0, "inspected")
-            return inspection
-
-        def done(inspection: Inspection) -> None:
-            """Report how many parts pass, and mark the session as changed."""
-            self._engine.notices.add(
-                "warning" if inspection.failure else "good", describe_inspection(inspection)
-            )
-            self._engine.publisher.mark_changed(session=True)
-
-        self._engine.jobs.submit("Running the plan", work, done)
+        self._run(
+            "Running the plan",
+            run_plan,
+            RunPlanSettings(store.folder / plan, surfaces),
+            "measurements",
+        )
 
     @request(COMPARING)
     def compare_nominal(
@@ -291,12 +251,6 @@ def describe_quantities(measured: Measurement) -> str:
     """Describe a measurement in one sentence: its name and quantities."""
     values = "; ".join(quantity.text() for quantity in measured.quantities)
     return f"{measured.name}: {values}"
-
-
-def describe_inspection(inspection: Inspection) -> str:
-    """Describe in a sentence how many parts pass."""
-    failure = inspection.failure
-    return f"{inspection.plan.name}: {failure or f'all {len(inspection.parts)} parts pass'}"
 
 
 def describe_deviation(result: NominalComparison) -> str:

@@ -9,7 +9,8 @@ from slviewer.errors import InputError
 from slviewer.pipeline.align import FOLDER as PLACEMENTS
 from slviewer.pipeline.align import AlignSettings, align, remove_placement
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.export import What, check_export, formats
+from slviewer.pipeline.export import What, check_export, default_file_name, formats
+from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.models import (
     ModelName,
     accept_rejected_calibration,
@@ -25,7 +26,7 @@ from slviewer.records.verification import Shape
 from slviewer.session.names import clean_label
 from slviewer.surface.meshing import MeshingPlan
 from slviewer.wizard import diagnostics, tasks
-from slviewer.wizard.export_files import export_file
+from slviewer.wizard.export_files import export_file, export_textured
 from slviewer.wizard.requests import RequestHandler, request
 
 
@@ -192,21 +193,20 @@ class ResultRequests(RequestHandler):
             if view is None or view.merge is None:
                 raise InputError("there is no merge yet: merge scans first")
             name = view.merge.name
-        self._submit(
-            "Exporting",
-            partial(
-                export_file,
+        if texture is None:
+            write = partial(export_file, store, what, name, chosen, plan)
+        else:
+            source = f"{MERGED}{name}" if what == "merged-mesh" else name
+            write = partial(
+                export_textured,
                 store,
-                what,
-                name,
-                chosen,
+                source,
+                default_file_name(what, name, chosen),
                 plan,
                 texture,
-                warn=self._warner("measurements"),
-                white=white,
-            ),
-            str,
-        )
+                white,
+            )
+        self._submit("Exporting", partial(write, warn=self._warner("measurements")), str)
 
     def report(self) -> bool:
         """Write the HTML report into the exports."""

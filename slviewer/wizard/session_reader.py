@@ -15,7 +15,6 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.fringe.presets import PRESETS
-from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
@@ -33,10 +32,9 @@ from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.stored_records import Stored, captures_of, read_record
 from slviewer.records.kinds import RECORDS
 from slviewer.records.placement import Placement
-from slviewer.records.plain import from_plain
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.capture import Capture
-from slviewer.session.inspection_plan import Characteristic, list_plans
+from slviewer.session.inspection_plan import list_plans
 from slviewer.session.measurements import FOLDER as MEASUREMENTS
 from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
 from slviewer.session.names import join_names, natural_key
@@ -49,7 +47,6 @@ from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.snapshot import (
     CalibrationView,
-    InspectionView,
     PoseState,
     PoseView,
     RigView,
@@ -204,7 +201,6 @@ class SessionReader:
             ),
             nominals=list_nominals(session.folder),
             plans=list_plans(session.folder),
-            inspection=self._attempt("the inspection", lambda: self._read_inspection(inputs), None),
             exports=list_exports(session),
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
@@ -540,17 +536,6 @@ class SessionReader:
                 if not stale:
                     known[result] = meta["hash"]
         return tuple(read)
-
-    def _read_inspection(self, inputs: _Inputs) -> InspectionView | None:
-        """Read the latest run of an inspection plan; None where there is none."""
-        if not (names := self._list_results("inspection/")):
-            return None
-        meta = self._load_meta(names[-1])
-        characteristic = from_plain(meta["characteristic"], tuple[Characteristic, ...])
-        parts = from_plain(meta["parts"], tuple[PartResult, ...])
-        return InspectionView(
-            meta["plan"], characteristic, parts, _has_changed(meta["inputs"], inputs.hashes)
-        )
 
     # files
 

@@ -12,7 +12,6 @@ from slviewer.calibration.next_pose import Coverage, Suggestion
 from slviewer.calibration.stereo import StereoModel
 from slviewer.devices.browser import PageRole
 from slviewer.devices.world import Thing
-from slviewer.inspection.parts import PartResult
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.stored_records import Stored
@@ -25,7 +24,6 @@ from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.registration.refusal import Reason
 from slviewer.session.capture import TurnStep
-from slviewer.session.inspection_plan import Characteristic
 from slviewer.session.measurements import Measurement
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
@@ -209,17 +207,6 @@ class ExportView:
 
 
 @dataclass(frozen=True)
-class InspectionView:
-    """The latest run of an inspection plan: its characteristics, and the results of each part;
-    stale where a scan has changed since."""
-
-    plan: str
-    characteristic: tuple[Characteristic, ...]
-    parts: tuple[PartResult, ...]
-    stale: bool
-
-
-@dataclass(frozen=True)
 class StepView:
     """One step: its `instruction`, its `problems` with their remedies, and `blocked_by`: why it
     cannot be done yet."""
@@ -269,7 +256,6 @@ class SessionView:
     deleted_measurements: int = 0  # how many can be restored
     nominals: tuple[str, ...] = ()  # names of the nominal models that were uploaded
     plans: tuple[str, ...] = ()  # paths of inspection plans in the session's folder
-    inspection: InspectionView | None = None
     exports: tuple[ExportView, ...] = ()
     deleted_poses: tuple[str, ...] = ()  # what can be restored, the last deleted first
     deleted_scans: tuple[str, ...] = ()

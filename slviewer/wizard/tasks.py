@@ -85,7 +85,7 @@ def merge_scanned_turn(
     (number,) = merged
     try:
         words = export_file(
-            session, "merged-mesh", number, "ply", WATERTIGHT, None, report.within(0.7, 1), warn
+            session, "merged-mesh", number, "ply", WATERTIGHT, report.within(0.7, 1), warn
         )
     except Cancelled:
         raise

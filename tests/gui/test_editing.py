@@ -30,6 +30,7 @@ from slviewer.gui.app import App
 from slviewer.gui.scene import read_view
 from slviewer.pipeline.capture import capture
 from slviewer.pipeline.rig_choice import RigSetup
+from slviewer.records.inspection import Inspection
 from slviewer.server.secure import Serving
 from slviewer.session.inspection_plan import OWN_PLAN, read_plan, write_plan
 from slviewer.session.scan_edits import load_edits
@@ -407,8 +408,8 @@ def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Bro
         click(page, "Run plan")
 
         def decisions() -> list[str]:
-            seen = operator.snapshot().session.inspection  # type: ignore[union-attr]
-            return [] if seen is None else [part.decision for part in seen.parts]
+            runs = operator.snapshot().session.list_records(Inspection)  # type: ignore[union-attr]
+            return [part.decision for part in runs[-1].record.parts] if runs else []
 
         wait_until(page, lambda: len(decisions()) == 2)
         assert decisions() == [

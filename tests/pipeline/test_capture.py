@@ -14,7 +14,7 @@ from slviewer.devices.simulated import preset_rig
 from slviewer.errors import Cancelled, DeviceError, InputError, SessionError
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
-from slviewer.pipeline.capture import capture, set_camera
+from slviewer.pipeline.capture import RigSettings, capture, set_camera
 from slviewer.pipeline.capture_phases import capture_texture
 from slviewer.pipeline.devices import list_drivers
 from slviewer.pipeline.rig_choice import RigSetup, set_up
@@ -291,7 +291,7 @@ def test_what_the_camera_took_in_place_of_a_setting_is_reported(tmp_path: Path):
     rig = preset_rig(scale=0.1)
     said: list[str] = []
     with rig.opened():
-        set_camera(rig, {"exposure_ms": 1000.0}, None, 20.0, said.append)
+        set_camera(rig, {"exposure_ms": 1000.0}, RigSettings(gain=20.0, warn=said.append))
         assert [
             missing_facts(*note)
             for note in zip(said, ("100 ms", "16"), ("1000 ms", "20"), strict=True)
@@ -300,9 +300,11 @@ def test_what_the_camera_took_in_place_of_a_setting_is_reported(tmp_path: Path):
             [],
         ]
         said.clear()
-        set_camera(rig, {}, 105.0, None, said.append)  # rounding by a few percent is normal
+        set_camera(
+            rig, {}, RigSettings(exposure_ms=105.0, warn=said.append)
+        )  # rounding by a few percent is normal
         rig.camera.notes = ("its exposure is 100 ms, 1000 ms were requested",)  # type: ignore[attr-defined]
-        set_camera(rig, {}, 1000.0, None, said.append)
+        set_camera(rig, {}, RigSettings(exposure_ms=1000.0, warn=said.append))
     assert said == ["its exposure is 100 ms, 1000 ms were requested"]
     said.clear()
     capture(

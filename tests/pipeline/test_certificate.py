@@ -19,8 +19,11 @@ from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certif
 from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.measurements import add_distance, add_fit, add_relation, add_section
 from slviewer.pipeline.report import report
+from slviewer.pipeline.run_plan import run_plan
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.records.inspection import Characteristic
 from slviewer.report.page import CERTIFICATE, split_page
+from slviewer.session.inspection_plan import Plan, PlanFeature, PlanRegion, write_plan
 from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
@@ -75,6 +78,11 @@ def measured_report(folder: Path, model: str) -> Path:
             store, plane, "plane", Region.ball(plane.points[middle[1], middle[0] + 30], 15.0)
         )
         add_relation(store, first.id, second.id)
+        place = PlanRegion("ball", tuple(plane.points[middle[1], middle[0]].tolist()), (20.0,))
+        features = (PlanFeature("middle", "plane", place),)
+        flatness = Characteristic("flatness", "flatness", ("middle",), upper=1.0)
+        write_plan(Plan("plate", features, (flatness,)), folder.parent / "plan.toml")
+        run_plan(store, folder.parent / "plan.toml", ["plane_01"])
         report(store, page)
     return page
 
@@ -102,7 +110,9 @@ def test_the_figures_of_a_report_follow_from_the_frames(
     found = verify_report(folder, page)
     assert not found.failure, found.text()
     assert set(states(found).values()) == {"same"}, found.text()
-    assert expected | {"page", "measurements/m1", "measurements/m5"} <= set(states(found))
+    assert expected | {"page", "measurements/m1", "measurements/m5", "inspection/1"} <= set(
+        states(found)
+    )
     assert sorted(path.name for path in folder.rglob("*")) == before
     certificate = read_certificate(page)[1]
     assert all(

@@ -47,6 +47,25 @@ limits = {form_mm = 5.0}
 """.replace("\\\n", "")
 
 
+PLAN = """version = 1
+name = "plane"
+[[feature]]
+name = "middle"
+kind = "plane"
+region = {kind = "ball", centre = [0.0, 0.0, 600.0], size = [400.0]}
+[[characteristic]]
+name = "flatness"
+kind = "flatness"
+features = ["middle"]
+upper = 5.0
+"""
+
+
+def find_plan(session: Path) -> str:
+    """Path of the inspection plan, beside the session."""
+    return str(session.parent / "plan.toml")
+
+
 def find_ball(session: Path) -> str:
     """Path of the file of the ball's certificate, beside the session."""
     return str(session.parent / "ball.toml")
@@ -60,6 +79,15 @@ OPERATIONS = {
         # type: ignore[union-attr]
         ("acceptance/1",),
         "sphere_3",
+    ),
+    "run_plan": Operation(
+        ("run-plan", "SESSION", "PLAN", "--scan", "plane_03"),
+        lambda session: sl.run_plan(session, find_plan(session), ["plane_03"]),
+        lambda operator: operator.run(
+            "run-plan", plan=find_plan(operator.session.folder), scans=["plane_03"]
+        ),  # type: ignore[union-attr]
+        ("inspection/1",),
+        "plane_03",
     ),
     "reconstruct": Operation(
         ("reconstruct", "SESSION", "object_r1"),
@@ -114,7 +142,7 @@ OPERATIONS = {
 
 
 def by_terminal(operation: Operation, session: Path) -> None:
-    places = {"SESSION": str(session), "BALL": find_ball(session)}
+    places = {"SESSION": str(session), "BALL": find_ball(session), "PLAN": find_plan(session)}
     assert main([places.get(word, word) for word in operation.terminal]) == 0
 
 
@@ -155,6 +183,7 @@ def done(
         store.save_capture("later", "scan", board.sequence, board.frames, source="simulated")
     sessions = {door: copy_session(first, folder / door) for door in DOORS}
     (folder / "ball.toml").write_text(BALL)
+    (folder / "plan.toml").write_text(PLAN)
     for door, session in sessions.items():
         DOORS[door](operation, session)
     return operation, sessions

@@ -12,6 +12,7 @@ from slviewer.pipeline.calibrate import CalibrateSettings
 from slviewer.pipeline.stored_records import Stored, load_record, name_records
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.drift import Drift
+from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.merge import Merge
 from slviewer.records.model_comparison import ModelComparison
@@ -124,6 +125,15 @@ def test_a_stereo_calibration_keeps_its_figures_and_can_be_repeated(session: Ses
     assert CalibrateSettings(**found.settings) == CalibrateSettings(
         "circles:21x16:9", ["stereo", "pixelwise", "splined"]
     )
+
+
+def test_inspections_keep_their_decisions(session: Session) -> None:
+    old, found = as_stored("inspection/1"), load_record(session, Inspection, "1")
+    assert [found.plan, found.inputs] == [old["plan"], old["inputs"]]
+    plain = json.loads(json.dumps(to_plain(found)))
+    assert plain["characteristic"] == old["characteristic"] and plain["parts"] == old["parts"]
+    assert found.count_parts() == {"pass": 0, "fail": 1, "undecided": 1} and not found.is_good
+    assert found.figures()["object_r1 angle deg"] == 90.61
 
 
 def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None:

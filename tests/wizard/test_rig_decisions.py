@@ -69,6 +69,16 @@ def test_poses_in_several_exposures_are_judged_as_others_are(operator: Operator)
     assert operator.session.load_capture("pose_02").exposures_ms == ()
 
 
+def test_a_pose_that_is_too_bright_is_warned_of(operator: Operator) -> None:
+    assert operator.set_exposure(20.0)
+    assert operator.wait_for(lambda s: s.rig.exposure_ms == 20.0, HANG_S)
+    assert operator.capture_pose()
+    notices = operator.wait_until_idle().notices
+    assert [
+        each.text.partition(":")[0] for each in notices if each.section == "check-exposure"
+    ] == ["pose_01"]
+
+
 @pytest.mark.slow
 def test_a_suggested_exposure_is_set_and_can_be_undone(operator: Operator) -> None:
     assert operator.set_exposure(20.0) and operator.set_exposures((20.0, 90.0))  # far too bright

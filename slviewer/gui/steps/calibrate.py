@@ -17,6 +17,7 @@ from slviewer.gui.calibration_html import (
 from slviewer.gui.inputs import Choice, SessionValue, change, scan_options
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pictures import PLOT_PX, Plot
+from slviewer.gui.scene import Stroke
 from slviewer.gui.widgets import (
     Html,
     Text,
@@ -339,17 +340,10 @@ class CalibratePanel(StepPanel):
                 )
                 colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
                 here = pose.name == chosen
-                label = pose.name if here else ""
-                width = 5.0 if here else 1.5
-                scene.board(
-                    BOARDS,
-                    pose.name,
-                    pose.T_camera_board,
-                    outline,
-                    colour,
-                    label=label,
-                    width_px=width,
+                label, stroke = (
+                    (pose.name, Stroke(colour, 5.0)) if here else ("", Stroke(colour, 1.5))
                 )
+                scene.board(BOARDS, pose.name, pose.T_camera_board, outline, stroke, label=label)
         scene.show(BOARDS, self._visible)
 
     def _load_details(self, made: tuple[Any, ...]) -> CalibrationFigures:

@@ -12,7 +12,7 @@ from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change
 from slviewer.gui.panel import PanelContext, StepPanel
 from slviewer.gui.pose_list import TONES, PoseBoards, pose_table
 from slviewer.gui.preview import board_html, draw_preview, exposure_html, legend
-from slviewer.gui.scene import GHOST
+from slviewer.gui.scene import GHOST, Stroke
 from slviewer.gui.widgets import (
     Html,
     Picture,
@@ -254,9 +254,8 @@ class PosesPanel(StepPanel):
                 "suggestion",
                 suggestion.T_camera_board,
                 outline,
-                GHOST,
+                Stroke(GHOST, 4.0),
                 label="next pose",
-                width_px=4.0,
             )
 
     def _draw_world(self, snapshot: Snapshot) -> None:
@@ -273,7 +272,7 @@ class PosesPanel(StepPanel):
             return
         T, centre = world.T_camera_object, self._get_board_centre(self._board)
         if self._world is None:
-            scene.board(WORLD, "board", T, self._board.outline(), (70, 70, 70), width_px=3.0)
+            scene.board(WORLD, "board", T, self._board.outline(), Stroke((70, 70, 70), 3.0))
             scene.gizmo(WORLD, "handle", T @ centre, self._drag_board, self._place_board)
         elif not np.array_equal(T, self._world):
             scene.move(WORLD, "board", T)

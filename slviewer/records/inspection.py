@@ -1,0 +1,199 @@
+"""Parts that were measured and judged by an inspection plan."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import msgspec
+
+from slviewer.records.acceptance import MARKS, Decision
+from slviewer.records.record import Count, Record
+from slviewer.records.table import Cell, Column, Table, Value
+
+RULE = (
+    "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
+    " U (k = 2) stay within the limits, fail where the value is beyond one by more than U, else"
+    " undecided."
+)
+Interval = tuple[float, float, float]
+"""A figure, and the ends of its 95 % confidence interval."""
+
+
+@dataclass(frozen=True)
+class Characteristic:
+    """What is measured and judged: its ``kind``, the names of its ``features`` (the second is the
+    datum), ``nominal`` value and limits ``lower`` and ``upper`` in ``unit``, as absolute values, of
+    which one or both may be absent.
+    """
+
+    name: str
+    kind: str
+    features: tuple[str, ...]
+    nominal: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    unit: str = "mm"
+
+    def __post_init__(self) -> None:
+        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+            raise ValueError(
+                f"the lower limit {self.lower:g} of {self.name} is not below the upper"
+                f" {self.upper:g}"
+            )
+        if self.unit != ("deg" if self.kind == "angle" else "mm"):
+            raise ValueError(f"a {self.kind} is not measured in {self.unit!r}")
+
+
+class CharacteristicResult(msgspec.Struct, frozen=True):
+    """A characteristic of one part: its ``value`` and ``U`` (k = 2), and the ``decision``; or the
+    ``reason`` why it could not be measured. ``whole``: whether U holds the calibration's part."""
+
+    name: str
+    value: float | None
+    U: float | None
+    decision: Decision
+    reason: str = ""
+    whole: bool = True
+
+
+class PartResult(msgspec.Struct, frozen=True):
+    """The characteristics of one part, in the plan's order."""
+
+    part: str
+    results: tuple[CharacteristicResult, ...]
+
+    @property
+    def decision(self) -> Decision:
+        """ "fail" where one characteristic fails, else "undecided" where one is, else "pass"."""
+        decisions = [each.decision for each in self.results]
+        return (
+            "fail" if "fail" in decisions else "undecided" if "undecided" in decisions else "pass"
+        )
+
+
+class Capability(msgspec.Struct, frozen=True):
+    """Of ``parts`` values of this ``mean`` and standard deviation ``sigma``: ``cp`` (None for a
+    single limit) and ``cpk``."""
+
+    parts: Count
+    mean: float
+    sigma: float
+    cp: Interval | None
+    cpk: Interval
+
+
+class Inspection(Record, frozen=True, kw_only=True):
+    """Parts measured by an inspection plan, and judged by its limits.
+
+    ``capability`` of each characteristic, from the parts on which it was measured; None for fewer
+    than 3 parts, without a limit, or where the values do not vary. ``alignment``: how parts are
+    aligned; without, places are in the camera's frame.
+    """
+
+    kind: ClassVar[str] = "inspection"
+    title: ClassVar[str] = "Inspection"
+    plan: str
+    characteristic: tuple[Characteristic, ...]
+    parts: tuple[PartResult, ...]
+    capability: tuple[Capability | None, ...] = ()
+    alignment: str = "none"
+
+    def count_parts(self) -> dict[Decision, int]:
+        """Return the number of parts of each decision."""
+        counts = Counter(each.decision for each in self.parts)
+        return {"pass": counts["pass"], "fail": counts["fail"], "undecided": counts["undecided"]}
+
+    @property
+    def failure(self) -> str:
+        """Which parts do not pass; empty where all do."""
+        listed = []
+        for decision in ("fail", "undecided"):
+            if names := [each.part for each in self.parts if each.decision == decision]:
+                listed.append(f"{len(names)} {decision} ({', '.join(names)})")
+        return f"of {len(self.parts)} parts {', '.join(listed)}" if listed else ""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether all parts pass."""
+        return not self.failure
+
+    def summary(self) -> str:
+        """Return which parts do not pass in one sentence."""
+        return f"{self.plan}: {self.failure or f'all {len(self.parts)} parts pass'}"
+
+    def figures(self) -> dict[str, float]:
+        """Return the values of each part."""
+        return {
+            f"{each.part} {wanted.name} {wanted.unit}": result.value
+            for each in self.parts
+            for wanted, result in zip(self.characteristic, each.results, strict=True)
+            if result.value is not None
+        }
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Inspection"]) -> list[Table]:  # type: ignore[override]
+        """Return, for each run of a plan, the parts by characteristic, and the capability; the last
+        run first."""
+        runs = list(found.values())[::-1]
+        return [
+            table
+            for each in runs
+            for table in (each.list_results().without_empty(), *each._list_capability())
+        ]
+
+    def list_results(self) -> Table:
+        """Return the table of parts by characteristic."""
+        columns = [
+            Column("part", align="left"),
+            Column("characteristic", align="left"),
+            Column("kind", align="left", detail=True),
+            Column("value", digits=4),
+            Column("U (k = 2)", digits=4),
+            Column("unit", align="left"),
+            *(Column(limit, digits=4, detail=True) for limit in ("nominal", "lower", "upper")),
+            Column("decision", align="left"),
+            Column("reason", align="left", detail=True),
+        ]
+        rows: list[list[Value | Cell]] = [
+            [
+                *(each.part, wanted.name, wanted.kind, result.value, result.U, wanted.unit),
+                *(wanted.nominal, wanted.lower, wanted.upper),
+                Cell(result.decision, MARKS[result.decision]),
+                result.reason,
+            ]
+            for each in self.parts
+            for wanted, result in zip(self.characteristic, each.results, strict=True)
+        ]
+        notes = [RULE]
+        if not all(result.whole for each in self.parts for result in each.results):
+            notes.append(
+                "Some U hold no part of the calibration's uncertainty: the model does not"
+                " predict it."
+            )
+        return Table(columns, rows, f"Parts by {self.plan}", notes)
+
+    def _list_capability(self) -> list[Table]:
+        columns = [
+            Column("characteristic", align="left"),
+            Column("parts"),
+            Column("mean", digits=4),
+            Column("std. dev.", digits=4),
+            Column("unit", align="left"),
+            *(
+                Column(title, digits=2, group=index, detail=title != "value")
+                for index in ("Cp", "Cpk")
+                for title in ("value", "from", "to")
+            ),
+        ]
+        rows: list[list[Value | Cell]] = [
+            [wanted.name, c.parts, c.mean, c.sigma, wanted.unit, *(c.cp or (None,) * 3), *c.cpk]
+            for wanted, c in zip(self.characteristic, self.capability, strict=False)
+            if c is not None
+        ]
+        note = (
+            "With 95 % confidence intervals; the spread of the values includes the measurement's."
+            " Not for fewer than 3 parts, without a limit, or where values do not vary; Cp needs"
+            " both limits."
+        )
+        return [Table(columns, rows, f"Capability by {self.plan}", [note])] if rows else []
