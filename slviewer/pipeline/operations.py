@@ -1,13 +1,27 @@
 """All operations by the names of their commands: whoever looks one up imports them from here."""
 
-from slviewer.pipeline import (
+from slviewer.pipeline import (  # each registers its own
     accept,
     align,
     check,
+    compare,
+    measure,
     merge,
     reconstruct,
+    relate,
     verify,
-)  # each registers its own
+)
 from slviewer.pipeline.operation import OPERATIONS
 
-__all__ = ["OPERATIONS", "accept", "align", "check", "merge", "reconstruct", "verify"]
+__all__ = [
+    "OPERATIONS",
+    "accept",
+    "align",
+    "check",
+    "compare",
+    "measure",
+    "merge",
+    "reconstruct",
+    "relate",
+    "verify",
+]

@@ -13,11 +13,11 @@ from slviewer.inspection.fitting import FeatureFit, fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.parts import CharacteristicResult, PartResult
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.relations import relation
 from slviewer.inspection.tolerance import judge_limits
 from slviewer.inspection.uncertainty import RigidSpread, Shared
 from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.records.quantities import Quantity
 from slviewer.session.inspection_plan import (
     FORMS,
     SIZES,

@@ -1,13 +1,20 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
 from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.compare import compare
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
 from slviewer.pipeline.inspect import inspect
-from slviewer.pipeline.measure import measure
 from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.operations import accept, align, check, merge, reconstruct, verify
+from slviewer.pipeline.operations import (
+    accept,
+    align,
+    check,
+    compare,
+    measure,
+    merge,
+    reconstruct,
+    verify,
+)
 from slviewer.pipeline.plan import plan
 from slviewer.pipeline.report import report
 from slviewer.pipeline.stored_records import load_arrays
@@ -30,12 +37,12 @@ class SessionOperations(Session):
     align = align.align
     calibrate = calibrate
     check = check.check
-    compare = compare
+    compare = compare.compare
     edit_scan = edit_scan
     export = export
     inspect = inspect
     load_arrays = load_arrays
-    measure = measure
+    measure = measure.measure
     merge = merge.merge
     mesh = mesh
     plan = plan

@@ -1,13 +1,23 @@
 """All kinds of records: whoever looks one up imports them from here."""
 
-from slviewer.records import (
+from slviewer.records import (  # each registers its own
     acceptance,
     drift,
+    measurement,
     merge,
     placement,
     reconstruction,
     verification,
-)  # each registers its own
+)
 from slviewer.records.record import RECORDS
 
-__all__ = ["RECORDS", "acceptance", "drift", "merge", "placement", "reconstruction", "verification"]
+__all__ = [
+    "RECORDS",
+    "acceptance",
+    "drift",
+    "measurement",
+    "merge",
+    "placement",
+    "reconstruction",
+    "verification",
+]

@@ -9,10 +9,10 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
-from slviewer.inspection.quantities import Unit
 from slviewer.inspection.regions import Region
 from slviewer.inspection.relations import MEANINGS
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.quantities import Unit
 from slviewer.session.atomic import replace_file
 from slviewer.session.reading import read_toml
 from slviewer.session.toml import table_lines
