@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from slviewer.fringe.phase import PhaseMap, Reason
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
-    from slviewer.inspection.quantities import Quantity
     from slviewer.pipeline import datasets
     from slviewer.pipeline.accept import accept
     from slviewer.pipeline.align import align
@@ -81,10 +80,11 @@ if TYPE_CHECKING:
     from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct_cloud
+    from slviewer.records.measurement import Measurement
+    from slviewer.records.quantities import Quantity
     from slviewer.records.verification import Verification
     from slviewer.registration.multiway import register_all as align_clouds
     from slviewer.report.maps import draw_error_maps
-    from slviewer.session.measurements import Measurement
     from slviewer.session.ply import read_ply, write_ply
     from slviewer.simulation.boards import Pose
     from slviewer.simulation.rig import letter as letter_rig
@@ -104,12 +104,12 @@ _EXPORTS = {
     "CalibrationResult": "pipeline.calibrate",
     "Cloud": "reconstruction.cloud",
     "Frame": "fringe.sequence",
-    "Measurement": "session.measurements",
+    "Measurement": "records.measurement",
     "MeshingPlan": "surface.meshing",
     "PatternSequence": "fringe.sequence",
     "PhaseMap": "fringe.phase",
     "Pose": "simulation.boards",
-    "Quantity": "inspection.quantities",
+    "Quantity": "records.quantities",
     "Reason": "fringe.phase",
     "Session": "pipeline.session_operations:SessionOperations",
     "SimulatedWorld": "devices.world",

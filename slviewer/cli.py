@@ -30,13 +30,6 @@ from slviewer.commands.wizard import wizard
 from slviewer.errors import Cancelled, SlviewerError
 
 
-def _describe_measurement(made: Any, **_: Any) -> str:
-    """Describe a measurement in one line."""
-    from slviewer.pipeline import measurements
-
-    return measurements.describe_measurement(made)
-
-
 def _describe_simulation(names: list[str], session: Path, **_: Any) -> str:
     """Describe how many captures were simulated, and the next command."""
     from slviewer.pipeline.simulate import TARGET
@@ -143,13 +136,9 @@ COMMANDS = Commands(
             "pipeline.compare:compare", "session", "scan", "nominal", options=JSON
         ),
         "measure": _define_command(
-            "pipeline.measure:measure",
-            "session",
-            "scan",
-            "what",
-            run=partial(show_result, describe=_describe_measurement),
+            "pipeline.measure:measure", "session", "scan", "what", options=JSON
         ),
-        "measurements": _define_command("pipeline.measure:edit_measurements", "session"),
+        "measurements": _define_command("pipeline.measurements:edit_measurements", "session"),
         "plan": _define_command("pipeline.plan:plan", "session"),
         "inspect-parts": _define_command(
             "pipeline.inspect_parts:inspect_parts",

@@ -22,7 +22,7 @@ assert sphere.centre_mm is not None and sphere.radius_mm is not None
 measured = sl.measure(
     session, scan, "sphere", ball=(*sphere.centre_mm, sphere.radius_mm + 5), model="splined"
 )
-diameter = measured["diameter"]
+diameter = measured.only["diameter"]
 assert diameter.whole  # the calibration's part is in it
 print(f"diameter {diameter.value:.3f} mm, U {diameter.U:.3f} mm (k = 2)")
 print(

@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from slviewer.inspection.features import Feature
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.section import CutPlane
-from slviewer.records.plain import from_plain
-from slviewer.session.measurements import Measurement
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.measurement import Measurement
+from slviewer.records.plain import from_plain, to_plain
 
-_UNITS = {"deg": "°", "%": " %", "": ""}
 _ROUND = 48
 _OFF = 0.01
 """Lines on the surface are drawn above it by this share of its size, so as to be visible."""
@@ -20,28 +19,13 @@ _EXTENT_MM = 15.0
 """Half size of a plane or a cylinder whose region has none."""
 
 
-def format_quantity(quantity: Quantity) -> str:
-    """Format value ± U (k = 2) with the unit; a star where the calibration's part of U is
-    unknown."""
-    digits = 1 if quantity.unit == "%" else 3
-    unit = _UNITS.get(quantity.unit, f" {quantity.unit}")
-    value = f"{round(quantity.value, digits) + 0.0:.{digits}f}".replace(
-        "-", "−"
-    )  # no minus before nothing
-    if quantity.U is None:
-        return f"{value}{unit}"
-    return f"{value} ± {quantity.U:.{digits}f}{unit}{'' if quantity.whole else '*'}"
-
-
-def label(measured: Measurement) -> str:
+def label(measured: Stored[Measurement]) -> str:
     """Return a measurement's label in 3D: the name, and the first quantity."""
-    if measured.kind in ("point", "section", "deviation"):
-        return measured.name
-    first = measured.quantities[0]
-    named = "" if measured.kind in ("distance", "relation") else f"{first.name} "
-    return f"{measured.name}: {named}{format_quantity(first)}" + (
-        " (stale)" if measured.stale else ""
-    )
+    what, first = measured.record.what, measured.record.quantities[0]
+    if what in ("point", "section", "deviation"):
+        return measured.label
+    named = "" if what in ("distance", "relation") else f"{first.name} "
+    return f"{measured.label}: {named}{first.format()}" + (" (stale)" if measured.stale else "")
 
 
 def drawn(
@@ -52,12 +36,12 @@ def drawn(
 
     ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
     """
-    if measured.kind == "distance":
-        a, b = (np.array(end) for end in measured.data["ends"])
+    if measured.ends is not None:
+        a, b = (np.array(end) for end in measured.ends)
         return _draw_dimension(a, b)
-    if measured.kind == "section":
-        return _draw_section(from_plain(measured.data["plane"], CutPlane), lines)
-    if measured.kind == "relation":
+    if measured.plane is not None:
+        return _draw_section(from_plain(to_plain(measured.plane), CutPlane), lines)
+    if measured.what == "relation":
         return _draw_relation([feature_of(others[each]) for each in measured.of if each in others])
     feature = feature_of(measured)
     return (
@@ -67,8 +51,7 @@ def drawn(
 
 def feature_of(measured: Measurement) -> Feature | None:
     """Return the point, plane, sphere or cylinder of a measurement; None for other kinds."""
-    feature = measured.data.get("feature") or measured.data.get("fit", {}).get("feature")
-    return None if feature is None else from_plain(feature, Feature)
+    return None if measured.feature is None else from_plain(to_plain(measured.feature), Feature)
 
 
 def lifted(plane: CutPlane, points: np.ndarray) -> np.ndarray:
@@ -163,5 +146,4 @@ def _join_segments(points: np.ndarray) -> np.ndarray:
 
 def _get_extent(measured: Measurement) -> float:
     """Return half the size, mm, at which to draw a fit: that of its region, or a default."""
-    size = measured.data.get("region", {}).get("size")
-    return float(np.max(size)) if size else _EXTENT_MM
+    return _EXTENT_MM if measured.region is None else max(measured.region.size)

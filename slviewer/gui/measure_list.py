@@ -10,12 +10,7 @@ import viser
 
 from slviewer.gui.inputs import Choice, change
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.measure_html import (
-    deviation_figure,
-    deviation_html,
-    measurement_html,
-    measurements_table,
-)
+from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table
 from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot
@@ -23,8 +18,9 @@ from slviewer.gui.widgets import Text, link, paragraph
 from slviewer.inspection.colours import colour_limit
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measurements import section_lines
+from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
+from slviewer.records.measurement import Measurement
 from slviewer.report.measurements import section_plot
-from slviewer.session.measurements import Measurement, measurement_arrays
 from slviewer.wizard.measure_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 
@@ -41,7 +37,7 @@ class MeasurementList:
         context: PanelContext,
         painter: Painter,
         layer: str,
-        changed: Callable[[Measurement | None], None],
+        changed: Callable[[Stored[Measurement] | None], None],
     ) -> None:
         self._context, self._painter, self._layer, self._changed = context, painter, layer, changed
         self._lock = threading.RLock()
@@ -58,7 +54,6 @@ class MeasurementList:
         with gui.add_folder("Result", visible=False) as self._chosen_folder:
             self._choice = Choice(gui, "Result")
             self._choice.on_change(context.callback(self.refresh))
-            self._verdict = Text(gui)
             self._histogram = Plot(gui)
             self._section = SectionPlot(self._context, self.refresh)
             self._details = Text(gui)
@@ -91,24 +86,24 @@ class MeasurementList:
             self._file = Text(gui)
 
     @property
-    def chosen(self) -> Measurement | None:
+    def chosen(self) -> Stored[Measurement] | None:
         """The chosen measurement; None where there is none."""
-        return next((each for each in self._measurements if each.id == self._choice.value), None)
+        return next((each for each in self._measurements if each.name == self._choice.value), None)
 
-    def draw(self, session: SessionView | None, on: str) -> list[Measurement]:
+    def draw(self, session: SessionView | None, on: str) -> list[Stored[Measurement]]:
         """Show the session's measurements, in 3D those on the surface ``on``; returns the new
         ones."""
         with self._lock:
             before, self._session, self._on = self._session, session, on
             measured = self._measurements
             if session is None or before is None or session.folder != before.folder:
-                self._known = {each.id for each in measured}
+                self._known = {each.name for each in measured}
                 self._clear_drawings()
-            new = [each for each in measured if each.id not in self._known]
-            self._known = {each.id for each in measured}
+            new = [each for each in measured if each.name not in self._known]
+            self._known = {each.name for each in measured}
             self._offer_choice()
             if new:
-                self._choice.choose(new[-1].id)
+                self._choice.choose(new[-1].name)
             for folder in (self._chosen_folder, self._table_folder):
                 change(folder, visible=bool(measured))
             change(self._restore, visible=bool(session and session.deleted_measurements))
@@ -127,13 +122,7 @@ class MeasurementList:
         occur twice."""
         measured = self._measurements
         names = [each.name for each in measured]
-        texts = [
-            each.name if names.count(each.name) == 1 else f"{each.name} ({each.id})"
-            for each in measured
-        ]
-        self._choice.offer(
-            [(each.id, text) for each, text in zip(measured, texts, strict=True)][::-1]
-        )
+        self._choice.offer(list(zip(names, name_records(measured), strict=True))[::-1])
 
     def change_surface(self, on: str) -> None:
         """Draw the measurements of another surface."""
@@ -144,21 +133,21 @@ class MeasurementList:
         """Update tables, plots and 3D drawings for the chosen measurement."""
         with self._lock:
             chosen, measured = self.chosen, self._measurements
-            chosen_id = chosen.id if chosen else ""
+            chosen_id = chosen.name if chosen else ""
             if chosen_id != self._chosen_id:
                 self._chosen_id = chosen_id
                 self._changed(chosen)
             labels = self._labels
-            self._table.set(measurements_table(measured, chosen_id, labels) if measured else "")
+            self._table.set(measurements_table(measured, labels) if measured else "")
             self._details.set(measurement_html(chosen, labels) if chosen else "")
-            self._draw_deviation(chosen if chosen and chosen.kind == "deviation" else None)
-            self._draw_section(chosen if chosen and chosen.kind == "section" else None)
+            self._draw_deviation(chosen)
+            self._draw_section(chosen)
             self._request_drawings(chosen)
 
     # inside
 
     @property
-    def _measurements(self) -> tuple[Measurement, ...]:
+    def _measurements(self) -> tuple[Stored[Measurement], ...]:
         """The session's measurements."""
         return self._session.measurements if self._session else ()
 
@@ -189,75 +178,79 @@ class MeasurementList:
             self._context.operator.relabel_measurement(self._choice.value, self._rename_to.value)
             change(self._rename_to, value="")
 
-    def _draw_deviation(self, measured: Measurement | None) -> None:
-        """Show the verdict and the histogram of a deviation; None: hide them."""
-        if measured is None:
+    def _draw_deviation(self, measured: Stored[Measurement] | None) -> None:
+        """Show the histogram of a deviation; hide it for others."""
+        if measured is None or measured.record.deviation is None:
             self._painter.cancel("histogram")
             self._histogram.hide()
-            self._verdict.set("")
             return
-        self._verdict.set(deviation_html(measured.data))
-        verdict = measured.data["verdict"]
-        tolerance = None if verdict is None else float(verdict["tolerance_mm"])
+        tolerance = measured.record.deviation.tolerance_mm
 
         def make() -> Any:
             """Plot the histogram of the deviation."""
-            arrays = measurement_arrays(self._context.session, measured.id)
+            arrays = load_arrays(self._context.session, f"{Measurement.kind}/{measured.name}")
             limit = colour_limit(arrays["signed"], tolerance)
             return deviation_figure(
-                measured.name, arrays["edges"], arrays["counts"], limit, tolerance
+                measured.label, arrays["edges"], arrays["counts"], limit, tolerance
             )
 
-        self._painter.request("histogram", (measured.id, measured.name), make, self._histogram.set)
+        self._painter.request(
+            "histogram", (measured.name, measured.label), make, self._histogram.set
+        )
 
-    def _draw_section(self, measured: Measurement | None) -> None:
+    def _draw_section(self, measured: Stored[Measurement] | None) -> None:
         """Show the plot of a section with its cursors, once its lines are read; None: hide it."""
-        if measured is None or measured.id not in self._lines:
+        if measured is None or measured.name not in self._lines:
             self._painter.cancel("section")
             self._section.hide()
             for cursor in CURSORS:
                 self._context.scene.remove(self._layer, f"cursor {cursor}")
             return
-        plane, lines = self._lines[measured.id]
-        self._section.set(measured.id, lines)
+        plane, lines = self._lines[measured.name]
+        self._section.set(measured.name, lines)
         at, on, key = (
             self._section.at,
             self._on,
-            (measured.id, measured.name, self._section.at, self._on),
+            (measured.name, measured.label, self._section.at, self._on),
         )
 
         def make() -> Any:
             """Plot the section; returns (figure, cursors (3, 2) mm)."""
             cursors = cursor_points(lines, at)
             named = dict(zip(CURSORS, cursors, strict=True))
-            return section_plot(measured.name, lines, named, width=PLOT_PX), cursors
+            return section_plot(measured.label, lines, named, width=PLOT_PX), cursors
 
         def show(made: Any) -> None:
             """Show the plot, and mark the cursors in 3D if the section's surface is shown."""
             self._section.show(*made)
             for cursor, point in zip(CURSORS, lifted(plane, made[1]), strict=True):
-                if on == measured.source:
+                if on == measured.record.source:
                     self._context.scene.mark(self._layer, f"cursor {cursor}", point, cursor)
                 else:
                     self._context.scene.remove(self._layer, f"cursor {cursor}")
 
         self._painter.request("section", key, make, show)
 
-    def _request_drawings(self, chosen: Measurement | None) -> None:
+    def _request_drawings(self, chosen: Stored[Measurement] | None) -> None:
         """Request the 3D drawings of all measurements on this surface; the lines of sections are
         read from disk."""
         measured = self._measurements
-        others = {each.id: each for each in measured}
+        others = {each.name: each.record for each in measured}
         shown = [
             each
             for each in measured
-            if self._on == each.source
-            or any(o in others and others[o].source == self._on for o in each.of)
+            if self._on
+            in (
+                each.record.source,
+                *(others[o].source for o in each.record.of if o in others),
+            )
         ]
         cut = [
-            each.id for each in (*shown, *([chosen] if chosen else ())) if each.kind == "section"
+            each.name
+            for each in (*shown, *([chosen] if chosen else ()))
+            if each.record.plane is not None
         ]
-        looks = {each.id: (each.name, each.stale, each is chosen) for each in shown}
+        looks = {each.name: (each.label, each.stale, each is chosen) for each in shown}
 
         def make() -> dict[str, tuple[CutPlane, Lines]]:
             """Load the plane and the lines of each section that is not loaded yet."""
@@ -273,25 +266,24 @@ class MeasurementList:
                     self._context.scene.remove(self._layer, identity)
                     del self._drawn[identity]
                 for each in shown:
-                    if self._drawn.get(each.id) != looks[each.id]:
-                        self._drawn[each.id] = looks[each.id]
+                    if self._drawn.get(each.name) != looks[each.name]:
+                        self._drawn[each.name] = looks[each.name]
                         self._draw_one(each, others, each is chosen)
-                if chosen is not None and chosen.id in loaded:
+                if chosen is not None and chosen.name in loaded:
                     self.refresh()
 
         self._painter.request("drawings", (self._on, tuple(looks.items()), tuple(cut)), make, show)
 
     def _draw_one(
-        self, measured: Measurement, others: dict[str, Measurement], chosen: bool
+        self, measured: Stored[Measurement], others: dict[str, Measurement], chosen: bool
     ) -> None:
         """Draw one measurement in 3D with its label, coloured by whether it is stale, chosen or
         neither."""
-        lines = drawn(
-            measured, others, self._lines[measured.id][1] if measured.kind == "section" else ()
-        )
+        cut = self._lines[measured.name][1] if measured.record.plane is not None else ()
+        lines = drawn(measured.record, others, cut)
         if lines is None:
             return
         colour = STALE if measured.stale else CHOSEN if chosen else OTHER
         self._context.scene.drawing(
-            self._layer, measured.id, lines[0], colour, lines[1], label(measured)
+            self._layer, measured.name, lines[0], colour, lines[1], label(measured)
         )

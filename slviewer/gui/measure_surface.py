@@ -14,7 +14,8 @@ from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, paint
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
-from slviewer.session.measurements import Measurement, measurement_arrays
+from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.records.measurement import Measurement
 from slviewer.wizard.snapshot import SessionView
 from slviewer.wizard.surfaces import place_at
 
@@ -31,7 +32,7 @@ class SurfaceView:
     ) -> None:
         self._context, self._painter, self._layer, self._loaded = context, painter, layer, loaded
         self._clicks = count()
-        self._deviation: Measurement | None = None
+        self._deviation: Stored[Measurement] | None = None
         self._versions: dict[str, Any] = {}
         self._visible = False
         self.on: MeasuredSurface | None = None
@@ -72,7 +73,7 @@ class SurfaceView:
         self._choice.offer(offered)
         self.request()
 
-    def show_deviation(self, measured: Measurement | None) -> None:
+    def show_deviation(self, measured: Stored[Measurement] | None) -> None:
         """Colour the surface by this deviation; None: by another quantity."""
         self._deviation = measured
         if measured is not None:
@@ -114,9 +115,9 @@ class SurfaceView:
             self._context.scene.remove(self._layer, "surface")
             self._legend.set("")
             return
-        if shown is not None and (shown.source != name or colour != DEVIATION):
+        if shown is not None and (shown.record.source != name or colour != DEVIATION):
             shown = None
-        key = (name, self._versions.get(name), colour if shown is None else shown.id)
+        key = (name, self._versions.get(name), colour if shown is None else shown.name)
         context = self._context
 
         def make() -> tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]:
@@ -124,8 +125,9 @@ class SurfaceView:
             on = context.operator.surface(name)
             if shown is None:
                 return (on, *paint_surface(on, COLOURS[0] if colour == DEVIATION else colour))
-            arrays = measurement_arrays(context.session, shown.id)
-            return (on, *_colour_by_deviation(arrays, shown))
+            assert shown.record.deviation is not None
+            arrays = load_arrays(context.session, f"{Measurement.kind}/{shown.name}")
+            return (on, *_colour_by_deviation(arrays, shown.record.deviation.tolerance_mm))
 
         self._painter.request("surface", key, make, self._draw_surface)
 
@@ -164,14 +166,11 @@ def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndar
 
 
 def _colour_by_deviation(
-    arrays: dict[str, np.ndarray], measured: Measurement
+    arrays: dict[str, np.ndarray], tolerance: float | None
 ) -> tuple[np.ndarray, np.ndarray, Html]:
     """Colour a surface by a stored deviation: (points (n, 3) mm, colours (n, 3), legend); grey
     where not measured."""
-    verdict = measured.data["verdict"]
-    limit = colour_limit(
-        arrays["signed"], None if verdict is None else float(verdict["tolerance_mm"])
-    )
+    limit = colour_limit(arrays["signed"], tolerance)
     uncovered = arrays["uncovered"].reshape(-1, 3)
     points = np.concatenate([arrays["points"], uncovered]).astype(np.float32)
     grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), uncovered.shape)

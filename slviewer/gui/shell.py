@@ -362,7 +362,7 @@ def _object_step(session: SessionView) -> str:
         return "scan"
     return (
         "export"
-        if any(measured.source == latest for measured in session.measurements)
+        if any(measured.record.source == latest for measured in session.measurements)
         else "measure"
     )
 

@@ -160,7 +160,7 @@ def records_html(
     if not found:
         return Html("")
     tables = type(found[0].record).tables(name_records(found))
-    if found[0].name.isdecimal():  # captures are named inside
+    if found[0].record.is_number(found[0].name):  # captures are named inside
         tables = [relabel(each, labels) for each in tables]
     if not named:
         tables = [replace(each.without_constant(), caption="") for each in tables]

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -87,16 +86,6 @@ class Deviation:
         limit = max(float(np.percentile(np.abs(values), 99.8)), 1e-6)
         edges = np.linspace(-limit, limit, bins + 1)
         return edges, np.histogram(values, edges)[0]
-
-    def to_json(self) -> dict[str, Any]:
-        """The figures of the whole scan, without those of each point."""
-        return {
-            "statistics_mm": self.statistics(),
-            "reach_mm": self.reach_mm,
-            "coverage": self.coverage,
-            "alignment_mm": self.alignment_mm,
-            "T_nominal_scan": self.T_nominal_scan,
-        }
 
 
 def deviation(

@@ -2,7 +2,6 @@
 where none fits."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -13,10 +12,9 @@ from slviewer.evaluation.fit import MAX_SIGMA, fit_settled, within_sigmas
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.geometry.vectors import diagonal, finite_rows, rms
 from slviewer.inspection.features import Feature, Kind
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.starts import estimate_start, fit_plane_feature, fit_sphere_feature
 from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance, scatter_covariance
-from slviewer.records.plain import to_plain
+from slviewer.records.quantities import Quantity
 from slviewer.records.verification import MAX_EXCLUDED
 
 LEAST_POINTS = 50
@@ -72,22 +70,6 @@ class FeatureFit:
         listed.append(Quantity("RMS", self.rms, "mm"))
         listed.append(Quantity("farthest off", self.maximum, "mm"))
         return listed
-
-    def to_json(self) -> dict[str, Any]:
-        """The record of a measurement, without the part of the uncertainty that fits of one
-        calibration share."""
-        return {
-            "feature": to_plain(self.feature),
-            "scatter": self.spread.scatter,
-            "calibration": self.spread.calibration,
-            "sigmas": self.spread.sigmas,
-            "rms_mm": self.rms,
-            "max_mm": self.maximum,
-            "form_mm": self.form,
-            "used": self.used,
-            "left_out": self.left_out,
-            "warnings": self.warnings,
-        }
 
 
 def fit_feature(

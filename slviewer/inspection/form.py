@@ -28,7 +28,6 @@ from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import finite_rows, unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.uncertainty import (
     DRAWS,
     PATCHES,
@@ -37,6 +36,7 @@ from slviewer.inspection.uncertainty import (
     draw_steps,
     joint_covariance,
 )
+from slviewer.records.quantities import Quantity
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
 OrientationKind = Literal["parallelism", "perpendicularity"]

@@ -33,10 +33,14 @@ class Region:
         return cls("ball", _check_place(centre), _check_size([radius]))
 
     @classmethod
-    def box(cls, low: ArrayLike, high: ArrayLike) -> "Region":
-        """Return the region between two corners (3,) mm."""
+    def box(cls, low: ArrayLike, high: ArrayLike, axes: np.ndarray | None = None) -> "Region":
+        """Return the region between two corners (3,) mm, given along ``axes`` where there are
+        some."""
         a, b = _check_place(low), _check_place(high)
-        return cls("box", (a + b) / 2, _check_size(np.abs(b - a) / 2))
+        middle = (a + b) / 2
+        return cls(
+            "box", middle if axes is None else middle @ axes, _check_size(np.abs(b - a) / 2), axes
+        )
 
     @classmethod
     def around(cls, points: np.ndarray, axes: np.ndarray) -> "Region":

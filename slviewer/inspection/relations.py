@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.inspection.features import KINDS, Feature
-from slviewer.inspection.quantities import Quantity, Unit
 from slviewer.inspection.uncertainty import Spread, joint_covariance, propagate_covariance
+from slviewer.records.quantities import Quantity, Unit
 
 PARALLEL_DEG = 5.0
 """Axes nearer to parallel than this are as far apart as they are in the measured region: where they

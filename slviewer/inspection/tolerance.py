@@ -1,42 +1,14 @@
 """Whether deviations stay within a tolerance, as far as their uncertainty lets one say."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance.figures import judge_property, make_length_error
 from slviewer.inspection.deviation import Deviation
 from slviewer.records.acceptance import Decision
+from slviewer.records.measurement import ToleranceVerdict
 
-DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
 LIMITED = "deviation of 99.7 % of the points"
-RULE = (
-    "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points"
-    " and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
-    " exceeds it by more than the uncertainty, else too close to tell"
-)
-
-
-@dataclass(frozen=True)
-class ToleranceVerdict:
-    """Deviations against plus and minus a tolerance, mm.
-
-    ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its
-    decision; ``decision`` of both. Percent of the points that lie ``within`` it, ``inside`` it by
-    more than U, ``outside`` it by more than U, and too ``close`` to tell. ``U_mm``: expanded
-    uncertainty (k = 2) of a point, in the median.
-    """
-
-    tolerance_mm: float
-    U_mm: float
-    lowest: tuple[float, Decision]
-    highest: tuple[float, Decision]
-    decision: Decision
-    within: float
-    inside: float
-    outside: float
-    close: float
 
 
 def judge_deviation(

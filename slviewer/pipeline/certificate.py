@@ -9,10 +9,9 @@ import html
 import platform
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -23,35 +22,24 @@ import numpy as np
 from slviewer import __version__
 from slviewer.errors import InputError, SlviewerError
 from slviewer.evaluation.render import format_count
-from slviewer.inspection.regions import Region
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.compare import compare_surface
-from slviewer.pipeline.feedback import Progress, ignore_progress, ignore_warnings
-from slviewer.pipeline.measured_surface import MERGED, Place, load_surface
-from slviewer.pipeline.measurements import (
-    add_distance,
-    add_fit,
-    add_point,
-    add_relation,
-    add_section,
-    load_measurements,
-)
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import MODELS, available_models
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.scale import load_scale_correction
-from slviewer.pipeline.stored_records import list_records, load_record
+from slviewer.pipeline.stored_records import list_records, load_record, save_record
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
-from slviewer.records.plain import from_plain
+from slviewer.records.record import Record
 from slviewer.records.table import Column, Table
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
 from slviewer.session.decisions import REGION_INPUT
-from slviewer.session.measurements import Measurement
-from slviewer.session.nominal import NOMINALS, read_nominal
+from slviewer.session.nominal import NOMINALS
 from slviewer.session.reading import MAX_JSON_BYTES, expand_user, read_file
+from slviewer.session.scan_edits import FOLDER as EDITS
 from slviewer.session.scan_edits import (
     load_edits,
     load_region,
@@ -163,15 +151,12 @@ def make_certificate(store: Session) -> Certificate:
 
 
 def collect_figures(store: Session) -> Figures:
-    """Return the figures of the records and measurements that are fresh."""
+    """Return the figures of the records that are fresh."""
     figures: Figures = {}
     for kind in RECORDS.values():
         for each in list_records(store, kind):
             if not each.stale and (of_record := each.record.figures()):
                 figures[f"{kind.kind}/{each.name}"] = of_record
-    for measured in load_measurements(store):
-        if not measured.stale:
-            figures[f"measurements/{measured.id}"] = _measurement_figures(measured)
     return figures
 
 
@@ -184,8 +169,9 @@ def verify_report(
         session: Session folder with the captures that the report was made from.
         report: The .html file that `report` wrote.
 
-    The page, every frame, calibration, record and measurement is checked; what cannot be recomputed
-    (measurements on merges, and models whose file is gone) is listed. The session is not changed.
+    The page, every frame, calibration and record is checked; what cannot be recomputed
+    (measurements on merges, and comparisons with models whose file is gone) is listed. The session
+    is not changed.
     """
     page, certificate = read_certificate(expand_user(report))
     with opened(session) as store:
@@ -237,14 +223,6 @@ def _software() -> dict[str, str]:
     """Return the versions of Python, slviewer and what it computes with."""
     return {"slviewer": __version__, "python": platform.python_version()} | {
         name: version(name) for name in PACKAGES
-    }
-
-
-def _measurement_figures(measured: Measurement) -> dict[str, float]:
-    """Return a measurement's values and uncertainties."""
-    values = {f"{q.name}, {q.unit}": q.value for q in measured.quantities}
-    return values | {
-        f"U of {q.name}, {q.unit}": q.U for q in measured.quantities if q.U is not None
     }
 
 
@@ -304,12 +282,13 @@ def _recompute(
         for name in fresh.capture_names("scan"):
             save_edits(fresh, name, load_edits(store, name))
         save_region(fresh, load_region(store))
+        if (store.folder / NOMINALS).is_dir():
+            _link(store.folder / NOMINALS, fresh.folder / NOMINALS)
         if "calibration/stereo" in certificate.figures:
             progress(0.1, "calibrating")
             _calibrate_again(store, fresh, why)
         figures = collect_figures(fresh)
         figures |= _run_again(store, fresh, certificate, why, progress)
-        figures |= _measure_again(store, fresh, certificate, why, progress)
     return figures, why
 
 
@@ -379,119 +358,63 @@ def _run_again(
     """Run the operations that found the session's records again, with their settings; return the
     figures."""
     runs: dict[tuple[str, bytes], list[str]] = {}
+    records: dict[str, Record] = {}
     for result in certificate.figures:
         kind, _, name = result.partition("/")
         if kind not in RECORDS or kind == ModelCalibration.kind:
             continue
         with _note_failure(why, result):
-            record = load_record(store, RECORDS[kind], name)
+            record = records[result] = load_record(store, RECORDS[kind], name)
             if record.operation not in OPERATIONS:
                 raise InputError(
                     "an older version of slviewer made it: make it again, and write the report"
                     " again"
                 )
+            _check_restrictions(store, record)
             runs.setdefault((record.operation, to_json(record.settings)), []).append(result)
     figures: Figures = {}
     for k, ((name, settings), results) in enumerate(runs.items()):
-        progress(0.6 + 0.2 * k / len(runs), f"repeating {name}")
+        progress(0.6 + 0.4 * k / len(runs), f"repeating {name}")
         operation = OPERATIONS[name]
-        with (
-            _note_failure(why, *results),
-            Session.open(fresh.folder) as reading,
-        ):  # nothing needs to be stored
+        # the session is read alone: its files stay as they are
+        with _note_failure(why, *results), Session.open(fresh.folder) as reading:
+            _check_made_from(reading, records[results[0]])
             for found in operation.find(
                 Job(reading), operation.settings(**msgspec.json.decode(settings))
             ):
                 # a number here may be another than that of before
-                names = results if found.name.isdecimal() else [f"{found.record.kind}/{found.name}"]
+                is_numbered = found.record.is_number(found.name)
+                names = results if is_numbered else [f"{found.record.kind}/{found.name}"]
                 figures |= dict.fromkeys(names, found.record.figures())
+                if is_numbered and not found.files:  # others may be made from it
+                    for each in names:
+                        save_record(fresh, each.partition("/")[2], found.record, found.arrays)
     return figures
 
 
-def _measure_again(
-    store: Session,
-    fresh: Session,
-    certificate: Certificate,
-    why: dict[str, str],
-    progress: Progress,
-) -> Figures:
-    """Make the session's measurements again on scans that are reconstructed anew; return their
-    figures."""
-    surface = cache(lambda source, model: load_surface(fresh, source, model=model))
-    again: dict[str, str] = {}
-    figures: Figures = {}
-    wanted = [m for m in load_measurements(store) if f"measurements/{m.id}" in certificate.figures]
-    for k, measured in enumerate(wanted):
-        progress(0.8 + 0.2 * k / len(wanted), f"measuring {measured.name}")
-        result = f"measurements/{measured.id}"
-        if measured.source.startswith(MERGED) or MERGED in measured.source:
-            why[result] = "merges are not registered again"
-            continue
-        with _note_failure(why, result):
-            _check_restrictions(store, measured)
-            made = _repeat(store, fresh, measured, surface, again)
-            again[measured.id] = made.id
-            figures[result] = _measurement_figures(made)
-    return figures
-
-
-def _check_restrictions(store: Session, measured: Measurement) -> None:
-    """Raise InputError where the edits and the region that a measurement was made with are not the
+def _check_restrictions(store: Session, record: Record) -> None:
+    """Raise InputError where the edits and the region that a record was made with are not the
     session's."""
-    if measured.kind == "relation":
+    used = {
+        name: value
+        for name, value in record.inputs.items()
+        if name.startswith((f"{EDITS}/", REGION_INPUT))
+    }
+    scans = [name.removeprefix(f"{EDITS}/") for name in used if name != REGION_INPUT]
+    if not scans:
         return
-    used = store.load_result(f"measurements/{measured.id}", only=())[0]["inputs"]
-    now = restriction_inputs(store, [measured.source])
-    if any(name in used for name in now) and REGION_INPUT not in used:
+    if REGION_INPUT not in used and not record.settings.get("roi"):
         raise InputError("it was made with a region of its own")
-    if any(used.get(name, "") != value for name, value in now.items()):
-        raise InputError(f"edits of {measured.source}, or the region, have changed since")
+    now = restriction_inputs(store, scans)
+    if any(now[name] != value for name, value in used.items()):
+        raise InputError(f"edits of {', '.join(scans)}, or the region, have changed since")
 
 
-def _repeat(
-    store: Session,
-    fresh: Session,
-    measured: Measurement,
-    surface: Callable[[str, str], Any],
-    again: Mapping[str, str],
-) -> Measurement:
-    """Make one measurement of a session again in another. Raises SlviewerError where that is not
-    possible."""
-    if measured.kind == "relation":
-        if missing := [each for each in measured.of if each not in again]:
-            raise InputError(f"{', '.join(missing)} could not be measured again")
-        return add_relation(fresh, *(again[each] for each in measured.of))
-    on, data = surface(measured.source, measured.model), measured.data
-    if measured.kind == "point":
-        return add_point(fresh, on, from_plain(data["at"], Place))  # type: ignore[arg-type]
-    if measured.kind in ("distance", "section"):
-        a, b = from_plain(data["at"], tuple[Place, Place])
-        return (add_distance if measured.kind == "distance" else add_section)(fresh, on, a, b)
-    if measured.kind == "deviation":
-        path = _find_nominal(store, data["nominal"]["hash"])
-        verdict = data.get("verdict")
-        made = compare_surface(
-            fresh,
-            on,
-            read_nominal(path, data["nominal"]["units"]),
-            tolerance=None if verdict is None else verdict["tolerance_mm"],
-            reach=data["reach_mm"],
-            warn=ignore_warnings,
-        )
-        assert made.measurement is not None
-        return made.measurement
-    return add_fit(fresh, on, measured.kind, from_plain(data["region"], Region))  # type: ignore[arg-type]
-
-
-def _find_nominal(store: Session, content: str) -> Path:
-    """Return the session's nominal model of that content; InputError where there is none."""
-    for path in sorted((store.folder / NOMINALS).glob("[!.]*")):
-        try:
-            if read_nominal(path).hash == content:
-                return path
-        except SlviewerError:
-            continue
-    raise InputError("its nominal model is not in the session")
+def _check_made_from(fresh: Session, record: Record) -> None:
+    """Raise InputError where a record was made from others that are not made again."""
+    of = [name for name in record.inputs if name.partition("/")[0] in RECORDS]
+    if missing := [name for name in of if not fresh.has_result(name)]:
+        raise InputError(f"{', '.join(missing)}, which it was made from, is not made again")
 
 
 @contextmanager
@@ -547,7 +470,7 @@ def certificate_section(certificate: Certificate) -> Section:
     results = Table(
         [Column("result", align="left"), Column("hash", align="left")],
         [[name, certificate.results[name]] for name in certificate.figures],
-        "Calibrations, records and measurements",
+        "Calibrations and records",
     )
     software = Table(
         [Column("software", align="left"), Column("version", align="left")],

@@ -1,25 +1,37 @@
-"""A scan against a nominal model: aligned, compared, judged, written and saved."""
+"""A scan against a nominal model: aligned, compared, judged."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
-from slviewer.errors import UsageError
-from slviewer.evaluation.render import Row, render
+from slviewer.errors import InputError, UsageError
 from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
-from slviewer.inspection.quantities import Quantity
-from slviewer.inspection.tolerance import DECIDED, RULE, ToleranceVerdict, judge_deviation
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
-from slviewer.pipeline.measurements import triangulate_surface
+from slviewer.inspection.tolerance import judge_deviation
+from slviewer.pipeline.feedback import part, stage
+from slviewer.pipeline.measure import provenance
+from slviewer.pipeline.measured_surface import (
+    LoadSurface,
+    MeasuredSurface,
+    load_surface,
+    triangulate_surface,
+)
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.records.plain import to_plain
-from slviewer.session.measurements import Measurement, save_measurement
-from slviewer.session.nominal import Nominal, Units, check_size, read_nominal
+from slviewer.pipeline.open_session import placed_file
+from slviewer.pipeline.operation import Found, Job, operation, plain_settings
+from slviewer.pipeline.stored_records import next_name
+from slviewer.records.measurement import (
+    DeviationStatistics,
+    Measurement,
+    NominalDeviation,
+    NominalModel,
+    ToleranceVerdict,
+)
+from slviewer.records.record import to_matrix, to_vector
+from slviewer.session.nominal import NOMINALS, Nominal, Units, check_size, read_nominal
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
 
@@ -29,92 +41,11 @@ LIKELY_COVERAGE = 0.05
 SCALARS = "deviation"
 
 
-@dataclass(frozen=True, eq=False)
-class NominalComparison:
-    """A scan against a nominal model: the ``found`` deviation, the ``verdict`` where a tolerance
-    was given, the noise that the scan alone has along the nominal's normals (RMS, ``noise_mm``),
-    and where it went: ``ply``, and the ``measurement`` that the session keeps."""
-
-    scan: str
-    model: str
-    nominal: Nominal
-    found: Deviation
-    verdict: ToleranceVerdict | None
-    noise_mm: float
-    ply: Path | None
-    measurement: Measurement | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the published values of ``compare --json``."""
-        return {
-            "scan": self.scan,
-            "model": self.model,
-            "nominal": {
-                "name": self.nominal.name,
-                "hash": self.nominal.hash,
-                "units": self.nominal.units or "mm",
-                "triangles": len(self.nominal.mesh.faces),
-                "size_mm": self.nominal.size_mm.tolist(),
-                "closed": self.nominal.closed,
-                "notes": list(self.nominal.notes),
-            },
-            "noise_mm": self.noise_mm,
-            **self.found.to_json(),
-            "tolerance": None if self.verdict is None else to_plain(self.verdict) | {"rule": RULE},
-        }
-
-    def text(self) -> str:
-        """Return the result as a report for the terminal."""
-        numbers = self.found.statistics()
-        lines = [f"{self.scan} by {self.model} against {self.nominal.text()}"]
-        lines += [f"{self.nominal.name}: {note}" for note in self.nominal.notes]
-        lines.append(render(_figure_rows(numbers, self.noise_mm)))
-        share = 100 * numbers["left_out"] / (numbers["points"] + numbers["left_out"])
-        lines.append(
-            f"{numbers['points']:,} points; {numbers['left_out']:,} ({share:.1f} %) lie farther"
-            f" than {self.found.reach_mm:.3g} mm from the nominal or face another way, and are"
-            " excluded"
-        )
-        lines.append(
-            f"{100 * self.found.coverage:.1f} % of the nominal's area was measured; the best fit"
-            f" adds {self.found.alignment_mm:.4f} mm (1 sigma)"
-        )
-        if self.verdict is not None:
-            v = self.verdict
-            lines.append(
-                f"tolerance ± {v.tolerance_mm:g} mm: {v.within:.2f} % of the points within; by more"
-                f" than U = {v.U_mm:.4f} mm (k = 2) {v.inside:.2f} % inside and {v.outside:.2f} %"
-                f" outside, {v.close:.2f} % too close to tell"
-            )
-            lines.append(
-                f"lowest {v.lowest[0]:+.4f} mm: {DECIDED[v.lowest[1]]}; highest {v.highest[0]:+.4f}"
-                f" mm: {DECIDED[v.highest[1]]} (99.7 % of the points)"
-            )
-            lines.append(f"{DECIDED[v.decision].upper()}: {RULE}")
-        if self.ply is not None:
-            lines.append(f"coloured points -> {self.ply}")
-        return "\n".join(lines)
-
-
-def compare(
-    session: SessionLike,
-    scan: str,
-    nominal: Path | str,
-    *,
-    tolerance: float | None = None,
-    units: Units | None = None,
-    reach: float | None = None,
-    out: Path | str | None = None,
-    model: ModelName | None = None,
-    accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> NominalComparison:
-    """Compare a scan with a nominal model after best-fit alignment: figures, coloured points,
-    pictures in the report.
+@dataclass(frozen=True)
+class CompareSettings:
+    """What a scan is compared with.
 
     Args:
-        session: Session folder.
         scan: Name of the capture, or merge/1 and the like for a merge of the session.
         nominal: STL, PLY, OBJ, STEP or 3MF file of the part as it should be.
         tolerance: Plus and minus, mm; the answer is pass, fail, or too close to tell.
@@ -127,104 +58,147 @@ def compare(
         model: Which calibration to use; by default the best one available.
         accept_rejected: Use the calibration although its verdict rejects it.
 
+    Python alone: ``content``, the hash that the nominal model must have; ``load`` returns the
+    surface where it is at hand.
+    """
+
+    UNRECORDED: ClassVar = ("out", "load")
+    scan: str
+    nominal: Path | str
+    tolerance: float | None = None
+    units: Units | None = None
+    reach: float | None = None
+    out: Path | str | None = None
+    model: ModelName | None = None
+    accept_rejected: bool = False
+    content: str = ""
+    load: LoadSurface | None = None
+
+    def __post_init__(self) -> None:
+        if self.out is not None and Path(self.out).suffix.lower() != ".ply":
+            raise UsageError(
+                f"coloured points are written as .ply, not as {Path(self.out).name}: end its"
+                " name so"
+            )
+
+
+@operation("compare", Measurement, CompareSettings)
+def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]:
+    """Compare a scan with a nominal model after best-fit alignment: figures, coloured points,
+    pictures in the report.
+
     The session stores the result as a measurement.
     """
-    if out is not None and Path(out).suffix.lower() != ".ply":
-        raise UsageError(
-            f"coloured points are written as .ply, not as {Path(out).name}: end its name so"
-        )
-    ideal = read_nominal(nominal, units)  # a wrong file is refused before minutes of work
-    with opened(session, write=True) as store:
-        reading = part(progress, 0.0, 0.4)
-        on = load_surface(
-            store, scan, model=model, accept_rejected=accept_rejected, progress=reading, warn=warn
-        )
-        default = (
-            store.exports / f"{_safe_name(scan)}_{_safe_name(Path(ideal.name).stem)}_deviation.ply"
-        )
-        return compare_surface(
-            store,
-            on,
-            ideal,
-            tolerance=tolerance,
-            reach=reach,
-            out=default if out is None else out,
-            progress=part(progress, 0.4, 1.0),
-            warn=warn,
-        )
-
-
-def compare_surface(
-    store: Session,
-    on: MeasuredSurface,
-    nominal: Nominal,
-    *,
-    tolerance: float | None = None,
-    reach: float | None = None,
-    out: Path | str | None = None,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-) -> NominalComparison:
-    """As ``compare``, of a surface that is there already, in a session open for writing. Without
-    ``out`` no file is written."""
-    measured = on.measured
-    points = on.points[measured].astype(np.float64)
+    store = job.store
+    path = _find_nominal(store, settings.nominal)
+    nominal = read_nominal(path, settings.units)  # a wrong file is refused before minutes of work
+    if settings.content not in ("", nominal.hash):
+        raise InputError(f"{path.name} is not the nominal model that it was: it has changed since")
+    for note in nominal.notes:
+        job.warn(f"{nominal.name}: {note}")
+    on = _load_surface(job, settings)
+    points = on.points[on.measured].astype(np.float64)
     check_size(nominal, points)
-    normals = None if on.normals is None else on.normals[measured]
-    sigma = on.sigma_mm[measured]
-    typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
+    result = _measure_deviation(job, settings.reach, on, nominal)
+    towards = np.nan_to_num(result.normals.astype(np.float64))
+    verdict = None
+    if settings.tolerance is not None:
+        verdict = judge_deviation(result, on.sigma_along(towards, whole=True), settings.tolerance)
+    described = _describe(nominal, result, on.sigma_along(towards), verdict)
+    place, folder = path.expanduser().absolute(), store.folder.absolute()
+    recorded = place.relative_to(folder) if place.is_relative_to(folder) else place
+    used = replace(
+        settings,
+        nominal=recorded.as_posix(),
+        content=nominal.hash,
+        model=on.model,  # type: ignore[arg-type]
+    )
+    record = Measurement(
+        what="deviation",
+        name=f"{on.source} against {nominal.name}",
+        **provenance(on),
+        quantities=described.quantities(),
+        deviation=described,
+        operation="compare",
+        settings=plain_settings(used),
+    )
+    job.progress(0.92, "writing")
+    file_name = f"{_safe_name(settings.scan)}_{_safe_name(Path(nominal.name).stem)}_deviation.ply"
+    with placed_file(store, settings.out, file_name) as (place, written):
+        _write_points(written, on, result, nominal, settings.tolerance)
+        note = f"coloured points -> {place}"
+        arrays = _list_arrays(points, result)
+        yield Found(next_name(store, Measurement), record, arrays, (place,), (note,))
+    job.progress(1.0, "compared")
+
+
+def _find_nominal(store: Session, nominal: Path | str) -> Path:
+    """Return the file of a nominal model: that of the session, as ``nominal/part.stl``, or any
+    other."""
+    own = store.folder / nominal
+    is_own = Path(nominal).parts[:1] == (NOMINALS,) and own.is_file()
+    return own if is_own else Path(nominal)
+
+
+def _load_surface(job: Job, settings: CompareSettings) -> MeasuredSurface:
+    """Return the surface to compare: the one at hand, or that of the scan."""
+    if settings.load is not None:
+        return settings.load(job.store)
+    return load_surface(
+        job.store,
+        settings.scan,
+        model=settings.model,
+        accept_rejected=settings.accept_rejected,
+        progress=part(job.progress, 0.0, 0.4),
+        warn=job.warn,
+    )
+
+
+def _measure_deviation(
+    job: Job, reach_mm: float | None, on: MeasuredSurface, nominal: Nominal
+) -> Deviation:
+    """Align a surface with a nominal model, and measure the deviation of its points."""
+    sigma = on.sigma_mm[on.measured]
     result = deviation(
-        points,
+        on.points[on.measured].astype(np.float64),
         nominal.mesh,
-        normals=normals,
-        sigma_mm=typical,
-        reach_mm=reach,
-        progress=stage(progress, 0.0, 0.85, "aligning"),
+        normals=None if on.normals is None else on.normals[on.measured],
+        sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
+        reach_mm=reach_mm,
+        progress=stage(job.progress, 0.4, 0.9, "aligning"),
     )
     if result.coverage < LIKELY_COVERAGE:
-        warn(
+        job.warn(
             f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is"
             " the same part"
         )
-    towards = np.nan_to_num(result.normals.astype(np.float64))
-    along = on.sigma_along(towards)
-    counted = result.counted
-    noise = (
-        float(np.sqrt(np.nanmean(along[counted] ** 2)))
-        if np.isfinite(along[counted]).any()
-        else float("nan")
-    )
-    verdict = (
-        None
-        if tolerance is None
-        else judge_deviation(result, on.sigma_along(towards, whole=True), tolerance)
-    )
-    progress(0.9, "writing")
-    ply = None
-    if out is not None:
-        ply = Path(out)
-        ply.parent.mkdir(parents=True, exist_ok=True)
-        _write_points(ply, on, result, nominal, tolerance)
-    measurement = _save_comparison(store, on, nominal, result, verdict, noise, points)
-    progress(1.0, "compared")
-    return NominalComparison(on.source, on.model, nominal, result, verdict, noise, ply, measurement)
+    return result
 
 
-def _figure_rows(numbers: dict[str, float], noise: float) -> list[Row]:
-    """Return the lines of the table of figures, mm."""
-    return [
-        {"deviation, mm": words, "value": f"{value:+.4f}" if signed else f"{value:.4f}"}
-        for words, value, signed in (
-            ("mean", numbers["mean"], True),
-            ("RMS", numbers["rms"], False),
-            ("RMS of noise alone", noise, False),
-            ("95 % are off by less than", numbers["within_95"], False),
-            ("range of 99.7 %, lower end", numbers["p_low"], True),
-            ("range of 99.7 %, upper end", numbers["p_high"], True),
-            ("lowest", numbers["lowest"], True),
-            ("highest", numbers["highest"], True),
-        )
-    ]
+def _describe(
+    nominal: Nominal, result: Deviation, sigma_mm: np.ndarray, verdict: ToleranceVerdict | None
+) -> NominalDeviation:
+    """Return the figures of a deviation; ``sigma_mm`` (n,): the noise of the points along the
+    nominal's normals."""
+    noise = sigma_mm[result.counted]
+    return NominalDeviation(
+        nominal=NominalModel(
+            nominal.name,
+            nominal.hash,
+            nominal.units or "mm",
+            len(nominal.mesh.faces),
+            to_vector(nominal.size_mm),
+            nominal.closed,
+            tuple(nominal.notes),
+        ),
+        statistics_mm=DeviationStatistics(**result.statistics()),  # type: ignore[arg-type]
+        noise_mm=float(np.sqrt(np.nanmean(noise**2))) if np.isfinite(noise).any() else None,
+        reach_mm=result.reach_mm,
+        coverage=result.coverage,
+        alignment_mm=result.alignment_mm,
+        T_nominal_scan=to_matrix(result.T_nominal_scan),
+        verdict=verdict,
+    )
 
 
 def _write_points(
@@ -254,39 +228,13 @@ def _write_points(
     )
 
 
-def _save_comparison(
-    store: Session,
-    on: MeasuredSurface,
-    nominal: Nominal,
-    result: Deviation,
-    verdict: ToleranceVerdict | None,
-    noise: float,
-    points: np.ndarray,
-) -> Measurement:
-    """Save a comparison as a measurement: figures, alignment, and each point's deviation."""
-    numbers = result.statistics()
-    quantities = [
-        Quantity("mean", numbers["mean"], "mm"),
-        Quantity("RMS", numbers["rms"], "mm"),
-        Quantity("95 % off by less than", numbers["within_95"], "mm"),
-        Quantity("range of 99.7 %, lower end", numbers["p_low"], "mm"),
-        Quantity("range of 99.7 %, upper end", numbers["p_high"], "mm"),
-        Quantity("area measured", 100 * result.coverage, "%"),
-    ]
-    if verdict is not None:
-        quantities.append(Quantity("within tolerance", verdict.within, "%"))
+def _list_arrays(points: np.ndarray, result: Deviation) -> dict[str, np.ndarray]:
+    """Return the arrays of a comparison: each point's deviation, thinned, and the histogram of
+    all."""
     edges, counts = result.histogram()
     counted = np.flatnonzero(result.counted)
     stored = counted[:: -(-len(counted) // MAX_STORED_POINTS)]
-    data = {
-        "quantities": quantities,
-        "scale": on.scale,
-        "nominal": {"name": nominal.name, "hash": nominal.hash, "units": nominal.units or "mm"},
-        "noise_mm": noise,
-        "verdict": verdict,
-        **result.to_json(),
-    }
-    arrays = {
+    return {
         "points": points[stored].astype(np.float32),
         "normals": result.normals[stored],
         "signed": result.signed[stored],
@@ -294,16 +242,6 @@ def _save_comparison(
         "edges": edges,
         "counts": counts,
     }
-    return save_measurement(
-        store,
-        "deviation",
-        source=on.source,
-        model=on.model,
-        inputs=on.inputs,
-        data=data,
-        arrays=arrays,
-        name=f"{on.source} against {nominal.name}",
-    )
 
 
 def _safe_name(name: str) -> str:

@@ -1,6 +1,6 @@
 """The surface that is measured on: a scan's points with all that is known of their errors."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,8 @@ from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.scale import load_scale_correction, scale_factor, scale_sigma
 from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.mesh import triangulate_grid
+from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
@@ -122,6 +124,16 @@ class MeasuredSurface:
         return sigma * np.abs(np.sum(points / points[:, 2:] * normals, axis=1))
 
 
+def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and faces (m, 3) of a surface; a scan's end where its depth jumps."""
+    if on.faces is not None:
+        return np.asarray(on.points, np.float64), on.faces
+    if not on.organised:
+        raise InputError(f"{on.source} is a cloud without triangles: mesh it first")
+    faces = triangulate_grid(on.points, JUMP * float(np.median(on.points[..., 2][on.measured])))
+    return on.points[on.measured].astype(np.float64), faces
+
+
 def load_surface(
     session: SessionLike,
     scan: str,
@@ -198,3 +210,7 @@ def load_merged_surface(
         texture=points.colours,
         scale=float(meta.get("scales", {}).get(model, 1.0)),
     )
+
+
+LoadSurface = Callable[[Session], MeasuredSurface]
+"""Returns a surface of a session that is at hand already."""

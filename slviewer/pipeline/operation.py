@@ -81,13 +81,16 @@ class Findings(dict[str, R]):
     def summary(self) -> str:
         """Return the records in one sentence."""
         return "; ".join(
-            each.summary() if name.isdecimal() else f"{name}: {each.summary()}"
+            each.summary() if each.is_number(name) else f"{name}: {each.summary()}"
             for name, each in self.items()
         )
 
     def text(self) -> str:
         """Return the records' tables and the notes for the terminal."""
-        tables = (f"{table.caption}\n{render_text(table)}" for table in self.kind.tables(self))
+        named = {
+            " ".join(dict.fromkeys((name, each.label(name)))): each for name, each in self.items()
+        }
+        tables = (f"{table.caption}\n{render_text(table)}" for table in self.kind.tables(named))
         return "\n".join([*tables, *self.notes])
 
 

@@ -12,12 +12,12 @@ from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.fitting import FeatureFit, fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.relations import relation
 from slviewer.inspection.tolerance import judge_limits
 from slviewer.inspection.uncertainty import RigidSpread, Shared
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.records.inspection import Characteristic, CharacteristicResult, PartResult
+from slviewer.records.quantities import Quantity
 from slviewer.session.inspection_plan import FORMS, SIZES, TO_DATUM, Plan, PlanFeature
 from slviewer.session.nominal import Nominal, check_size
 

@@ -8,15 +8,18 @@ import numpy as np
 from slviewer.errors import InputError, UsageError
 from slviewer.inspection.datums import datum_frame
 from slviewer.inspection.features import Feature
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measured_surface import load_surface
-from slviewer.pipeline.measurements import load_feature, load_measurements
+from slviewer.pipeline.measurements import load_measurements
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.part_inspection import fit_to_nominal
+from slviewer.pipeline.relate import load_feature
+from slviewer.pipeline.stored_records import Stored
 from slviewer.records.inspection import Characteristic
-from slviewer.records.plain import from_plain
+from slviewer.records.measurement import Measurement
+from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.quantities import Quantity
 from slviewer.session.inspection_plan import (
     KINDS,
     Alignment,
@@ -25,7 +28,6 @@ from slviewer.session.inspection_plan import (
     PlanRegion,
     write_plan,
 )
-from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import read_nominal
 
 TOLERANCE_MM = 0.1
@@ -103,7 +105,7 @@ def make_plan(
         start = tuple(map(tuple, T.round(9).tolist()))
         alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
     elif nominal is not None:
-        ideal, source = read_nominal(nominal), next(iter(fits.values()))
+        ideal, source = read_nominal(nominal), next(iter(fits.values())).record
         surface = load_surface(
             session, source.source, model=source.model, progress=progress, warn=warn
         )
@@ -111,7 +113,9 @@ def make_plan(
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
     left_out = [
-        each.name for each in measured if each.kind not in (*FORM_OF, "relation") or each.stale
+        each.label
+        for each in measured
+        if each.record.what not in (*FORM_OF, "relation") or each.stale
     ]
     if left_out:
         warn(
@@ -123,36 +127,35 @@ def make_plan(
     )
 
 
-def _select_fits(measured: Sequence[Measurement], warn: Warn) -> dict[str, Measurement]:
+def _select_fits(
+    measured: Sequence[Stored[Measurement]], warn: Warn
+) -> dict[str, Stored[Measurement]]:
     """The fits that are not stale, by id; warns where several scans have some: those of the last
     one are taken."""
-    fits = [each for each in measured if each.kind in FORM_OF and not each.stale]
+    fits = [each for each in measured if each.record.what in FORM_OF and not each.stale]
     if not fits:
         raise InputError(
             "nothing was fitted in this session: fit planes, spheres or cylinders to a scan first"
         )
-    last = fits[-1].source
-    if len(sources := {each.source for each in fits}) > 1:
+    last = fits[-1].record.source
+    if len(sources := {each.record.source for each in fits}) > 1:
         warn(
             f"measurements were made on {', '.join(sorted(sources))}: the plan takes those on"
             f" {last} alone"
         )
-    return {each.id: each for each in fits if each.source == last}
+    return {each.name: each for each in fits if each.record.source == last}
 
 
 def _list_characteristics(
-    measured: Sequence[Measurement], names: Mapping[str, str], tolerance: float
+    measured: Sequence[Stored[Measurement]], names: Mapping[str, str], tolerance: float
 ) -> Iterator[Characteristic]:
     """Size and form of the fits in ``names``, by id, then the relations between two of them."""
-    relations = [
-        each
-        for each in measured
-        if each.kind == "relation" and not each.stale and names.keys() >= {*each.of}
-    ]
-    for each in [*(each for each in measured if each.id in names), *relations]:
-        form = FORM_OF.get(each.kind)
-        features = (names[each.id],) if form else tuple(names[i] for i in each.of)
-        for quantity in each.quantities:
+    relations = [each for each in measured if each.record.what == "relation" and not each.stale]
+    related = [each for each in relations if names.keys() >= {*each.record.of}]
+    for each in [*(each for each in measured if each.name in names), *related]:
+        form = FORM_OF.get(each.record.what)
+        features = (names[each.name],) if form else tuple(names[i] for i in each.record.of)
+        for quantity in each.record.quantities:
             if quantity.name in (("diameter",) if form else KINDS):
                 yield _around(quantity, features, tolerance)
         if form:
@@ -167,9 +170,11 @@ def _around(quantity: Quantity, features: tuple[str, ...], tolerance: float) -> 
     return Characteristic(name, quantity.name, features, nominal, lower, upper, quantity.unit)
 
 
-def _plan_feature(name: str, measured: Measurement, feature: Feature, T: np.ndarray) -> PlanFeature:
+def _plan_feature(
+    name: str, measured: Stored[Measurement], feature: Feature, T: np.ndarray
+) -> PlanFeature:
     """A fitted feature with its region, in part coordinates."""
-    region = PlanRegion.of(from_plain(measured.data["region"], Region), T)
+    region = PlanRegion.of(from_plain(to_plain(measured.record.region), Region), T)
     place = tuple((T[:3, :3] @ feature.place + T[:3, 3]).round(6).tolist())
     direction = (
         None
@@ -179,10 +184,10 @@ def _plan_feature(name: str, measured: Measurement, feature: Feature, T: np.ndar
     return PlanFeature(name, feature.kind, region, place, direction, feature.radius)  # type: ignore[arg-type]
 
 
-def _distinct_names(fits: Mapping[str, Measurement]) -> dict[str, str]:
+def _distinct_names(fits: Mapping[str, Stored[Measurement]]) -> dict[str, str]:
     """The measurements' names by id, with the id where two have the same."""
-    names = [each.name for each in fits.values()]
+    names = [each.label for each in fits.values()]
     return {
-        i: each.name if names.count(each.name) == 1 else f"{each.name} {i}"
+        i: each.label if names.count(each.label) == 1 else f"{each.label} {i}"
         for i, each in fits.items()
     }

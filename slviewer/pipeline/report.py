@@ -1,6 +1,6 @@
 """A session as one self-contained HTML file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measurements import load_measurements, section_lines
+from slviewer.pipeline.measurements import section_lines
 from slviewer.pipeline.models import (
     available_models,
     load_model,
@@ -28,9 +28,16 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scale import describe_scale
-from slviewer.pipeline.stored_records import list_records, load_arrays, load_record, name_records
+from slviewer.pipeline.stored_records import (
+    Stored,
+    list_records,
+    load_arrays,
+    load_record,
+    name_records,
+)
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
+from slviewer.records.measurement import Measurement
 from slviewer.records.verification import Verification
 from slviewer.report.data import (
     CalibrationFigures,
@@ -43,13 +50,16 @@ from slviewer.report.data import (
     SessionData,
 )
 from slviewer.report.maps import verification_maps
+from slviewer.report.measurements import draw_deviation, section_plot
 from slviewer.report.page import Figure, write_page
 from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.session.capture import Capture
-from slviewer.session.measurements import measurement_arrays
 from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session
 
+MOST_DRAWN = 6
+"""Sections, and comparisons with nominal models, that are drawn, the last ones; the tables hold
+all."""
 MOST_MAPS = 8
 """Verified captures whose error maps are drawn; the tables hold them all."""
 
@@ -128,7 +138,6 @@ def _collect_data(store: Session) -> SessionData:
             for scan in store.capture_names("scan")
             for words in list_edits(store, scan)[0]
         ],
-        **measured_views(store),
     )
 
 
@@ -165,14 +174,24 @@ def _collect_records(store: Session) -> tuple[list[RecordsView], list[str]]:
             for each in every
             if each not in fresh
         ]
-        figures: list[Figure] = []
-        for each in fresh[:MOST_MAPS]:
-            if isinstance(each.record, Verification):
-                arrays = load_arrays(store, f"{kind.kind}/{each.name}")
-                figures.append(verification_maps(each.label, each.record, arrays))
         if fresh:
-            views.append(RecordsView(kind, name_records(fresh), figures))
+            views.append(RecordsView(kind, name_records(fresh), list(_draw_records(store, fresh))))
     return views, stale
+
+
+def _draw_records(store: Session, records: Sequence[Stored[Any]]) -> Iterator[Figure]:
+    """Yield pictures of records of one kind: of the first verifications, and of the last
+    measurements of each kind."""
+    for each in records[:MOST_MAPS]:
+        if isinstance(each.record, Verification):
+            arrays = load_arrays(store, f"{each.record.kind}/{each.name}")
+            yield verification_maps(each.label, each.record, arrays)
+    measured = [each for each in records if isinstance(each.record, Measurement)]
+    for each in [each for each in measured if each.record.plane is not None][-MOST_DRAWN:]:
+        yield section_plot(each.label, section_lines(store, each.name)[1])
+    for each in [each for each in measured if each.record.deviation is not None][-MOST_DRAWN:]:
+        arrays = load_arrays(store, f"{each.record.kind}/{each.name}")
+        yield draw_deviation(each.label, each.record.source, each.record.deviation, arrays)
 
 
 def _describe_capture(
@@ -243,24 +262,3 @@ def curve_at(
         return None
     x, y, z = points.T
     return PixelCurve(pixel, axis, phase, z, x, y, fit.coefficients[:, v, u], fit.rms_mm[:, v, u])
-
-
-MOST_DRAWN = 6
-"""Sections, and comparisons with nominal models, that are drawn, the last ones; the CSV holds
-all."""
-
-
-def measured_views(store: Session) -> dict[str, Any]:
-    """``measurements``, ``sections`` and ``deviations`` of a report's data."""
-    every = load_measurements(store)
-    sections = [each for each in every if each.kind == "section"]
-    deviations = [each for each in every if each.kind == "deviation"]
-    return {
-        "measurements": [each for each in every if each.kind != "deviation"],
-        "sections": [
-            (each.name, section_lines(store, each.id)[1]) for each in sections[-MOST_DRAWN:]
-        ],
-        "deviations": [
-            (each, measurement_arrays(store, each.id)) for each in deviations[-MOST_DRAWN:]
-        ],
-    }

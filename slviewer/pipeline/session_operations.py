@@ -1,16 +1,16 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
-from slviewer.pipeline.compare import compare
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
 from slviewer.pipeline.inspect import inspect
-from slviewer.pipeline.measure import measure
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.operations import (
     accept,
     align,
     calibrate,
     check,
+    compare,
+    measure,
     merge,
     reconstruct,
     run_plan,
@@ -38,12 +38,12 @@ class SessionOperations(Session):
     align = align.align
     calibrate = calibrate.calibrate
     check = check.check
-    compare = compare
+    compare = compare.compare
     edit_scan = edit_scan
     export = export
     inspect = inspect
     load_arrays = load_arrays
-    measure = measure
+    measure = measure.measure
     merge = merge.merge
     mesh = mesh
     plan = plan

@@ -7,8 +7,10 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from slviewer.errors import InputError
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.scale import scale_factor
+from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.record import Record
 from slviewer.session.store import Session
@@ -64,21 +66,38 @@ def captures_of(name: str, record: Record) -> list[str]:
     from."""
     if not record.is_of_captures:
         return []
-    return [each for each in record.inputs if "/" not in each] if name.isdecimal() else [name]
+    return [each for each in record.inputs if "/" not in each] if record.is_number(name) else [name]
+
+
+def load_stored(store: Session, kind: type[R], name: str) -> Stored[R]:
+    """Load a record with its label and whether it is stale. Raises InputError where there is none
+    of that name."""
+    result = f"{kind.kind}/{name}"
+    if not store.has_result(result):
+        there = [each.removeprefix(f"{kind.kind}/") for each in numbered_results(store, kind.kind)]
+        noun = kind.title.lower().removesuffix("s")
+        raise InputError(f"there is no {noun} {name!r}: there are {', '.join(there) or 'none'}")
+    record, labels = load_record(store, kind, name), store.valid_decision(kind.labels) or {}
+    return Stored(
+        name, str(labels.get(name) or record.label(name)), record, not is_up_to_date(store, result)
+    )
 
 
 def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
     """Return the records of a kind in natural order of their names; those of deleted captures are
     skipped."""
-    labels, there = store.valid_decision("names") or {}, set(store.capture_names())
-    records = []
-    for result in numbered_results(store, kind.kind):
-        name = result.removeprefix(f"{kind.kind}/")
-        record = load_record(store, kind, name)
-        if there.issuperset(captures_of(name, record)):
-            stale = store.state_of(result) != "fresh" or not _has_scales(store, record.scales)
-            records.append(Stored(name, str(labels.get(name, name)), record, stale))
-    return records
+    there = set(store.capture_names())
+    names = (result.removeprefix(f"{kind.kind}/") for result in numbered_results(store, kind.kind))
+    records = (load_stored(store, kind, name) for name in names)
+    return [each for each in records if there.issuperset(captures_of(each.name, each.record))]
+
+
+def next_name(store: Session, kind: type[Record]) -> str:
+    """Return the name of the next numbered record of a kind; those in the trash can come back, and
+    keep theirs."""
+    start = f"{kind.kind}/{kind.prefix}"
+    taken = [each.removeprefix(start) for each in (*store.result_names(), *store.deleted_results())]
+    return f"{kind.prefix}{1 + max((int(each) for each in taken if each.isdecimal()), default=0)}"
 
 
 def name_records(found: Sequence[Stored[R]]) -> dict[str, R]:
@@ -91,12 +110,15 @@ def name_records(found: Sequence[Stored[R]]) -> dict[str, R]:
 
 
 def is_up_to_date(store: Session, result: str) -> bool:
-    """Whether a result's inputs are as they were, and no correction of scale has changed since."""
+    """Whether a record's inputs are as they were, and no correction of scale has changed since,
+    also in records that it was made from; other results are taken to be."""
+    kind, _, name = result.partition("/")
+    if kind not in RECORDS:
+        return True
     if store.state_of(result) != "fresh":
         return False
-    return _has_scales(store, store.load_result(result, only=())[0].get("scales", {}))
-
-
-def _has_scales(store: Session, scales: Mapping[str, float]) -> bool:
-    """Whether these are the corrections of scale in force, by model."""
-    return all(scale_factor(store, model) == factor for model, factor in scales.items())
+    record = load_record(store, RECORDS[kind], name)
+    has_scales = all(
+        scale_factor(store, model) == factor for model, factor in record.scales.items()
+    )
+    return has_scales and all(is_up_to_date(store, each) for each in record.inputs)

@@ -43,12 +43,16 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     {capture or result: its hash}; ``scales``: {model: correction of scale in the figures}. A
     subclass names its ``kind``, the folder of its results, and its ``title``; its docstring
     explains its figures in the report. What older versions stored is converted by `upgrade`.
+    ``prefix``: what the names of numbered records begin with; ``labels``: the decision with the
+    operator's own.
     """
 
     kind: ClassVar[str] = ""
     title: ClassVar[str] = ""
     is_history: ClassVar[bool] = False  # also records of before are of interest
     is_of_captures: ClassVar[bool] = True  # and not shown once these are deleted
+    prefix: ClassVar[str] = ""
+    labels: ClassVar[str] = "names"
     operation: str = ""
     settings: dict[str, Any] = {}
     inputs: dict[str, str] = {}
@@ -62,6 +66,15 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the entries of a stored record with today's names."""
         return meta
+
+    @classmethod
+    def is_number(cls, name: str) -> bool:
+        """Whether a record of this name is numbered, and not named after a capture."""
+        return name.removeprefix(cls.prefix).isdecimal()
+
+    def label(self, name: str) -> str:
+        """Return what the record of this name is called unless the operator calls it otherwise."""
+        return name
 
     @classmethod
     def tables(cls, found: Mapping[str, "Record"]) -> list[Table]:

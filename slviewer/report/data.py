@@ -15,7 +15,6 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.report.page import Figure
-from slviewer.session.measurements import Measurement
 
 ByModel = Mapping[str, float]
 """One value a model, such as ``{"stereo": 0.198, "pixelwise": 0.076}``."""
@@ -219,12 +218,11 @@ class ModelsView:
 
 @dataclass(frozen=True, eq=False)
 class SessionData:
-    """A session's captures, its calibrations, and the measurements made with them.
+    """A session's captures, its calibrations, and the records made with them.
 
     ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that
-    made ``calibration``. ``sections``: names, and lines (k, 2) mm, along and up; ``deviations``
-    from nominal models, with their arrays. ``region``: the region of interest that is in effect, in
-    words; ``edits`` of scans in their order: scan and words.
+    made ``calibration``. ``region``: the region of interest that is in effect, in words; ``edits``
+    of scans in their order: scan and words.
     """
 
     name: str
@@ -236,8 +234,5 @@ class SessionData:
     verdict: Verdict | None = None
     verdict_of_calibration: bool = True
     models: ModelsView | None = None
-    measurements: Sequence[Measurement] = ()  # but deviations
-    sections: Sequence[tuple[str, Sequence[np.ndarray]]] = ()
-    deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]] = ()
     region: str = ""
     edits: Sequence[tuple[str, str]] = ()

@@ -1,15 +1,14 @@
-"""Measurements on scans, and deviations of scans from nominal models: tables, sections, coloured
-surfaces."""
+"""Pictures of measurements on scans: sections, and surfaces coloured by their deviation from a
+nominal model."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
-from slviewer.inspection.tolerance import DECIDED, RULE
-from slviewer.records.table import Cell, Column, Mark, Table
+from slviewer.records.measurement import NominalDeviation
 from slviewer.report.canvas import (
     DENSITY,
     FULL,
@@ -23,72 +22,19 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.page import Figure, Item, PageNotice, Section
+from slviewer.report.page import Figure
 from slviewer.report.shaded import render_points, view_rotation
-from slviewer.report.tables import UNKNOWN, format_number
-from slviewer.session.measurements import Measurement
 
 Lines = Sequence[NDArray[np.floating]]
 YAW_DEG, PITCH_DEG = 12.0, 10.0
 PICTURE = (560, 420)
 LINE = "#2270b8"
 TOLERANCE = "#b3261e"
-MARKS: dict[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
 CURSOR_COLOURS = ("#b3261e", "#1f9673", "#7b5cc4")
 LEAST_HIGH, MOST_HIGH = 220, 460
 FLAT = 0.1
 """Height over length of a section below which heights are enlarged, to be visible at all."""
 MOST_DRAWN = 4000
-
-
-def measurements_section(
-    rows: Sequence[Measurement], sections: Sequence[tuple[str, Lines]]
-) -> Section:
-    """The section with every measurement, its unit and uncertainty, and a plot of each
-    cross-section."""
-    items: list[Item] = [
-        PageNotice(f"{row.name} is out of date: its surface has changed. Measure again.")
-        for row in rows
-        if row.stale
-    ]
-    items += [
-        PageNotice(f"{row.name}: {note}.")
-        for row in rows
-        for note in row.data.get("fit", {}).get("warnings", ())
-    ]
-    body = [cells for row in rows for cells in _measurement_rows(row)]
-    columns = [
-        Column("measurement", align="left"),
-        Column("kind", align="left"),
-        Column("scan", align="left"),
-    ]
-    columns += [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
-    columns += [Column("U, k = 2"), Column("of", align="left")]
-    notes = [
-        "U is the expanded uncertainty: the scatter of the points, and the calibration's"
-        " uncertainty. –: a residual or a plain reading, which has none."
-    ]
-    if any(q.U is not None and not q.whole for row in rows for q in row.quantities):
-        notes.append("* without the calibration's part, which is unknown.")
-    if body:
-        items.append(Table(columns, body, "Measured on the scans", notes))
-    items += [section_plot(name, lines) for name, lines in sections]
-    return Section("Measurements", "Distances, fitted shapes and their relations.", items)
-
-
-def _measurement_rows(measured: Measurement) -> Iterator[list[str | Cell]]:
-    """Yield the cells of each quantity of a measurement; what they share stands in the first
-    row."""
-    name = Cell(f"{measured.name} (stale)", "worse") if measured.stale else measured.name
-    named: list[str | Cell] = [name, measured.kind, measured.source]
-    data = measured.data
-    where = " and ".join(data["between"]) if "between" in data else data.get("where", "")
-    for q in measured.quantities:
-        digits = 1 if q.unit == "%" else 4
-        U = UNKNOWN if q.U is None else f"{q.U:.{digits}f}{'' if q.whole else ' *'}"
-        unit = "°" if q.unit == "deg" else q.unit
-        yield [*named, q.name, format_number(q.value, digits), unit, U, where]
-        named, where = ["", "", ""], ""
 
 
 def section_plot(
@@ -130,117 +76,6 @@ def section_plot(
     )
 
 
-def deviations_section(
-    deviations: Sequence[tuple[Measurement, Mapping[str, np.ndarray]]],
-) -> Section:
-    """Return the section with each comparison with a nominal model: verdict, picture and
-    statistics."""
-    items: list[Item] = []
-    for measured, arrays in deviations:
-        items += _deviation_items(measured, arrays)
-    text = (
-        "Scans against nominal models, after the best fit of the one to the other: distances from"
-        " the nominal surface, positive outside it. The tolerance is " + RULE + "."
-    )
-    return Section("Deviation from nominal", text, items)
-
-
-def _deviation_items(view: Measurement, arrays: Mapping[str, np.ndarray]) -> list[Item]:
-    """Verdict, notices, pictures and table of one comparison with a nominal model."""
-    verdict = view.data["verdict"]
-    items: list[Item] = []
-    if verdict is not None:
-        words = DECIDED[verdict["decision"]]
-        kind = {"pass": "good", "fail": "warning", "undecided": "warning"}[verdict["decision"]]
-        items.append(
-            PageNotice(f"{view.name}, tolerance ± {verdict['tolerance_mm']:g} mm: {words}.", kind)  # type: ignore[arg-type]
-        )
-    if view.stale:
-        items.append(
-            PageNotice(
-                f"{view.name}: the scan or its calibration has changed since; compare it again."
-            )
-        )
-    items += [draw_deviation(view, arrays), _deviation_table(view)]
-    return items
-
-
-def _deviation_table(view: Measurement) -> Table:
-    """Table of the statistics of one comparison, with the decision for each where a tolerance is
-    set."""
-    data, verdict = view.data, view.data["verdict"]
-    numbers = data["statistics_mm"]
-    columns = [Column("quantity", align="left"), Column("value"), Column("unit", align="left")]
-    columns.append(Column("decision", align="left"))
-
-    def end(key: str) -> str | Cell:
-        """The cell with the decision for a statistic; empty without a tolerance."""
-        return "" if verdict is None else _decision_cell(verdict[key][1])
-
-    rows: list[list[str | Cell]] = [
-        ["mean", format_number(numbers["mean"], 4, signed=True), "mm", ""],
-        ["RMS", format_number(numbers["rms"], 4), "mm", ""],
-        ["RMS of the scan's noise alone", format_number(data["noise_mm"], 4), "mm", ""],
-        [
-            "95 % of the points deviate by less than",
-            format_number(numbers["within_95"], 4),
-            "mm",
-            "",
-        ],
-        [
-            "range of 99.7 % of the points, lower end",
-            format_number(numbers["p_low"], 4, signed=True),
-            "mm",
-            end("lowest"),
-        ],
-        [
-            "range of 99.7 % of the points, upper end",
-            format_number(numbers["p_high"], 4, signed=True),
-            "mm",
-            end("highest"),
-        ],
-        [
-            "lowest, highest point",
-            f"{numbers['lowest']:+.3f}, {numbers['highest']:+.3f}".replace("-", "−"),
-            "mm",
-            "",
-        ],
-    ]
-    if verdict is not None:
-        rows += [
-            [
-                "expanded uncertainty U of a point, k = 2",
-                format_number(verdict["U_mm"], 4),
-                "mm",
-                "",
-            ],
-            [
-                f"within ± {verdict['tolerance_mm']:g} mm",
-                format_number(verdict["within"], 2),
-                "%",
-                "",
-            ],
-            ["inside by more than U", format_number(verdict["inside"], 2), "%", ""],
-            ["outside by more than U", format_number(verdict["outside"], 2), "%", ""],
-            ["undecided", format_number(verdict["close"], 2), "%", ""],
-        ]
-    rows.append(
-        ["area of the nominal that was measured", format_number(100 * data["coverage"], 1), "%", ""]
-    )
-    share = 100 * numbers["left_out"] / max(numbers["points"] + numbers["left_out"], 1)
-    notes = [
-        f"{numbers['points']:,} points. {numbers['left_out']:,} ({share:.1f} %) lie farther than"
-        f" {data['reach_mm']:.3g} mm from the nominal or face another direction, and are excluded."
-        f" The best fit adds {data['alignment_mm']:.4f} mm (1 sigma)."
-    ]
-    return Table(columns, rows, f"{view.source} against {view.data['nominal']['name']}", notes)
-
-
-def _decision_cell(decision: str) -> Cell:
-    """Return the table cell of a decision, with its colour: pass, fail or undecided."""
-    return Cell(DECIDED[decision], MARKS[decision])  # type: ignore[index]
-
-
 def draw_deviations(
     axes: Any, edges: np.ndarray, counts: np.ndarray, limit: float, tolerance: float | None
 ) -> None:
@@ -273,7 +108,9 @@ def draw_deviations(
         add_legend(axes, loc="lower right", bbox_to_anchor=(1, 1.0), borderaxespad=0.2)
 
 
-def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figure:
+def draw_deviation(
+    name: str, source: str, found: NominalDeviation, arrays: Mapping[str, np.ndarray]
+) -> Figure:
     """Figure of the scan coloured by its deviation, unmeasured parts of the nominal in grey, and
     the histogram.
 
@@ -284,8 +121,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
-    verdict = view.data["verdict"]
-    tolerance = None if verdict is None else float(verdict["tolerance_mm"])
+    tolerance, against = found.tolerance_mm, f"{source} against {found.nominal.name}"
     limit = colour_limit(arrays["signed"], tolerance)
     limit = round_up(limit) if tolerance is None else limit
     palette = ListedColormap(deviation_colours(np.linspace(-1, 1, 255), 1.0) / 255)
@@ -296,7 +132,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     normals = np.concatenate([arrays["normals"], np.full(arrays["uncovered"].shape, np.nan)])
     grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), arrays["uncovered"].shape)
     colours = np.concatenate([deviation_colours(arrays["signed"], limit), grey]) / 255.0
-    style_image_axes(left, f"{view.source} against {view.data['nominal']['name']}")
+    style_image_axes(left, against)
     left.imshow(
         render_points(
             points,
@@ -310,8 +146,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     add_colour_bar(
         drawing, mapped, left, "deviation, mm", location="bottom", shrink=0.7, aspect=40, pad=0.02
     )
-    numbers = view.data["statistics_mm"]
-    style_axes(right, f"RMS {numbers['rms']:.4f} mm", "deviation, mm", "points, %")
+    style_axes(right, f"RMS {found.statistics_mm.rms:.4f} mm", "deviation, mm", "points, %")
     edges = arrays["edges"]
     draw_deviations(right, edges, arrays["counts"], limit, tolerance)
     far = max(edges[-1], 0.0 if tolerance is None else 1.15 * tolerance)
@@ -324,8 +159,7 @@ def draw_deviation(view: Measurement, arrays: Mapping[str, np.ndarray]) -> Figur
     )
     return finish_figure(
         drawing,
-        f"{view.name}: red lies outside the nominal surface, blue inside it. Right: the "
-        "distribution of the deviations.",
-        f"{view.source} coloured by its deviation from {view.data['nominal']['name']}, with their"
-        " histogram",
+        f"{name}: red lies outside the nominal surface, blue inside it. Right: the distribution of"
+        " the deviations.",
+        f"{source} coloured by its deviation from {found.nominal.name}, with their histogram",
     )

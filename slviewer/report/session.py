@@ -13,7 +13,6 @@ from slviewer.records.verification import Verification
 from slviewer.report.canvas import percentile
 from slviewer.report.data import CalibrationFigures, RecordsView, SessionData
 from slviewer.report.maps import rms_maps
-from slviewer.report.measurements import deviations_section, measurements_section
 from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.quality import (
     models_section,
@@ -116,10 +115,6 @@ def session_sections(data: SessionData) -> list[Section]:
     if data.pixel_fits:
         sections.append(_pixel_fits_section(data))
     sections += [_records_section(view) for view in data.records]
-    if data.measurements or data.sections:
-        sections.append(measurements_section(data.measurements, data.sections))
-    if data.deviations:
-        sections.append(deviations_section(data.deviations))
     if data.region or data.edits:
         sections.append(_restrictions_section(data))
     return [*sections, _captures_section(data)]

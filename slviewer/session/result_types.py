@@ -129,32 +129,6 @@ class _Edits(ResultMeta, total=False):
     content: str
 
 
-class _MeasurementData(TypedDict, total=False):
-    """The entries of a measurement's data that several readers use."""
-
-    quantities: list[dict[str, Any]]
-    scale: float | None
-    feature: dict[str, Any]
-    scatter: list[Any]
-    calibration: str
-    fit: dict[str, Any]
-    plane: dict[str, Any]
-    where: str
-    between: list[str]
-
-
-class _Measurement(ResultMeta, total=False):
-    """`measurements/*`."""
-
-    kind: str
-    name: str
-    source: str
-    model: str
-    time: str
-    data: _MeasurementData
-    of: list[str]
-
-
 class _Scale(ResultMeta, total=False):
     """`scale/*`."""
 
@@ -171,7 +145,6 @@ _TYPES: dict[str, Any] = {
     "evidence": _Evidence,
     "trust": _FrameCheck,
     "edits": _Edits,
-    "measurements": _Measurement,
     "scale": _Scale,
 }
 

@@ -13,8 +13,8 @@ from numpy.polynomial import legendre
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
-from slviewer.inspection.quantities import Quantity
 from slviewer.pipeline.feedback import Progress
+from slviewer.records.quantities import Quantity
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 
 REPEATS = 200

@@ -10,7 +10,7 @@ threads do the work.
 `preview_watcher`     analyses the latest preview frame: board, brightness, stillness
 `jobs`                one worker that computes, one job after the other; each can be cancelled
                       within a second
-`session_reader`      reads poses, calibration, records and measurements from the session's files
+`session_reader`      reads poses, calibration and records from the session's files
 `planner`             computes where the board should be held next
 `steps`               the nine steps, and what each is waiting for
 `snapshot`            what a panel draws; `publisher` builds and publishes it

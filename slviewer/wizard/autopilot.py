@@ -12,7 +12,6 @@ from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measured_surface import MeasuredSurface, Place
-from slviewer.pipeline.measurements import add_distance, add_fit
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
@@ -156,13 +155,13 @@ class Autopilot:
         sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
         region = _make_ball_region(operator.surface(sphere))
         self._perform_act(
-            "Measuring the sphere", partial(operator.measure, sphere, add_fit, "sphere", region)
+            "Measuring the sphere", partial(operator.measure, sphere, "sphere", region=region)
         )
         latest = _list_scans(operator.snapshot())[-1].name
         a, b = _select_width_ends(operator.surface(latest))
         self._perform_act(
             "Measuring the width of the object",
-            partial(operator.measure, latest, add_distance, a, b),
+            partial(operator.measure, latest, "distance", [a, b]),
         )
 
     def _place(self, thing: Thing, scene: Scene) -> None:

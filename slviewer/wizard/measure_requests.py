@@ -2,36 +2,37 @@
 model."""
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Concatenate, ParamSpec
+
+import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.render import format_count
-from slviewer.inspection.tolerance import DECIDED
-from slviewer.pipeline import measurements
-from slviewer.pipeline.compare import NominalComparison, compare_surface
-from slviewer.pipeline.measured_surface import MeasuredSurface
-from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
-from slviewer.pipeline.run_plan import RunPlanSettings, run_plan
-from slviewer.session import atomic
-from slviewer.session.atomic import rename
-from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
-from slviewer.session.measurements import (
-    Measurement,
+from slviewer.inspection.regions import Region
+from slviewer.pipeline.compare import CompareSettings, compare
+from slviewer.pipeline.measure import MeasureSettings, What, measure
+from slviewer.pipeline.measured_surface import LoadSurface, MeasuredSurface, Place
+from slviewer.pipeline.measurements import (
+    export_measurements,
     rename_measurement,
     restore_measurement,
     trash_measurement,
 )
+from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
+from slviewer.pipeline.relate import RelateSettings, relate
+from slviewer.pipeline.run_plan import RunPlanSettings, run_plan
+from slviewer.records.measurement import MeasuredRegion
+from slviewer.records.plain import from_plain, to_plain
+from slviewer.session import atomic
+from slviewer.session.atomic import rename
+from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
-from slviewer.session.store import Session
 from slviewer.wizard.jobs import Reporter
 from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import Surfaces
 
-P = ParamSpec("P")
 TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
@@ -49,34 +50,28 @@ class MeasureRequests(RequestHandler):
 
     @request(MEASURING)
     def measure(
-        self,
-        on: str,
-        add: Callable[Concatenate[Session, MeasuredSurface, P], Measurement],
-        *args: P.args,
-        **kwargs: P.kwargs,
+        self, on: str, what: What, at: Sequence[Place] = (), region: Region | None = None
     ) -> None:
-        """Measure on a surface by a function of `pipeline.measurements`: `measure("scan_01",
-        add_distance, a, b)`."""
-        store = self._engine.store
-
-        def work(report: Reporter) -> Measurement:
-            """Load the surface, then add and return the measurement."""
-            report(0.0, f"measuring on {on}")
-            surface = self._surfaces.load(store, on)
-            return add(store.guarded(report.saving), surface, *args, **kwargs)
-
-        self._submit(MEASURING, work, describe_quantities)
+        """Measure on a surface, at places of it, or in a region."""
+        chosen = (
+            {} if region is None else from_plain(to_plain(region), MeasuredRegion).to_settings()
+        )
+        chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
+        self._run(
+            MEASURING,
+            measure,
+            MeasureSettings(on, what, **chosen, load=self._loader(on)),
+            "measurements",
+        )
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:
         """Measure angles and distances between two points or fits, by their ids."""
-        store = self._engine.store
+        self._run(MEASURING, relate, RelateSettings(a, b), "measurements")
 
-        def work(report: Reporter) -> Measurement:
-            """Add and return the relation of the two measurements."""
-            return measurements.add_relation(store.guarded(report.saving), a, b)
-
-        self._submit(MEASURING, work, describe_quantities)
+    def _loader(self, on: str) -> LoadSurface:
+        """Return what loads a surface, unless it is the last one that was."""
+        return lambda store: self._surfaces.load(store, on)
 
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
@@ -153,35 +148,14 @@ class MeasureRequests(RequestHandler):
     ) -> None:
         """Measure a surface's deviation from one of the session's nominal models after best fit;
         also writes a PLY."""
-        store = self._engine.store
-        path = store.folder / NOMINALS / safe_name(nominal)
+        path = self._engine.store.folder / NOMINALS / safe_name(nominal)
         if not path.is_file():
             raise InputError(
                 f"there is no nominal model {nominal!r} in the session: upload it first"
             )
-
-        def work(report: Reporter) -> NominalComparison:
-            """Compare the surface with the nominal model, and write the deviations as PLY into the
-            exports."""
-            report(0.0, f"reading {nominal}")
-            ideal, surface = read_nominal(path, units), self._surfaces.load(store, on)
-            name = f"{on.replace('/', '_')}_{path.stem}_deviation.ply"
-            with store.guarded(report.saving).staged_export(name) as ply, _reword_errors():
-                result = compare_surface(
-                    store.guarded(report.saving),
-                    surface,
-                    ideal,
-                    tolerance=tolerance_mm,
-                    out=ply,
-                    progress=report.within(0.05, 0.98),
-                    warn=self._warner("measurements"),
-                )
-            for note in ideal.notes:
-                self._warner("measurements")(f"{ideal.name}: {note}")
-            report(1.0, "compared")
-            return result
-
-        self._submit(COMPARING, work, describe_deviation)
+        settings = CompareSettings(on, path, tolerance_mm, units, load=self._loader(on))
+        failed = lambda error: self._engine.notices.add_failure(COMPARING, _reword(error))  # noqa: E731
+        self._run(COMPARING, compare, settings, "measurements", failed)
 
     @request("Renaming")
     def relabel_measurement(self, identity: str, name: str) -> None:
@@ -207,7 +181,7 @@ class MeasureRequests(RequestHandler):
             """Write the CSV into the exports; returns a sentence with the number of
             measurements."""
             with store.guarded(report.saving).staged_export(TABLE) as path:
-                count = measurements.export_measurements(store, path)
+                count = export_measurements(store, path)
             report(1.0, "written")
             return f"{TABLE} is ready to download: {count} measurement{'s' * (count != 1)}"
 
@@ -236,35 +210,12 @@ class MeasureRequests(RequestHandler):
         self._submit("Making the plan", work, str)
 
 
-@contextmanager
-def _reword_errors() -> Iterator[None]:
-    """Reword InputErrors raised in the block: remove the command line's option ``--units``."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(
-            str(error).replace("give --units ", "choose its units, ").replace("--units ", "")
-        ) from error
-
-
-def describe_quantities(measured: Measurement) -> str:
-    """Describe a measurement in one sentence: its name and quantities."""
-    values = "; ".join(quantity.text() for quantity in measured.quantities)
-    return f"{measured.name}: {values}"
-
-
-def describe_deviation(result: NominalComparison) -> str:
-    """Describe a comparison in one sentence: RMS deviation in mm, and the decision against the
-    tolerance."""
-    text = (
-        f"{result.scan} against {result.nominal.name}: RMS"
-        f" {result.found.statistics()['rms']:.4f} mm"
-    )
-    if result.verdict is None:
-        return text
-    return (
-        f"{text}; tolerance ± {result.verdict.tolerance_mm:g} mm:"
-        f" {DECIDED[result.verdict.decision]}"
+def _reword(error: BaseException) -> BaseException:
+    """Return an error without the command line's option ``--units``."""
+    if not isinstance(error, InputError):
+        return error
+    return InputError(
+        str(error).replace("give --units ", "choose its units, ").replace("--units ", "")
     )
 
 

@@ -31,12 +31,11 @@ from slviewer.pipeline.models import (
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.stored_records import Stored, captures_of, read_record
 from slviewer.records.kinds import RECORDS
+from slviewer.records.measurement import Measurement
 from slviewer.records.placement import Placement
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.capture import Capture
 from slviewer.session.inspection_plan import list_plans
-from slviewer.session.measurements import FOLDER as MEASUREMENTS
-from slviewer.session.measurements import NAMES, Measurement, measurement_from_meta
 from slviewer.session.names import join_names, natural_key
 from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
 from slviewer.session.store import Session
@@ -72,14 +71,6 @@ class _Inputs:
     labels: Mapping[str, str]
     hashes: Mapping[str, str]
     factors: Mapping[str, float]
-
-    def is_fresh(self, meta: Mapping[str, Any]) -> bool:
-        """Whether every input of a result still has the hash it was made from, and no scale has
-        changed since."""
-        return not (
-            _has_changed(meta.get("inputs", {}), self.hashes)
-            or _has_changed(meta.get("scales", {}), self.factors)
-        )
 
 
 class SessionReader:
@@ -193,11 +184,8 @@ class SessionReader:
             verdict_of_calibration=verdict is not None and verdict == judged,
             records=records,
             scans=tuple(self._read_scan(captures[name], of_scan[name], inputs) for name in scans),
-            measurements=self._attempt(
-                "the measurements", lambda: self._read_measurements(inputs), ()
-            ),
             deleted_measurements=sum(
-                name.startswith(f"{MEASUREMENTS}/") for name in session.deleted_results()
+                name.startswith(f"{Measurement.kind}/") for name in session.deleted_results()
             ),
             nominals=list_nominals(session.folder),
             plans=list_plans(session.folder),
@@ -227,6 +215,10 @@ class SessionReader:
         for name in (f"calibration/{model}" for model in models):
             meta = self._load_meta(name)
             if not _has_changed(meta["inputs"], hashes):
+                hashes[name] = meta["hash"]
+        for name in self._list_results("scale/"):
+            meta = self._load_meta(name)
+            if not _has_changed(meta.get("inputs", {}), hashes):
                 hashes[name] = meta["hash"]
         factors = {model: scale_factor(session, model) for model in models}
         return _Inputs(captures, session.valid_decision("names") or {}, hashes, factors)
@@ -463,6 +455,7 @@ class SessionReader:
 
     def _read_records(self, inputs: _Inputs) -> tuple[Stored[Any], ...]:
         """Read all records of existing captures, with whether they are stale."""
+        known = dict(inputs.hashes)  # with those of fresh records, which others are made from
 
         def read(result: str) -> Stored[Any] | None:
             """Read one record by its result name; None where a capture of it is gone."""
@@ -473,11 +466,18 @@ class SessionReader:
             )
             if not set(captures_of(name, record)) <= set(inputs.captures):
                 return None
-            return Stored(
-                name, str(inputs.labels.get(name, name)), record, not inputs.is_fresh(meta)
+            stale = _has_changed(record.inputs, known) or _has_changed(
+                record.scales, inputs.factors
             )
+            if not stale:
+                known[result] = meta["hash"]
+            labels = self.session.valid_decision(record.labels) or {}
+            return Stored(name, str(labels.get(name) or record.label(name)), record, stale)
 
-        names = [name for kind in RECORDS for name in self._list_results(f"{kind}/")]
+        kinds = sorted(
+            RECORDS, key=lambda kind: kind == Measurement.kind
+        )  # which are made from merges
+        names = [name for kind in kinds for name in self._list_results(f"{kind}/")]
         records = [self._attempt(name, partial(read, name), None) for name in names]
         return tuple(record for record in records if record is not None)
 
@@ -506,36 +506,6 @@ class SessionReader:
             edits=edits,
             undone_edits=undone,
         )
-
-    def _read_measurements(self, inputs: _Inputs) -> tuple[Measurement, ...]:
-        """Read all measurements, in the order they were made; stale as ``pipeline.measurements``
-        defines it."""
-        known, read, names = dict(inputs.hashes), [], self.session.valid_decision(NAMES) or {}
-        results = self.session.result_names()
-        for kind in (
-            "scale/",
-            "merge/",
-            f"{MEASUREMENTS}/",
-        ):  # each is made from captures and from those before it
-            for result in (name for name in results if name.startswith(kind)):
-                meta = self._load_meta(result)
-                scales = meta.get("scales", {})
-                if kind == f"{MEASUREMENTS}/":
-                    scales = (
-                        {meta["model"]: used}
-                        if (used := meta["data"].get("scale")) is not None
-                        else {}
-                    )
-                stale = _has_changed(meta.get("inputs", {}), known) or _has_changed(
-                    scales, inputs.factors
-                )
-                if kind == f"{MEASUREMENTS}/":
-                    read.append(
-                        measurement_from_meta(result.removeprefix(kind), meta, names, stale)
-                    )
-                if not stale:
-                    known[result] = meta["hash"]
-        return tuple(read)
 
     # files
 

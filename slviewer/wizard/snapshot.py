@@ -17,6 +17,7 @@ from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.stored_records import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.records.calibration import PixelwiseFit, SplinedFit
+from slviewer.records.measurement import Measurement
 from slviewer.records.merge import Merge
 from slviewer.records.placement import Placement
 from slviewer.records.reconstruction import Reconstruction
@@ -24,7 +25,6 @@ from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.registration.refusal import Reason
 from slviewer.session.capture import TurnStep
-from slviewer.session.measurements import Measurement
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard.pose_plan import PlanInput, PosePlan
 
@@ -252,7 +252,6 @@ class SessionView:
     verdict_of_calibration: bool = True  # whether that attempt made `calibration`
     records: tuple[Stored[Any], ...] = ()  # in natural order of their names
     scans: tuple[ScanView, ...] = ()
-    measurements: tuple[Measurement, ...] = ()
     deleted_measurements: int = 0  # how many can be restored
     nominals: tuple[str, ...] = ()  # names of the nominal models that were uploaded
     plans: tuple[str, ...] = ()  # paths of inspection plans in the session's folder
@@ -277,6 +276,11 @@ class SessionView:
     def list_records(self, kind: type[R]) -> list[Stored[R]]:
         """Return the session's records of a kind."""
         return [each for each in self.records if isinstance(each.record, kind)]
+
+    @property
+    def measurements(self) -> tuple[Stored[Measurement], ...]:
+        """The session's measurements, in the order in which they were made."""
+        return tuple(self.list_records(Measurement))
 
     @property
     def merge(self) -> Stored[Merge] | None:

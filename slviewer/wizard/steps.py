@@ -387,7 +387,7 @@ def _measure_instruction(facts: Facts) -> str:
 def _measure_problems(facts: Facts) -> Iterator[str]:
     """Yield the stale measurements, whose surface has changed."""
     if stale := (
-        [measured.name for measured in facts.session.measurements if measured.stale]
+        [measured.label for measured in facts.session.measurements if measured.stale]
         if facts.session
         else []
     ):

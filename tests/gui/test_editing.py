@@ -398,8 +398,7 @@ def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Bro
         click(page, "Fit sphere")
         wait_until(page, lambda: len(operator.snapshot().session.measurements) == 1)  # type: ignore[union-attr]
         (fitted,) = operator.snapshot().session.measurements  # type: ignore[union-attr]
-        radius = fitted.data["quantities"][0]
-        assert abs(radius["value"] - 98.0) < 1.5 and "box" in fitted.data["where"]
+        assert abs(fitted.record["radius"].value - 98.0) < 1.5 and "box" in fitted.record.where
         click(page, "End tool")
         click(page, "Make plan")
         wait_until(page, lambda: operator.snapshot().session.plans == (OWN_PLAN,))  # type: ignore[union-attr]

@@ -6,24 +6,20 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.gui.measure_drawing import drawn, format_quantity, label, lifted
-from slviewer.gui.measure_html import (
-    deviation_figure,
-    deviation_html,
-    measurement_html,
-    measurements_table,
-)
+from slviewer.gui.measure_drawing import drawn, label, lifted
+from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table
 from slviewer.gui.measure_section import cursor_html, cursor_points
 from slviewer.gui.measure_surface import paint_surface
 from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
-from slviewer.inspection.quantities import Quantity
+from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
-from slviewer.inspection.tolerance import DECIDED
 from slviewer.pipeline.measured_surface import MeasuredSurface
-from slviewer.records.plain import to_plain
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.measurement import DECIDED, Measurement
+from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.quantities import Quantity
 from slviewer.report.measurements import section_plot
-from slviewer.session.measurements import Measurement
 from slviewer.wizard.surfaces import place_at
 
 CENTRE = np.array([10.0, 20.0, 500.0])
@@ -31,19 +27,24 @@ TOP = CENTRE - np.array([0.0, 0.0, 30.0])
 
 
 def made(
-    kind: str, quantities: list[Quantity], of: tuple[str, ...] = (), stale: bool = False, **data
-) -> Measurement:
-    name = f"<b>{kind}</b>"
-    data["quantities"] = to_plain(quantities)
-    return Measurement(f"m_{kind}", name, kind, "scan_01", "stereo", "", data, of, stale)
+    what: str, quantities: list[Quantity], stale: bool = False, **fields: object
+) -> Stored[Measurement]:
+    fields = {"quantities": quantities, "source": "scan_01", "model": "stereo", **fields}
+    return Stored(
+        f"m_{what}",
+        f"<b>{what}</b>",
+        from_plain(to_plain({"what": what, **fields}), Measurement),
+        stale,
+    )
 
 
 SPHERE = made(
     "sphere",
     [Quantity("radius", 25.0, "mm", 0.01, whole=False)],
-    fit={"feature": to_plain(Feature("sphere", CENTRE, None, 25.0)), "warnings": ["it is rough"]},
+    feature=Feature("sphere", CENTRE, None, 25.0),
+    warnings=["it is rough"],
 )
-POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=to_plain(Feature("point", TOP)))
+POINT = made("point", [Quantity("x", -0.00001, "mm")], feature=Feature("point", TOP))
 
 
 def text(html: str) -> str:
@@ -77,13 +78,13 @@ def test_tool_states_instruction_and_ends_after_its_picks() -> None:
 
 
 def test_drawing_lies_where_it_was_measured() -> None:
-    segments, place = drawn(SPHERE, {})  # type: ignore[misc]
+    segments, place = drawn(SPHERE.record, {})  # type: ignore[misc]
     away = np.linalg.norm(segments[:-3].reshape(-1, 3) - CENTRE, axis=1)
     assert np.allclose(away, 1.01 * 25) and np.array_equal(place, CENTRE)
     width = made(
         "distance", [Quantity("distance", 80.0, "mm", 0.1)], ends=[[-40, 0, 500], [40, 0, 500]]
     )
-    segments, place = drawn(width, {})  # type: ignore[misc]
+    segments, place = drawn(width.record, {})  # type: ignore[misc]
     assert np.allclose(segments[0, 0], [-40, 0, 500]) and np.allclose(segments[2, 1], [40, 0, 500])
     assert np.allclose(place, [0, 0, 488]) and label(width) == "<b>distance</b>: 80.000 ± 0.200 mm"
     related = made(
@@ -91,21 +92,17 @@ def test_drawing_lies_where_it_was_measured() -> None:
         [Quantity("distance from the centre", 30.0, "mm", 0.1)],
         of=("m_point", "m_sphere"),
     )
-    assert drawn(related, {"m_point": POINT}) is None  # the sphere was deleted
-    segments, _ = drawn(related, {"m_point": POINT, "m_sphere": SPHERE})  # type: ignore[misc]
+    assert drawn(related.record, {"m_point": POINT.record}) is None  # the sphere was deleted
+    segments, _ = drawn(related.record, {"m_point": POINT.record, "m_sphere": SPHERE.record})  # type: ignore[misc]
     assert np.allclose(segments[0, 0], TOP) and np.allclose(segments[2, 1], CENTRE)
     tube = Feature("cylinder", CENTRE, np.array([0.0, 1.0, 0.0]), 8.0)
-    cylinder = made(
-        "cylinder", [], fit={"feature": to_plain(tube)}, region={"kind": "ball", "size": [12.0]}
-    )
-    segments, _ = drawn(cylinder, {})  # type: ignore[misc]
+    cylinder = made("cylinder", [], feature=tube, region=Region.ball(CENTRE, 12.0))
+    segments, _ = drawn(cylinder.record, {})  # type: ignore[misc]
     assert np.allclose(np.abs(segments[:-1, :, 1] - CENTRE[1]), 12) and np.ptp(
         segments[..., 0]
     ) == pytest.approx(16.16)
-    plane = made(
-        "plane", [], fit={"feature": to_plain(Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])))}
-    )
-    segments, _ = drawn(plane, {})  # type: ignore[misc]
+    plane = made("plane", [], feature=Feature("plane", CENTRE, np.array([0.0, 0.0, -1.0])))
+    segments, _ = drawn(plane.record, {})  # type: ignore[misc]
     assert np.allclose(segments[:-1, :, 2], CENTRE[2] - 0.15)
 
 
@@ -127,36 +124,51 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     assert "equal" in section_plot("s", [arc], dict(zip("ABC", cursors, strict=True))).caption
     flat = arc * [1, 0.01]
     assert "enlarged" in section_plot("s", [flat]).caption
-    cut = made("section", [], plane=to_plain(plane))
-    segments, place = drawn(cut, {}, [arc])  # type: ignore[misc]
+    cut = made("section", [], plane=plane)
+    segments, place = drawn(cut.record, {}, [arc])  # type: ignore[misc]
     assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(
         449
     )  # the highest point, a little off
 
 
 def test_measurements_as_text() -> None:
-    assert format_quantity(Quantity("x", -0.00001, "mm")) == "0.000 mm"
-    assert format_quantity(Quantity("height", -1.5, "mm", 0.1)) == "−1.500 ± 0.200 mm"
-    assert format_quantity(Quantity("angle", 90.0, "deg", 0.01, whole=False)) == "90.000 ± 0.020°*"
+    assert Quantity("x", -0.00001, "mm").format() == "0.000 mm"
+    assert Quantity("height", -1.5, "mm", 0.1).format() == "−1.500 ± 0.200 mm"
+    assert Quantity("angle", 90.0, "deg", 0.01, whole=False).format() == "90.000 ± 0.020°*"
     full = text(measurement_html(SPHERE, {"scan_01": "Lion <i>"}))
-    assert missing_facts(full, "25.000 ± 0.020 mm*", "rough", "Lion <i>") == []
+    assert missing_facts(full, "25.0000", "0.0200", "rough", "Lion <i>", "sphere") == []
     assert (
         "<b>sphere" not in measurement_html(SPHERE, {}) and missing_facts(full, "calibration") == []
     )
     stale = made("point", [Quantity("x", 1.0, "mm")], stale=True)
-    listed = text(measurements_table([SPHERE, stale], "", {}))
-    assert listed.index("point on scan_01, stale") < listed.index("sphere on scan_01")
-    statistics = {"points": 900, "left_out": 100}
-    verdict = {
-        "tolerance_mm": 0.1,
-        "decision": "undecided",
-        "U_mm": 0.02,
-        "inside": 90.0,
-        "close": 9.0,
-        "outside": 1.0,
-    }
-    told = text(deviation_html({"verdict": verdict, "statistics_mm": statistics, "reach_mm": 2.0}))
-    facts = (f"± 0.1 mm: {DECIDED['undecided']}", "90.00 %", "9.00 %", "1.00 %", "10.0 %", "2 mm")
+    listed = text(measurements_table([SPHERE, stale], {"scan_01": "Lion"}))
+    assert listed.index("m_point, stale") < listed.index("m_sphere") and listed.count("Lion") == 2
+    ends = dict(lowest=-0.2, highest=0.3, p_low=-0.09, p_high=0.1, within_95=0.05)
+    verdict = dict(
+        tolerance_mm=0.1,
+        U_mm=0.02,
+        within=95.0,
+        inside=90.0,
+        close=9.0,
+        outside=1.0,
+        decision="undecided",
+    )
+    found = dict(
+        nominal=dict(name="part.stl", hash="a"),
+        statistics_mm=dict(mean=0.0, rms=0.02, sigma=0.02, points=900, left_out=100, **ends),
+        verdict=dict(**verdict, lowest=(-0.09, "pass"), highest=(0.1, "undecided")),
+        T_nominal_scan=np.eye(4), noise_mm=0.01, reach_mm=2.0, coverage=0.5, alignment_mm=0.001,
+    )  # fmt: skip
+    told = text(measurement_html(made("deviation", [], deviation=found), {}))
+    facts = (
+        f"± 0.1 mm: {DECIDED['undecided']}",
+        "90.0000",
+        "9.0000",
+        "1.0000",
+        "10.0 %",
+        "2 mm",
+        "part.stl",
+    )
     assert missing_facts(told, *facts) == []
     edges = np.linspace(-0.2, 0.2, 9)
     assert deviation_figure("d", edges, np.arange(8), 0.1, 0.1).png.startswith(b"\x89PNG")

@@ -40,12 +40,12 @@ from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
 from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.stored_records import Stored
+from slviewer.records.measurement import Measurement
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
 from slviewer.server.secure import Serving
-from slviewer.session.measurements import Measurement
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -311,10 +311,9 @@ def measure_distance(page: Page, operator: Operator, count: int) -> None:
     click_until(page, (480, 440), "Click the second point.")
     page.mouse.click(590, 420)
     width = came(operator, count)
-    assert width.kind == "distance" and 5 < width.quantities[0].value < 140
-    expect(
-        page.get_by_text(re.compile(rf"{width.quantities[0].value:.3f} ±\s0\.\d+\smm")).first
-    ).to_be_visible()
+    value = width.quantities[0].value
+    assert width.what == "distance" and 5 < value < 140
+    expect(page.get_by_text(re.compile(rf"{value:.3f} ±\s0\.\d+\smm")).first).to_be_visible()
 
 
 @pytest.mark.slow
@@ -364,8 +363,9 @@ def test_part_is_measured_and_compared_with_its_nominal(
     field(page, "Tolerance ±, mm").fill("1.5")
     expect(button(page, "Compare")).to_be_enabled()
     click(page, "Compare")
-    found = came(operator, before + 4).data
-    assert found["verdict"]["decision"] == "pass" and 0.01 < found["statistics_mm"]["rms"] < 0.5
+    found = came(operator, before + 4).deviation
+    assert found is not None and found.verdict is not None
+    assert found.verdict.decision == "pass" and 0.01 < found.statistics_mm.rms < 0.5
     expect(page.get_by_text("Tolerance ± 1.5 mm: pass").first).to_be_visible()
     expect(page.get_by_text("Histogram of the deviations.")).to_be_visible()
 
@@ -408,7 +408,7 @@ def came(operator: Operator, count: int) -> Measurement:
         lambda s: s.session is not None and len(s.session.measurements) == count, PATIENCE_S
     )
     assert found is not None and found.session is not None, operator.snapshot().notices[-1].text
-    return found.session.measurements[-1]
+    return found.session.measurements[-1].record
 
 
 def test_rejected_calibration_states_reason_and_blocks_scans_until_accepted(

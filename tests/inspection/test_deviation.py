@@ -11,7 +11,8 @@ from slviewer.inspection import placing
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation, deviation
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.tolerance import ToleranceVerdict, judge_deviation
+from slviewer.inspection.tolerance import judge_deviation
+from slviewer.records.measurement import ToleranceVerdict
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose

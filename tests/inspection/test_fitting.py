@@ -11,9 +11,9 @@ from shapes_of_points import MIDDLE, cylinder, plane, sphere, strewn
 from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature, least_squares
-from slviewer.inspection.quantities import Quantity
 from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.records.plain import from_plain
+from slviewer.records.quantities import Quantity
 from slviewer.session.atomic import to_json
 
 pytestmark = pytest.mark.computes
@@ -129,14 +129,13 @@ def test_a_features_parameters_move_it_as_its_jacobian_says(kind) -> None:
 
 def test_a_saved_fit_gives_the_same_feature_and_quantities() -> None:
     fit = fit_feature("sphere", sphere(2000, 50.0, 0.8, 0.02))
-    record = json.loads(to_json(fit.to_json()))
-    feature = from_plain(record["feature"], Feature)
+    feature = from_plain(json.loads(to_json(fit.feature)), Feature)
     assert feature.radius == fit.feature.radius and np.array_equal(feature.place, fit.feature.place)
     quantities = from_plain(json.loads(to_json(fit.quantities())), list[Quantity])
     assert quantities == fit.quantities()
     assert (
         missing_facts(
-            quantities[0].text(), "radius", f"{quantities[0].value:.4f}", f"{quantities[0].U:.4f}"
+            quantities[0].format(), f"{quantities[0].value:.3f}", f"{quantities[0].U:.3f}"
         )
         == []
     )

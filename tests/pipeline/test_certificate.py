@@ -11,13 +11,13 @@ import pytest
 from copies import copy_session
 from facts import missing_facts, raises
 
+import slviewer as sl
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.inspection.regions import Region
 from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
 from slviewer.pipeline.measured_surface import load_surface
-from slviewer.pipeline.measurements import add_distance, add_fit, add_relation, add_section
+from slviewer.pipeline.relate import relate
 from slviewer.pipeline.report import report
 from slviewer.pipeline.run_plan import run_plan
 from slviewer.pipeline.simulate import save_true_stereo
@@ -68,17 +68,16 @@ def measured_report(folder: Path, model: str) -> Path:
         applied = {"factor": 1.001, "U_ppm": 20.0, "certificate": "lab 7", "inputs": inputs}
         store.save_result(f"scale/{model}", applied, {})
         plane = load_surface(store, "plane_01")
-        middle = tuple(int(v) for v in np.argwhere(plane.measured).mean(axis=0)[::-1])
-        first = add_fit(
-            store, plane, "plane", Region.ball(plane.points[middle[1], middle[0]], 20.0)
-        )
-        add_distance(store, plane, (middle[0] - 20, middle[1]), (middle[0] + 20, middle[1]))
-        add_section(store, plane, (middle[0] - 20, middle[1]), (middle[0] + 20, middle[1]))
-        second = add_fit(
-            store, plane, "plane", Region.ball(plane.points[middle[1], middle[0] + 30], 15.0)
-        )
-        add_relation(store, first.id, second.id)
-        place = PlanRegion("ball", tuple(plane.points[middle[1], middle[0]].tolist()), (20.0,))
+        u, v = (int(value) for value in np.argwhere(plane.measured).mean(axis=0)[::-1])
+        sl.measure(store, "plane_01", "plane", ball=(*plane.points[v, u].tolist(), 20.0))
+        sl.measure(store, "plane_01", "distance", at=(u - 20, v, u + 20, v))
+        sl.measure(store, "plane_01", "section", at=(u - 20, v, u + 20, v))
+        turned = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+        middle = turned @ plane.points[v, u + 30].astype(float)
+        box = (*(middle - 12).tolist(), *(middle + 12).tolist())
+        sl.measure(store, "plane_01", "plane", box=box, axes=turned.tolist())
+        relate(store, "m1", "m4")
+        place = PlanRegion("ball", tuple(plane.points[v, u].tolist()), (20.0,))
         features = (PlanFeature("middle", "plane", place),)
         flatness = Characteristic("flatness", "flatness", ("middle",), upper=1.0)
         write_plan(Plan("plate", features, (flatness,)), folder.parent / "plan.toml")

@@ -17,7 +17,9 @@ from slviewer.errors import SessionError
 from slviewer.pipeline import operation, operations
 from slviewer.pipeline.certificate import make_certificate
 from slviewer.pipeline.reconstruct import ReconstructSettings
+from slviewer.pipeline.relate import relate
 from slviewer.session.store import Session
+from slviewer.simulation.assets import asset
 from slviewer.wizard.operator import Operator
 
 pytestmark = pytest.mark.computes
@@ -71,6 +73,20 @@ def find_ball(session: Path) -> str:
     return str(session.parent / "ball.toml")
 
 
+def find_part(session: Path) -> str:
+    """Path of the file of the object's nominal model."""
+    return str(asset("objects/ammonite.ply"))
+
+
+def save_picked_points(session: Path) -> None:
+    """Measure two points of the object."""
+    for name, shift in (("one", 0), ("other", 20)):
+        u, v = AT[0] + shift, AT[1]
+        sl.measure(session, "object_r1", "point", at=(u, v), name=name)
+
+
+AT = (190, 150, 210, 150)
+AT_PLACES = [(190, 150), (210, 150)]
 OPERATIONS = {
     "accept": Operation(
         ("accept", "SESSION", "--artefact", "BALL"),
@@ -131,6 +147,32 @@ OPERATIONS = {
         ("drift/1",),
         "later",
     ),
+    "compare": Operation(
+        ("compare", "SESSION", "object_r1", "PART", "--tolerance", "1.5"),
+        lambda session: sl.compare(session, "object_r1", find_part(session), tolerance=1.5),
+        lambda operator: operator.run(
+            "compare", scan="object_r1", nominal=find_part(Path()), tolerance=1.5
+        ),
+        ("measurements/m1",),
+        "object_r1",
+    ),
+    "measure": Operation(
+        ("measure", "SESSION", "object_r1", "distance", "--at", *map(str, AT)),
+        lambda session: sl.measure(session, "object_r1", "distance", AT),
+        lambda operator: (
+            operator.reconstruct("object_r1")
+            and operator.measure("object_r1", "distance", AT_PLACES)
+        ),
+        ("measurements/m1",),
+        "object_r1",
+    ),
+    "relate": Operation(
+        ("measurements", "SESSION", "--relate", "m1", "m2"),
+        lambda session: relate(session, "m1", "m2"),
+        lambda operator: operator.measure_between("m1", "m2"),
+        ("measurements/m3",),
+        "object_r1",
+    ),
     "merge": Operation(
         ("merge", "SESSION", "object_r1", "object_r2", "--reference", "object_r2"),
         lambda session: sl.merge(session, ["object_r1", "object_r2"], "object_r2"),
@@ -142,7 +184,8 @@ OPERATIONS = {
 
 
 def by_terminal(operation: Operation, session: Path) -> None:
-    places = {"SESSION": str(session), "BALL": find_ball(session), "PLAN": find_plan(session)}
+    places = {"SESSION": str(session), "BALL": find_ball(session)}
+    places |= {"PLAN": find_plan(session), "PART": find_part(session)}
     assert main([places.get(word, word) for word in operation.terminal]) == 0
 
 
@@ -181,6 +224,8 @@ def done(
     with Session.open(first, write=True) as store:
         board = store.load_capture("pose_03")
         store.save_capture("later", "scan", board.sequence, board.frames, source="simulated")
+    if request.param == "relate":
+        save_picked_points(first)
     sessions = {door: copy_session(first, folder / door) for door in DOORS}
     (folder / "ball.toml").write_text(BALL)
     (folder / "plan.toml").write_text(PLAN)
@@ -207,12 +252,8 @@ def assert_same(found: Any, wanted: Any, place: str) -> None:
         assert found == wanted, place
 
 
-OWN = {
-    "acceptance/1": ("hash", "time"),
-    "calibration/stereo": ("hash", "checksums"),
-    "drift/1": ("hash", "time"),
-}
-"""What each run of an operation has of its own in its record."""
+TOLERANCE = {"calibration/stereo": 1e-6, "measurements/m1": 1e-5}
+"""By how much arrays may differ: bundle adjustment and best fit sum in parallel."""
 
 
 def test_every_door_stores_the_same_record(done: tuple[Operation, dict[str, Path]]) -> None:
@@ -220,7 +261,8 @@ def test_every_door_stores_the_same_record(done: tuple[Operation, dict[str, Path
     terminal, *others = (records(session, operation.stored) for session in sessions.values())
     for other in others:
         for name, (meta, arrays) in terminal.items():
-            own = OWN.get(name, () if name.startswith(("clouds/", "verify/")) else ("hash",))
+            own = () if name.startswith(("clouds/", "verify/")) else ("hash", "time")
+            own += ("checksums",) if name in TOLERANCE else ()
             assert_same(
                 *(
                     {k: v for k, v in each.items() if k not in own}
@@ -230,7 +272,7 @@ def test_every_door_stores_the_same_record(done: tuple[Operation, dict[str, Path
             )
             assert arrays.keys() == other[name][1].keys()
             for key, array in arrays.items():
-                tolerance = 1e-6 if name in OWN else 0  # a bundle adjustment sums in parallel, too
+                tolerance = TOLERANCE.get(name, 0)
                 np.testing.assert_allclose(
                     array, other[name][1][key], tolerance, tolerance, err_msg=f"{name}, {key}"
                 )

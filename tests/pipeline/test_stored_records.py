@@ -9,15 +9,17 @@ import pytest
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError
 from slviewer.pipeline.calibrate import CalibrateSettings
-from slviewer.pipeline.stored_records import Stored, load_record, name_records
+from slviewer.pipeline.operations import OPERATIONS
+from slviewer.pipeline.stored_records import Stored, load_record, load_stored, name_records
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.drift import Drift
 from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
+from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.merge import Merge
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.placement import Placement
-from slviewer.records.plain import to_plain
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, centre_distances_mm
@@ -134,6 +136,73 @@ def test_inspections_keep_their_decisions(session: Session) -> None:
     assert plain["characteristic"] == old["characteristic"] and plain["parts"] == old["parts"]
     assert found.count_parts() == {"pass": 0, "fail": 1, "undecided": 1} and not found.is_good
     assert found.figures()["object_r1 angle deg"] == 90.61
+
+
+def test_measurements_keep_their_figures_and_can_be_repeated(session: Session) -> None:
+    names = [f"m{k}" for k in range(1, 8)]
+    old = {name: as_stored(f"measurements/{name}") for name in names}
+    stored = {name: load_stored(session, Measurement, name) for name in names}
+    for name, each in stored.items():
+        meta, record = old[name], each.record
+        assert isinstance(meta["data"], dict)
+        assert json.loads(json.dumps(to_plain(record.quantities))) == meta["data"]["quantities"]
+        kept = [
+            record.what,
+            record.source,
+            record.model,
+            record.time,
+            list(record.of),
+            record.inputs,
+        ]
+        assert kept == [meta[key] for key in ("kind", "source", "model", "time", "of", "inputs")]
+        assert record.scales == ({} if name == "m6" else {"stereo": 1.001}) and each.stale
+        settings = OPERATIONS[record.operation].settings(**record.settings)
+        if record.operation == "measure":
+            assert (settings.scan, settings.what, settings.model) == (
+                "object_r1",
+                meta["kind"],
+                "stereo",
+            )
+        if "region" in meta["data"]:
+            region = from_plain(to_plain(settings.region()), MeasuredRegion)
+            expected = from_plain(meta["data"]["region"], MeasuredRegion)
+            for key in ("centre", "size"):
+                assert getattr(region, key) == pytest.approx(getattr(expected, key))
+            assert (region.kind, region.axes) == (expected.kind, expected.axes)
+    assert [stored[name].label for name in ("m1", "m4", "m6")] == [
+        "point 1",
+        "left",
+        "left – plane 5",
+    ]
+    assert stored["m1"].record.settings["at"] == [180, 150]
+    assert (
+        stored["m2"].record.settings["at"] == [180, 150, 220, 150]
+        and stored["m2"].record.ends is not None
+    )
+    sphere, compared = stored["m4"].record, stored["m7"].record
+    assert (
+        sphere.feature is not None
+        and sphere.feature.radius == 25.01
+        and len(sphere.feature.scatter) == 4
+    )
+    assert (
+        "900 used" in sphere.where
+        and sphere.warnings == ("points lie off",)
+        and sphere["radius"].U == 0.02
+    )
+    assert (
+        stored["m6"].record.settings == {"a": "m4", "b": "m5"}
+        and stored["m3"].record.plane is not None
+    )
+    assert (
+        compared.deviation is not None
+        and compared.deviation.tolerance_mm == 1.5
+        and compared.is_good
+    )
+    assert (
+        compared.settings["content"] == "ab" * 20
+        and compared.settings["nominal"] == "nominal/part.stl"
+    )
 
 
 def test_every_record_has_figures_a_summary_and_tables(session: Session) -> None:

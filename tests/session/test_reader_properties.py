@@ -125,18 +125,27 @@ def full(session: Session) -> Session:
     session.save_capture("scan", "scan", sequence, np.zeros((4, 6, 8), np.uint8), source="test")
     session.decide("excluded", {"scan": "dark"})
     session.decide("levels", [0, 255])
+    quantities = [{"name": "x", "value": 1.0, "unit": "mm", "sigma": None, "whole": True}]
+    feature = {"kind": "point", "place": [1.0, 2.0, 3.0], "direction": None, "radius": None}
+    data = {
+        "scale": 1.0,
+        "quantities": quantities,
+        "at": [3, 4],
+        "feature": feature,
+        "scatter": [],
+        "calibration": "",
+    }
     meta = {
         "kind": "point",
         "name": "a",
         "source": "scan",
         "model": "stereo",
         "time": "",
-        "data": {"scale": 1.0},
+        "data": data,
+        "of": [],
     }
     session.save_result(
-        "measurements/m1",
-        {**meta, "of": [], "inputs": session.input_hashes("scan")},
-        {"K": np.eye(3)},
+        "measurements/m1", {**meta, "inputs": session.input_hashes("scan")}, {"K": np.eye(3)}
     )
     return session
 

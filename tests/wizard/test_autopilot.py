@@ -129,11 +129,11 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     assert len(merged.points) == merge.record.points > 30_000
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
     sphere, width = session.measurements
-    radius = sphere.quantities[0]
+    radius = sphere.record["radius"]
     assert (
         radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2
     )  # the simulated sphere's
-    assert 130 < width.quantities[0].value < 150  # the ammonite's
+    assert 130 < width.record.quantities[0].value < 150  # the ammonite's
 
 
 def test_poses_are_asked_for_until_the_wanted_sigma_is_reached(operator: Operator) -> None:

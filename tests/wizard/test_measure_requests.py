@@ -14,13 +14,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measurements import (
-    add_distance,
-    add_fit,
-    add_point,
-    add_section,
-    load_measurements,
-)
+from slviewer.pipeline.measurements import load_measurements
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.session.inspection_plan import read_plan
 from slviewer.session.store import Session
@@ -97,33 +91,33 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
     np.testing.assert_allclose(point_at(on, a), CENTRES[0] - [0, 0, RADIUS], atol=1.0)
     assert place_at(on, np.zeros(3), np.array([0.0, 1.0, 0.1])) is None
     for place in (a, b):
-        assert operator.measure("balls", add_fit, "sphere", Region.ball(point_at(on, place), 15.0))
-    assert operator.measure("balls", add_distance, a, b) and operator.measure(
-        "balls", add_section, a, b
+        assert operator.measure("balls", "sphere", region=Region.ball(point_at(on, place), 15.0))
+    assert operator.measure("balls", "distance", [a, b]) and operator.measure(
+        "balls", "section", [a, b]
     )
-    assert operator.measure("balls", add_point, a)
+    assert operator.measure("balls", "point", [a])
     left, right, width, cut, point = now(operator).measurements
-    assert operator.measure_between(left.id, right.id)
+    assert operator.measure_between(left.name, right.name)
     apart = now(operator).measurements[-1]
-    radius, true = left.quantities[0], float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
+    radius, true = left.record["radius"], float(np.linalg.norm(CENTRES[1] - CENTRES[0]))
     assert abs(radius.value - RADIUS) < max(3 * (radius.sigma or 0), 0.05)
-    assert apart.quantities[0].value == pytest.approx(true, abs=0.1)
-    assert width.quantities[0].value == pytest.approx(true, abs=2.0)
-    assert [each.kind for each in (cut, point, apart)] == ["section", "point", "relation"]
+    assert apart.record.quantities[0].value == pytest.approx(true, abs=0.1)
+    assert width.record.quantities[0].value == pytest.approx(true, abs=2.0)
+    assert [each.record.what for each in (cut, point, apart)] == ["section", "point", "relation"]
     assert operator.snapshot().step("measure").state == "done"
 
-    assert operator.relabel_measurement(width.id, "Width <b>") and operator.delete_measurement(
-        right.id
+    assert operator.relabel_measurement(width.name, "Width <b>") and operator.delete_measurement(
+        right.name
     )
     session = now(operator)
-    assert [each.stale for each in session.measurements if each.id == apart.id] == [True]
+    assert [each.stale for each in session.measurements if each.name == apart.name] == [True]
     assert session.deleted_measurements == 1
-    assert missing_facts(operator.snapshot().step("measure").problems[0], apart.name) == []
+    assert missing_facts(operator.snapshot().step("measure").problems[0], apart.label) == []
     assert operator.undo_delete() and not any(each.stale for each in now(operator).measurements)
     assert operator.export_measurements_table()
     made = next(each for each in now(operator).exports if each.name == "measurements.csv")
     rows = list(csv.DictReader(made.path.read_text("utf-8-sig").splitlines()))
-    assert {row["name"] for row in rows} >= {"Width <b>", left.name}
+    assert {row["name"] for row in rows} >= {"Width <b>", left.label}
     assert operator.make_inspection_plan()
     made = next(each for each in now(operator).exports if each.name == "plan.toml")
     assert {each.kind for each in read_plan(made.path).characteristic} >= {
@@ -134,17 +128,15 @@ def test_what_is_clicked_is_measured_and_true(operator: Operator) -> None:
 
 def test_what_cannot_be_measured_is_said_and_nothing_kept(operator: Operator) -> None:
     place = place_at(operator.surface("balls"), np.zeros(3), CENTRES[0] - [0, 0, RADIUS])
-    assert operator.measure("balls", add_point, place)
+    assert operator.measure("balls", "point", [place])
     before = now(operator).measurements
-    assert operator.measure(
-        "balls", add_fit, "plane", Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0)
-    )
+    assert operator.measure("balls", "plane", region=Region.ball(CENTRES[0] - [0, 0, RADIUS], 15.0))
     assert lacks(operator, "bends") == []
     assert (
-        operator.measure("balls", add_distance, (0, 0), (1, 1)) and lacks(operator, "(0, 0)") == []
+        operator.measure("balls", "distance", [(0, 0), (1, 1)]) and lacks(operator, "(0, 0)") == []
     )
     assert (
-        operator.measure("nothing", add_point, (0, 0))
+        operator.measure("nothing", "point", [(0, 0)])
         and lacks(operator, "nothing", "reconstructed") == []
     )
     assert operator.measure_between("m1", "m1") and lacks(operator, "twice") == []
@@ -191,7 +183,7 @@ def test_a_nominal_model_is_looked_at_kept_and_compared_with(
     assert operator.compare_nominal("object", "My_ammonite.ply", tolerance_mm=1.5)
     assert lacks(operator, "± 1.5 mm", "pass") == []
     session = now(operator)
-    assert session.measurements[-1].kind == "deviation"
+    assert session.measurements[-1].record.what == "deviation"
     assert "object_My_ammonite_deviation.ply" in [each.name for each in session.exports]
 
 

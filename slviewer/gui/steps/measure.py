@@ -15,10 +15,11 @@ from slviewer.gui.scene import GHOST
 from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, to_html
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
+from slviewer.pipeline.measure import What
 from slviewer.pipeline.measured_surface import Place
-from slviewer.pipeline.measurements import Shape, add_distance, add_fit, add_point, add_section
+from slviewer.pipeline.stored_records import Stored
+from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up
-from slviewer.session.measurements import Measurement
 from slviewer.session.nominal import MM
 from slviewer.surface.selection import ViewCamera
 from slviewer.wizard.snapshot import SessionView, Snapshot
@@ -30,7 +31,6 @@ BALL, RECTANGLE = "ball", "rectangle"
 BOX_COLOUR = (20, 150, 140)
 _BALL, _BOX = "ball", "box"
 _PICKED = ("picked 1", "picked 2")
-_MEASURES: dict[str, Any] = {"Point": add_point, "Distance": add_distance, "Section": add_section}
 
 
 class MeasurePanel(StepPanel):
@@ -134,7 +134,7 @@ class MeasurePanel(StepPanel):
             self._offer_inputs(session)
             new = self._results.draw(session, self._surface.name)
             self._inspection.draw(snapshot, self._surface.name)
-            if self._tool.fits and any(each.kind == self._tool.name.lower() for each in new):
+            if self._tool.fits and any(each.record.what == self._tool.name.lower() for each in new):
                 self._select_tool(self._tool.name)
             change(self._compare, disabled=snapshot.is_busy or not self._nominal.value)
             change(self._fit, disabled=snapshot.is_busy)
@@ -200,7 +200,7 @@ class MeasurePanel(StepPanel):
             self._draw_tool()
         if places is None:
             return
-        self._operator.measure(on, _MEASURES[self._tool.name], *places)
+        self._operator.measure(on, cast(What, self._tool.name.lower()), places)
 
     def _draw_tool(self) -> None:
         """Show the instruction and the inputs of the tool, and the points picked with it."""
@@ -279,12 +279,13 @@ class MeasurePanel(StepPanel):
                 self._radius.max, self._radius.step, self._radius.min = most, most / 200, most / 200
                 self._radius.value = most / 5
 
-    def _show_measurement(self, measured: Measurement | None) -> None:
+    def _show_measurement(self, measured: Stored[Measurement] | None) -> None:
         """Show the surface on which a measurement was made."""
-        if measured is not None and measured.source != self._surface.name:
-            self._surface.choose(measured.source)
+        record = None if measured is None else measured.record
+        if record is not None and record.source != self._surface.name:
+            self._surface.choose(record.source)
         self._surface.show_deviation(
-            measured if measured is not None and measured.kind == "deviation" else None
+            measured if record is not None and record.deviation is not None else None
         )
 
     # requests
@@ -293,7 +294,9 @@ class MeasurePanel(StepPanel):
         """Offer the results to relate, by default the latest two, and the nominal models."""
         measured = session.measurements if session else ()
         related = [
-            (each.id, each.name) for each in measured if each.kind in KINDS and not each.stale
+            (each.name, each.label)
+            for each in measured
+            if each.record.what in KINDS and not each.stale
         ]
         for choice in (self._from, self._to):
             choice.offer(related)
@@ -309,9 +312,9 @@ class MeasurePanel(StepPanel):
     def _request_fit(self) -> None:
         """Request the fit of the tool's shape to the region."""
         with self._lock:
-            region, shape = self._make_region(), cast(Shape, self._tool.name.lower())
+            region, shape = self._make_region(), cast(What, self._tool.name.lower())
         if region is not None:
-            self._operator.measure(self._surface.name, add_fit, shape, region)
+            self._operator.measure(self._surface.name, shape, region=region)
 
     def _request_comparison(self) -> None:
         """Request the comparison with the chosen nominal model."""

@@ -24,11 +24,13 @@ class Quantity:
         """Expanded uncertainty, k = 2, in the quantity's unit."""
         return None if self.sigma is None else COVERAGE * self.sigma
 
-    def text(self) -> str:
-        """Format the quantity with its uncertainty for the terminal."""
-        digits = 1 if self.unit == "%" else 4
+    def format(self) -> str:
+        """Return value ± U (k = 2) with the unit; a star where the calibration's part of U is
+        unknown."""
+        digits = 1 if self.unit == "%" else 3
         unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
-        if self.U is None:
-            return f"{self.name} {self.value:.{digits}f}{unit}"
-        part = "" if self.whole else ", without the calibration's part"
-        return f"{self.name} {self.value:.{digits}f} ± {self.U:.{digits}f}{unit} (k = 2{part})"
+        value = f"{round(self.value, digits) + 0.0:.{digits}f}".replace(
+            "-", "−"
+        )  # no minus before nothing
+        U = "" if self.U is None else f" ± {self.U:.{digits}f}"
+        return f"{value}{U}{unit}{'*' if U and not self.whole else ''}"

@@ -1,0 +1,388 @@
+"""What was measured on scans: points, distances, fitted shapes, their relations, deviations from
+nominal models."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import msgspec
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.records.acceptance import Decision
+from slviewer.records.plain import from_plain
+from slviewer.records.quantities import Quantity
+from slviewer.records.record import Count, Matrix4, Record, Vector
+from slviewer.records.table import Cell, Column, Mark, Table, Value
+
+What = Literal[
+    "point", "distance", "section", "plane", "sphere", "cylinder", "relation", "deviation"
+]
+DECIDED: dict[Decision, str] = {"pass": "pass", "fail": "fail", "undecided": "too close to tell"}
+RULE = (
+    "decided with a guard band as in ISO 14253-1: pass if the deviations of 99.7 % of the points"
+    " and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
+    " exceeds it by more than the uncertainty, else too close to tell"
+)
+_MARKS: dict[Decision, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
+_UNCERTAINTY = (
+    "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty."
+    " –: a residual or a plain reading, which has none."
+)
+
+
+class MeasuredFeature(msgspec.Struct, frozen=True):
+    """A picked point or a fitted shape, as `inspection.features.Feature`, and the covariance
+    ``scatter`` of its own of its parameters; the part that fits of one ``calibration`` share is the
+    array ``shared``."""
+
+    kind: Literal["point", "plane", "sphere", "cylinder"]
+    place: Vector
+    direction: Vector | None = None
+    radius: float | None = None
+    scatter: tuple[tuple[float, ...], ...] = ()
+    calibration: str = ""
+
+
+class MeasuredRegion(msgspec.Struct, frozen=True):
+    """The region that a shape was fitted to, as `inspection.regions.Region`."""
+
+    kind: Literal["ball", "box"]
+    centre: Vector
+    size: tuple[float, ...]
+    axes: tuple[Vector, Vector, Vector] | None = None
+
+    def to_settings(self) -> dict[str, Any]:
+        """Return the settings of `measure` that choose this region."""
+        if self.kind == "ball":
+            return {"ball": [*self.centre, *self.size]}
+        size, axes = np.array(self.size), np.eye(3) if self.axes is None else np.array(self.axes)
+        middle = axes @ np.array(self.centre)
+        box = {"box": [*(middle - size).tolist(), *(middle + size).tolist()]}
+        return box if self.axes is None else {**box, "axes": axes.tolist()}
+
+
+class SectionPlane(msgspec.Struct, frozen=True):
+    """The plane of a section, as `inspection.section.CutPlane`."""
+
+    origin: Vector
+    along: Vector
+    up: Vector
+
+
+class NominalModel(msgspec.Struct, frozen=True):
+    """A nominal model: its file's name and content, the ``units`` of the file, and ``notes`` on
+    repairs."""
+
+    name: str
+    hash: str
+    units: str = "mm"
+    triangles: Count = 0
+    size_mm: Vector | None = None
+    closed: bool | None = None
+    notes: tuple[str, ...] = ()
+
+
+class DeviationStatistics(msgspec.Struct, frozen=True):
+    """Of the points that belong to the nominal, mm: ``within_95``: 95 % are off by less; 99.7 % lie
+    between ``p_low`` and ``p_high``."""
+
+    mean: float
+    rms: float
+    sigma: float
+    within_95: float
+    lowest: float
+    highest: float
+    p_low: float
+    p_high: float
+    points: Count
+    left_out: Count
+
+
+@dataclass(frozen=True)
+class ToleranceVerdict:
+    """Deviations against plus and minus a tolerance, mm.
+
+    ``lowest`` and ``highest``: the ends of the range of 99.7 % of the points, each with its
+    decision; ``decision`` of both. Percent of the points that lie ``within`` it, ``inside`` it by
+    more than U, ``outside`` it by more than U, and too ``close`` to tell. ``U_mm``: expanded
+    uncertainty (k = 2) of a point, in the median.
+    """
+
+    tolerance_mm: float
+    U_mm: float
+    lowest: tuple[float, Decision]
+    highest: tuple[float, Decision]
+    decision: Decision
+    within: float
+    inside: float
+    outside: float
+    close: float
+
+    def text(self) -> str:
+        """Return the decision in words."""
+        return f"Tolerance ± {self.tolerance_mm:g} mm: {DECIDED[self.decision]}"
+
+
+class NominalDeviation(msgspec.Struct, frozen=True):
+    """Signed distances of a scan from a nominal model after the best fit, positive outside it.
+
+    ``noise_mm``: RMS of the scan's noise alone along the nominal's normals; points farther than
+    ``reach_mm`` belong to something else; ``coverage``: share of the nominal's area that was
+    measured; ``alignment_mm``: standard uncertainty that the best fit adds to a point.
+    """
+
+    nominal: NominalModel
+    statistics_mm: DeviationStatistics
+    noise_mm: float | None
+    reach_mm: float
+    coverage: float
+    alignment_mm: float
+    T_nominal_scan: Matrix4
+    verdict: ToleranceVerdict | None = None
+
+    @property
+    def tolerance_mm(self) -> float | None:
+        """The tolerance, mm; None without one."""
+        return None if self.verdict is None else self.verdict.tolerance_mm
+
+    def quantities(self) -> list[Quantity]:
+        """Return the most important figures."""
+        numbers, verdict = self.statistics_mm, self.verdict
+        listed = [
+            Quantity("mean", numbers.mean, "mm"),
+            Quantity("RMS", numbers.rms, "mm"),
+            Quantity("95 % off by less than", numbers.within_95, "mm"),
+            Quantity("range of 99.7 %, lower end", numbers.p_low, "mm"),
+            Quantity("range of 99.7 %, upper end", numbers.p_high, "mm"),
+            Quantity("area measured", 100 * self.coverage, "%"),
+        ]
+        return (
+            listed
+            if verdict is None
+            else [*listed, Quantity("within tolerance", verdict.within, "%")]
+        )
+
+    def table(self, name: str, source: str) -> Table:
+        """Return all figures, with the decision for each end of the range where there is a
+        tolerance."""
+        numbers, verdict, nominal = self.statistics_mm, self.verdict, self.nominal
+        low, high = (None, None) if verdict is None else (verdict.lowest[1], verdict.highest[1])
+        lines: list[tuple[str, float | None, str, Decision | None]] = [
+            ("mean", numbers.mean, "mm", None),
+            ("RMS", numbers.rms, "mm", None),
+            ("RMS of the scan's noise alone", self.noise_mm, "mm", None),
+            ("95 % are off by less than", numbers.within_95, "mm", None),
+            ("range of 99.7 %, lower end", numbers.p_low, "mm", low),
+            ("range of 99.7 %, upper end", numbers.p_high, "mm", high),
+            ("lowest", numbers.lowest, "mm", None),
+            ("highest", numbers.highest, "mm", None),
+            ("area of the nominal that was measured", 100 * self.coverage, "%", None),
+        ]
+        if verdict is not None:
+            lines += [
+                (f"within ± {verdict.tolerance_mm:g} mm", verdict.within, "%", None),
+                ("inside by more than U", verdict.inside, "%", None),
+                ("too close to tell", verdict.close, "%", None),
+                ("outside by more than U", verdict.outside, "%", None),
+                ("U of a point, k = 2", verdict.U_mm, "mm", None),
+            ]
+        columns = [Column("quantity", align="left"), Column("value", digits=4)]
+        columns += [Column("unit", align="left"), Column("decision", align="left")]
+        rows: list[list[Value | Cell]] = [
+            [title, value, unit, "" if decided is None else Cell(DECIDED[decided], _MARKS[decided])]
+            for title, value, unit, decided in lines
+        ]
+        share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
+        size = (
+            ""
+            if nominal.size_mm is None
+            else f", {' x '.join(f'{side:.1f}' for side in nominal.size_mm)} mm"
+        )
+        triangles = f": {nominal.triangles:,} triangles" if nominal.triangles else ""
+        notes = [
+            f"{source} against {nominal.name}{triangles}{size}.",
+            *(f"{nominal.name}: {note}." for note in nominal.notes),
+            (
+                f"{numbers.points:,} points; {numbers.left_out:,} ({share:.1f} %) lie farther than"
+                f" {self.reach_mm:.3g} mm from the nominal or face another way, and are excluded."
+                f" The best fit adds {self.alignment_mm:.4f} mm (1 sigma)."
+            ),
+            *([] if verdict is None else [f"{verdict.text()}, {RULE}."]),
+        ]
+        return Table(columns, rows, f"Deviation from nominal: {name}", notes).without_empty()
+
+
+class Measurement(Record, frozen=True, kw_only=True):
+    """Points, distances, sections, fitted planes, spheres and cylinders, their relations, and
+    deviations of scans from nominal models after the best fit, positive outside.
+
+    ``source``: the scan, or the merge, that it was made on; ``of``: the measurements that it was
+    made from; ``name``: what it was called when it was made; ``time``: ISO 8601, UTC. ``where``:
+    region or features in words. Arrays: ``shared`` (k, p) of a feature; of a section ``lines`` (n,
+    2) float32 mm, along and up, of ``lengths`` each; of a deviation ``points`` (n, 3) float32 mm
+    with the nominal's ``normals`` and their ``signed`` distances, places ``uncovered`` (k, 3) mm
+    that were not measured, ``counts`` of all points between ``edges`` mm.
+    """
+
+    kind: ClassVar[str] = "measurements"
+    title: ClassVar[str] = "Measurements"
+    prefix: ClassVar[str] = "m"
+    labels: ClassVar[str] = "measurement names"
+    what: What
+    source: str
+    model: str
+    quantities: list[Quantity]
+    name: str = ""
+    time: str = ""
+    of: tuple[str, ...] = ()
+    where: str = ""
+    feature: MeasuredFeature | None = None
+    region: MeasuredRegion | None = None
+    ends: tuple[Vector, Vector] | None = None
+    plane: SectionPlane | None = None
+    deviation: NominalDeviation | None = None
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Convert a measurement of version 0.2, whose figures were in its ``data``."""
+        if "data" not in meta:
+            return meta
+        data, what = meta["data"], meta["kind"]
+        fit, scale = data.get("fit", {}), data.get("scale")
+        same = ("name", "source", "model", "time", "of", "inputs")
+        new = {key: meta[key] for key in same if key in meta} | {
+            "what": what,
+            "operation": "measure",
+        }
+        new |= {key: data[key] for key in ("quantities", "ends", "plane", "region") if key in data}
+        new |= {
+            "warnings": fit.get("warnings", ()),
+            "scales": {} if scale is None else {meta["model"]: scale},
+        }
+        new["where"] = data.get("where") or " and ".join(data.get("between", ()))
+        if "feature" in (source := fit or data):
+            new["feature"] = source["feature"] | {
+                key: source[key] for key in ("scatter", "calibration")
+            }
+        settings: dict[str, Any] = {"scan": meta["source"], "what": what, "model": meta["model"]}
+        if what == "relation":
+            new["operation"], settings = "relate", dict(zip("ab", meta["of"], strict=True))
+        elif what == "deviation":
+            new |= {"operation": "compare", "deviation": data}
+            settings = _settings_of_comparison(meta)
+        elif "region" in data:
+            settings |= from_plain(data["region"], MeasuredRegion).to_settings()
+        else:
+            settings["at"] = np.ravel(data.get("at", ())).tolist()
+        return {**new, "settings": settings}
+
+    def label(self, name: str) -> str:
+        """Return the name that it was given when it was made, or its kind and number."""
+        return self.name or f"{self.what} {name.removeprefix(self.prefix)}"
+
+    def __getitem__(self, name: str) -> Quantity:
+        """Return the quantity of that name, such as "diameter". Raises InputError for others."""
+        for quantity in self.quantities:
+            if quantity.name == name:
+                return quantity
+        raise InputError(
+            f"there is no {name!r}: the quantities are"
+            f" {', '.join(each.name for each in self.quantities)}"
+        )
+
+    @property
+    def is_good(self) -> bool:
+        """Whether no tolerance is exceeded, nor may be."""
+        return (
+            self.deviation is None
+            or self.deviation.verdict is None
+            or self.deviation.verdict.decision == "pass"
+        )
+
+    def summary(self) -> str:
+        """Return kind, scan and quantities in one sentence."""
+        known = [each for each in self.quantities if each.U is not None]
+        note = (
+            "k = 2"
+            if all(each.whole for each in known)
+            else "k = 2; *: without the calibration's part"
+        )
+        listed = "; ".join(f"{each.name} {each.format()}" for each in self.quantities) + (
+            f" ({note})" if known else ""
+        )
+        if self.deviation is None:
+            return f"{self.what} on {self.source}: {listed}"
+        verdict = self.deviation.verdict
+        end = "" if verdict is None else f". {verdict.text()}"
+        return f"deviation of {self.source} from {self.deviation.nominal.name}: {listed}{end}"
+
+    def figures(self) -> dict[str, float]:
+        """Return the values of the quantities, and their uncertainties."""
+        values = {f"{each.name}, {each.unit}": each.value for each in self.quantities}
+        return values | {
+            f"U of {each.name}, {each.unit}": each.U
+            for each in self.quantities
+            if each.U is not None
+        }
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Measurement"]) -> list[Table]:  # type: ignore[override]
+        """Return a table with a line for each quantity, and one of each deviation from a nominal
+        model."""
+        measured = {name: each for name, each in found.items() if each.deviation is None}
+        tables = [list_quantities(measured)] if measured else []
+        return tables + [
+            each.deviation.table(name, each.source)
+            for name, each in found.items()
+            if each.deviation is not None
+        ]
+
+
+def _settings_of_comparison(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of `compare` of a deviation that version 0.2 stored."""
+    data, nominal = meta["data"], meta["data"]["nominal"]
+    settings = {
+        "scan": meta["source"],
+        "nominal": f"nominal/{nominal['name']}",
+        "units": nominal["units"],
+        "reach": data["reach_mm"],
+        "model": meta["model"],
+        "content": nominal["hash"],
+    }
+    verdict = data.get("verdict")
+    return settings if verdict is None else {**settings, "tolerance": verdict["tolerance_mm"]}
+
+
+def list_quantities(found: Mapping[str, Measurement]) -> Table:
+    """Return the table of all quantities of measurements."""
+    columns = [
+        Column("measurement", align="left"),
+        Column("kind", align="left", detail=True),
+        Column("scan", align="left"),
+        Column("quantity", align="left"),
+        Column("value", digits=4),
+        Column("unit", align="left"),
+        Column("U, k = 2", digits=4),
+        Column("calibration in U", align="left", detail=True),
+        Column("of", align="left", detail=True),
+    ]
+    rows: list[list[Value | Cell]] = [
+        [name, each.what, each.source, q.name, q.value, q.unit, q.U,
+         q.U and ("yes" if q.whole else "no"), each.where]
+        for name, each in found.items()
+        for q in each.quantities
+    ]  # fmt: skip
+    partial = [
+        name
+        for name, each in found.items()
+        if any(q.U is not None and not q.whole for q in each.quantities)
+    ]
+    notes = [
+        _UNCERTAINTY,
+        *(f"{name}: {warning}." for name, each in found.items() for warning in each.warnings),
+    ]
+    if partial:
+        notes.append(f"U lacks the calibration's part, which is unknown: {', '.join(partial)}.")
+    return Table(columns, rows, "Measured on the scans", notes)
