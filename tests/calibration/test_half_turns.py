@@ -57,7 +57,8 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
         f"pose_{i:02d}" for i in TURNED
     )
     assert not found.bundle.excluded
-    assert missing_facts(found.text(), *found.bundle.half_turned_poses) == []
+    notes = " ".join(found.describe().table().notes)
+    assert missing_facts(notes, *found.bundle.half_turned_poses) == []
     assert found.bundle.noise.camera_px == pytest.approx(as_held.bundle.noise.camera_px, rel=0.05)
     assert np.abs(found.bundle.state.offsets - as_held.bundle.state.offsets).max() < 0.003
     assert np.sqrt(np.mean(found.bundle.state.offsets**2)) > 0.025

@@ -42,6 +42,7 @@ from slviewer.pipeline.calibration_verdict import save_verdict
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import Measurement
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
+from slviewer.records.plain import to_plain
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Shape, Verification
@@ -425,7 +426,7 @@ def test_rejected_calibration_states_reason_and_blocks_scans_until_accepted(
     ).to_be_visible()
     meta, arrays = store.load_result("calibration/stereo")
     meta = {key: value for key, value in meta.items() if key not in ("hash", "arrays", "checksums")}
-    store.save_result("calibration/stereo", {**meta, "verdict": REJECTED.to_json()}, arrays)
+    store.save_result("calibration/stereo", {**meta, "verdict": to_plain(REJECTED)}, arrays)
     save_verdict(store, REJECTED, ["pose_03"])
     assert operator.choose_model("")
     expect(page.get_by_text("do not measure with it")).to_be_visible()

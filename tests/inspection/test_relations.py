@@ -67,9 +67,10 @@ def test_a_distances_uncertainty_is_that_along_it() -> None:
     found = distance(A, B, sure_across, none)
     assert found.value == pytest.approx(50.0) and found.sigma == pytest.approx(0.05)
     assert (
-        missing_facts(found.text(), "50.0000 ± 0.1000 mm", "k = 2", "without", "calibration") == []
+        missing_facts(found.format(), "50.0000 ± 0.1000 mm", "k = 2", "without", "calibration")
+        == []
     )
-    assert replace(found, whole=True).text().endswith("50.0000 ± 0.1000 mm (k = 2)")
+    assert replace(found, whole=True).format().endswith("50.0000 ± 0.1000 mm (k = 2)")
     across = np.cross(along, Z)
     assert distance(A, B, Spread(0.05**2 * np.outer(across, across)), none).sigma < 1e-4
 
