@@ -258,8 +258,8 @@ def preferred_model(store: Session) -> str:
 
 
 def recommended_model(store: Session) -> str:
-    """The calibration that cross-validation recommends, where it was made for these; else splined
-    or pixelwise, if it has 8 poses or more; else stereo.
+    """The calibration that cross-validation recommends, where it compared all that there are; else
+    splined or pixelwise, if it has 8 poses or more; else stereo.
     """
     return _recommend(store)[0]
 
@@ -279,7 +279,7 @@ def _recommend(store: Session) -> tuple[str, str]:
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
     compared = load_comparison(store)
-    if compared is not None and compared.recommended in there:
+    if compared is not None and compared.recommended in there and compared.covers(there):
         return compared.recommended, "recommended by the comparison on held-out poses"
     for name in ("splined", "pixelwise"):
         if (

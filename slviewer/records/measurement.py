@@ -364,7 +364,7 @@ def list_quantities(found: Mapping[str, Measurement]) -> Table:
         Column("quantity", align="left"),
         Column("value", digits=4),
         Column("unit", align="left"),
-        Column("U, k = 2", digits=4),
+        Column("U (k=2)", digits=4),
         Column("calibration in U", align="left", detail=True),
         Column("of", align="left", detail=True),
     ]

@@ -1,6 +1,6 @@
 """How well each calibration measures target poses that it was not made from."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -59,6 +59,10 @@ class ModelComparison(Record, frozen=True, kw_only=True):
         settings = {"models": list(old.get("models", {})), "folds": len(old.get("folds", ()))}
         inputs = meta.get("inputs", {})
         return {**old, "inputs": inputs, "operation": "validate", "settings": settings}
+
+    def covers(self, models: Iterable[str]) -> bool:
+        """Whether all of these models were compared."""
+        return {*self.models, *self.failed}.issuperset(models)
 
     def summary(self) -> str:
         """Return the error of each model on boards, and the recommended model, in one sentence."""

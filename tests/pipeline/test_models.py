@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from copies import copy_session
@@ -12,6 +13,8 @@ from slviewer.calibration.splined import model as splined
 from slviewer.errors import InputError, SessionError
 from slviewer.pipeline import models
 from slviewer.pipeline.models import available_models, load_model, preferred_model, warn_if_stale
+from slviewer.pipeline.stored_records import save_record
+from slviewer.records.model_comparison import HeldOutError, ModelComparison
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator
 
@@ -30,6 +33,27 @@ def test_a_calibration_of_another_layout_is_refused_with_what_to_do(
         )
         with raises(SessionError, name, "slviewer calibrate"):
             load_model(store, name)
+
+
+@pytest.mark.parametrize(
+    ("compared", "preferred"),
+    [(("stereo", "pixelwise"), "splined"), (("stereo", "pixelwise", "splined"), "pixelwise")],
+)
+def test_a_comparison_decides_between_the_models_that_it_compared(
+    compared: tuple[str, ...], preferred: str, recorded: Path, tmp_path: Path
+) -> None:
+    error = HeldOutError(0.1, 0.1, 10.0, 0.1, 0.1)
+    found = ModelComparison(
+        recommended="pixelwise",
+        models=dict.fromkeys(compared, error),
+        poses={},
+        folds=(("pose_01",), ("pose_02",)),
+    )
+    folder = copy_session(recorded / "session", tmp_path / "session")
+    with Session.open(folder, write=True) as store:
+        inputs = store.input_hashes(*(f"calibration/{name}" for name in compared))
+        save_record(store, "1", msgspec.structs.replace(found, inputs=inputs), {})
+        assert preferred_model(store) == preferred
 
 
 @pytest.mark.slow
