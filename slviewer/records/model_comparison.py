@@ -106,7 +106,7 @@ class ModelComparison(Record, frozen=True, kw_only=True):
                 " folds). Plane: distance of the board's features from their plane; board: from"
                 " their true positions."
             ),
-            f"Recommended: {self.recommended}.",
+            f"Recommended of these: {self.recommended}.",
             *(f"{model} could not be compared: {why}." for model, why in self.failed.items()),
         ]
         return Table(columns, rows, "RMS on held-out poses", notes)
