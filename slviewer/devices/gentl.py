@@ -174,7 +174,7 @@ def read_info(module: Any, what: str) -> Any:
 
 
 def _list_library_errors() -> tuple[type[Exception], ...]:
-    """Return the exception types of the GenICam libraries."""
+    """Return the exception types of the GenICam libraries, which are optional: imported here."""
     from genicam import genapi, gentl
 
     return (genapi.GenericException, gentl.GenericException)

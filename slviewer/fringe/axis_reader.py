@@ -239,8 +239,9 @@ class AxisReader:
         return min((pixels / (1 + crossed) for pixels, crossed in parts if pixels), default=0.0)
 
     def phasor(self, images: Images, frames: AxisFrames) -> np.ndarray | None:
-        """Return modulation * e^(i phase), (p,) complex64; None with fewer than three of the
-        steps."""
+        """Return modulation * e^(i phase), (p,) complex64, at the sampled pixels, from the images
+        of one phase shift as ``frames`` states sign, offset and gamma; None with fewer than three
+        images."""
         wave = self._wave(images, frames.gamma)
         if wave is None:
             return None

@@ -1,7 +1,7 @@
 """The base of all records, their kinds, and figures by name."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -113,7 +113,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
             for key, value in to_plain(self).items()
             if key not in Record.__struct_fields__
         }
-        return dict(_list_numbers(plain, ""))
+        return list_numbers(plain)
 
 
 def figure_column(name: str) -> Column:
@@ -123,11 +123,14 @@ def figure_column(name: str) -> Column:
     return Column(" ".join(words[:-1] if unit else words), unit, digits=digits)
 
 
-def _list_numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
-    """List the numbers in plain values, with their names; texts, lists and truth values are
-    none."""
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _list_numbers(inner, f"{name} {key}".strip())
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        yield name, value
+def list_numbers(values: Mapping[str, Any], outer: str = "") -> dict[str, float]:
+    """Return the numbers in plain values by name; of those inside others ``name of the outer, of
+    the inner``. Texts, lists and truth values are none."""
+    numbers: dict[str, float] = {}
+    for key, value in values.items():
+        name = f"{outer} {key}".strip()
+        if isinstance(value, Mapping):
+            numbers |= list_numbers(value, name)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            numbers[name] = value
+    return numbers

@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
-from slviewer.records.record import Count, Record, Vector
+from slviewer.records.plain import to_plain
+from slviewer.records.record import Count, Record, Vector, list_numbers
 from slviewer.records.table import Cell, Column, Table, Value, compare_errors
 
 Shape = Literal["plane", "sphere"]
@@ -83,13 +84,8 @@ class Verification(Record, frozen=True, kw_only=True):
         )
 
     def figures(self) -> dict[str, float]:
-        """Return RMS, noise floor and radius of each model."""
-        return {
-            f"{name} {figure}": value
-            for name, fit in self.models.items()
-            for figure in ("rms_mm", "noise_floor_mm", "radius_mm")
-            if (value := getattr(fit, figure)) is not None
-        }
+        """Return the numbers of each model's fit."""
+        return list_numbers(to_plain(self.models))
 
     @classmethod
     def tables(cls, found: Mapping[str, "Verification"]) -> list[Table]:  # type: ignore[override]

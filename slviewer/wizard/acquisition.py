@@ -364,7 +364,8 @@ class Acquisition:
         self._offer(frame, stated_full_scale(rig.camera))
 
     def _serve_stream(self, rig: Rig, stream: Stream) -> None:
-        """Capture a stream's sequence once; aborted where something else is requested."""
+        """Capture a stream's sequence once, and show its white frame as preview. Aborted once
+        `_stream` is another, which every request, change of the rig and fault causes."""
         self._apply_settings(rig)
         try:
             if self._shown != (_STREAM, stream.sequence):

@@ -238,7 +238,7 @@ def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
 
 
 @kernel()
-def _is_cell_supported(illuminated, u, v, size):
+def _is_in_illuminated_cell(illuminated, u, v, size):
     """Return whether the cell of pixel (u, v) was illuminated; False outside the image."""
     if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
         return False
@@ -266,7 +266,7 @@ def _tabulate(
                 continue
             # the last nodes may be outside the image, where the edge pixel's support applies
             edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            camera_supported = _is_cell_supported(
+            camera_supported = _is_in_illuminated_cell(
                 camera_illuminated, edge_u, edge_v, rig.camera.size
             )
             for k in range(grid.shape[2]):
@@ -285,6 +285,6 @@ def _tabulate(
                 settled = abs(change) < 1e-3 or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    known[j, i, k] = camera_supported and _is_cell_supported(
+                    known[j, i, k] = camera_supported and _is_in_illuminated_cell(
                         projector_illuminated, pu, pv, rig.projector.size
                     )
