@@ -58,18 +58,17 @@ class CharacteristicResult(msgspec.Struct, frozen=True):
 
 
 class PartResult(msgspec.Struct, frozen=True):
-    """The characteristics of one part, in the plan's order."""
+    """The characteristics of one part, in the plan's order. Its ``decision`` follows from them:
+    "fail" where one fails, else "undecided" where one is, else "pass"."""
 
     part: str
     results: tuple[CharacteristicResult, ...]
+    decision: Decision = "pass"
 
-    @property
-    def decision(self) -> Decision:
-        """ "fail" where one characteristic fails, else "undecided" where one is, else "pass"."""
-        decisions = [each.decision for each in self.results]
-        return (
-            "fail" if "fail" in decisions else "undecided" if "undecided" in decisions else "pass"
-        )
+    def __post_init__(self) -> None:
+        decisions = {each.decision for each in self.results}
+        worst = next((each for each in ("fail", "undecided") if each in decisions), "pass")
+        msgspec.structs.force_setattr(self, "decision", worst)
 
 
 class Capability(msgspec.Struct, frozen=True):
@@ -147,7 +146,7 @@ class Inspection(Record, frozen=True, kw_only=True):
         columns = [
             Column("part", align="left"),
             Column("characteristic", align="left"),
-            Column("kind", align="left", detail=True),
+            Column("type", align="left", detail=True),
             Column("value", digits=4),
             Column("U (k = 2)", digits=4),
             Column("unit", align="left"),

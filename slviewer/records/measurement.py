@@ -359,7 +359,7 @@ def list_quantities(found: Mapping[str, Measurement]) -> Table:
     """Return the table of all quantities of measurements."""
     columns = [
         Column("measurement", align="left"),
-        Column("kind", align="left", detail=True),
+        Column("type", align="left", detail=True),
         Column("scan", align="left"),
         Column("quantity", align="left"),
         Column("value", digits=4),

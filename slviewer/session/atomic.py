@@ -271,7 +271,11 @@ def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
 
     with decoding(decided):
         return [
-            (inside(target), staged and inside(staged), old_to and inside(old_to))
+            (
+                inside(target),
+                None if staged is None else inside(staged),
+                None if old_to is None else inside(old_to),
+            )
             for target, staged, old_to in read_json(decided)["changes"]
         ]
 

@@ -61,7 +61,7 @@ def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(
             click(page, "Upload zip")
         chooser.value.set_files({"name": name, "mimeType": "application/zip", "buffer": content})
         if name == "broken.zip":
-            expect(page.get_by_text(re.compile("the file is no zip")).first).to_be_visible()
+            expect(page.get_by_text(re.compile("the file is not a zip")).first).to_be_visible()
             expect(button(page, "Upload zip")).to_be_enabled()
     expect(page.get_by_text("1 capture imported as a target pose: capture_0").first).to_be_visible()
     expect(

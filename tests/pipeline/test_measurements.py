@@ -432,8 +432,9 @@ def test_measurements_are_repeated_by_a_plan(made: Path, run: Run, tmp_path: Pat
     assert apart == pytest.approx(true, abs=0.1)
     # the other scan shows no balls there: it is named, and the status says so
     status, text, error = run("inspect-parts", plan, session, "--out", results)
-    assert (
-        status == 1
-        and not missing_facts(error, "object")
-        and not missing_facts(text, "not measured")
-    )
+    parts = {
+        each["part"]: each for each in json.loads((results / "parts.json").read_text())["parts"]
+    }
+    reasons = {each["reason"] for each in parts["object"]["results"]}
+    assert status == 1 and not missing_facts(error, "object")
+    assert all(reasons) and not missing_facts(text, *reasons)

@@ -123,7 +123,12 @@ def test_a_result_that_is_trashed_and_saved_again_is_in_the_trash_once(folder):
 
 @pytest.mark.parametrize(
     "listed",
-    ['{"changes": [["../x", null, "trash/x"]]}', '{"changes": [["/tmp/x", null, null]]}', "{"],
+    [
+        '{"changes": [["../x", null, "trash/x"]]}',
+        '{"changes": [["/tmp/x", null, null]]}',
+        '{"changes": [["results/a", [], null]]}',
+        "{",
+    ],
 )
 def test_a_listing_that_names_other_folders_is_ignored(folder, listed):
     (folder.parent / "x").mkdir()

@@ -267,7 +267,8 @@ def test_files_for_other_programs(operator: Operator) -> None:
     assert len(surface.faces) > 5_000 and np.median(gaps) < 1.0
     rows = list(csv.DictReader(files["figures.csv"].path.read_text().splitlines()))
     verified = [row for row in rows if row["kind"] == "verify" and row["model"]]
-    assert len(verified) == 6 and {row["kind"] for row in rows} == {"verify", "clouds", "merge"}
+    kinds = {"calibration", "clouds", "measurements", "merge", "verify"}
+    assert len(verified) == 6 and {row["kind"] for row in rows} == kinds
     assert [verified[0][key] for key in ("record", "label", "model")] == [
         "plane_01",
         "A flat plate",
