@@ -64,6 +64,7 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
     sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
     rows = information_rows(bench, np.array(known[1]))

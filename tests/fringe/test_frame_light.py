@@ -74,6 +74,7 @@ def test_a_steady_capture_is_left_as_it_is(name, gamma):
     assert not light.is_significant and detect_light_faults(sequence, light) == []
 
 
+@pytest.mark.slow
 def test_mains_flicker_under_a_rolling_shutter():
     sequence = SEQUENCES["p18"]
     stack = capture(sequence, TRUTH, shot=0.02)

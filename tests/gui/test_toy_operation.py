@@ -96,6 +96,7 @@ def test_terminal_json_csv_report_and_certificate_hold_the_figure(
 
 
 @pytest.mark.computes
+@pytest.mark.slow
 def test_python_and_wizard_store_what_the_terminal_does(session: Path, tmp_path: Path) -> None:
     again = copy_session(session, tmp_path / "again")
     (found,) = brightness(session, "object_r1").values()

@@ -213,7 +213,16 @@ def records(
         return {name: store.load_result(name) for name in names}
 
 
-@pytest.fixture(scope="module", params=OPERATIONS)
+SLOW = {"check", "validate"}
+"""Operations whose results every door takes seconds for."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in OPERATIONS
+    ],
+)
 def done(
     request: pytest.FixtureRequest, recorded: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Operation, dict[str, Path]]:

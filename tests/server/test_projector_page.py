@@ -145,7 +145,9 @@ def state_has(channel: ProjectorChannel, *facts: object) -> bool:
     return missing_facts(channel.page_state().words, *facts) == []
 
 
-@pytest.mark.parametrize("ratio", [1, 1.25, 1.5, 2])
+@pytest.mark.parametrize(
+    "ratio", [1, 1.5, *(pytest.param(each, marks=pytest.mark.slow) for each in (1.25, 2))]
+)
 def test_every_pixel_of_a_pattern_is_one_pixel_of_the_screen(opens, channel, projector, ratio):
     page = opens(ratio=ratio)
     ready(channel, projector)
