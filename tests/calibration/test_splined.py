@@ -152,6 +152,7 @@ def _left_of(o: Observation, limit: float):
     )
 
 
+@pytest.mark.slow
 def test_what_is_saved_comes_back_the_same(model, true) -> None:
     import json
 

@@ -213,7 +213,7 @@ def records(
         return {name: store.load_result(name) for name in names}
 
 
-SLOW = {"check", "validate"}
+SLOW = {"accept", "calibrate", "check", "compare", "run_plan", "validate"}
 """Operations whose results every door takes seconds for."""
 
 
