@@ -18,9 +18,8 @@ RINGS = 142  # triangles of half a millimetre on the front
 SIDE_RINGS = 6
 HALF_WIDTH_MM = 70.0
 GROWTH = np.log(2.15) / (2 * np.pi)  # the spiral's radius grows 2.15-fold in a turn
-TUBE = (2.15 - 1) / (
-    2.15 + 1
-)  # tube radius as a share of the spiral's: neighbouring whorls just touch
+# tube radius as a share of the spiral's: neighbouring whorls just touch
+TUBE = (2.15 - 1) / (2.15 + 1)
 
 
 def disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
@@ -90,9 +89,8 @@ def ammonite(
     outer = size / (1 + TUBE)  # the spiral's radius at the mouth
     height, covered = np.full_like(x, -np.inf), np.zeros(x.shape, bool)
     for whorl in range(int(turns) + 1):
-        along = np.mod(angle, 2 * np.pi) - 2 * np.pi * (
-            whorl + 1
-        )  # 0 at the mouth, negative inwards
+        # 0 at the mouth, negative inwards
+        along = np.mod(angle, 2 * np.pi) - 2 * np.pi * (whorl + 1)
         centre = outer * np.exp(GROWTH * along)
         tube = 1.05 * TUBE * centre
         across = (radius - centre) / tube

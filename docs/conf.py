@@ -55,9 +55,8 @@ html_title = "slviewer"
 html_show_sourcelink = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_sidebars = {
-    page: [] for page in ("index", "quickstart", "architecture")
-}  # these have no pages beside them
+# these have no pages beside them
+html_sidebars = {page: [] for page in ("index", "quickstart", "architecture")}
 html_context = {"default_mode": "auto"}
 html_theme_options = {
     "navbar_align": "left",

@@ -269,9 +269,8 @@ def draw_pictures() -> None:
     GALLERY.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
     for script in sorted(EXAMPLES.glob("*.py")):
-        if "sys.argv[1:]" not in script.read_text(
-            encoding="utf-8"
-        ):  # its only argument is a picture's path
+        # its only argument is a picture's path
+        if "sys.argv[1:]" not in script.read_text(encoding="utf-8"):
             picture = GALLERY / f"{script.stem}.png"
             subprocess.run([sys.executable, str(script), str(picture)], env=environment, check=True)
     subprocess.run(

@@ -6,9 +6,8 @@ is.
 
 import re
 
-_CREDENTIALS = re.compile(
-    r"(?<=://)[^\s\"']+(?=@)"
-)  # up to the last @, as passwords hold all kinds of characters
+# up to the last @, as passwords hold all kinds of characters
+_CREDENTIALS = re.compile(r"(?<=://)[^\s\"']+(?=@)")
 
 
 def hide_passwords(text: str) -> str:

@@ -51,9 +51,8 @@ FORBIDDEN = [
     ("session", "slviewer.devices"),
 ]
 NUMERIC = PACKAGES[1 : PACKAGES.index("simulation")]
-SOURCES = sorted(
-    set((ROOT / "slviewer").rglob("*.py")) - {ROOT / "slviewer/_version.py"}
-)  # a build writes that
+# a build writes that
+SOURCES = sorted(set((ROOT / "slviewer").rglob("*.py")) - {ROOT / "slviewer/_version.py"})
 MOST_LINES = 600
 MANY_BRANCHES, MANY_PARAMETERS = 15, 8
 MOST_WITH_MANY_BRANCHES, MOST_WITH_MANY_PARAMETERS = 0, 1

@@ -84,9 +84,8 @@ def test_a_session_has_the_operations_as_methods(recorded: Path, tmp_path: Path)
         assert (
             found["plane_03"].best == "splined" and session.state_of("verify/plane_03") == "fresh"
         )
-        again = sl.verify(
-            folder.as_posix(), ["plane_03"], "plane"
-        )  # read, as the session is open for writing
+        # read, as the session is open for writing
+        again = sl.verify(folder.as_posix(), ["plane_03"], "plane")
         assert again["plane_03"].models == found["plane_03"].models
         assert session.load_arrays("verify/plane_03")["error_splined"].shape == (300, 400)
         assert session.reconstruct("object_r1").only.points > 10_000

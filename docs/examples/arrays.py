@@ -11,9 +11,8 @@ import slviewer as sl
 folder, board, picture = sys.argv[1:]
 poses = sl.read_captures(f"{folder}/poses")
 frames = {pose.name: pose.frames for pose in poses}
-calibration = sl.calibrate_frames(
-    poses[0].sequence, frames, board, models=["stereo"]
-)  # without models: all of them
+# without models: all of them
+calibration = sl.calibrate_frames(poses[0].sequence, frames, board, models=["stereo"])
 (scan,) = sl.read_captures(f"{folder}/scan")
 phases = {axis: sl.decode(scan.sequence, scan.frames, axis) for axis in scan.sequence.axes}
 cloud = sl.reconstruct_cloud(calibration.best, phases)

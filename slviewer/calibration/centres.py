@@ -77,9 +77,8 @@ def move_to_centres(observations: Sequence[Observation], stereo: StereoModel) ->
     unchanged.
     """
     radii = [o.radius_mm for o in observations if o.radius_mm]
-    radius = (
-        float(np.median(radii)) if radii else 0.0
-    )  # one board: what differs between poses is noise
+    # one board: what differs between poses is noise
+    radius = float(np.median(radii)) if radii else 0.0
     return [
         _move_to_centres(o, stereo, radius) if o.radius_mm and o.name in stereo.poses else o
         for o in observations

@@ -64,9 +64,8 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     modulation = np.asarray(phase.modulation, np.float32)
     crest, trough = (_local_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
     contrast = crest - trough
-    edged = (
-        cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    )  # the board's outline is no edge
+    # the board's outline is no edge
+    edged = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     edged &= contrast > 0.4 * crest
     level = np.clip((modulation - trough) / np.maximum(contrast, 1e-6), 0, 1)
     area = np.count_nonzero(edged & (level > EDGE_BAND) & (level < 1 - EDGE_BAND))

@@ -36,10 +36,11 @@ NOMINAL_FOCAL = 1.5
 """In widths of the image, where nothing is known of the lens: between a phone's and a machine
 lens's."""
 
+# nearest: the squarely held board fills so much of the image; farthest: times this
 _NEAR_FILL, _DEPTH_RATIO = (
     0.9,
     1.45,
-)  # nearest: the squarely held board fills so much of the image; farthest: times this
+)
 _CELL_SHARE = 0.5  # of a cell that the board must cover
 _REACH_MARGIN = 0.02  # of the projector's image, inside which points are reached
 _FREE = 0.015  # of the image's width, left free around the board
@@ -247,9 +248,8 @@ def _list_candidates(
     depths = near + (far - near) * (np.arange(3) + 0.5) / 3
     R = Rotation.from_rotvec([(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]).as_matrix()
     t = depths[:, None, None, None, None] * rays - (R @ middle)[:, None, None]
-    T = rigid_transform(
-        np.broadcast_to(R[:, None, None], (*t.shape, 3)), t
-    )  # by depth, tilt, place and share
+    # by depth, tilt, place and share
+    T = rigid_transform(np.broadcast_to(R[:, None, None], (*t.shape, 3)), t)
     visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(t.shape[:-1])
     farthest = visible.argmax(axis=-1)
     far_enough = (shares[farthest] > 0.15) | (places == 0).all(axis=1)

@@ -176,9 +176,8 @@ def calibrate_pixelwise(
     periods = {axis: used[0].periods_px[axis] for axis in axes}
     fits = {axis: _empty_fit(height, width) for axis in axes}
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
-    buffer = np.empty(
-        (len(axes) + 1, len(used) * band * width)
-    )  # allocated once: new memory is slow at first
+    # allocated once: new memory is slow at first
+    buffer = np.empty((len(axes) + 1, len(used) * band * width))
     for first in range(0, height, band):
         rows = slice(first, min(first + band, height))
         phases, z, rays = _collect_rows(

@@ -80,9 +80,8 @@ class StereoModel:
         if not rms:
             return 0.0
         magnification = self.rig.projector.K[1, 1] / self.rig.camera.K[1, 1]
-        return float(
-            np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2)
-        )  # of one coordinate
+        # of one coordinate
+        return float(np.hypot(rms["projector"], magnification * rms["camera"]) / np.sqrt(2))
 
     def undistort_pairs(
         self, camera_pixels: Floats, projector_pixels: Floats
@@ -336,12 +335,12 @@ def _detect_outliers(
     An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either
     device.
     """
-    errors = {
-        o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used
-    }  # in the camera and projector
+    # in the camera and projector
+    errors = {o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used}
+    # Rayleigh
     sigma = (
         np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774
-    )  # Rayleigh
+    )
     limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
     outliers = {o.name: inliers[o.name] & (errors[o.name] > limit).any(1) for o in used}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}

@@ -70,9 +70,8 @@ def _capture_loaded(
                 rig.camera.grab(out[k])
             if k == n - 1:
                 with report_driver_faults(rig.projector):
-                    rig.projector.show(
-                        k
-                    )  # a change during this exposure is reported by the next request only
+                    # a change during this exposure is reported by the next request only
+                    rig.projector.show(k)
         except DeviceError as error:
             raise DeviceError(
                 f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: {error}"
@@ -120,9 +119,8 @@ def capture_with_texture(
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
     with report_driver_faults(rig.projector):
-        rig.projector.load(
-            sequence
-        )  # once: a projector reconnected between two exposures must not go unnoticed
+        # once: a projector reconnected between two exposures must not go unnoticed
+        rig.projector.load(sequence)
     before, applied_ms = _read_settings(rig), []
     try:
         for e, exposure in enumerate(wanted):
@@ -136,10 +134,11 @@ def capture_with_texture(
                 rig, n, out[e * n : (e + 1) * n], _offset_progress(progress, e * n, len(out))
             )
     finally:
+        # a lost device raises its own error
         with (
             contextlib.suppress(DeviceError),
             report_driver_faults(rig.camera),
-        ):  # a lost device raises its own error
+        ):
             rig.camera.apply(before)
     return CapturedFrames(
         out, _read_settings(rig), sequence, rig.name, tuple(applied_ms), _try_capture_colour(rig)

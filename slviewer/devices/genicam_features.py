@@ -15,11 +15,12 @@ from slviewer.errors import DeviceError, InputError
 
 Trigger = Literal["software", "hardware", "free"]
 
+# EAccessMode: 1 not now, 2 write, 3 read, 4 both
 _IMPLEMENTED, _READABLE, _WRITABLE = (
     (1, 2, 3, 4),
     (3, 4),
     (2, 4),
-)  # EAccessMode: 1 not now, 2 write, 3 read, 4 both
+)
 _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")  # the second is older GigE cameras'
 _MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "s": 1e3}
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "BlackLevelAuto")

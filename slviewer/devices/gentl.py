@@ -24,9 +24,8 @@ LOCK = threading.RLock()
 _PRODUCERS: dict[str, "_Producer"] = {}
 
 _LOG = logging.getLogger("slviewer.gentl")
-_LOG.addHandler(
-    logging.NullHandler()
-)  # harvesters prints every failure with its stack; errors are raised as sentences
+# harvesters prints every failure with its stack; errors are raised as sentences
+_LOG.addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True)
@@ -139,9 +138,8 @@ def _load_producer(file: str) -> Any:
     try:
         harvester.add_file(file, check_existence=True, check_validity=True)
         harvester.update()
-        if (
-            not harvester.has_revised_device_info_list
-        ):  # harvesters logs why, and goes on without cameras
+        # harvesters logs why, and goes on without cameras
+        if not harvester.has_revised_device_info_list:
             raise DeviceError(
                 f"the GenTL producer {file} cannot list cameras: close other programs that use them"
             )

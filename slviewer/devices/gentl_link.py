@@ -106,9 +106,8 @@ class Link:
                 del _LINKS[self._camera]
             acquirer, self._acquirer, self.streaming = self._acquirer, None, False
             if acquirer is not None:
-                ignore_errors(
-                    lambda: acquirer.__exit__(None, None, None)
-                )  # unlike destroy(), lets go of its memory
+                # unlike destroy(), lets go of its memory
+                ignore_errors(lambda: acquirer.__exit__(None, None, None))
                 if acquirer.is_valid():  # it failed halfway: the second time skips what failed
                     ignore_errors(acquirer.destroy)
                 ignore_errors(lambda: self._harvester.image_acquirers.remove(acquirer))

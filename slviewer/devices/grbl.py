@@ -238,9 +238,8 @@ class GcodeTurntable(Openable):
                 self._write(f"{question}\n".encode())
                 until = min(end, self._clock() + _ANSWER_S * self.boot_s / BOOT_S)
                 while (line := self._read_line(until)) is not None:
-                    refused = dialect == "grbl" and line.startswith(
-                        "error:"
-                    )  # it is GRBL, but paused
+                    # it is GRBL, but paused
+                    refused = dialect == "grbl" and line.startswith("error:")
                     if answer in line or refused:
                         self._drain()
                         return "grbl" if dialect == "grbl" else "marlin"
@@ -276,9 +275,8 @@ class GcodeTurntable(Openable):
             self._check_line(line, command)
             if line.startswith("ok"):
                 return
-            if (
-                line.startswith("echo:busy") and command != "M400"
-            ):  # it says every two seconds that it is alive
+            # it says every two seconds that it is alive
+            if line.startswith("echo:busy") and command != "M400":
                 end = self._clock() + self.reply_s
         raise TurntableError(
             f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its"

@@ -99,9 +99,8 @@ class OpenCVCamera(Openable):
         """Start reading. Raises DeviceError where the source does not answer, or its frames have
         another size."""
         if self._reader is not None:
-            self._reader.join(
-                self.timing.opening_s
-            )  # it may hang in a call, the device still in its hands
+            # it may hang in a call, the device still in its hands
+            self._reader.join(self.timing.opening_s)
         self._reader = Reader(self.name, self._connect, self.timing)
         self._next, self._read = self._check_size(self._reader.first()), 0
         self._notices = {}

@@ -82,9 +82,8 @@ class Pace:
             mean = (arrivals[-1][0] - arrivals[0][0]) / (len(arrivals) - 1)
             periods = (now - arrivals[-1][0]) / max(mean, 1e-6)
         arrivals.append((now, busy))
-        while (
-            len(arrivals) > 3 and arrivals[1][0] < now - _WINDOW_S
-        ):  # a pause stays until its flood has gone by
+        # a pause stays until its flood has gone by
+        while len(arrivals) > 3 and arrivals[1][0] < now - _WINDOW_S:
             arrivals.popleft()
         return periods
 
@@ -285,13 +284,11 @@ class Reader:
         self._arrived = now
         periods = self._pace.add(now, time.thread_time())
         wanted = self._wanted
-        if (
-            wanted is None or periods is None or periods < 0.5
-        ):  # None, or hard on the one before: out of a buffer
+        # None, or hard on the one before: out of a buffer
+        if wanted is None or periods is None or periods < 0.5:
             return
-        if (
-            periods > 2 and not wanted.paused
-        ):  # after a pause of the reader's own, the first of those that waited
+        # after a pause of the reader's own, the first of those that waited
+        if periods > 2 and not wanted.paused:
             wanted.paused = True
             return
         wanted.remaining -= 1

@@ -142,8 +142,7 @@ def _is_device(source: str) -> bool:
 def _silence_libraries() -> None:
     """Silence the libraries' terminal output, unless a log level is set: errors are raised."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
-    os.environ.setdefault(
-        "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2"
-    )  # s until a webcam without pictures is given up
+    # s until a webcam without pictures is given up
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

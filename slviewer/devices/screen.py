@@ -78,9 +78,8 @@ def refusal(screen: Screen, size: tuple[int, int] | None) -> str:
             f" px at {screen.dpr:g} px per page pixel: set the scaling of the projector's display"
             " to 100 % in the system's display settings, and the page's zoom to 100 % (Ctrl+0)"
         )
-    if (
-        screen.inner != screen.whole
-    ):  # zoomed, next to a bar, or full screen inside a tab that is recorded
+    # zoomed, next to a bar, or full screen inside a tab that is recorded
+    if screen.inner != screen.whole:
         (width, height), (columns, rows) = screen.inner, screen.whole
         return (
             f"the projector page is full screen and {width} x {height} page pixels large where its"

@@ -56,10 +56,11 @@ TABLE_2 = (
     SpherePose(6, "R3", 0.085, 0.085, 98.10, 98.06),
 )
 TABLE_2_MEAN_MM = (0.091, 0.072)
+# mean and standard deviation: stereo, pixelwise
 TABLE_2_RADIUS_MM = (
     (98.256, 0.111),
     (98.060, 0.053),
-)  # mean and standard deviation: stereo, pixelwise
+)
 
 EXPERIMENT_3_POINTS = {"R1": 1_642_179, "R2": 1_476_327, "R3": 1_034_094}
 EXPERIMENT_3_ICP_RMS_MM = {"R1": 0.26, "R2": 0.25}  # with R3 as the reference

@@ -129,9 +129,8 @@ def place(
     z = unit_vectors(aim)
     x = unit_vectors(np.cross([0.0, 1.0, 0.0], z))
     R = np.stack([x, np.cross(z, x), z])
-    tilt = np.arctan(
-        projector.offset * rows / fy
-    )  # so that the picture's middle, not the axis, is aimed
+    # so that the picture's middle, not the axis, is aimed
+    tilt = np.arctan(projector.offset * rows / fy)
     R = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]) @ R
     return StereoRig(nominal_lens(camera.size, camera.focal_px), lens, R, -R @ centre)
 

@@ -105,9 +105,8 @@ def estimate_aliased_harmonics(
         noise_gain = max(float(np.mean(slope**-2.0)) - 1, 0.0)
         remaining = np.sqrt((spread**2 + d.error**2 + second**2) / 2 + noise_gain * pieces.sigma**2)
         return AliasedHarmonics(n, M.value, d.value, True, float(remaining))
-    if (
-        abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2
-    ):  # no phase follows: the modulation is texture's
+    # no phase follows: the modulation is texture's
+    if abs(d.value - M.value) > SIGMAS * d.error + abs(M.value) / 2:
         return none
     return AliasedHarmonics(n, M.value, d.value, False, abs(M.value) / np.sqrt(2))
 

@@ -292,9 +292,8 @@ def _compute_log_ratio(a, b, between):
     """
     if abs(a - b) < np.float32(0.1) * between:
         return (a - b) / between
-    least = (
-        np.float32(0.05) * between
-    )  # two and a half standard deviations outside of a straight edge
+    # two and a half standard deviations outside of a straight edge
+    least = np.float32(0.05) * between
     return np.log(max(a, least) / max(b, least))
 
 

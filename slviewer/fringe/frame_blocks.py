@@ -264,9 +264,8 @@ def _detect_phase_runs(reader: BlockReader) -> list[PhaseRun]:
             if (run := reader.run(tuple(range(start, start + n)))) is not None
         ]
         if fitting:
-            runs.append(
-                min(fitting, key=lambda run: run.misfit + 0.3 / len(run.images))
-            )  # three steps fit anything
+            # three steps fit anything
+            runs.append(min(fitting, key=lambda run: run.misfit + 0.3 / len(run.images)))
             start = runs[-1].images[-1]
         start += 1
     return runs

@@ -143,9 +143,8 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     if sample is None:
         return steady
     fit = fit_light(sample, ("gain",), Light.constant(len(stack)))
-    if (
-        np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded
-    ):  # bits and inverses are now separated better
+    # bits and inverses are now separated better
+    if np.ptp(np.log(fit.light.gain)) > 0.2 and sample.coded:
         sample = sample_light(sequence, stack, fit.light.gain) or sample
         coarse = sample_light(sequence, stack, fit.light.gain, coarse=True) or coarse
         fit = fit_light(sample, ("gain",), fit.light)
@@ -343,9 +342,8 @@ def _locate_room_changes(
     First of a change of room light alone, then together with gains. ``weight`` (p,) of the pixels.
     """
     model = light_model(sample)
-    if (
-        model.phased and not model.phase_freedom
-    ):  # three steps: nothing but the Gray code contradicts a change
+    # three steps: nothing but the Gray code contradicts a change
+    if model.phased and not model.phase_freedom:
         return (), ()
     remainder = model.eliminate(light, SHARE_PRIOR[0], weight)
     normal, moment = remainder.normal_equations(

@@ -191,9 +191,8 @@ def _detect_weak_fringes(task: DecodingTask, white_frame: np.ndarray, maps: Maps
     if not PLAUSIBLE[0] < typical < PLAUSIBLE[1] or spread > MOST_SPREAD:
         return nothing
     if is_narrow:
-        margin = margin - min(
-            np.log(typical), 0.0
-        )  # narrow fringes: the more unsharp they are, the more blur varies
+        # narrow fringes: the more unsharp they are, the more blur varies
+        margin = margin - min(np.log(typical), 0.0)
     expected = np.full(phase.shape, np.inf)
     expected[rows, columns] = _model_terms(phase, slope, rows, columns) @ fit
     with np.errstate(invalid="ignore"):

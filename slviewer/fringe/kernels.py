@@ -172,9 +172,8 @@ def sums_row(stack, shift, row, cosine, sine, total, peak):
     and ``peak`` (w,) of the frames' dtype.
     """
     width, lines = stack.shape[2], len(shift.cosines)
-    for k in range(
-        0, lines - 1, 2
-    ):  # two lines to a pass: the sums are read and written less often
+    # two lines to a pass: the sums are read and written less often
+    for k in range(0, lines - 1, 2):
         i, j = shift.frames[k], shift.frames[k + 1]
         a, b, c, d = stack[i[0], row], stack[i[1], row], stack[i[2], row], stack[i[3], row]
         e, f, g, h = stack[j[0], row], stack[j[1], row], stack[j[2], row], stack[j[3], row]

@@ -523,9 +523,8 @@ class Remainder:
         model = self.model
         n, u = len(model.phased), len(model.used)
         known = np.isin(model.used, model.informed)
-        relative = np.eye(u) + COMMON * np.outer(
-            known, known
-        )  # the frames' mean is the scene's own
+        # the frames' mean is the scene's own
+        relative = np.eye(u) + COMMON * np.outer(known, known)
         columns = [(term, column) for term in terms for column in light.values(term, model.used).T]
         for a, (term, column) in enumerate(columns):
             here = slice(a * u, (a + 1) * u)

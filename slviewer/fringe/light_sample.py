@@ -174,9 +174,8 @@ def _compute_half_range(
     pairs = [(i, coded[k]) for i, k in zip(coded, partner, strict=True) if k > -1]
     if pairs:
         differences = np.maximum.reduce([cv2.absdiff(frames[i], frames[j]) for i, j in pairs])
-        return np.float32(0.5) * differences.reshape(
-            frames.shape[1:]
-        )  # OpenCV makes columns of vectors
+        # OpenCV makes columns of vectors
+        return np.float32(0.5) * differences.reshape(frames.shape[1:])
     ends = [0, *changes, len(frames)]
     longest = max(([i for i in coded if a <= i < b] for a, b in pairwise(ends)), key=len)
     high, low = (

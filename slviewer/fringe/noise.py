@@ -136,11 +136,12 @@ def _measure_difference_noise(
     else:
         samples = samples[(samples.max(axis=-1) < white) & (samples.min(axis=-1) > 0)]
     third = np.diff(samples, n=3, axis=-1)
+    # 1 + 9 + 9 + 1; five that overlap
     return (
         samples.mean(axis=-1),
         (third**2).mean(axis=-1) / 20,
         2.5,
-    )  # 1 + 9 + 9 + 1; five that overlap
+    )
 
 
 def _select_unclipped_blocks(samples: np.ndarray, white: float) -> np.ndarray:

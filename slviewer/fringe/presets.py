@@ -78,13 +78,11 @@ def micro(projector: Size) -> PatternSequence:
     periods = 4
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        longest = max(
-            1.1 * extent, 700.0
-        )  # of small projectors too: shorter beats need wider stripes
+        # of small projectors too: shorter beats need wider stripes
+        longest = max(1.1 * extent, 700.0)
         ratio = (longest / MICRO_PX[1]) ** (1 / (periods - 1))
-        differences = [
-            1 / (longest / ratio**k) for k in range(periods - 1)
-        ]  # of neighbouring frequencies
+        # of neighbouring frequencies
+        differences = [1 / (longest / ratio**k) for k in range(periods - 1)]
         frequencies = [1 / MICRO_PX[0] - sum(differences[k:]) for k in range(periods)]
         for i, frequency in enumerate(frequencies):
             frames += phase_steps(axis, 8 if i == periods - 1 else 4, 1 / frequency)

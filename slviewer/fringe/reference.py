@@ -199,9 +199,8 @@ def _read_code(
     """Return the binary number (h, w) int32 that Gray bits encode, its last digit, and the bits'
     heights (b, h, w)."""
     heights = np.stack([bit_heights(layout, stack, i, background) for i in bits])
-    digits = np.logical_xor.accumulate(
-        heights > 0
-    )  # a binary digit is the parity of all Gray bits so far
+    # a binary digit is the parity of all Gray bits so far
+    digits = np.logical_xor.accumulate(heights > 0)
     places = 1 << np.arange(len(bits), dtype=np.int32)[::-1]
     return np.tensordot(places, digits.astype(np.int32), 1), digits[-1].astype(np.int32), heights
 

@@ -369,9 +369,8 @@ def _detect_repeated_steps(sampled: Fringe, products: _Products) -> list[int]:
     """Return the steps whose frame repeats the frame before it, judged by the usual difference of
     successive frames."""
     n, seen = sampled.steps, sampled.seen
-    if (
-        n == 3 and not sampled.turns
-    ):  # two steps look alike where the pixels cover one side of the fringe only
+    # two steps look alike where the pixels cover one side of the fringe only
+    if n == 3 and not sampled.turns:
         return []
     differences = np.array([float(np.mean((seen[k] - seen[k - 1]) ** 2)) for k in range(1, n)])
     noise = 2 * sampled.roughness**2

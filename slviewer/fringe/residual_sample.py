@@ -128,9 +128,8 @@ def estimate_roughness(frames: np.ndarray, width: int) -> float:
     differ at all.
     """
     third = np.diff(frames.reshape(len(frames), -1, width), n=3, axis=-1).ravel()
-    counts = np.cumsum(
-        np.bincount(np.abs(third, out=third).astype(np.intp))
-    )  # faster than sorting integral values
+    # faster than sorting integral values
+    counts = np.cumsum(np.bincount(np.abs(third, out=third).astype(np.intp)))
     median = float(
         np.searchsorted(counts, [(third.size - 1) // 2, third.size // 2], side="right").mean()
     )

@@ -181,9 +181,8 @@ class PatternSequence:
             )
         for name in ("phase_sign", "gray_origin_px", "phase_offset_rad", "gray_cell_px"):
             value = getattr(self, name)
-            if (
-                isinstance(value, PerAxis) and value.x == value.y
-            ):  # one way to write it, so that equal is equal
+            # one way to write it, so that equal is equal
+            if isinstance(value, PerAxis) and value.x == value.y:
                 object.__setattr__(self, name, value.x)
         for axis in get_args(Axis):
             self._check_values(axis)

@@ -64,14 +64,14 @@ def _compile_once(compile_here: Callable[[Any], Any], path: Path) -> Callable[[A
     def compile_or_load(signature: Any) -> Any:
         """Compile while this process holds the kernel's lock; without it where the disk has no
         locks."""
+        # in the order in which numba takes its own for callees
         with (
             global_compiler_lock,
             ExitStack() as stack,
-        ):  # in the order in which numba takes its own for callees
+        ):
             with suppress(OSError, NotImplementedError):
-                stack.enter_context(
-                    FileLock(path, thread_local=False)
-                )  # of this process, were it forked
+                # of this process, were it forked
+                stack.enter_context(FileLock(path, thread_local=False))
             return compile_here(signature)
 
     return compile_or_load
@@ -169,9 +169,8 @@ def _prefetch(_typing: Any, array: Any, index: Any) -> Any:
         at = builder.bitcast(builder.gep(view.data, [arguments[1]]), byte)
         kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(
-            function, [at, flag(0), flag(1), flag(1)]
-        )  # to read; into the outer caches; data
+        # to read; into the outer caches; data
+        builder.call(function, [at, flag(0), flag(1), flag(1)])
         return context.get_dummy_value()
 
     return numba.types.void(array, index), build

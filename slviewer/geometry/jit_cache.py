@@ -39,9 +39,8 @@ def cache_folder(module: str) -> Path | None:
                 if old != folder:  # another process may just have made it
                     shutil.rmtree(old, ignore_errors=True)
             folder.mkdir(exist_ok=True)
-    except (
-        OSError
-    ):  # no source beside the byte code, no temporary folder, or a disk that has filled up
+    except OSError:
+        # no source beside the byte code, no temporary folder, or a disk that has filled up
         return None
     return folder
 

@@ -89,9 +89,8 @@ def fit_polynomial(
 def monomials(points: np.ndarray, degree: int) -> np.ndarray:
     """(n, m): x^i y^j of points (n, 2) for i from 0 and j from 0 while i + j <= ``degree``; j runs
     fastest."""
-    x, y = (
-        np.vander(column, degree + 1, increasing=True) for column in points.T
-    )  # products, much faster than powers
+    # products, much faster than powers
+    x, y = (np.vander(column, degree + 1, increasing=True) for column in points.T)
     return np.stack(
         [x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
     )

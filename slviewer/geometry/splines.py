@@ -171,9 +171,8 @@ def _accumulate(cells_u, basis_u, cells_v, basis_v, weights, values, columns, ba
         for a in range(4):
             for b in range(4):
                 products[4 * a + b] = basis_v[k, a] * basis_u[k, b]
-        corner = np.uint64(
-            cells_v[k] * columns + cells_u[k]
-        )  # an index with a sign would be tested for its end
+        # an index with a sign would be tested for its end
+        corner = np.uint64(cells_v[k] * columns + cells_u[k])
         for a in range(4):
             for b in range(4):
                 row = corner + np.uint64(a * columns + b)

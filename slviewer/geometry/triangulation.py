@@ -94,9 +94,8 @@ def points_from_depth(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
     points = np.empty((*z.shape, 3), dtype=np.float32)
     points[..., 0] = rays[..., 0] * z
     points[..., 1] = rays[..., 1] * z
-    points[..., 2] = np.where(
-        np.isnan(points[..., 0]), np.nan, z
-    )  # a pixel without a ray is invalid as a whole
+    # a pixel without a ray is invalid as a whole
+    points[..., 2] = np.where(np.isnan(points[..., 0]), np.nan, z)
     return points
 
 

@@ -247,9 +247,8 @@ def run(
         _check_granted(operator, operator.open_session(session or Path(DEFAULT_SESSION)))
         store = operator.session
         remembered = store is not None and (store.valid_decision("rig") or store.decision_faults())
-        if (
-            rig or not remembered
-        ):  # a remembered rig that is not connected now is not replaced by the simulated one
+        # a remembered rig that is not connected now is not replaced by the simulated one
+        if rig or not remembered:
             _check_granted(
                 operator, operator.choose_rig(rig_choice(rig or "simulated", operator.session))
             )

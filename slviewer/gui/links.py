@@ -75,9 +75,8 @@ def _link_html(what: str, link: str, qr_code: bool) -> Html:
 def encode_qr_code(text: str) -> str:
     """Return the QR code of a text as the address of a PNG picture, a pixel a module."""
     modules = cv2.QRCodeEncoder.create().encode(text)
-    border = max(
-        0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax())
-    )  # OpenCV adds some of it
+    # OpenCV adds some of it
+    border = max(0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax()))
     modules = cv2.copyMakeBorder(modules, *(border,) * 4, cv2.BORDER_CONSTANT, value=255)
     png = cv2.imencode(".png", modules)[1].tobytes()
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"

@@ -15,10 +15,11 @@ from slviewer.wizard.live_scan import LiveCloud
 
 LAYER = "live"
 MOST_POINTS, FEWEST_POINTS = 60_000, 15_000
+# a browser that takes longer, or less, for a cloud is sent fewer points, or more
 _SLOW_S, _QUICK_S = (
     0.09,
     0.05,
-)  # a browser that takes longer, or less, for a cloud is sent fewer points, or more
+)
 
 
 class LiveScreen:

@@ -83,10 +83,11 @@ class _EditedScan:
         same."""
         if other.cloud.name != self.cloud.name or other.points.shape != self.points.shape:
             return False
+        # no plane: others may lie below it now
         self.hidden, self.selected = (
             other.hidden,
             other.selected & self.shown,
-        )  # no plane: others may lie below it now
+        )
         return True
 
 

@@ -71,9 +71,8 @@ def legend(preview: PreviewView, *lines: Html) -> Html:
 
 def histogram_chart(preview: PreviewView) -> Html:
     """Return a bar chart of the grey levels; the last bar is red: saturated pixels."""
-    shares = np.sqrt(
-        preview.histogram / max(float(preview.histogram.max()), 1e-9)
-    )  # the few bright pixels matter most
+    # the few bright pixels matter most
+    shares = np.sqrt(preview.histogram / max(float(preview.histogram.max()), 1e-9))
     bars = "".join(
         f'<rect x="{4 * k}" y="{40 - 40 * share:.1f}" width="3.4" height="{40 * share:.1f}" '
         f'fill="var(--mantine-color-{"red-6" if k == len(shares) - 1 else "blue-5"})"/>'

@@ -46,9 +46,8 @@ class RigCheck:
     def draw(self, snapshot: Snapshot) -> None:
         """Show the result of the last check."""
         session, result, rig = snapshot.session, snapshot.preflight, snapshot.rig
-        change(
-            self._check, disabled=not rig.is_idle or rig.is_recorded
-        )  # a recording cannot be checked
+        # a recording cannot be checked
+        change(self._check, disabled=not rig.is_idle or rig.is_recorded)
         change(
             self._linear,
             visible=bool((result and result.levels) or (session and session.is_linear)),

@@ -208,9 +208,8 @@ class RigChoice:
         page = self._context.page_state("projector") if projector.page else None
         if self._size.value.strip():
             projector_choice["size"] = _size(self._size.value)
-        elif (
-            page is not None and page.size is not None
-        ):  # saved, since the page may be opened after the session
+        elif page is not None and page.size is not None:
+            # saved, since the page may be opened after the session
             projector_choice["size"] = list(page.size)
         choice = {
             "name": f"{camera.name} and {projector.name}",

@@ -209,9 +209,8 @@ class Shell:
     def _follow_autopilot(self, snapshot: Snapshot) -> None:
         """Show the autopilot's step when it advances to another one."""
         key, keys = autopilot_step(snapshot), ["", *self._panels]
-        onward = keys.index(key) > keys.index(
-            self._autopilot_key
-        )  # between two of its acts it may seem to step back
+        # between two of its acts it may seem to step back
+        onward = keys.index(key) > keys.index(self._autopilot_key)
         if key != self._autopilot_key and (onward or not key):
             self._autopilot_key = key
             self.go(key)

@@ -93,9 +93,8 @@ class SimulatedObject:
         def changed(event: Any) -> None:
             """Move the object, if a browser has set a valid number."""
             if event.client_id is not None and number.min <= number.value <= number.max:
-                value = (
-                    number.value
-                )  # read now: an older snapshot may be drawn over it before the callback's turn
+                # read now: an older snapshot may be drawn over it before the callback's turn
+                value = number.value
                 self._context.callback(lambda: self._context.operator.move_object(**{what: value}))(
                     event
                 )

@@ -48,9 +48,8 @@ def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
         return
     low, high = np.percentile(flat, [2, 98], axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    away = max(
-        1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0
-    )  # the field of view is that of the height
+    # the field of view is that of the height
+    away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)
     _set_view(client, middle + _FROM * away, middle)
 
 

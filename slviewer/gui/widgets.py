@@ -132,9 +132,8 @@ def report_table(shown: Table) -> Html:
     titles = [
         f"{c.title[:1].upper()}{c.title[1:]}{c.unit and f', {c.unit}'}" for c in shown.columns
     ]
-    titles = [
-        title.replace("-", NO_BREAK_HYPHEN) for title in titles
-    ]  # a line ends between words, in any font
+    # a line ends between words, in any font
+    titles = [title.replace("-", NO_BREAK_HYPHEN) for title in titles]
     rows = [
         [
             coloured(text, tones.get(mark, "plain"), bold=mark in ("better", "strong"))

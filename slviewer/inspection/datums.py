@@ -86,9 +86,8 @@ def face_towards(fit: FeatureFit, side: np.ndarray) -> FeatureFit:
     f = fit.feature
     if f.kind != "plane" or f.unit_direction @ side >= 0:
         return fit
-    sign = np.array(
-        [1.0, -1.0, -1.0]
-    )  # the second tangent stays, the first and the normal are reversed
+    # the second tangent stays, the first and the normal are reversed
+    sign = np.array([1.0, -1.0, -1.0])
     spread = fit.spread
     shared = None if spread.shared is None else spread.shared * sign
     turned = Spread(spread.scatter * np.outer(sign, sign), shared, spread.calibration)

@@ -227,9 +227,8 @@ def form_error(
         normals = f.normals(points)
         across = normals - (normals @ axis)[:, None] * axis
         coordinates = unit_vectors(across)
-        fitted = np.column_stack(
-            [coordinates, np.ones(len(points))]
-        )  # a circle: a thin section shows no tilt
+        # a circle: a thin section shows no tilt
+        fitted = np.column_stack([coordinates, np.ones(len(points))])
         first = coordinates[0]
         unrolled = np.arctan2(coordinates @ np.cross(axis, first), coordinates @ first)[:, None]
     else:
@@ -370,9 +369,8 @@ def profile_error(
     )
     if not len(points):
         raise InputError("No point of the region belongs to the nominal: select a region on it.")
-    coordinates = _region_coordinates(
-        points - deviations[:, None] * normals, axes=3
-    )  # on the nominal: without noise
+    # on the nominal: without noise
+    coordinates = _region_coordinates(points - deviations[:, None] * normals, axes=3)
     smooth = smooth_deviations(deviations, points, normals, coordinates, np.zeros((len(points), 0)))
     moves = None if alignment is None else alignment.draw(np.random.default_rng(3))
 

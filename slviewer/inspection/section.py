@@ -60,9 +60,8 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     first, open ones from left to right. Raises InputError where nothing is cut.
     """
     heights = (np.asarray(vertices, np.float64) - plane.origin) @ plane.normal
-    above = (
-        heights >= 0
-    )  # what lies in the plane counts as above: every triangle is cut through two sides or none
+    # what lies in the plane counts as above: every triangle is cut through two sides or none
+    above = heights >= 0
     cut = faces[above[faces].any(axis=1) & ~above[faces].all(axis=1)]
     if not len(cut):
         raise InputError("The section's plane does not meet the surface: pick two points on it.")

@@ -172,9 +172,8 @@ def _length_budget(
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
     noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
     scatter = None if len(errors) < 2 else float(np.sqrt(max(errors.var(ddof=1) - noise**2, 0.0)))
-    uncorrected_ppm = (
-        abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0
-    )  # known, not removed
+    # known, not removed
+    uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0
     board = mm * 1e-6 * float(np.hypot(scale.u_ppm, uncorrected_ppm))
     warmth = mm * 1e-6 * artefact.expansion.ppm_per_kelvin * artefact.temperature.U_kelvin / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"

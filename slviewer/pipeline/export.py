@@ -104,9 +104,8 @@ def estimate_file_bytes(
     ``triangles`` where that is wanted; None where it is not known before."""
     if what in ("cloud", "merge"):
         return estimated_bytes(file_format, points, scalars=3 if model == "splined" else 1)
-    faces = (
-        2 * points if what == "mesh" else None
-    )  # between neighbouring pixels, all but those at borders
+    # between neighbouring pixels, all but those at borders
+    faces = 2 * points if what == "mesh" else None
     if triangles is not None:
         faces = triangles if faces is None else min(triangles, faces)
     return None if faces is None else estimated_bytes(file_format, faces // 2, faces, scalars=1)
@@ -186,12 +185,13 @@ def export(settings: ExportSettings) -> Exported:
         target = _output_path(store, what, name, settings.out, chosen)
         if what not in ("report", "table"):
             check_accepted(store, accept_rejected)
+        # reading a merge warns by itself
         if what not in (
             "report",
             "table",
             "merge",
             "merged-mesh",
-        ):  # reading a merge warns by itself
+        ):
             warn_if_stale(store, warn)
         plan, making = (
             (settings.plan or MeshingPlan()) if "mesh" in what else None,

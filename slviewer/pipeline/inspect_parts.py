@@ -77,9 +77,8 @@ def inspect_parts(
         for name in names:
             label = name if len(folders) == 1 else f"{folder.name}/{name}"
             sources.append((label, partial(load, folder, name)))
-    found = msgspec.structs.replace(
-        inspect_surfaces(read, sources, progress), inputs={}
-    )  # of several sessions
+    # of several sessions
+    found = msgspec.structs.replace(inspect_surfaces(read, sources, progress), inputs={})
     folder = Path(f"{Path(plan).with_suffix('')}-results") if out is None else out
     files = tuple(folder.absolute() / name for name in FILES)
     write_inspection(found, files)

@@ -195,9 +195,8 @@ def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     end."""
     store, names, warn = job.store, settings.names, job.warn
     if settings.out is not None:
-        Path(settings.out).parent.mkdir(
-            parents=True, exist_ok=True
-        )  # or it fails now, not after minutes
+        # or it fails now, not after minutes
+        Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(store, settings, table_deg, warn)
     check_accepted(store, settings.accept_rejected)
@@ -503,9 +502,8 @@ def _initial_alignments(
         picks[scan, onto] = pick
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
     for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
-        if all(
-            (name, base) in picks for name in names if name != base
-        ):  # pairs without picked points start there too
+        # pairs without picked points start there too
+        if all((name, base) in picks for name in names if name != base):
             poses = {base: np.eye(4)} | {
                 name: picks[name, base].T for name in names if name != base
             }

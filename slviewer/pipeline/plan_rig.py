@@ -222,9 +222,8 @@ def _simulate_plane(
     ideal = (0.0,) * 5
     column, row = rig.projector.K[:2, 2].tolist()
     focus = float(rig.to_projector(np.array([0.0, 0.0, plan.distance]))[2])
-    peak = (
-        DARK_LEVEL + (PEAK_LEVEL - DARK_LEVEL) * light.reflectance
-    )  # the renderer exposes for what it sees
+    # the renderer exposes for what it sees
+    peak = DARK_LEVEL + (PEAK_LEVEL - DARK_LEVEL) * light.reflectance
     simulated = SimulatedRig(
         SimulatedLens(size, (camera.focal_px,) * 2, ((size[0] - 1) / 2, (size[1] - 1) / 2), ideal),
         SimulatedLens(projector.size, (fx, fy), (column, row), ideal),

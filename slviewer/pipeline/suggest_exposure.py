@@ -171,9 +171,8 @@ class _Bracket:
         if gain is not None and gain > 1:
             gain = self._rig.camera.apply(CameraSettings(gain=1.0)).gain
         low, high, lit = self._examine(current_ms)
-        for _ in range(
-            _MAX_DOUBLINGS
-        ):  # of the gain, where time does not allow for the exposures that are needed
+        # of the gain, where time does not allow for the exposures that are needed
+        for _ in range(_MAX_DOUBLINGS):
             late = np.count_nonzero(low[lit] > self._longest_ms())
             if gain is None or late <= _LATE * np.count_nonzero(lit):
                 break
@@ -310,9 +309,8 @@ class _Bracket:
             look = shorter
         look = self._look(max(self._looks))
         for _ in range(_MAX_LOOKS):
-            next_ms = (
-                _STOP * look.exposure_ms
-            )  # one more than time allows for, to see what is missed
+            # one more than time allows for, to see what is missed
+            next_ms = _STOP * look.exposure_ms
             is_bright = np.mean(look.peak[self._inside] >= self._clip) > _ALL
             if is_bright or next_ms > min(_STOP * self._longest_ms(), _LONGEST_LOOK_MS):
                 break
@@ -427,9 +425,8 @@ def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
         return indices[:: len(indices) // count], True
     if layout.inverse:
         return (layout.gray[-1], layout.inverse[-1]), False
-    assert (
-        layout.white is not None and layout.black is not None
-    )  # or its layout would have been refused
+    # or its layout would have been refused
+    assert layout.white is not None and layout.black is not None
     return (layout.white, layout.black), False
 
 

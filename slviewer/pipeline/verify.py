@@ -110,9 +110,8 @@ def verify(
             {f"error_{m}": r.error_map for m, r in each.found.results.items()},
         )
         if store.is_writable and (best := chosen.get(preferred_model(store))) is not None:
-            yield _reconstruct_best(
-                store, best, each, settings
-            )  # by its own best axis, as reconstruct
+            # by its own best axis, as reconstruct
+            yield _reconstruct_best(store, best, each, settings)
 
 
 def compare_captures(

@@ -9,10 +9,11 @@ from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
 
 _CHANGE_COUNT = 8
+# share of a change that may be missing from one that has arrived, and under flicker
 _NEAR, _NEAREST = (
     0.05,
     0.4,
-)  # share of a change that may be missing from one that has arrived, and under flicker
+)
 _TIMEOUT_S = 1.2
 _STALE_TRIALS = 3
 _LONG_MS = 250.0

@@ -56,9 +56,8 @@ class Cloud:
     @property
     def mask(self) -> np.ndarray:
         """(h, w) bool: the measured pixels."""
-        with np.errstate(
-            invalid="ignore"
-        ):  # `all` along a short axis takes ten times as long as a product
+        # `all` along a short axis takes ten times as long as a product
+        with np.errstate(invalid="ignore"):
             return np.isfinite(self.points @ np.ones(3, np.float32))
 
     @property

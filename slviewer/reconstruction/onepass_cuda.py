@@ -149,9 +149,8 @@ class CudaPass(OnePass):
         if self._texture >= 0:  # the device has no use for it
             np.copyto(scan.texture, frames[self._texture])
         highest = card.fetch(scan)
-        if (
-            clip_level(frames.dtype, highest, self.sequence.full_scale) > scan.light.white
-        ):  # a camera of more bits than it seemed
+        # a camera of more bits than it seemed
+        if clip_level(frames.dtype, highest, self.sequence.full_scale) > scan.light.white:
             return self._scan_on_device(frames, replace(scan, light=self.light(frames)), repaired)
         return scan
 

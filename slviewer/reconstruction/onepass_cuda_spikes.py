@@ -14,9 +14,8 @@ from slviewer.fringe import kernels_spikes
 from slviewer.fringe.kernels_spikes import INVALID, TURN, UNCHANGED, UP, SpikeRules
 from slviewer.geometry.cuda_device import device_function
 
-cuda: Any = import_module(
-    "numba.cuda"
-)  # its own annotations are not those of what a kernel may call
+# its own annotations are not those of what a kernel may call
+cuda: Any = import_module("numba.cuda")
 
 
 def spike_kernels(
@@ -47,9 +46,8 @@ def spike_kernels(
             row = i // width
             x = i - row * width
             words[i] = UNCHANGED
-            if phase[row, x] == phase[row, x] and is_suspect(
-                phase, row, x, per_cell
-            ):  # False for NaN
+            # False for NaN
+            if phase[row, x] == phase[row, x] and is_suspect(phase, row, x, per_cell):
                 words[i] = period_change(phase, row, x, rules)
 
     @cuda.jit

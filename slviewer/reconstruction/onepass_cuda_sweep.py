@@ -32,9 +32,8 @@ from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKE
 from slviewer.fringe.layout import Layout
 from slviewer.reconstruction.onepass import PassTask
 
-cuda: Any = import_module(
-    "numba.cuda"
-)  # its own annotations are not those of what a kernel may call
+# its own annotations are not those of what a kernel may call
+cuda: Any = import_module("numba.cuda")
 
 TWO_PI = 2 * math.pi
 

@@ -29,8 +29,7 @@ class Quantity:
         unknown."""
         digits = 1 if self.unit == "%" else 3
         unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
-        value = f"{round(self.value, digits) + 0.0:.{digits}f}".replace(
-            "-", "−"
-        )  # no minus before nothing
+        # no minus before nothing
+        value = f"{round(self.value, digits) + 0.0:.{digits}f}".replace("-", "−")
         U = "" if self.U is None else f" ± {self.U:.{digits}f}"
         return f"{value}{U}{unit}{'*' if U and not self.whole else ''}"

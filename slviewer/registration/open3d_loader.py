@@ -60,9 +60,8 @@ def open3d() -> Any:
 def _uninterrupted() -> Iterator[None]:
     """Context manager: delay Ctrl-C to the end of the block, because an interrupted import of
     Open3D is reported as a missing package, or ends the process with its own messages."""
-    if (
-        threading.current_thread() is not threading.main_thread()
-    ):  # signals come to the main thread alone
+    # signals come to the main thread alone
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     came = False

@@ -129,9 +129,8 @@ def register_prepared(
             result = _refine_start(scan, reference, start, size)
         except Refused as error:
             refusal = refusal or error  # the best start's refusal says most
-            if (
-                error.reason in WORDS
-            ):  # the surfaces agree, and every other start would slide or turn as well
+            # the surfaces agree, and every other start would slide or turn as well
+            if error.reason in WORDS:
                 break
             continue
         if start.start in SEARCHED:
@@ -207,9 +206,8 @@ def _refine_start(
             2.0 * max(scan.spacing, reference.spacing),
             3.0 * _pair_noise(scan, reference),
         )
-        if (
-            markers is None
-        ):  # else it starts within a fraction of a millimetre, and a plane would slide
+        # else it starts within a fraction of a millimetre, and a plane would slide
+        if markers is None:
             loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
             T = align_icp(
                 scan.thinned(voxel * scale),

@@ -175,9 +175,8 @@ def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) ->
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     if normals is not None:
-        finite = np.nan_to_num(
-            np.asarray(normals, dtype=np.float64)
-        )  # a NaN normal weighs nothing in a voxel's mean
+        # a NaN normal weighs nothing in a voxel's mean
+        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))
         cloud.normals = o3d.utility.Vector3dVector(finite)
         cloud = cloud.voxel_down_sample(voxel)
         known = lengths(np.asarray(cloud.normals)) > 0.1

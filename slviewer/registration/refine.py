@@ -125,9 +125,8 @@ def _match_pairs(
     normal /= np.maximum(np.sqrt(np.einsum("ij,ij->i", normal, normal)), 1e-9)[:, None]
     residual = np.einsum("ij,ij->i", gap, normal)
     across = np.sqrt(np.maximum(np.einsum("ij,ij->i", gap, gap) - residual**2, 0.0))
-    is_pair &= (np.abs(residual) < gate) & (
-        across < lateral
-    )  # beyond the rim the nearest point is far across
+    # beyond the rim the nearest point is far across
+    is_pair &= (np.abs(residual) < gate) & (across < lateral)
     return (
         (points[is_pair], normal[is_pair], residual[is_pair])
         if np.count_nonzero(is_pair) >= _MIN_PAIRS

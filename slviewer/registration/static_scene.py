@@ -122,9 +122,8 @@ def register_object(
         candidate = remove_points(clouds, static)
         again = Starts(poses=alignment.T_reference_scan, markers=markers)
         refined = _try_register(candidate, reference, again, lambda share: report(0.9))
-        if (
-            refined is None
-        ):  # too few points remain of a scan: its background may be needed to determine its pose
+        # too few points remain of a scan: its background may be needed to determine its pose
+        if refined is None:
             moving, samples, static = clouds, all_samples, _no_points(clouds)
             break
         pairs = {

@@ -145,9 +145,8 @@ def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
     present = np.zeros((int(place.max()) + 1, scans), bool)
     present[place, source] = True
     turn = (at // FINER).sum(axis=1) % np.maximum(present[place].sum(axis=1), 1)
-    rank = (
-        np.cumsum(present, axis=1) - 1
-    )  # the how-manieth of the scans that are present each one is
+    # the how-manieth of the scans that are present each one is
+    rank = np.cumsum(present, axis=1) - 1
     return np.flatnonzero(rank[place, source] == turn)
 
 

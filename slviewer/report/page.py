@@ -182,9 +182,8 @@ def _render(
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: (
-            escape_controls(value) if type(value) is str else value
-        ),  # not of Markup
+        # not of Markup
+        finalize=lambda value: escape_controls(value) if type(value) is str else value,
     )
     environment.tests["figure"] = lambda item: isinstance(item, Figure)
     environment.tests["table"] = lambda item: isinstance(item, Table)

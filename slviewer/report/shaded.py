@@ -73,9 +73,8 @@ def render_points(
     sigma = float(np.clip(0.7 * np.sqrt(covered / max(occupied.sum(), 1)), 0.6, 5.0))
     reach = 2 * int(np.ceil(1.5 * sigma)) + 1
     nearest = cv2.erode(depth.reshape(height, width), np.ones((reach, reach), np.uint8)).ravel()
-    front = (
-        z <= nearest[index] + 2.5 * reach / scale
-    )  # behind the front, noise in depth decides nothing
+    # behind the front, noise in depth decides nothing
+    front = z <= nearest[index] + 2.5 * reach / scale
     layers = [
         np.bincount(index[front], weights, cells)
         for weights in (*colours[front].T, np.ones(front.sum()))

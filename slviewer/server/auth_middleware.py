@@ -95,9 +95,8 @@ class AuthMiddleware:
         path, _, _ = request.path.partition("?")
         if not _PATH.fullmatch(path):
             raise Refusal(HTTPStatus.NOT_FOUND, "There is nothing here.")
-        if (
-            "?" in request.path
-        ):  # some parameters make viser's page load messages, and so code, from elsewhere
+        # some parameters make viser's page load messages, and so code, from elsewhere
+        if "?" in request.path:
             raise Refusal(HTTPStatus.BAD_REQUEST, "This address takes no parameters.")
         if (
             not websocket
@@ -109,9 +108,8 @@ class AuthMiddleware:
         if websocket:
             self._check_websocket(request, grant, rest)
             return None
-        if (
-            rest == "favicon.ico"
-        ):  # asked for by the page of "/" too, which so learns whether its cookie is valid
+        # asked for by the page of "/" too, which so learns whether its cookie is valid
+        if rest == "favicon.ico":
             return respond(HTTPStatus.NO_CONTENT)
         if grant.role in DEVICE_PATHS.values():
             if rest or grant.role not in self.device_pages:
@@ -134,10 +132,11 @@ class AuthMiddleware:
         """Return the response that needs no cookie; None where the path needs one."""
         if path == "/":
             return self._show_login(host)
+        # browsers ask for the icon by themselves, and would report its absence
         if path in (
             "/favicon.ico",
             HEALTH,
-        ):  # browsers ask for the icon by themselves, and would report its absence
+        ):
             return respond(HTTPStatus.NO_CONTENT)
         return self._log_in(connection, request) if path == LOGIN else None
 

@@ -45,9 +45,8 @@ def network_address() -> str | None:
     without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         try:
-            sock.connect(
-                ("192.0.2.1", 9)
-            )  # an address for documentation (RFC 5737); nothing is sent
+            # an address for documentation (RFC 5737); nothing is sent
+            sock.connect(("192.0.2.1", 9))
         except OSError:
             return None
         return str(sock.getsockname()[0])

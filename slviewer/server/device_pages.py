@@ -53,9 +53,8 @@ async def _talk(connection: ServerConnection, channel: PageChannel[Any]) -> None
 
     def send(message: bytes | None) -> None:
         """Queue a message to the page; None: close the connection."""
-        with contextlib.suppress(
-            RuntimeError
-        ):  # the server has stopped, and the page is gone with it
+        # the server has stopped, and the page is gone with it
+        with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(outbox.put_nowait, message)
 
     async def write() -> None:

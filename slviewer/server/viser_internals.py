@@ -142,9 +142,8 @@ def decode_message(raw: bytes) -> Message | None:
         fields = msgspec.msgpack.decode(raw)
         kind = FROM_CLIENTS[fields.pop("type")]
         known = {field.name for field in dataclasses.fields(kind)}
-        return (
-            msgspec.convert(fields, kind) if fields.keys() <= known else None
-        )  # viser fails on unknown fields
+        # viser fails on unknown fields
+        return msgspec.convert(fields, kind) if fields.keys() <= known else None
     except (msgspec.MsgspecError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 

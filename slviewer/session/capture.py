@@ -75,9 +75,8 @@ class Capture:
     # of frames, exposures, texture, sequence: equal where every result computed from them is equal
     hash: str
     folder: Path
-    meta: dict[str, Any] = field(
-        repr=False, compare=False
-    )  # content of capture.json: source, settings, board, ...
+    # content of capture.json: source, settings, board, ...
+    meta: dict[str, Any] = field(repr=False, compare=False)
 
     @property
     def frames(self) -> np.ndarray:
@@ -393,9 +392,8 @@ def _verify_once(folder: Path, content_hash: str, identity: object) -> None:
     """Verify a capture whose frames have no checksums, once a process while its files stay the
     same."""
     capture = read_capture(folder)
-    if (
-        capture.hash == content_hash
-    ):  # else it is being replaced, which the reader of the frames reports
+    # else it is being replaced, which the reader of the frames reports
+    if capture.hash == content_hash:
         capture.verify()
 
 

@@ -21,9 +21,8 @@ class WriterLock:
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._lock = FileLock(
-            folder / ".lock", thread_local=False
-        )  # closed by another thread than opened it
+        # closed by another thread than opened it
+        self._lock = FileLock(folder / ".lock", thread_local=False)
         self._holder = folder / ".lock-holder"
 
     def acquire(self, patience_s: float = _PATIENCE_S) -> None:

@@ -184,9 +184,8 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
             " again, as triangles"
         ) from error
     declared = re.search(rb"element face (\d{1,12})\b", data[:65536]) if form == "ply" else None
-    if declared and len(faces) < int(
-        declared[1]
-    ):  # a text that breaks off is read as far as it goes
+    # a text that breaks off is read as far as it goes
+    if declared and len(faces) < int(declared[1]):
         raise SessionError(
             f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read;"
             " export the model again"
@@ -267,9 +266,8 @@ def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
         mixed = (mixed ^ column) * np.uint64(11400714819323198485)
         mixed ^= mixed >> np.uint64(29)
     _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-    if not np.array_equal(
-        rounded[first[inverse]], rounded, equal_nan=True
-    ):  # two points share a hash: all are kept
+    # two points share a hash: all are kept
+    if not np.array_equal(rounded[first[inverse]], rounded, equal_nan=True):
         return vertices, faces
     return vertices[first], inverse[faces]
 
@@ -334,13 +332,11 @@ def _orient_faces(
     order = np.argsort(keys, kind="stable")
     sides = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(keys[order]) != 0, [True]])))
     closed, manifold = bool((sides == 2).all()), bool((sides <= 2).all())
-    pair = np.flatnonzero(
-        np.diff(keys[order]) == 0
-    )  # of a manifold: the places of each edge that two faces share
+    # of a manifold: the places of each edge that two faces share
+    pair = np.flatnonzero(np.diff(keys[order]) == 0)
     one, other = order[pair], order[pair + 1]
-    alike = (
-        forward[one] == forward[other]
-    )  # neighbours that turn alike run along their side in opposite directions
+    # neighbours that turn alike run along their side in opposite directions
+    alike = forward[one] == forward[other]
     if alike.any():
         turned = _turn_alike(vertices, faces, one // 3, other // 3, alike) if manifold else None
         if turned is None:
@@ -382,9 +378,8 @@ def _turn_alike(
         return None
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    kept = np.bincount(
-        as_is, area, int(labels.max()) + 1
-    )  # area that an orientation leaves as it is
+    # area that an orientation leaves as it is
+    kept = np.bincount(as_is, area, int(labels.max()) + 1)
     wrong = kept[as_is] < kept[turned]
     wrong |= (kept[as_is] == kept[turned]) & (as_is > turned)
     return np.where(wrong[:, None], faces[:, ::-1], faces)

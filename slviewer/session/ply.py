@@ -53,9 +53,8 @@ def write_ply(
     """
     points = np.asarray(points)
     fields = _vertex_fields(points, colours, normals, dict(scalars or {}))
-    vertex = np.dtype(
-        [("+".join(names), code, (len(names),)) for names, code, _ in fields]
-    )  # grouped: written faster
+    # grouped: written faster
+    vertex = np.dtype([("+".join(names), code, (len(names),)) for names, code, _ in fields])
     types = {code: name for name, code in TYPES.items()}
     header = ["ply", "format binary_little_endian 1.0", "comment slviewer: units mm"]
     header += [

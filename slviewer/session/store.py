@@ -90,9 +90,8 @@ class Session(Decisions):
         try:
             if session._lock is not None:
                 session._lock.acquire()
-                layout.session_folder(
-                    path
-                )  # its creator may have removed it before the lock was taken
+                # its creator may have removed it before the lock was taken
+                layout.session_folder(path)
             session._recover()
         except BaseException:
             session.close()
@@ -442,10 +441,11 @@ class Session(Decisions):
         folder = self._result_folder(name)
         if name in known or not (folder / "meta.json").is_file():
             return known.get(name, "absent")
+        # while it is examined, or if that fails
         inputs, known[name] = (
             read_meta(folder).get("inputs", {}),
             "stale",
-        )  # while it is examined, or if that fails
+        )
         with contextlib.suppress(DamagedError, InputError):
             for other, used in inputs.items():
                 changed = used not in (self._hashes(other) or [""]) or depth == _MAX_INPUTS_CHAIN

@@ -43,9 +43,8 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
             length = math.sqrt(1 + zx * zx + zy * zy)
             xy[i, j, 0], xy[i, j, 1] = x, y
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = depth * r, depth * s, depth
-            for k in range(
-                3
-            ):  # (zx, zy, -1) looks back at the camera, because the board's z points away from it
+            # (zx, zy, -1) looks back at the camera, because the board's z points away from it
+            for k in range(3):
                 n = rotation[k, 0] * zx + rotation[k, 1] * zy - rotation[k, 2]
                 normals[i, j, k] = n / length if depth > 0 else np.nan
     return xy, points, normals

@@ -110,9 +110,8 @@ class ConcaveScene(MeshScene):
         corners, normal = self._corners, self._normals_and_areas[0]
         k = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
         a, b = (each.ravel()[:, None] for each in np.meshgrid(k, k))
-        weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])[
-            ..., 0
-        ]  # (4, samples)
+        # (4, samples)
+        weights = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b])[..., 0]
         points = np.einsum("mkd,ks->msd", corners, weights)
         way = rig.projector_centre - points
         distance = np.linalg.norm(way, axis=-1)
@@ -199,9 +198,8 @@ class ConcaveScene(MeshScene):
         their distance."""
         area, middle = self._normals_and_areas[1], self._corners.mean(axis=1)
         distance = np.linalg.norm(self.placed[:, None] - middle[None], axis=-1)
-        length = (
-            self.indirect.reach_mm / 2
-        )  # the mean distance of exp(-r / length) over a plane is twice its length
+        # the mean distance of exp(-r / length) over a plane is twice its length
+        length = self.indirect.reach_mm / 2
         return (area / (2 * np.pi * length**2) * np.exp(-distance / length)).astype(np.float32)
 
 

@@ -92,9 +92,8 @@ def _project_point(x, y, numbers, waves):
     fx, fy, cx, cy, k1, k2, p1, p2, k3, scale = numbers
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (
-        k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    )  # d radial / d r2, twice: times x or y it is d radial / dx or dy
+    # d radial / d r2, twice: times x or y it is d radial / dx or dy
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
     u = cx + fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x))
     v = cy + fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
     ux = fx * (radial + x * x * slope + 2 * p1 * y + 6 * p2 * x)
@@ -152,9 +151,8 @@ def _undistort_kernel(pixels, numbers, waves):
             x += (vy * du - uy * dv) / determinant
             y += (ux * dv - vx * du) / determinant
             error = abs(du) + abs(dv)
-            if (
-                not error > 1e-6
-            ):  # the step just taken squares this: 1e-12 px and better; also leaves on NaN
+            # the step just taken squares this: 1e-12 px and better; also leaves on NaN
+            if not error > 1e-6:
                 break
         if error <= 1e-6:
             out[i, 0], out[i, 1] = x, y

@@ -92,9 +92,8 @@ class MeshScene:
         """Unit normals (n, 3) of the vertices in the camera frame, averaged over triangles by
         area."""
         corners = self.placed[self.triangles]
-        flat = np.cross(
-            corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        )  # twice the area: a fair weight
+        # twice the area: a fair weight
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals = np.zeros_like(self.placed)
         for k in range(3):
             np.add.at(normals, self.triangles[:, k], flat)

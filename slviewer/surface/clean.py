@@ -53,9 +53,8 @@ def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels
         bool
     )
     edges = int(mask.sum() - inside.sum())
-    facing = inside & (
-        np.abs(viewing_cosines(cloud.points, normals)) > MIN_VIEWING_COSINE
-    )  # False for NaN
+    # False for NaN
+    facing = inside & (np.abs(viewing_cosines(cloud.points, normals)) > MIN_VIEWING_COSINE)
     grazing = int(inside.sum() - facing.sum())
     grouped = _select_large_groups(facing)
     surface = grouped & ~detect_far_clusters(cloud.points, grouped)

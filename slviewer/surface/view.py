@@ -149,9 +149,8 @@ def _fill_noise(
         ratio = np.abs(bend / shape[1:-1, 1:-1])
         # of five equal, independent errors the difference has the standard deviation sqrt(1.25)
         scale = 1.4826 / np.sqrt(1.25) * float(np.nanmedian(ratio))
-    scale = max(
-        scale, 1e-7 / float(np.nanmedian(z))
-    )  # positive for a perfect plane too, as weights divide by it
+    # positive for a perfect plane too, as weights divide by it
+    scale = max(scale, 1e-7 / float(np.nanmedian(z)))
     return np.where(known, sigma_z, scale * shape)
 
 

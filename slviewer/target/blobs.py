@@ -118,9 +118,8 @@ def _select_ellipses(mask: np.ndarray, inverted: bool) -> Blobs:
     du, dv = u - centres[label, 0], v - centres[label, 1]
     label, n = number[label], area[plausible].astype(float)
     covariances = np.empty((count, 2, 2))
-    covariances[:, 0, 0] = (
-        np.bincount(label, du * du, count) / n + 1 / 12
-    )  # a pixel is a square, not a point
+    # a pixel is a square, not a point
+    covariances[:, 0, 0] = np.bincount(label, du * du, count) / n + 1 / 12
     covariances[:, 1, 1] = np.bincount(label, dv * dv, count) / n + 1 / 12
     covariances[:, 0, 1] = covariances[:, 1, 0] = np.bincount(label, du * dv, count) / n
     blobs = Blobs(centres[plausible], n, covariances, inverted)

@@ -102,9 +102,8 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
                 du, dv = column - u, row - v
                 square = (yy * du * du - 2 * xy * du * dv + xx * dv * dv) / (4 * determinant)
                 radius = np.sqrt(max(square, 0.0))  # 1 on the edge
-                beyond = np.sqrt(du * du + dv * dv) * (
-                    1 - 1 / max(radius, 1e-6)
-                )  # px from the edge, outwards
+                # px from the edge, outwards
+                beyond = np.sqrt(du * du + dv * dv) * (1 - 1 / max(radius, 1e-6))
                 place[0, i], place[1, i], level[i] = du, dv, image[row, column]
                 within[i], ring[i], core[i] = (
                     beyond < soft,

@@ -324,9 +324,8 @@ def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None
     height, width = image.grey.shape
     gaps = {"left": centres[:, 0].min(), "right": width - 1 - centres[:, 0].max()}
     gaps |= {"upper": centres[:, 1].min(), "lower": height - 1 - centres[:, 1].max()}
-    sides = [
-        side for side, gap in gaps.items() if gap < 1.5 * spacing
-    ]  # a circle that the border cuts is not detected
+    # a circle that the border cuts is not detected
+    sides = [side for side, gap in gaps.items() if gap < 1.5 * spacing]
     if sides:
         facts.append(f"up to the {' and the '.join(sides)} border of the image")
     return f"{', '.join(facts)}: {light_advice(image.grey)}"

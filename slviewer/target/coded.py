@@ -95,10 +95,11 @@ def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats 
         for k in range(4):
             before, after = sides[k - 1], sides[k]
             assert before is not None and after is not None
+            # places and directions of the sides at their common corner
             (p, d), (q, e) = (
                 before[1],
                 after[0],
-            )  # places and directions of the sides at their common corner
+            )
             along = np.linalg.lstsq(np.stack([d, -e], axis=1), q - p, rcond=None)[0]
             meeting.append(p + along[0] * d)
         quad = np.array(meeting)

@@ -158,9 +158,8 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.n
     _, near = tree.query(centres, k=min(NEIGHBOURS, len(centres)))
     near = near[:, 1:]
     alike = np.abs(np.log(areas[near] / areas[:, None])) < np.log(AREA_RATIO)
-    first = np.argsort(~alike, axis=1, kind="stable")[
-        :, :8
-    ]  # the nearest eight of its size, ignoring others between
+    # the nearest eight of its size, ignoring others between
+    first = np.argsort(~alike, axis=1, kind="stable")[:, :8]
     near, alike = np.take_along_axis(near, first, axis=1), np.take_along_axis(alike, first, axis=1)
     step = centres[near] - centres[:, None]
     length = np.linalg.norm(step, axis=2)

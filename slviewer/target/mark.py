@@ -169,9 +169,8 @@ def _measure_profile(
     share = np.nan_to_num((paper - levels) / difference, nan=0.0)
     middle = float(np.median(ring))
     is_alone = bool(np.abs(ring - middle).max() < 0.5 * abs(difference))
-    ink = (
-        np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]
-    )  # weighted by the area of each sample
+    # weighted by the area of each sample
+    ink = np.clip(share, 0.0, 1.0) * (_RADII < 1.9)[:, None] * _RADII[:, None]
     centroid = np.einsum("ra,r,ac->c", ink, _RADII, directions) / max(float(ink.sum()), 1e-9)
     means = share.mean(axis=1) / max(float(share[:2].mean()), 1e-9)
     below = np.nonzero(means < 0.5)[0]

@@ -73,9 +73,8 @@ def _fit_corners(
     """
     n = len(offset)
     q = np.zeros((n, 9))
-    q[:, 2:4] = np.arctan2(
-        to_px[:, 0], -to_px[:, 1]
-    )  # an edge along (a, b) has its normal along (-b, a)
+    # an edge along (a, b) has its normal along (-b, a)
+    q[:, 2:4] = np.arctan2(to_px[:, 0], -to_px[:, 1])
     q[:, 4] = 1.0
     q[:, 5] = (weight * grey).sum(1) / np.maximum(weight.sum(1), 1)
     q[:, 8] = 0.1

@@ -187,9 +187,8 @@ def _time_kernel(
         marks[2].record(card.stream)
         card.stream.synchronize()
         durations.append((marks[0].elapsed_time(marks[1]), marks[1].elapsed_time(marks[2])))
-    copied, swept = (
-        max(1e-3 * statistics.median(ms), 1e-9) for ms in zip(*durations, strict=True)
-    )  # simulators return 0
+    # simulators return 0
+    copied, swept = (max(1e-3 * statistics.median(ms), 1e-9) for ms in zip(*durations, strict=True))
     return swept, copied, card.bytes_moved
 
 

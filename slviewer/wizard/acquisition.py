@@ -346,9 +346,8 @@ class Acquisition:
             if settings is None:
                 self._applied = actual
                 with self._condition:
-                    self._settings = (
-                        self._settings or actual
-                    )  # another thread may have set it meanwhile
+                    # another thread may have set it meanwhile
+                    self._settings = self._settings or actual
             notes = (
                 *list_notes(rig.camera),
                 *list_changed_settings(rig.camera, settings or actual, actual),

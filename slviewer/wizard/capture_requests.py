@@ -105,10 +105,11 @@ class CaptureRequests(ResultRequests):
             follow()
             engine.publisher.mark_changed(session=True)
             if bench is not None and bench.reel is not None:
+                # the next recording may lack these
                 if engine.acquisition.view().light in (
                     "dark",
                     "pattern",
-                ):  # the next recording may lack these
+                ):
                     engine.acquisition.set_light("white")
                 bench.reel.wind_on()
 

@@ -83,9 +83,8 @@ def write_bundle(
         bundle.writestr("state.json", hide_passwords(to_json(_summarise_state(snapshot)).decode()))
         bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
         for file in ("session.json", "decisions.json"):
-            with suppress(
-                OSError
-            ):  # whatever it holds: a damaged one may be the reason for the report
+            # whatever it holds: a damaged one may be the reason for the report
+            with suppress(OSError):
                 content = read_file(session.folder / file, MAX_JSON_BYTES)
                 bundle.writestr(f"session/{file}", hide_passwords(content.decode(errors="replace")))
         report(0.4, "captures and results")

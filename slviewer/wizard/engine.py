@@ -81,15 +81,15 @@ class Engine:
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
         self._reader: SessionReader | None = None
-        self._queued: set[tuple[str, str, str]] = (
-            set()
-        )  # captures by name and content hash, and the target
+        # captures by name and content hash, and the target
+        self._queued: set[tuple[str, str, str]] = set()
         self._brightness: Brightness = ""
         # the publisher's thread alone writes these:
+        # a session, and whether its poses were enough
         self._reached: tuple[Path | None, bool] = (
             None,
             False,
-        )  # a session, and whether its poses were enough
+        )
         self._failed_reads, self._reported_faults = 0, set[str]()
         empty = Snapshot(
             0, None, RigView(), None, None, (), views(Facts(None, RigView(), None)), None, False, ""
@@ -210,11 +210,12 @@ class Engine:
             if store is not None and known != dict(choice):
                 self._remember(store, "rig", dict(choice))
             if store is not None and not same:
+                # those of another camera do not apply
                 for decision in (
                     "exposure",
                     "exposures",
                     "levels",
-                ):  # those of another camera do not apply
+                ):
                     self._remember(store, decision, None)
             exposure = store.valid_decision("exposure") if store is not None else None
             exposure = exposure or {

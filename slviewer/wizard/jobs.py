@@ -78,9 +78,8 @@ class Reporter:
     def within(self, start: float, end: float) -> "Reporter":
         """Return a reporter for one part of the work, which maps its shares 0 ... 1 to `start` ...
         `end`."""
-        return _PartReporter(
-            self, start, min(end, 0.999)
-        )  # the last report is the whole work's own
+        # the last report is the whole work's own
+        return _PartReporter(self, start, min(end, 0.999))
 
     @property
     def cancelled(self) -> bool:

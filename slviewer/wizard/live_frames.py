@@ -60,9 +60,8 @@ class Stream:
             settle(rig)
             rig.camera.grab(frames[k])
         else:
-            rig.projector.show(
-                count - 1
-            )  # a change during this exposure is reported at the next call
+            # a change during this exposure is reported at the next call
+            rig.projector.show(count - 1)
             last = frames[-1].copy()
             self._store_newest(LiveCapture(frames, begun, settings))
             return last

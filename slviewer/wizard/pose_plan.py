@@ -160,7 +160,8 @@ def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
     except (
         InputError,
         np.linalg.LinAlgError,
-    ):  # devices that share no view: better coverage may repair it
+    ):
+        # devices that share no view: better coverage may repair it
         guidance = None
     if guidance is None:
         return _plan_by_coverage(given, rig.camera, known)

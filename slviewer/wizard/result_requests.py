@@ -82,9 +82,8 @@ class ResultRequests(RequestHandler):
         def failed(error: BaseException) -> None:
             """Report why the calibration failed, and mark the session as changed."""
             engine.notices.add_failure("Calibrating", error)
-            engine.publisher.mark_changed(
-                session=True
-            )  # a rejected calibration is saved, to be inspected
+            # a rejected calibration is saved, to be inspected
+            engine.publisher.mark_changed(session=True)
 
         settings = CalibrateSettings(target, models, replace_all=True)
         self._run("Calibrating", calibrate, settings, "calibration", failed)

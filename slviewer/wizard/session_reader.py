@@ -346,9 +346,8 @@ class SessionReader:
             if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
                 return "used", ""
             why = calibration.stereo.excluded.get(pose.name, "")
-            if why and not why.startswith(
-                "excluded by the operator"
-            ):  # such a pose was included again since
+            # such a pose was included again since
+            if why and not why.startswith("excluded by the operator"):
                 return "unused", why
         return "good", ""
 
@@ -474,9 +473,8 @@ class SessionReader:
             labels = self.session.valid_decision(record.labels) or {}
             return Stored(name, str(labels.get(name) or record.label(name)), record, stale)
 
-        kinds = sorted(
-            RECORDS, key=lambda kind: kind == Measurement.kind
-        )  # which are made from merges
+        # which are made from merges
+        kinds = sorted(RECORDS, key=lambda kind: kind == Measurement.kind)
         names = [name for kind in kinds for name in self._list_results(f"{kind}/")]
         records = [self._attempt(name, partial(read, name), None) for name in names]
         return tuple(record for record in records if record is not None)

@@ -58,9 +58,8 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
     sizes = true.camera.size, true.projector.size
     assert estimate_rig(*zip(*seen[:2], strict=True), sizes) is None
     points, camera, projector = (list(a) for a in zip(*seen[:4], strict=True))
-    assert (
-        estimate_rig(points, camera, projector[1:] + projector[:1], sizes) is None
-    )  # of other poses
+    # of other poses
+    assert estimate_rig(points, camera, projector[1:] + projector[:1], sizes) is None
 
 
 @pytest.mark.computes

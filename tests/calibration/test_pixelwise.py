@@ -57,9 +57,8 @@ def test_depth_inside_and_outside_the_calibrated_range(
     error = (measured - truth)[seen]
     rms = np.sqrt(np.nanmean(error[:, 2] ** 2))
     assert 1e-4 < rms < limit
-    assert (
-        np.sqrt(np.nanmean(error[:, :2] ** 2)) < 0.15
-    )  # the gauge: a principal point some tenths of a pixel off
+    # the gauge: a principal point some tenths of a pixel off
+    assert np.sqrt(np.nanmean(error[:, :2] ** 2)) < 0.15
 
 
 def test_fit_rms_is_kept_in_z_x_and_y(model: PixelwiseModel) -> None:

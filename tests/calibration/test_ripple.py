@@ -62,9 +62,8 @@ def test_a_ripple_is_measured_beside_what_lenses_leave(seen, stereo, waves: int)
     clean = measure_ripple(seen, stereo)
     assert set(clean) == {"x", "y"} and max(r.rms_px for r in clean.values()) < 0.5 * SAMPLE_PX
     depth = clean["x"].depth_mm
-    pinhole = depth**2 / (
-        stereo.rig.projector.K[0, 0] * np.linalg.norm(rig(seed=2).t)
-    )  # dz / du = z^2 / (f b)
+    # dz / du = z^2 / (f b)
+    pinhole = depth**2 / (stereo.rig.projector.K[0, 0] * np.linalg.norm(rig(seed=2).t))
     assert 500 < depth < 700 and clean["x"].mm_per_px == pytest.approx(pinhole, rel=0.25)
     for found in measure_ripple([with_ripple(o, 0.05, waves) for o in seen], stereo).values():
         assert found.waves == waves and found.noise_px == pytest.approx(SAMPLE_PX)

@@ -27,10 +27,11 @@ def test_the_grid_is_added_between_its_eight_nodes(layers: int, step: int) -> No
     z = np.full(width, 500.0, np.float32)
     outside = rng.random(width) < 0.2
     cell[outside], z[outside] = -1, np.nan
+    # a grid cell that measures nothing
     cell[2 * step : 3 * step], z[2 * step : 3 * step] = (
         -1,
         np.nan,
-    )  # a grid cell that measures nothing
+    )
     given = z.copy()
     _corrected(z, cell, rest, grid, step, row)
     seen = cell >= 0

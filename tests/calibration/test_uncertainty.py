@@ -230,9 +230,8 @@ def test_what_is_fitted_is_as_sure_as_the_calibrations_covariance_says(model) ->
     volume = working_volume(model.rig, bundle.depth_range_mm, columns=5, rows=4, depths=3)
     supported = volume.supported(model.rig, *illuminated(model))
     inside = np.argsort(np.linalg.norm(volume.points - volume.points.mean(axis=0), axis=1))
-    two = inside[supported[inside]][
-        :2
-    ]  # well inside: at the rim, rounding decides on which side a place lies
+    # well inside: at the rim, rounding decides on which side a place lies
+    two = inside[supported[inside]][:2]
     pixels, z, points = (each[two] for each in (volume.pixels, volume.z, volume.points))
     shared = splined_shared(bundle, "x")
     ends = [

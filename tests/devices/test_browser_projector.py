@@ -93,9 +93,8 @@ def test_one_window_is_the_projector_until_another_is_asked_for():
     first = channel.connect(hello("a"), sent["first"].append)
     assert channel.page_state().state == "ready" and channel.page_state().size == (1920, 1080)
     assert channel.connect(hello("b"), sent["other"].append) is None and sent["other"] == []
-    again = channel.connect(
-        hello("a"), sent["again"].append
-    )  # reloaded, its old connection not yet gone
+    # reloaded, its old connection not yet gone
+    again = channel.connect(hello("a"), sent["again"].append)
     assert sent["first"][-1] is None and not missing_facts(first.gone, "reloaded")
     channel.disconnect(first)
     assert channel.page() is again

@@ -117,9 +117,8 @@ def test_a_hundred_frames_fill_the_array_they_are_given(camera):
     places = np.array([column(frame) for frame in frames])
     steps = np.abs(np.diff(places))
     assert places.min() >= 9.5 and places.max() <= 390.5
-    assert (
-        np.median(steps) >= IN_FLIGHT + 1
-    )  # no two are the same, and none had begun before the call
+    # no two are the same, and none had begun before the call
+    assert np.median(steps) >= IN_FLIGHT + 1
     assert (steps >= IN_FLIGHT + 1).mean() > 0.9  # where it turns, it may come back to where it was
     assert len({frame.tobytes() for frame in frames}) > 80
 

@@ -199,9 +199,8 @@ def rhythm(times: list[float], busy: float = 0.0) -> tuple[list[float | None], P
 
 def test_a_flood_after_a_pause_does_not_look_like_a_rhythm():
     steady = [k / 30 for k in range(60)]
-    flood = [
-        steady[-1] + 3 + k / 500 for k in range(90)
-    ]  # what 3 s of 30 pictures have left in the buffers
+    # what 3 s of 30 pictures have left in the buffers
+    flood = [steady[-1] + 3 + k / 500 for k in range(90)]
     after = [flood[-1] + (k + 1) / 30 for k in range(30)]
     periods, _ = rhythm(steady + flood + after)
     assert periods[:3] == [None] * 3

@@ -39,9 +39,8 @@ def test_a_sequence_is_taken_in_every_exposure_the_shortest_first():
     assert taken.exposures_ms == (0.5, 4.0) and taken.texture is None
     assert taken.frames.shape == (2 * N, 120, 160)
     short, long = taken.frames[:N].astype(float), taken.frames[N:]
-    clear = (long < 250) & (
-        long > 100
-    )  # chosen by one, measured by both: no pixel is there for its noise
+    # chosen by one, measured by both: no pixel is there for its noise
+    clear = (long < 250) & (long > 100)
     assert (long[clear] - 3.0).mean() / (short[clear] - 3.0).mean() == pytest.approx(8, rel=0.05)
     assert (
         seen[0] == (0, 2 * N)

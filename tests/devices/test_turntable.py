@@ -115,9 +115,8 @@ def broken(dialect: Any, fault: Fault) -> str:
             table.turn_to(60.0, give_up)
         if fault in ("stuck", "alarm"):  # it does not turn on unattended, and nothing unlocks it
             stop = "cancel" if dialect == "grbl" else "M410"
-            assert until(
-                lambda: stop in controller.received
-            )  # perhaps after the driver has given up
+            # perhaps after the driver has given up
+            assert until(lambda: stop in controller.received)
         assert not any("$X" in line for line in controller.received)
         table.close()
     return str(raised.value)

@@ -118,9 +118,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, few_cells: None) -> Path
         patch.chdir(folder)
         Path("my-rig.toml").write_text(RIG)
         with pytest.MonkeyPatch.context() as fewer:
-            fewer.setattr(
-                simulation, "turning", lambda: dict(list(turning().items())[:3])
-            )  # those that the pages name
+            # those that the pages name
+            fewer.setattr(simulation, "turning", lambda: dict(list(turning().items())[:3]))
             run("slviewer simulate my-session --preset turn --poses 8 --scale 0.15")
         with Session.open("my-session", write=True) as session:
             sequence = session.load_capture("object_r1").sequence

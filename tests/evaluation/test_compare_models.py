@@ -146,9 +146,8 @@ def test_the_letters_means_follow_from_its_rows() -> None:
         radii = [getattr(row, f"{name}_radius_mm") for row in letter.TABLE_2]
         assert rms == pytest.approx(letter.TABLE_2_MEAN_MM[k], abs=6e-4)
         assert np.mean(radii) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][0], abs=1e-3)
-        assert np.std(radii, ddof=1) == pytest.approx(
-            letter.TABLE_2_RADIUS_MM[k][1], abs=2e-3
-        )  # rows have 2 decimals
+        # rows have 2 decimals
+        assert np.std(radii, ddof=1) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][1], abs=2e-3)
 
 
 def test_tables_show_the_letters_figures_beside_ours(
@@ -212,9 +211,8 @@ def test_a_plane_that_is_a_minor_part_of_the_scene_is_told_with_its_place() -> N
     rows, columns = (np.flatnonzero(result.region.any(axis=axis)) for axis in (1, 0))
     assert missing_facts(result.region_text(), columns[0], columns[-1], rows[0], rows[-1]) == []
     given = fit_clouds("plane", {"stereo": seen(points, "stereo")}, region=board)
-    assert all(
-        missing_facts(warning, given.region_text()) for warning in given.warnings
-    )  # it was not searched for
+    # it was not searched for
+    assert all(missing_facts(warning, given.region_text()) for warning in given.warnings)
 
 
 def test_an_rms_far_above_the_floor_by_every_model_is_told() -> None:

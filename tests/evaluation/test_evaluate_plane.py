@@ -20,9 +20,8 @@ def along_normal(points: np.ndarray, normal: np.ndarray, sigma_z: float) -> floa
 def test_the_plane_and_its_noise_are_found_in_a_whole_cloud() -> None:
     points, board = board_before_a_wall(SIGMA)
     result = evaluate_plane(points, None, np.full(points.shape[:2], SIGMA, np.float32))
-    truth = np.array([0.2, -0.1, -1.0]) / np.sqrt(
-        1.05
-    )  # z = 600 + 0.2 x - 0.1 y, towards the camera
+    # z = 600 + 0.2 x - 0.1 y, towards the camera
+    truth = np.array([0.2, -0.1, -1.0]) / np.sqrt(1.05)
     assert np.degrees(np.arccos(result.plane.normal @ truth)) < 0.01
     assert result.points > 0.95 * board.sum()
     assert not np.isfinite(result.error_map[~board]).any()
@@ -36,9 +35,8 @@ def test_the_plane_and_its_noise_are_found_in_a_whole_cloud() -> None:
 def test_noise_that_differs_from_pixel_to_pixel_has_its_own_floor() -> None:
     sigma = np.linspace(0.03, 0.12, 400)[None].repeat(300, axis=0)
     result = evaluate_plane(cloud(plane_depth(), sigma), np.ones((300, 400), bool), sigma)
-    assert result.noise_floor_mm == pytest.approx(
-        0.079 * 0.97, rel=0.05
-    )  # root mean square, on a slanted plane
+    # root mean square, on a slanted plane
+    assert result.noise_floor_mm == pytest.approx(0.079 * 0.97, rel=0.05)
     assert result.rms_mm == pytest.approx(result.noise_floor_mm, rel=0.02)
 
 
@@ -86,9 +84,8 @@ def test_a_bow_of_half_a_millimetre_is_not_flattened() -> None:
     result = evaluate_plane(cloud(plane_depth() - bow, 0.02), None)
     inner = bow[2:-2, 2:-2]
     assert result.excluded == 0
-    assert result.rms_mm == pytest.approx(
-        np.std(inner) * 0.976, rel=0.06
-    )  # 0.976: the plane's slant
+    # 0.976: the plane's slant
+    assert result.rms_mm == pytest.approx(np.std(inner) * 0.976, rel=0.06)
 
 
 def test_a_bent_corner_stays_in_the_region() -> None:

@@ -21,9 +21,8 @@ def sphere_before_a_wall(sigma_z: float = SIGMA) -> tuple[np.ndarray, np.ndarray
 def test_radius_and_noise_are_found_in_a_whole_cloud(radius: float | None) -> None:
     points, hit = sphere_before_a_wall()
     result = evaluate_sphere(points, None, np.full(points.shape[:2], SIGMA), radius)
-    assert result.radius_mm == pytest.approx(
-        RADIUS, abs=0.01
-    )  # a radius handed in does not hold the fit
+    # a radius handed in does not hold the fit
+    assert result.radius_mm == pytest.approx(RADIUS, abs=0.01)
     assert np.linalg.norm(result.sphere.centre - CENTRE) < 0.02
     assert 0.9 * hit.sum() < result.points <= hit.sum()
     assert 0.4 * SIGMA < result.rms_mm < SIGMA

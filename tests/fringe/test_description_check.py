@@ -182,9 +182,8 @@ def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
             decode(sequence, stack.copy(), axis).coordinate for stack in (frames, brighter)
         )
         assert np.isfinite(seen).sum() > 0.99 * np.isfinite(truth).sum()
-        assert (
-            0.01 < np.sqrt(np.nanmean((seen - truth) ** 2)) < 0.08
-        )  # px; rounding to 0.7 of the levels
+        # px; rounding to 0.7 of the levels
+        assert 0.01 < np.sqrt(np.nanmean((seen - truth) ** 2)) < 0.08
 
 
 @pytest.mark.parametrize(
@@ -404,6 +403,5 @@ def test_inverses_may_be_captured_in_another_order_than_their_bits() -> None:
         FrameLikeness(each, sample_lines(each, stack))._finest
         for each, stack in ((turned, blurred[order]), (sequence, blurred))
     )
-    assert (
-        as_captured == by_bit and max(by_bit.values()) < 6
-    )  # the finest bits are blurred to one grey
+    # the finest bits are blurred to one grey
+    assert as_captured == by_bit and max(by_bit.values()) < 6

@@ -50,9 +50,8 @@ def test_the_error_at_edges_is_predicted_and_removed(sigma_px: float) -> None:
     at_edges = known & (np.abs(displaced.shift) > 5 * noise)
     ratio = np.sqrt(np.mean(error[at_edges] ** 2) / np.mean(displaced.shift[at_edges] ** 2))
     assert 0.5 < ratio < 1.3  # neither explained away nor missed
-    assert (
-        np.median(np.abs(displaced.shift[known]) / noise[known]) < 0.4
-    )  # little is added far from edges
+    # little is added far from edges
+    assert np.median(np.abs(displaced.shift[known]) / noise[known]) < 0.4
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     at_spots = at_edges & (np.hypot(u - 160, v - 120) < 90)
     assert displaced.is_continuous[at_spots].mean() > 0.75, "the disc is one surface, spots or not"

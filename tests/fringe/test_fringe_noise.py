@@ -32,9 +32,8 @@ def test_shot_and_read_noise(sequence, within, gamma, read, shot):
     assert a >= 0 and b >= 0
     for level in (50, 90):
         expected = read**2 + 1 / 12 + shot * level
-        assert (
-            abs((a + b * level) / expected - 1) < 2 * within
-        )  # of the variance: half of it in sigma
+        # of the variance: half of it in sigma
+        assert abs((a + b * level) / expected - 1) < 2 * within
 
 
 @pytest.mark.parametrize("steps", variants([3, 4, 5, 6, 7], 3, 4))

@@ -129,17 +129,15 @@ def test_coverage_rises_and_every_error_stays_at_its_noise(shot):
     phase, coverage, normalised = shot.measured(shot.frames)
     assert 0.99 < coverage <= 1
     valid = phase.mask & shot.illuminated
-    assert (
-        np.abs(normalised[valid] * phase.sigma_phase[valid]).max() < 1.0
-    )  # no fringe order is wrong
+    # no fringe order is wrong
+    assert np.abs(normalised[valid] * phase.sigma_phase[valid]).max() < 1.0
     for index in range(len(EXPOSURES)):
         part = valid & (shot.choice == index)
         assert np.count_nonzero(part) > 0.02 * np.count_nonzero(shot.illuminated)
         assert 0.9 < np.median(np.abs(normalised[part])) / 0.6745 < 1.15
     dark = shot.choice == 2
-    assert (
-        np.median(phase.sigma_phase[valid & dark]) < 0.06
-    )  # 0.3 at the shortest exposure, were it not masked
+    # 0.3 at the shortest exposure, were it not masked
+    assert np.median(phase.sigma_phase[valid & dark]) < 0.06
 
 
 @pytest.mark.computes

@@ -74,9 +74,8 @@ def test_on_random_and_flat_frames(name):
     assert_same(sequence, np.full((n, 3, 1), 255, np.uint8), "y")
 
 
-@pytest.mark.parametrize(
-    "name", variants(SEQUENCES)
-)  # another type of frames: each kernel is compiled for it too
+# another type of frames: each kernel is compiled for it too
+@pytest.mark.parametrize("name", variants(SEQUENCES))
 def test_on_random_frames_of_more_bits(name):
     """The kernels are compiled for uint16 as well."""
     sequence = SEQUENCES[name]

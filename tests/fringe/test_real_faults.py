@@ -145,10 +145,11 @@ def test_light_that_varies_is_corrected_and_named(
     severity: float,
 ) -> None:
     if (name, fault, severity) == (DAVID, "drift", 0.9):
+        # frames of up to 1.7 times the light: a warning of either helps
         causes = {
             "exposure-drift",
             "room-light",
-        }  # frames of up to 1.7 times the light: a warning of either helps
+        }
     sequence, frames = photographed(real_data, name)
     faulty = with_fault(make_faulty, fault, frames, severity)
     assert check_description(sequence, faulty) == ()

@@ -116,9 +116,8 @@ def test_gamma_is_a_fault_of_three_steps_alone():
 @pytest.mark.parametrize("how", LIGHTS, ids=str)
 def test_sound_captures_in_any_light_raise_no_suspects(name, how):
     expected = {0: "gamma"} if name == "three" and "gamma" in how else {}
-    coordinate = slope(
-        120, 200, start=20.0
-    )  # in dim light, fewer pixels raise an alarm in one of eight captures
+    # in dim light, fewer pixels raise an alarm in one of eight captures
+    coordinate = slope(120, 200, start=20.0)
     for seed in range(3):
         assert (
             told(SEQUENCES[name], capture(SEQUENCES[name], coordinate, seed=seed, **how))
@@ -260,11 +259,12 @@ def test_a_late_or_swapped_bit_is_named():
 def test_gray_frames_that_are_late_lost_or_swapped_are_named():
     sequence = SEQUENCES["p18"]
     stack = capture(sequence, COORDINATE)
+    # the scene lies in ten of 128 periods: bits before these are the same everywhere
     for k in (
         18,
         23,
         24,
-    ):  # the scene lies in ten of 128 periods: bits before these are the same everywhere
+    ):
         assert told(sequence, late(stack, k)).get(k) == "late"
     for k in (22, 23):
         assert told(sequence, swapped(stack, k)).get(k) == "swapped"
@@ -288,9 +288,8 @@ def test_it_looks_at_a_full_camera_within_a_fraction_of_a_second():
     renderer = Renderer(rig, blank_board(Pose(np.eye(3), np.array([0.0, 0.0, 600.0]))))
     sequence = PatternSequence(rig.projector.size, p18(rig.projector.size).frames[:26])
     stack = renderer.capture(sequence)
-    stack[:, 500:560, 700:760] = np.minimum(
-        2.5 * stack[:, 500:560, 700:760].astype(float), 255
-    )  # a specular spot
+    # a specular spot
+    stack[:, 500:560, 700:760] = np.minimum(2.5 * stack[:, 500:560, 700:760].astype(float), 255)
     assert told(sequence, stack) == {}
     assert told(sequence, late(stack, 9)) == {9: "late"}
     times = []

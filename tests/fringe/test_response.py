@@ -72,9 +72,10 @@ def ripple_rad(phase, coordinate):
 
 
 @pytest.mark.computes
+# noise leaves 1.3 mrad
 @pytest.mark.parametrize(
     ("steps", "before_rad", "times"), variants([(3, 0.15, 20), (4, 0.005, 3)], (3, 0.15, 20))
-)  # noise leaves 1.3 mrad
+)
 def test_phase_errors_of_gamma_shrink_with_the_table_on_a_plane(
     monkeypatch, steps, before_rad, times
 ):

@@ -151,9 +151,8 @@ def test_descriptions_written_before_read_the_same_and_stay_as_they_are():
     written = {"projector": "912x1140", "phase_sign": 1, "gray_origin": -0.5}
     written["frame"] = [f.to_dict() for f in p18((912, 1140)).frames]
     assert p18((912, 1140)).to_dict() == written
-    assert json.dumps(p18((912, 1140)).to_dict()) == json.dumps(
-        written
-    )  # what a capture's hash is made of
+    # what a capture's hash is made of
+    assert json.dumps(p18((912, 1140)).to_dict()) == json.dumps(written)
     assert PatternSequence.from_dict(written) == p18((912, 1140))
 
 

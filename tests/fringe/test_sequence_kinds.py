@@ -125,9 +125,8 @@ def test_a_relative_phase_is_right_modulo_what_it_states(name):
     sequence, reach = RELATIVE[name]
     phase = assert_measured(sequence, "x", slope(per_px=1.2))
     assert phase.unambiguous_px == pytest.approx(reach)
-    coordinate = phase.coordinate[
-        phase.mask
-    ]  # cut at -0.5 and a whole range beyond, where noise allows
+    # cut at -0.5 and a whole range beyond, where noise allows
+    coordinate = phase.coordinate[phase.mask]
     assert -3 < coordinate.min() < 1 and reach - 2 < coordinate.max() < reach + 2
 
 

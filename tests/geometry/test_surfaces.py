@@ -101,9 +101,8 @@ def test_polynomials_are_reproduced() -> None:
     inside = grids()[2]
     for fitted in (
         fit_polynomial(u, v, values, None, BOX, 5),
-        fit_polynomial(
-            u, v, values, None, (400, 300), 5, robust=True
-        ),  # the samples cover a part of the box only
+        # the samples cover a part of the box only
+        fit_polynomial(u, v, values, None, (400, 300), 5, robust=True),
         fit_spline(u, v, values, None, BOX),
     ):
         assert np.abs(fitted.evaluate_grid(SHAPE) - truth)[inside].max() < 1e-6

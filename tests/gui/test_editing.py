@@ -280,11 +280,12 @@ def test_region_is_set_by_numbers_and_by_handle(
     assert 0.2 * total < load_scan_cloud(operator.session, "one").measured_count < 0.9 * total
     expect(page.get_by_text(re.compile("removed by edits and region"))).to_be_visible()
     page.locator("xpath=//*[normalize-space(text())='Handles']/following::input[1]").check()
+    # of the box, along the arrow; what is drawn just then may take the drag
     for share in 10 * (
         0.3,
         0.25,
         0.35,
-    ):  # of the box, along the arrow; what is drawn just then may take the drag
+    ):
         wait_until_still(page)
         start = region()
         arrow = np.array([share * max(start.size_mm), 0, 0])
@@ -364,9 +365,8 @@ def test_six_clicks_make_textured_mesh_of_part_without_its_table(
     height = np.abs(
         np.sum((points - truth.vertices[nearest]) * truth.vertex_normals[nearest], axis=1)
     )
-    assert (
-        0.02 < np.median(height) < 0.2 and np.percentile(height, 99) < 0.6
-    )  # the calibration is without distortion
+    # the calibration is without distortion
+    assert 0.02 < np.median(height) < 0.2 and np.percentile(height, 99) < 0.6
     assert away.max() < 3.0  # nothing is left of the table
     assert np.asarray(mesh.visual.material.baseColorTexture).shape[:2] == (2048, 2048)
 
@@ -411,10 +411,11 @@ def test_plan_is_made_uploaded_and_run_on_two_scans(tmp_path: Path, browser: Bro
             return [part.decision for part in runs[-1].record.parts] if runs else []
 
         wait_until(page, lambda: len(decisions()) == 2)
+        # the plan's own tolerance is as small as the uncertainty
         assert decisions() == [
             "undecided",
             "undecided",
-        ]  # the plan's own tolerance is as small as the uncertainty
+        ]
         expect(page.get_by_text("2 undecided", exact=True)).to_be_visible()
 
         plan = read_plan(folder / OWN_PLAN)

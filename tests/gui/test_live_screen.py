@@ -23,11 +23,12 @@ SCALE = 0.15
 def app(tmp_path: Path) -> Iterator[App]:
     folder = tmp_path / "session"
     true_calibration(folder, letter(SCALE))
+    # the browser needs the cores too
     slow = {
         "driver": "simulated",
         "scale": SCALE,
         "settle_ms": 30,
-    }  # the browser needs the cores too
+    }
     with Operator(folder, slow, timing=CALM) as operator:
         assert operator.wait_for(lambda s: s.rig.state == "open", PATIENCE_S) is not None
         operator.place("object")

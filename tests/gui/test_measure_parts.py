@@ -65,9 +65,8 @@ def test_tool_states_instruction_and_ends_after_its_picks() -> None:
     tool.select("Distance")
     assert tool.pick((1, 2)) is None and "second" in tool.instruction
     assert tool.pick((1, 2)) is None and "second" in tool.instruction  # a double click
-    assert (
-        tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.instruction
-    )  # ready for the next distance
+    # ready for the next distance
+    assert tool.pick((3, 4)) == ((1, 2), (3, 4)) and "first" in tool.instruction
     tool.select("Point")
     assert tool.pick(7) == (7,)
     tool.select("Sphere")
@@ -126,9 +125,8 @@ def test_a_section_is_read_off_at_its_cursors() -> None:
     assert "enlarged" in section_plot("s", [flat]).caption
     cut = made("section", [], plane=plane)
     segments, place = drawn(cut.record, {}, [arc])  # type: ignore[misc]
-    assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(
-        449
-    )  # the highest point, a little off
+    # the highest point, a little off
+    assert np.allclose(segments[..., 1], 0) and place[2] == pytest.approx(449)
 
 
 def test_measurements_as_text() -> None:

@@ -178,9 +178,8 @@ def pick_two_places(page: Page) -> None:
     click_until(page, (385, 400), re.compile(r"click the same point on .* on the right\.$"))
     click_until(page, (640, 400), re.compile("^[1-9] of 3 pairs picked"))
     said = page.get_by_text(re.compile(r"^(Pair \d|\d pairs): "))
-    while not said.inner_text().startswith(
-        "Pair 1: click a point on"
-    ):  # one sent twice began another pair
+    # one sent twice began another pair
+    while not said.inner_text().startswith("Pair 1: click a point on"):
         with suppress(NotShownError):  # the text was of before: all points are taken back
             button(page, "Undo last point").click(timeout=5000)
     expect(page.get_by_text("0 of 3 pairs picked")).to_be_visible()
@@ -248,9 +247,8 @@ def test_scans_are_reconstructed_picked_merged_and_exported(
         page.get_by_role("link", name="Download object_r2_mesh.glb").click()
     download.value.save_as(tmp_path / "part.glb")
     part = trimesh.load(tmp_path / "part.glb", force="mesh")
-    assert (
-        4000 < len(part.faces) <= 6000 and 0.08 < part.extents.max() < 0.2
-    )  # the ammonite, 140 mm wide
+    # the ammonite, 140 mm wide
+    assert 4000 < len(part.faces) <= 6000 and 0.08 < part.extents.max() < 0.2
     expect(
         page.get_by_text(
             re.compile(
@@ -346,9 +344,8 @@ def test_part_is_measured_and_compared_with_its_nominal(
     click_until(page, (540, 400), "points in the ball")
     click(page, "Fit sphere")
     radius = came(operator, before + 3).quantities[0]
-    assert radius.U is not None and abs(radius.value - 98.0) < max(
-        2 * radius.U, 0.1
-    )  # the simulated sphere's, mm
+    # the simulated sphere's, mm
+    assert radius.U is not None and abs(radius.value - 98.0) < max(2 * radius.U, 0.1)
     expect(
         page.get_by_text(re.compile("ball of radius 30"))
     ).to_be_visible()  # or the name typed is that of before
@@ -395,9 +392,8 @@ def click_until(page: Page, place: tuple[int, int], answer: str | re.Pattern[str
     for _ in range(40):
         page.mouse.click(*place)
         try:
-            return page.get_by_text(answer).first.wait_for(
-                timeout=5000
-            )  # a second click too early is a second point
+            # a second click too early is a second point
+            return page.get_by_text(answer).first.wait_for(timeout=5000)
         except NotShownError:
             continue
     raise AssertionError(f"no click brought {answer!r}")

@@ -75,9 +75,8 @@ def test_guest_sees_same_step_and_changes_nothing(
     click(opened.page, "2. Target")
     expect(button(guest, "Use this board")).to_be_visible()
     shared_guest.send(lambda: click(guest, "1. Rig"), "GuiUpdateMessage")
-    click(
-        opened.page, "Use this board"
-    )  # what the operator requests after that is all that happens
+    # what the operator requests after that is all that happens
+    click(opened.page, "Use this board")
     expect(guest.get_by_text("In use: circles:21x16:9")).to_be_visible()
     assert app.shell.current == "target"
 

@@ -122,9 +122,8 @@ def test_wizard_leads_from_unknown_rig_to_merged_mesh(
         pair = merged.record.pairs["scan_01"]
         rms, overlap, T = pair.rms_mm, pair.overlap, np.array(pair.T_reference_scan)
         assert 0.0 < rms < 0.2 and overlap > 0.95
-        assert (
-            np.linalg.norm((T @ [0, 0, 600, 1])[:3] - [0, 0, 600]) < 0.5
-        )  # the object was not moved
+        # the object was not moved
+        assert np.linalg.norm((T @ [0, 0, 600, 1])[:3] - [0, 0, 600]) < 0.5
 
         click(page, "9. Export")
         choose(page, "Type", "mesh")
@@ -306,9 +305,8 @@ def take_home(page: Page, operator: Operator, folder: Path) -> None:
     merged = session_of(operator).merge
     assert merged is not None and isinstance(cloud, trimesh.PointCloud)
     assert len(cloud.vertices) == merged.record.points and np.isfinite(cloud.vertices).all()
-    assert cloud.extents == pytest.approx(
-        [141, 126, 31], abs=3
-    )  # the ammonite's size, mm, less its steep rim
+    # the ammonite's size, mm, less its steep rim
+    assert cloud.extents == pytest.approx([141, 126, 31], abs=3)
 
 
 def session_of(operator: Operator) -> SessionView:

@@ -24,9 +24,8 @@ def test_a_sphere_with_strays_has_its_radius_within_its_uncertainty() -> None:
     sigma = found.spread.sigmas[3]
     assert abs(found.feature.radius - 50.0) < 3 * sigma and 0.002 < sigma < 0.03
     assert np.linalg.norm(found.feature.place - MIDDLE) < 0.06
-    assert (
-        0.028 < found.rms < 0.032 and 0.11 < found.form < 0.125
-    )  # 95 % of a normal's width: 3.92 sigma
+    # 95 % of a normal's width: 3.92 sigma
+    assert 0.028 < found.rms < 0.032 and 0.11 < found.form < 0.125
     assert found.rms < abs(found.maximum) < 0.2
     assert (
         0.13 < found.left_out / 6000 < 0.15 and missing_facts(found.warnings[0], "excluded") == []

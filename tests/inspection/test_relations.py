@@ -54,9 +54,8 @@ def test_figures_that_can_be_told_by_hand() -> None:
     crossing = Feature("cylinder", B + 12 * Z + 99 * Y, Y, 3.0)
     assert read(rod, crossing) == pytest.approx({"angle": 90.0, "distance of the axes": 12.0})
     beside = Feature("cylinder", B + 9 * Y + 70 * X, X * np.cos(0.02) + Z * np.sin(0.02), 3.0)
-    assert read(rod, beside)["distance of the axes"] == pytest.approx(
-        9.05, abs=0.06
-    )  # in the middle of the regions
+    # in the middle of the regions
+    assert read(rod, beside)["distance of the axes"] == pytest.approx(9.05, abs=0.06)
 
 
 def test_a_distances_uncertainty_is_that_along_it() -> None:

@@ -148,9 +148,8 @@ def test_a_rejected_calibration_is_kept_and_refused(
             and verdict.level == "rejected"
             and verdict.causes[0] == "fringe-period"
         )
-        assert available_models(store) == (
-            "stereo",
-        )  # those of the poses before do not belong to it
+        # those of the poses before do not belong to it
+        assert available_models(store) == ("stereo",)
         assert "period_px" in rejection_reason(store)
     refuse(session, "pose_00", "pose_01", ply, run)
     pose = ("pose_00", "--out", ply)

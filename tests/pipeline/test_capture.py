@@ -67,9 +67,8 @@ def test_several_exposures_measure_the_dark_circles_and_find_the_board_where_it_
     assert np.count_nonzero(dark) > 1000
     gain = np.median(single.sigma_phase[dark]) / np.median(several.sigma_phase[dark])
     assert 3 < gain < 10  # 9 times the light, whose own noise grows too
-    both = (
-        single.mask & several.mask & (three.exposure_choice > 0)
-    )  # the first of both has the same noise
+    # the first of both has the same noise
+    both = single.mask & several.mask & (three.exposure_choice > 0)
     z = (single.phase - several.phase)[both] / np.hypot(single.sigma_phase, several.sigma_phase)[
         both
     ]
@@ -300,9 +299,8 @@ def test_what_the_camera_took_in_place_of_a_setting_is_reported(tmp_path: Path):
             [],
         ]
         said.clear()
-        set_camera(
-            rig, {}, RigSettings(exposure_ms=105.0, warn=said.append)
-        )  # rounding by a few percent is normal
+        # rounding by a few percent is normal
+        set_camera(rig, {}, RigSettings(exposure_ms=105.0, warn=said.append))
         rig.camera.notes = ("its exposure is 100 ms, 1000 ms were requested",)  # type: ignore[attr-defined]
         set_camera(rig, {}, RigSettings(exposure_ms=1000.0, warn=said.append))
     assert said == ["its exposure is 100 ms, 1000 ms were requested"]

@@ -190,9 +190,8 @@ def test_a_merge_and_one_surface_through_it(kept: Path, tmp_path: Path) -> None:
     found = trimesh.load(surface.path)
     assert len(found.faces) > 100
     off = np.abs(np.linalg.norm(found.vertices - SPHERE[0], axis=1) - SPHERE[1])
-    assert (
-        np.median(off) < 0.3 and off.max() < 10
-    )  # beyond the limb, which so few pixels show, it is cut a little late
+    # beyond the limb, which so few pixels show, it is cut a little late
+    assert np.median(off) < 0.3 and off.max() < 10
 
 
 @pytest.mark.process  # which reads a storage of OpenCV

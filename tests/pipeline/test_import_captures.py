@@ -74,9 +74,8 @@ def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Pat
     status, out, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
     assert status == 0 and not missing_facts(out, "3 captures") and unchanged(err) == {"capture_1"}
     assert not (session / "trash").exists()
-    chunk.write_bytes(
-        sound[:100] + bytes(len(sound) - 100)
-    )  # the remedy for damage is to import again
+    # the remedy for damage is to import again
+    chunk.write_bytes(sound[:100] + bytes(len(sound) - 100))
     status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
     assert status == 0 and unchanged(err) == {"capture_0", "capture_2"}
     assert any(not missing_facts(line, "capture_1", "damaged") for line in err.splitlines())

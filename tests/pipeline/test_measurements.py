@@ -195,9 +195,8 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
     assert one.label == "distance 1"
     with Session.open(folder, write=True) as store:
         assert rename_measurement(store, one.name, "=width").label == "=width"
-        assert ",'=width," in measurements.measurements_csv(store).replace(
-            "m1,'", "m1,'"
-        )  # no formula in a table
+        # no formula in a table
+        assert ",'=width," in measurements.measurements_csv(store).replace("m1,'", "m1,'")
         assert rename_measurement(store, one.name, "").label == "distance 1"
         two = measure(store, balls, "distance", b, a, name="back")
         trash_measurement(store, two.name)

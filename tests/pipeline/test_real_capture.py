@@ -66,9 +66,8 @@ def test_poses_give_the_board(
         assert main(["reconstruct", str(kamino), f"capture_{k}", "--out", str(ply)]) == 0
         text = capsys.readouterr().out
         with Session.open(kamino) as store:
-            assert (
-                load_record(store, Reconstruction, f"capture_{k}").axis == "y"
-            )  # the baseline is vertical
+            # the baseline is vertical
+            assert load_record(store, Reconstruction, f"capture_{k}").axis == "y"
         assert "stereo" in text and "pixelwise" in text and "coverage" in text
         points = np.asarray(trimesh.load(ply).vertices)
         centred = points - points.mean(0)

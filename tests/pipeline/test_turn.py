@@ -111,9 +111,8 @@ class Turned:
         self.rig, self.faults = breakable(self.bench.rig)
 
     def set_up(self, choice: Choice, board: object) -> RigSetup:
-        return RigSetup(
-            self.rig
-        )  # without its world, where the board stays in view: it is quick to render
+        # without its world, where the board stays in view: it is quick to render
+        return RigSetup(self.rig)
 
     def __call__(
         self, progress: Callable[[float, str], None] = lambda share, doing: None, **options: Any

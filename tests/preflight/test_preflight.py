@@ -85,9 +85,8 @@ def test_a_sound_rig_is_left_in_peace(seed, looked, compiled):
     )
     assert wrong_with(found) == set() and found.verdict == "good"
     assert found.settle_ms == 0 and found.exposure_ms is None
-    assert (
-        found.seconds > 0 and process_time() - before < 10
-    )  # of the processor, whatever else it does
+    # of the processor, whatever else it does
+    assert found.seconds > 0 and process_time() - before < 10
     assert len(said) == len(found.checks) == 10 and done == sorted(done) and done[-1] == 1.0
     assert all(check.sentence.endswith(".") for check in found.checks)
     assert found.to_dict()["checks"][0]["name"] == "screen"

@@ -146,9 +146,8 @@ def scans_to(folder):
         one = one_pass(sequence, model, "x")
         assert isinstance(one, CudaPass) and has_pass(model)
         scan = one.run(frames)
-        if case.startswith(
-            "heterodyne"
-        ):  # light of a camera of fewer bits is found out, and arrays are used again
+        # light of a camera of fewer bits is found out, and arrays are used again
+        if case.startswith("heterodyne"):
             before = scan.points.copy()
             again = one.run(frames, replace(scan.light, white=1023.0), scan)
             assert again.light.white == 4095 and again.points is scan.points
@@ -242,9 +241,8 @@ def test_a_device_that_fails_is_told_once_and_the_processor_goes_on(scans):
 
 def test_without_a_device_all_is_the_processors(monkeypatch, caplog):
     monkeypatch.setattr(cuda_device, "_cached_name", [])
-    broken = SimpleNamespace(
-        cuInit=lambda flags: 803
-    )  # as if the kernel's module were another version's
+    # as if the kernel's module were another version's
+    broken = SimpleNamespace(cuInit=lambda flags: 803)
     monkeypatch.setattr(cuda_device.ctypes, "CDLL", lambda name: broken)
     real = importlib.util.find_spec
     monkeypatch.setattr(

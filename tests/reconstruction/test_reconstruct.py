@@ -82,9 +82,8 @@ def test_sigma_is_compared_on_the_same_pixels() -> None:
     both["y"].offset[:20] = np.nan
     assert reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "x"
     both["x"].offset[5:] = np.nan
-    assert (
-        reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "y"
-    )  # nothing in common, and y measures more
+    # nothing in common, and y measures more
+    assert reconstruct_cloud(Uneven({"x": 1, "y": 1}), both).axis == "y"
 
 
 def test_what_the_calibrations_own_phases_scatter_by_is_part_of_sigma() -> None:

@@ -55,9 +55,8 @@ def test_three_depths_come_into_one_frame(clouds: dict[str, Cloud]) -> None:
         shift, turn = off(pair.T_reference_scan, pose(name))
         assert shift < 0.02 and turn < 0.01
         assert 0.8 * NOISE < pair.rms_mm < 2.0 * NOISE
-        assert (
-            pair.overlap > 0.6 and pair.start == "features" and pair.gate_mm <= 2.0
-        )  # two pixels of this camera
+        # two pixels of this camera
+        assert pair.overlap > 0.6 and pair.start == "features" and pair.gate_mm <= 2.0
         assert 0.0002 < pair.uncertainty.shift_mm < 0.02
     assert len(found.pairs) == 3 and len(found.loops) == 1 and not found.dropped
     assert found.loops[0].after.shift_mm < found.loops[0].before.shift_mm < 0.05

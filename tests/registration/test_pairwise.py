@@ -25,13 +25,11 @@ def test_a_known_motion_is_found(deg: float, mm: float) -> None:
     shift, turn = error(result, T)
     assert shift < 0.03
     assert turn < 0.02
-    assert (
-        0.9 * NOISE < result.rms_mm < 1.6 * NOISE
-    )  # both scans' noise, sqrt(2) times one's, on tilted surfaces
+    # both scans' noise, sqrt(2) times one's, on tilted surfaces
+    assert 0.9 * NOISE < result.rms_mm < 1.6 * NOISE
     assert result.inlier_rmse_mm > 3 * result.rms_mm  # the spacing of the points is in it
-    assert (
-        0.68 < result.overlap < 0.78
-    )  # 90 of 120 mm, less the points beyond the gate across steep slopes
+    # 90 of 120 mm, less the points beyond the gate across steep slopes
+    assert 0.68 < result.overlap < 0.78
     assert result.agreement > 0.98
 
 

@@ -140,9 +140,8 @@ def test_contradictions_are_counted_where_one_scan_sees_through_the_others_point
     share = float(wall["b"].sum() / clouds["b"].mask.sum())
     T = np.linalg.inv(turned(2.0))
     moved = measure_contradiction(views["b"], views["a"], T, 1.0).share
-    assert (
-        0.2 * share < moved < 0.8 * share
-    )  # half of the turned wall lies before itself, the other half behind
+    # half of the turned wall lies before itself, the other half behind
+    assert 0.2 * share < moved < 0.8 * share
     still = measure_contradiction(views["b"], views["a"], np.eye(4), 1.0).share
     assert 0.001 < still < 0.5 * (1 - share)
 

@@ -37,9 +37,8 @@ def opened(figure: Figure) -> np.ndarray:
 def test_colours_stay_true_where_they_mean_something() -> None:
     drawing = new_figure(300, 200)
     axes = drawing.subplots()
-    axes.imshow(
-        np.random.default_rng(0).uniform(size=(200, 200, 3))
-    )  # thousands of colours that compete
+    # thousands of colours that compete
+    axes.imshow(np.random.default_rng(0).uniform(size=(200, 200, 3)))
     drawing.text(0.1, 0.9, "■", fontsize=30, color=MODELS["stereo"])
     image = opened(finish_figure(drawing, "c", "a")).reshape(-1, 3)
     assert (image == 255).all(axis=1).mean() > 0.1

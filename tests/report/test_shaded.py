@@ -55,9 +55,8 @@ def test_the_viewer_steps_aside_and_up() -> None:
     R = view_rotation(24, 18)
     assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1)
     nearer = R @ [0.0, 0.0, -1.0]
-    assert (
-        nearer[0] > 0 and nearer[1] > 0
-    )  # what sticks out moves right and down: seen from the left and above
+    # what sticks out moves right and down: seen from the left and above
+    assert nearer[0] > 0 and nearer[1] > 0
 
 
 def test_a_mosaic_shows_one_scan_in_each_square_and_leaves_no_hole() -> None:

@@ -95,9 +95,8 @@ def phone(browser: Browser, film: Film) -> Iterator[Browser]:
 
 @pytest.fixture
 def channel(server: SafeServer) -> Iterator[CameraChannel]:
-    pages = PageChannels(
-        camera=CameraChannel(HANG_S, settling_ms=0.0)
-    )  # a film does not change by itself
+    # a film does not change by itself
+    pages = PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0))
     serve_device_pages(server, pages)
     yield pages.camera
     server.device_pages.clear()
@@ -220,9 +219,8 @@ def test_the_page_works_encrypted_by_the_certificate_made_here(phone, film, tmp_
         PageChannels(camera=CameraChannel(HANG_S, settling_ms=0.0)),
     )
     serve_device_pages(server, pages)
-    context = phone.new_context(
-        ignore_https_errors=True
-    )  # as a person who has compared the fingerprint
+    # as a person who has compared the fingerprint
+    context = phone.new_context(ignore_https_errors=True)
     try:
         context.new_page().goto(server.link("camera"))
         assert (

@@ -118,9 +118,8 @@ def serving(tmp_path) -> Iterator:
 
 
 def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(serving):
-    operator, address = serving(
-        stall_s=10 * HANG_S
-    )  # whoever waited for the slow reader would wait for too long
+    # whoever waited for the slow reader would wait for too long
+    operator, address = serving(stall_s=10 * HANG_S)
     with socket.create_connection(("127.0.0.1", operator.server.port), timeout=HANG_S) as slow:
         slow.sendall(operator.raw_request(address))
         assert slow.recv(100).startswith(b"HTTP/1.1 200")

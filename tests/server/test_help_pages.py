@@ -145,6 +145,5 @@ def test_comments_of_a_page_are_not_shown(folder):
 def test_an_equation_is_drawn_with_its_source_for_screen_readers(folder):
     html = HelpPages(folder).file("howto/equation.md").content.decode()
     assert "<code" not in html and html.count("<svg") == 1 and r'aria-label="z = \frac{c_0' in html
-    assert (
-        len(re.findall("M", re.findall(r' d="([^"]+)"', html)[0])) > 10
-    )  # the outlines of its letters
+    # the outlines of its letters
+    assert len(re.findall("M", re.findall(r' d="([^"]+)"', html)[0])) > 10

@@ -270,9 +270,8 @@ def test_a_click_fills_the_screen_and_leaving_it_ends_the_capture(opens, channel
     assert left < 6000 <= since_click
     page.evaluate("settlesAt += 1e6")  # the browser's notice stays until it is looked at here
     grown = {"width": SIZE[0], "height": SIZE[1], "screenWidth": SIZE[0], "screenHeight": SIZE[1]}
-    session = page.context.new_cdp_session(
-        page
-    )  # without a display the window does not grow by itself
+    # without a display the window does not grow by itself
+    session = page.context.new_cdp_session(page)
     session.send(
         "Emulation.setDeviceMetricsOverride", {**grown, "deviceScaleFactor": 1, "mobile": False}
     )

@@ -45,9 +45,8 @@ def test_each_is_ready_once_it_has_drawn_what_it_was_sent(
         viewers.sent(client)
     assert ready() == set()
     assert until(lambda: asked(quick) == asked(slow) == 1)
-    assert quick.received[-2]["type"] == "LabelMessage" or "Label" in str(
-        quick.received[:-1]
-    )  # drawn before it asks
+    # drawn before it asks
+    assert quick.received[-2]["type"] == "LabelMessage" or "Label" in str(quick.received[:-1])
     clock.sleep(0.25)
     answer(quick)
     assert until(lambda: ready() == {quick.number}) and heard.wait(HANG_S)

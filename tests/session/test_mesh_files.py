@@ -63,9 +63,8 @@ def test_trimesh_reads_every_mesh(tmp_path: Path, suffix: str) -> None:
     turned = [1, -1, -1] if suffix == "glb" else [1, 1, 1]  # y up, z towards the viewer
     near(unit * found.vertices, MESH.vertices * turned)
     assert np.array_equal(found.faces, MESH.faces)
-    if (
-        suffix == "glb"
-    ):  # beside a material, trimesh keeps the colours as an attribute of the scene's mesh
+    # beside a material, trimesh keeps the colours as an attribute of the scene's mesh
+    if suffix == "glb":
         ((_, found),) = trimesh.load(path, process=False).geometry.items()
         painted = found.visual.vertex_attributes["color"]
     else:

@@ -41,9 +41,8 @@ def test_every_format_gives_the_same_closed_mesh(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.process
 def test_step_and_3mf_state_their_units(tmp_path: Path) -> None:
-    plate = read_nominal(
-        PLATE
-    )  # 60 x 40 x 8 mm with a bore of radius 12, and a pin of radius 5 and height 6
+    # 60 x 40 x 8 mm with a bore of radius 12, and a pin of radius 5 and height 6
+    plate = read_nominal(PLATE)
     assert plate.closed and plate.units == "mm" and len(plate.notes) == 1
     assert missing_facts(plate.notes[0], "0.005 mm") == []
     assert plate.size_mm == pytest.approx([60, 40, 14], abs=1e-5)
@@ -219,9 +218,8 @@ def test_other_units_are_asked_for_with_both_sizes(
     with raises(InputError, "b.stl", *facts):
         check_size(read_nominal(tmp_path / "b.stl"), scan)
     check_size(read_nominal(tmp_path / "b.stl", "mm"), scan)  # the operator has said so
-    assert read_nominal(tmp_path / "b.stl").size_mm.max() == pytest.approx(
-        80 / factor, rel=1e-3
-    )  # as it was
+    # as it was
+    assert read_nominal(tmp_path / "b.stl").size_mm.max() == pytest.approx(80 / factor, rel=1e-3)
 
 
 def test_units_that_are_given_are_taken(tmp_path: Path) -> None:
@@ -231,6 +229,5 @@ def test_units_that_are_given_are_taken(tmp_path: Path) -> None:
     found = read_nominal(tmp_path / "b.stl", "inch")
     assert found.size_mm == pytest.approx([80, 80, 80], rel=1e-3)
     check_size(found, BALL.vertices)
-    check_size(
-        read_nominal(tmp_path / "b.stl"), BALL.vertices / 25.4 * 3
-    )  # three times larger: a part of it, or more
+    # three times larger: a part of it, or more
+    check_size(read_nominal(tmp_path / "b.stl"), BALL.vertices / 25.4 * 3)

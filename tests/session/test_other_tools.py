@@ -48,9 +48,8 @@ def decoded_error(capture: NewCapture, axis: str) -> np.ndarray:
 def slstudio_frames(codec: str) -> list[np.ndarray]:
     """Both axes, or the columns alone for the codecs of one axis."""
     if codec == "gray":
-        bits = [bit_of(U, 9 - p) for p in range(10)] + [
-            bit_of(V, 6 - p) for p in range(6)
-        ]  # of 10 and of 7
+        # of 10 and of 7
+        bits = [bit_of(U, 9 - p) for p in range(10)] + [bit_of(V, 6 - p) for p in range(6)]
         return [np.ones(U.shape), np.zeros(U.shape), *bits]
     frames: list[np.ndarray] = []
     for at, extent in ((U, COLUMNS), (V, ROWS)):
@@ -120,9 +119,8 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
         opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
     found = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
-    other = (
-        (2000, ROWS) if shadow else (COLUMNS, 60)
-    )  # as many images as another projector without, or with them
+    # as many images as another projector without, or with them
+    other = (2000, ROWS) if shadow else (COLUMNS, 60)
     with pytest.raises(InputError):
         opencv_graycode.LAYOUT.read(tmp_path, projector=other, files="pattern_cam1_*")
     with raises(InputError, f"{len(patterns)} images", "4000x120", 40):

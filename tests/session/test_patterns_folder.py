@@ -23,9 +23,8 @@ def test_a_camera_that_sees_the_patterns_themselves_decodes_its_own_pixels(tmp_p
     assert capture.sequence == sequence and capture.settings == {"gray_origin_given": True}
     truth = {"x": np.arange(120.0)[None, :], "y": np.arange(90.0)[:, None]}
     for axis in sequence.axes:
-        phase = decode(
-            capture.sequence, capture.frames // 2 + 40, axis
-        )  # neither dark nor saturated
+        # neither dark nor saturated
+        phase = decode(capture.sequence, capture.frames // 2 + 40, axis)
         assert phase.mask.mean() > 0.97
         error = (phase.coordinate - truth[axis])[phase.mask]
         assert np.abs(error).max() < 0.1

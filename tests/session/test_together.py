@@ -64,9 +64,8 @@ def inject(monkeypatch, at: int, fault: BaseException) -> Callable[[], int]:
         def wrapped(*args, real=real, **options):
             nonlocal calls
             calls += 1
-            if calls == at or (
-                isinstance(fault, Killed) and calls > at
-            ):  # nothing runs after a kill
+            # nothing runs after a kill
+            if calls == at or (isinstance(fault, Killed) and calls > at):
                 raise fault
             return real(*args, **options)
 

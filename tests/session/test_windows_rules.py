@@ -30,9 +30,8 @@ def windows(monkeypatch):
     real_open = os.open
 
     def open_file(path, flags, *rest, **options):
-        if (
-            not isinstance(path, int) and os.path.isdir(path) and not options
-        ):  # not shutil.rmtree's, of other systems
+        # not shutil.rmtree's, of other systems
+        if not isinstance(path, int) and os.path.isdir(path) and not options:
             raise PermissionError(13, "Permission denied", str(path))
         return real_open(path, flags, *rest, **options)
 

@@ -208,10 +208,11 @@ def test_a_session_that_another_writer_works_in_is_never_removed(tmp_path, seque
     with pytest.raises(SessionError), opened_or_made(tmp_path / "made"):
         raise SessionError("a failure")
     assert list((tmp_path / "made").iterdir()) == []
+    # made by another: never removed
     with (
         pytest.raises(SessionError),
         opened_or_made(folder) as session,
-    ):  # made by another: never removed
+    ):
         raise SessionError("a failure")
     assert (folder / "session.json").exists()
 

@@ -51,9 +51,8 @@ def test_spheres_and_objects_lie_in_their_ranges():
         assert shares(scene)[i] > 99
     one, two, three = (scene.pose.R for scene in objects().values())
     for R in (one, two):
-        assert (
-            1 < np.degrees(np.arccos((np.trace(R.T @ three) - 1) / 2)) < 10
-        )  # something for ICP to do
+        # something for ICP to do
+        assert 1 < np.degrees(np.arccos((np.trace(R.T @ three) - 1) / 2)) < 10
 
 
 @pytest.mark.parametrize("seed", [0, 7])

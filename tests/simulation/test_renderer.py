@@ -49,9 +49,8 @@ def test_frames_decode_to_the_true_coordinates_but_for_the_specified_noise():
     )
     truth, sequence = renderer.truth(), p18(PROJECTOR)
     stack = renderer.capture(sequence, seed=4)
-    inner = (
-        truth.mask.copy()
-    )  # pixels mixed with the dark beside the plate are noisier than specified
+    # pixels mixed with the dark beside the plate are noisier than specified
+    inner = truth.mask.copy()
     for axis in (0, 1):
         for step in (-1, 1):
             inner &= np.roll(truth.mask, step, axis)
@@ -95,9 +94,8 @@ def test_noise_has_the_specified_variance():
         assert variance[chosen].mean() == pytest.approx(expected, rel=0.03)
     noise = (stack - level)[:, 100:200, 150:250]
     assert abs((noise[1:] * noise[:-1]).mean()) < 0.02 * noise.var()  # from frame to frame
-    assert (
-        abs((noise[:, :, 1:] * noise[:, :, :-1]).mean()) < 0.02 * noise.var()
-    )  # from pixel to pixel
+    # from pixel to pixel
+    assert abs((noise[:, :, 1:] * noise[:, :, :-1]).mean()) < 0.02 * noise.var()
 
 
 def test_the_seed_alone_decides_the_frames():
@@ -124,9 +122,8 @@ def test_circles_are_seen_where_they_are():
     detection = detect(board, image)
     error = detection.pixels - rig.camera.project(pose.to_camera(scene.features))[detection.ids]
     assert len(detection.ids) == 336
-    assert (
-        np.abs(error.mean(0)).max() < 0.05
-    )  # shading and perspective shift a blob by hundredths of a pixel
+    # shading and perspective shift a blob by hundredths of a pixel
+    assert np.abs(error.mean(0)).max() < 0.05
     assert 0.001 < np.sqrt(np.mean(error**2)) < 0.06
 
 
@@ -154,9 +151,8 @@ def test_defocus_takes_modulation_and_leaves_phase():
         assert abs(error.mean()) < 2e-4
         modulation[blur] = np.median(B)
     sharp, soft_B = modulation.values()
-    sigma = [
-        np.hypot(0.5, f * 1500 * abs(1 / 483 - 1 / 600)) for f in (1, 3)
-    ]  # the projector is 33 mm further away
+    # the projector is 33 mm further away
+    sigma = [np.hypot(0.5, f * 1500 * abs(1 / 483 - 1 / 600)) for f in (1, 3)]
     assert soft_B / sharp == pytest.approx(
         np.exp(-2 * (np.pi / 18) ** 2 * (sigma[1] ** 2 - sigma[0] ** 2)), rel=0.03
     )

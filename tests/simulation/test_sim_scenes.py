@@ -46,13 +46,11 @@ def test_printed_circles_cover_their_share_of_the_plate():
     pose = Pose(np.eye(3), np.array([-90.0, -67.5, 620.0]))
     scene = printed_board(board, pose, BoardShape(misplaced_mm=0.02), margin_mm=9)
     surface = scene.trace(RIG.camera.rays())
-    per_pixel = np.prod(
-        620 / np.array(RIG.camera.focal_px) / 0.25
-    )  # mm^2, but for the lens's distortion
+    # mm^2, but for the lens's distortion
+    per_pixel = np.prod(620 / np.array(RIG.camera.focal_px) / 0.25)
     local = surface.points[..., :2] - pose.t[:2]
-    inner = ((local > -6) & (local < [186, 141])).all(
-        -1
-    )  # without the plate's rim, dark in part for its own reason
+    # without the plate's rim, dark in part for its own reason
+    inner = ((local > -6) & (local < [186, 141])).all(-1)
     dark = (scene.white - surface.albedo[inner]).sum() / (scene.white - scene.dark)
     assert dark * per_pixel == pytest.approx(336 * np.pi * 2.25**2, rel=0.02)
     assert np.allclose(scene.misplacement.std(), 0.02, rtol=0.1)

@@ -66,9 +66,8 @@ def test_the_error_of_a_pose_is_part_of_sigma_where_it_moves_the_surface(fused: 
         added[near], 0.1 * np.abs(uncertain.surface.normals[near, 2]), atol=1e-3
     )
     assert near.mean() > 0.5 and np.array_equal(after[~near], before[~near])
-    turned = fuse(
-        *depths(), poses={"near": (np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))}
-    )  # about the ball's middle
+    # about the ball's middle
+    turned = fuse(*depths(), poses={"near": (np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))})
     assert turned.surface.sigma_mm is not None
     assert np.abs(turned.surface.sigma_mm - before).max() < 0.05 * np.median(before)
 

@@ -120,9 +120,8 @@ def test_a_volume(points: PointSet) -> None:
         VOLUME, rel=3e-3
     )
     assert rms(off(found.mesh.vertices)) < 0.04
-    one, other = (
-        volume_surface(points, found.cell_mm) for _ in range(2)
-    )  # whatever thread is first
+    # whatever thread is first
+    one, other = (volume_surface(points, found.cell_mm) for _ in range(2))
     assert np.array_equal(one.vertices, other.vertices) and np.array_equal(one.faces, other.faces)
 
 
@@ -155,9 +154,8 @@ def sheet(holes: list[tuple[slice, slice]]) -> Mesh:
 
 
 def test_holes_are_filled_up_to_their_size() -> None:
-    mesh = sheet(
-        [np.s_[5:8, 5:8], np.s_[20:30, 20:30], np.s_[8:10, 8:10]]
-    )  # the first and last share a corner
+    # the first and last share a corner
+    mesh = sheet([np.s_[5:8, 5:8], np.s_[20:30, 20:30], np.s_[8:10, 8:10]])
     assert analyse_topology(mesh).openings_mm == pytest.approx((62.6, 14.1, 4.2, 2.8), rel=0.05)
     filled, report = fill_holes(mesh, 5.0)
     assert (report.holes, report.left) == (2, 2) and report.largest_mm == pytest.approx(
@@ -176,9 +174,8 @@ def test_small_parts_go(closed: BuiltMesh) -> None:
         np.concatenate([closed.mesh.vertices, chip.vertices]),
         np.concatenate([closed.mesh.faces, chip.faces + n]),
     )
-    assert (
-        drop_small_parts(both, 0.1)[1].parts == 0
-    )  # it is large, for all that the other is larger
+    # it is large, for all that the other is larger
+    assert drop_small_parts(both, 0.1)[1].parts == 0
     cleaned, report = drop_small_parts(both, 1.0)
     assert len(cleaned.faces) == len(closed.mesh.faces) and report.parts == 1
     assert report.largest_mm2 == pytest.approx(0.5)

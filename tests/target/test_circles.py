@@ -54,11 +54,12 @@ def test_centroids_are_exact_to_a_hundredth_of_a_pixel_under_uneven_light(tilt: 
     [
         ("circles:9x7:20", replace(SMALL, noise=3, shade=3, tilt=20), 0.04),
         ("circles:9x7:20", replace(SMALL, inverted=True, shade=3, noise=1, tilt=25), 0.04),
+        # distortion moves centroids as well
         (
             "circles:9x7:20",
             replace(SMALL, k1=0.4, tilt=20),
             0.15,
-        ),  # distortion moves centroids as well
+        ),
         ("acircles:4x11:20", replace(SMALL, tilt=25, shade=3, noise=1), 0.03),
         *often(
             ("circles:9x7:20", replace(SMALL, blur=2.5, tilt=20), 0.03),
@@ -194,9 +195,8 @@ def test_an_odd_asymmetric_board_is_numbered_by_its_own_pattern(roll: float) -> 
         ("circles:9x7:20", (-30, -30, 190, 10)),  # the first row
         ("circles:9x7:20", (70, 50, 90, 70)),  # one circle in the middle
         ("acircles:4x11:20", (-30, -30, 190, 10)),
-        *often(
-            ("circles:9x7:20", (150, -30, 190, 190)), ("acircles:4x11:20", (-30, -30, 190, 30))
-        ),  # the last column
+        # the last column
+        *often(("circles:9x7:20", (150, -30, 190, 190)), ("acircles:4x11:20", (-30, -30, 190, 30))),
     ],
 )
 def test_hidden_circles_are_counted_not_guessed(

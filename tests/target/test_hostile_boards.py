@@ -75,9 +75,8 @@ def test_a_board_among_clutter_is_detected_in_order(board: Board) -> None:
             continue
         detected += 1
         off = distance(detection.pixels, scene.truth(board), board is SYMMETRIC)
-        assert off.max() < 0.6, (
-            name
-        )  # centroids are not images of centres: a tenth of a pixel under a steep slant
+        # centroids are not images of centres: a tenth of a pixel under a steep slant
+        assert off.max() < 0.6, name
         assert not detection.marked, name
         errors.append(float(np.sqrt((off**2).mean())))
     assert detected >= len(scenes) - 1

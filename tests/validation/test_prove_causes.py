@@ -57,9 +57,8 @@ def test_each_cause_is_named_first(fault: str) -> None:
     case = next(case for case in proof.record["cases"] if case["fault"] == fault)
     assert case["causes"][0] == FAULTS[fault][0], case
     assert case["findings"][0][-1] not in ".:"
-    assert (case["level"] == "good") == (
-        fault in SINGLE
-    )  # one pose is excluded, and the others are sound
+    # one pose is excluded, and the others are sound
+    assert (case["level"] == "good") == (fault in SINGLE)
 
 
 @pytest.mark.computes

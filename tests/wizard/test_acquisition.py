@@ -170,13 +170,14 @@ def test_devices_that_do_not_open_are_tried_again_and_reported_once(
 
     monkeypatch.setattr(bench.rig.camera, "open", refuse)
     bench.acquisition.use(bench.rig)
+    # 0.1 s after the last one
     for now_s, count in (
         (0.0, 1),
         (0.09, 1),
         (0.11, 2),
         (0.2, 2),
         (0.22, 3),
-    ):  # 0.1 s after the last one
+    ):
         clock.now_s = now_s
         until(lambda count=count: len(tries) >= count)
         look_at_the_clock_again()

@@ -130,9 +130,8 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     assert next(scan.label for scan in session.scans if scan.purpose == "scan") == "Ammonite, near"
     sphere, width = session.measurements
     radius = sphere.record["radius"]
-    assert (
-        radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2
-    )  # the simulated sphere's
+    # the simulated sphere's
+    assert radius.U is not None and abs(radius.value - 98) < 2 * radius.U < 0.2
     assert 130 < width.record.quantities[0].value < 150  # the ammonite's
 
 
@@ -341,10 +340,11 @@ def test_what_changes_makes_stale_what_came_from_it(operator: Operator) -> None:
         and session.calibration.stale == ""
         and len(session.calibration.stereo.poses) == 7
     )
+    # what was made of other poses is gone
     assert session.calibration.models == (
         "stereo",
         "pixelwise",
-    )  # what was made of other poses is gone
+    )
     assert any(not missing_facts(notice.text, "splined", 8, 7) for notice in again.notices)
     assert {scan.cloud for scan in session.scans} == {"stale"} and all(
         view.stale for view in session.list_records(Verification)

@@ -200,9 +200,8 @@ def test_another_rig_ends_what_the_one_before_was_doing(bench: Bench) -> None:
     bench.acquisition.capture(bench.request("waits"))
     other = replace(bench.rig, name="another")
     bench.acquisition.use(other)
-    assert (
-        not bench.acquisition.idle
-    )  # not before the task has ended: nobody may close what it saves into
+    # not before the task has ended: nobody may close what it saves into
+    assert not bench.acquisition.idle
     until(lambda: bench.acquisition.idle and bench.acquisition.view().state == "open")
     assert (bench.acquisition.view().name, bench.acquisition.view().light) == ("another", "white")
     assert not done and not bench.saved

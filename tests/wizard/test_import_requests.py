@@ -82,9 +82,8 @@ def test_a_zip_becomes_scans_and_leaves_nothing_behind(operator: Operator, sourc
     )
     operator.wait_until_idle(HANG_S)
     assert reports(operator, "warning", "capture_0", "already")
-    assert operator.import_zip(
-        "one.zip", archived(source / "capture_0"), projector="120x90"
-    )  # as poses
+    # as poses
+    assert operator.import_zip("one.zip", archived(source / "capture_0"), projector="120x90")
     operator.wait_until_idle(HANG_S)
     assert reports(operator, "error", "capture_0", "already")
 

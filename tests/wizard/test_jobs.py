@@ -223,9 +223,8 @@ def read_memory_mb() -> float:
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are left alone")
 def test_memory_freed_between_blocks_in_use_is_returned() -> None:
     release_memory()  # what other tests left
-    blocks = [
-        b"x" * 100_000 for _ in range(2000)
-    ]  # smaller than what the system gives in whole pages
+    # smaller than what the system gives in whole pages
+    blocks = [b"x" * 100_000 for _ in range(2000)]
     in_use = blocks[::20]
     del blocks
     before = read_memory_mb()

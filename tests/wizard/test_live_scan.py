@@ -32,11 +32,12 @@ from slviewer.wizard.snapshot import Level
 pytestmark = pytest.mark.computes
 
 SCALE = 0.15
+# what waits beside it needs the cores too
 RIG = {
     "driver": "simulated",
     "scale": SCALE,
     "settle_ms": 4,
-}  # what waits beside it needs the cores too
+}
 SETTINGS = CameraSettings(1.0, 1.0)
 
 
@@ -201,9 +202,8 @@ def test_what_moved_between_the_frames_is_masked_and_not_guessed() -> None:
     frames = world.renderer(False).capture(sequence)
     late = frames.copy()
     moving = (slice(None), slice(60, 180), slice(120, 200))
-    late[9][moving[1:]] = np.roll(frames[9], 4, axis=1)[
-        moving[1:]
-    ]  # one of the finest steps, four columns further
+    # one of the finest steps, four columns further
+    late[9][moving[1:]] = np.roll(frames[9], 4, axis=1)[moving[1:]]
     phases = [decode(sequence, each, "x") for each in (frames, late)]
 
     class Depth:

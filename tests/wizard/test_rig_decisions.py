@@ -121,9 +121,8 @@ def test_a_rig_is_kept_under_a_name_with_its_exposure(operator: Operator) -> Non
 def test_several_exposures_follow_the_one_that_they_were_chosen_by(operator: Operator) -> None:
     assert operator.session is not None
     assert operator.set_exposures((0.8, 3.2))
-    assert operator.set_exposure(1.6) and operator.set_exposure(
-        0.4
-    )  # both before the camera has said anything
+    # both before the camera has said anything
+    assert operator.set_exposure(1.6) and operator.set_exposure(0.4)
     assert operator.session.decision("exposures") == pytest.approx([0.4, 1.6])
 
 

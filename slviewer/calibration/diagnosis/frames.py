@@ -124,9 +124,8 @@ def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> flo
     for here, there in ((first, second), (second, first)):
         edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
         below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
-        if (
-            layout.complementary is not None
-        ):  # the cell that starts here is the second half of a period if odd
+        # the cell that starts here is the second half of a period if odd
+        if layout.complementary is not None:
             below = below - (code[there][edge] & 1) * np.pi
             above = above - (code[there][edge] & 1) * np.pi
         origins.append(below)

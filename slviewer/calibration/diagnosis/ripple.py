@@ -179,9 +179,8 @@ def _fit_ripple(samples: np.ndarray, mm_per_px: float, depth_mm: float) -> Rippl
         rms_px=float(np.sqrt(power.sum())),
         waves=int(waves[strongest]),
         strongest_px=float(np.sqrt(power[strongest])),
-        noise_px=float(
-            np.median(sigma * samples[:, 5])
-        ),  # the noise of a block's mean, times the block's side
+        # the noise of a block's mean, times the block's side
+        noise_px=float(np.median(sigma * samples[:, 5])),
         mm_per_px=mm_per_px,
         depth_mm=depth_mm,
     )

@@ -282,9 +282,8 @@ def _fit_sigmas(pose_changes: Sequence[PoseChange], start: Mapping[str, float]) 
 
     It exceeds the scatter of the residuals, as errors of neighbouring samples are correlated.
     """
-    spreads = np.array(
-        [[a.spreads[kind] for kind in KINDS] for a in pose_changes]
-    )  # (views, kinds, 6, 6)
+    # (views, kinds, 6, 6)
+    spreads = np.array([[a.spreads[kind] for kind in KINDS] for a in pose_changes])
     changes = np.array([a.change for a in pose_changes])[..., None]
 
     def negative_log_likelihood(logs: np.ndarray) -> float:

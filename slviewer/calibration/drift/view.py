@@ -167,13 +167,14 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
         for s in steps
     ]
     features, samples = model(np.zeros(13))
+    # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
     J = np.stack(
         [
             (model(np.zeros(13), 0.1 * e)[1] - model(np.zeros(13), -0.1 * e)[1]) / 0.2
             for e in np.eye(2)
         ],
         2,
-    )  # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
+    )
     camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
     on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
     on_samples = projector.basis(np.nan_to_num(samples))

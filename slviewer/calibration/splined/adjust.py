@@ -117,9 +117,8 @@ def adjust_bundle(
     where the adjustment does not converge, is undetermined, or where too few poses agree with each
     other.
     """
-    with threadpool_limits(
-        numba.get_num_threads(), user_api="blas"
-    ):  # for one large matrix, not for many small ones
+    # for one large matrix, not for many small ones
+    with threadpool_limits(numba.get_num_threads(), user_api="blas"):
         return _adjust(observations, stereo, progress, cells_across)
 
 

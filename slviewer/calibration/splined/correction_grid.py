@@ -26,10 +26,11 @@ def locate_layers(rational, near, per_mm, deepest):
 def _blend_rows(above, below, down, i, k):
     """Interpolate linearly between the rows ``above`` and ``below`` of the grid at column ``i`` and
     layer ``k``."""
+    # an index with a sign would be tested for counting from the end
     column, layer = (
         np.uint64(i),
         np.uint64(k),
-    )  # an index with a sign would be tested for counting from the end
+    )
     upper = above[column, layer]
     return fma(down, below[column, layer] - upper, upper)
 

@@ -98,9 +98,8 @@ def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.
     """Return the offset (p, f, 2) mm of each feature on the board by each pose; 0 where missing or
     an outlier."""
     by_place = []
-    data = data._replace(
-        sample_from=np.zeros_like(data.sample_from)
-    )  # the samples' predictions are not needed
+    # the samples' predictions are not needed
+    data = data._replace(sample_from=np.zeros_like(data.sample_from))
     here, _ = predict_observations(state, data)
     for k in range(2):
         step = np.zeros_like(state.offsets)

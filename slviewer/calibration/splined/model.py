@@ -195,9 +195,8 @@ class SplinedModel:
         """Return the standard deviation in projector px of the residuals beyond their predicted
         noise; 0 if none."""
         excess = float(self.bundle.noise.excess_px[AXES.index(axis)])
-        return (
-            excess if excess > 2 * MIN_SIGMA_PX else 0.0
-        )  # the least that an estimate can be means none
+        # the least that an estimate can be means none
+        return excess if excess > 2 * MIN_SIGMA_PX else 0.0
 
     def sigma_map(self, axis: Axis) -> SigmaMap:
         """Return the map of the depth uncertainty by the calibration, for depths measured through

@@ -59,12 +59,13 @@ def project_to_device(device, X, basis, by_point, by_lens):
     u, v = k[0] * xd + k[2], k[1] * yd + k[3]
     du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
     _fill_pixel_by_lens(x, y, xd, yd, k, by_lens)
+    # d(u, v before displacement) by x, y
     ux, uy, vx, vy = (
         k[0] * dxx,
         k[0] * dxy,
         k[1] * dxy,
         k[1] * dyy,
-    )  # d(u, v before displacement) by x, y
+    )
     by_point[0, 0], by_point[0, 1] = ux * inverse, uy * inverse
     by_point[1, 0], by_point[1, 1] = vx * inverse, vy * inverse
     by_point[0, 2] = -(ux * x + uy * y) * inverse
@@ -129,9 +130,8 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
         return u, v, i, j
     for k in range(2):
         m0, m1, m2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
-        fill_cross(
-            L, work.by_point[k], 1.0, row[k, POSE : POSE + 3]
-        )  # a turn w moves the point by w x L
+        # a turn w moves the point by w x L
+        fill_cross(L, work.by_point[k], 1.0, row[k, POSE : POSE + 3])
         row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = m0, m1, m2
         along = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
         for c in range(heights.shape[0]):
@@ -160,9 +160,8 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
         return np.nan, np.nan, ci, cj, 0, 0
     s = (R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2]) / facing
     Y, N = work.local, work.normal
-    for _ in range(
-        4
-    ):  # onto the bent surface: the bow is a thousandth of the distance, so this squares fast
+    # onto the bent surface: the bow is a thousandth of the distance, so this squares fast
+    for _ in range(4):
         Y[0], Y[1], Y[2] = s * x - t[0], s * y - t[1], s - t[2]
         bx = R[0, 0] * Y[0] + R[1, 0] * Y[1] + R[2, 0] * Y[2]
         by = R[0, 1] * Y[0] + R[1, 1] * Y[1] + R[2, 1] * Y[2]

@@ -78,9 +78,8 @@ def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volum
     projector's image."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     points, projector = view_pixels(rig, pixels, z)
-    in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(
-        axis=1
-    )  # False for NaN
+    # False for NaN
+    in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)
     return Volume(pixels[in_view], z[in_view], points[in_view], projector[in_view])
 
 

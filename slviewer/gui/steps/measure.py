@@ -300,9 +300,8 @@ class MeasurePanel(StepPanel):
         ]
         for choice in (self._from, self._to):
             choice.offer(related)
-        if (
-            related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]
-        ):  # likely the latest two
+        # likely the latest two
+        if related != self._related and len(related) > 1 and self._tool.name != COMPARE[0]:
             self._from.choose(related[-2][0])
             self._to.choose(related[-1][0])
         self._related = related

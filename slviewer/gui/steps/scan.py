@@ -370,9 +370,10 @@ class ScanPanel(StepPanel):
         self._scene.remove(LAYER, "picked")
         self._point.set("")
         painted = np.where(aligned.seen_by[:, None] > 1, SEEN_AGAIN, SEEN_ONCE)
+        # shows the relief
         painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
             np.uint8
-        )  # shows the relief
+        )
         self._scene.cloud(LAYER, "cloud", aligned.points, painted)
         self._scene.show(LAYER, self._visible)
         self._legend.set(aligned_html(aligned))

@@ -39,9 +39,8 @@ class FrameImages:
     """
 
     stack: np.ndarray  # (n, h, w) uint8 or uint16
-    texture: (
-        np.ndarray | None
-    )  # (h, w, 3) RGB of the frame that was asked for, where it is in colour
+    # (h, w, 3) RGB of the frame that was asked for, where it is in colour
+    texture: np.ndarray | None
     in_colour: bool
     full_scale: int | None
 

@@ -23,9 +23,8 @@ class ImportableRecording:
 
     name: str
     sequence: PatternSequence
-    files: tuple[
-        Path, ...
-    ]  # one a frame, in the sequence's order; of several exposures one after the other
+    # one a frame, in the sequence's order; of several exposures one after the other
+    files: tuple[Path, ...]
     source: Path
     settings: Mapping[str, Any] = field(default_factory=dict)
     channel: Channel | None = None  # of colour frames; None: the default

@@ -19,6 +19,7 @@ _SPELLINGS: tuple[tuple[str, ...], ...] = (
     ENTRIES,
     ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),  # sltk
     ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),  # SLStudio
+    # procam-calibration, as it spells it
     (
         "cam_int",
         "cam_dist",
@@ -26,7 +27,7 @@ _SPELLINGS: tuple[tuple[str, ...], ...] = (
         "proj_dist",
         "roration",
         "translation",
-    ),  # procam-calibration, as it spells it
+    ),
     ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
     ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
     ("K_cam", "D_cam", "K_proj", "D_proj", "R", "T"),

@@ -132,9 +132,8 @@ def test_the_board_is_detected_where_it_is() -> None:
     )
     found = detect(board, image)
     assert len(found.ids) == 4 * 20
-    points = (
-        board.points[found.ids][:, :2] * 10 + 100 - 0.5
-    )  # a tag of 10 mm is 100 px, and its edge is between pixels
+    # a tag of 10 mm is 100 px, and its edge is between pixels
+    points = board.points[found.ids][:, :2] * 10 + 100 - 0.5
     true = cv2.perspectiveTransform(points[None], H)[0]
     error = np.sqrt(np.mean((found.pixels - true) ** 2))
     assert 0.001 < error < 0.3
