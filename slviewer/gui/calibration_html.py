@@ -47,7 +47,7 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
     """List the poses that the verdict or the joint adjustment names, each once."""
     names = [name for finding in verdict.findings for name in finding.poses] if verdict else []
     if calibration is not None and calibration.splined is not None:
-        names += calibration.splined.left_out
+        names += calibration.splined.excluded
     return tuple(dict.fromkeys(names))
 
 
@@ -65,7 +65,7 @@ def exclusions_html(calibration: CalibrationView) -> Html:
     if calibration.splined is not None:
         lines += [
             f"{name}, in the splined model only: it {why}"
-            for name, why in calibration.splined.left_out.items()
+            for name, why in calibration.splined.excluded.items()
         ]
     if not lines:
         return note

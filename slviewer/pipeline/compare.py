@@ -21,7 +21,7 @@ from slviewer.pipeline.measured_surface import (
 )
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import placed_file
-from slviewer.pipeline.operation import Found, Job, operation, plain_settings
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.stored_records import next_name
 from slviewer.records.measurement import (
     DeviationStatistics,
@@ -119,8 +119,6 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         **provenance(on),
         quantities=described.quantities(),
         deviation=described,
-        operation="compare",
-        settings=plain_settings(used),
     )
     job.progress(0.92, "writing")
     file_name = f"{_safe_name(settings.scan)}_{_safe_name(Path(nominal.name).stem)}_deviation.ply"
@@ -128,7 +126,7 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         _write_points(written, on, result, nominal, settings.tolerance)
         note = f"coloured points -> {place}"
         arrays = _list_arrays(points, result)
-        yield Found(next_name(store, Measurement), record, arrays, (place,), (note,))
+        yield Found(next_name(store, Measurement), record, arrays, (place,), (note,), settings=used)
     job.progress(1.0, "compared")
 
 

@@ -13,7 +13,7 @@ from slviewer.evaluation.capability import process_capability
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.open_session import match_names, opened
+from slviewer.pipeline.open_session import SessionLike, match_names, opened
 from slviewer.pipeline.operation import Findings
 from slviewer.pipeline.part_inspection import fail_part, inspect_part
 from slviewer.printable import format_csv
@@ -60,13 +60,6 @@ def inspect_parts(
     read = read_plan(plan)
     sources: list[tuple[str, Load]] = []
     folders = list_sessions(sessions)
-
-    def load(folder: Path, scan: str, report: Progress) -> MeasuredSurface:
-        """Load one part's surface."""
-        return load_surface(
-            folder, scan, model=model, accept_rejected=accept_rejected, progress=report, warn=warn
-        )
-
     for folder in folders:
         try:
             with opened(folder) as store:
@@ -76,13 +69,22 @@ def inspect_parts(
             continue
         for name in names:
             label = name if len(folders) == 1 else f"{folder.name}/{name}"
-            sources.append((label, partial(load, folder, name)))
+            sources.append((label, part_loader(folder, name, model, accept_rejected, warn)))
     # of several sessions
     found = msgspec.structs.replace(inspect_surfaces(read, sources, progress), inputs={})
     folder = Path(f"{Path(plan).with_suffix('')}-results") if out is None else out
     files = tuple(folder.absolute() / name for name in FILES)
     write_inspection(found, files)
     return Findings(Inspection, {found.plan: found}, files, tuple(f"-> {path}" for path in files))
+
+
+def part_loader(
+    session: SessionLike, scan: str, model: ModelName | None, accept_rejected: bool, warn: Warn
+) -> Load:
+    """Return what loads the surface of a part."""
+    return lambda progress: load_surface(
+        session, scan, model=model, accept_rejected=accept_rejected, progress=progress, warn=warn
+    )
 
 
 def inspect_surfaces(

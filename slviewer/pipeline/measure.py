@@ -22,7 +22,7 @@ from slviewer.pipeline.measured_surface import (
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName, available_models
-from slviewer.pipeline.operation import Found, Job, operation, plain_settings
+from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.stored_records import next_name
 from slviewer.records.measurement import MeasuredFeature, MeasuredRegion, Measurement, SectionPlane
 from slviewer.records.plain import from_plain, to_plain
@@ -143,8 +143,6 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
         what=settings.what,
         name=clean_label(settings.name),
         **provenance(on),
-        operation="measure",
-        settings=plain_settings(replace(settings, model=on.model)),  # type: ignore[arg-type]
         **fields,
     )
     yield Found(
@@ -152,6 +150,7 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
         record,
         arrays,
         notes=uncertainty_notes(job.store, record),
+        settings=replace(settings, model=on.model),  # type: ignore[arg-type]
     )
     job.progress(1.0, "measured")
 

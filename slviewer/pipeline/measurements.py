@@ -60,10 +60,10 @@ def describe_measurement(measured: Stored[Measurement]) -> str:
     return f"{measured.name:<4} {measured.label}: {measured.record.summary()}{mark}"
 
 
-def measurements_csv(session: SessionLike) -> str:
-    """All measurements as comma-separated values, one row a quantity; U where it is known."""
+def format_measurements(found: Sequence[Stored[Measurement]]) -> str:
+    """Return measurements as comma-separated values, one row a quantity; U where it is known."""
     rows: list[Iterable[object]] = [COLUMNS]
-    for each in load_measurements(session):
+    for each in found:
         record, state = each.record, "stale" if each.stale else "fresh"
         for q in record.quantities:
             known = ("", "") if q.U is None else (f"{q.U:.6g}", "yes" if q.whole else "no")
@@ -75,13 +75,13 @@ def measurements_csv(session: SessionLike) -> str:
 
 
 def export_measurements(session: SessionLike, out: Path | str) -> int:
-    """Write ``measurements_csv`` to a file; returns how many measurements it holds."""
+    """Write all measurements to a CSV file; returns how many it holds."""
     out = Path(out)
     if out.suffix.lower() != ".csv":
         raise InputError(f"{out.name} is no table: end its name in .csv")
-    with opened(session) as store:
-        replace_file(out.absolute(), measurements_csv(store).encode("utf-8-sig"))
-        return len(load_measurements(store))
+    found = load_measurements(session)
+    replace_file(out.absolute(), format_measurements(found).encode("utf-8-sig"))
+    return len(found)
 
 
 def rename_measurement(store: Session, name: str, label: str) -> Stored[Measurement]:

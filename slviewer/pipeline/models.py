@@ -75,11 +75,8 @@ def save_model(
 def save_compiled(store: Session, model: Model) -> None:
     """Compile a splined model that was stored, and store that too."""
     if isinstance(model, SplinedModel):
-        _restore_or_compile(
-            store,
-            model,
-            store.input_hashes(f"calibration/{model.name}")[f"calibration/{model.name}"],
-        )
+        (content,) = store.input_hashes(f"calibration/{model.name}").values()
+        _restore_or_compile(store, model, content)
 
 
 def available_models(store: Session) -> tuple[str, ...]:

@@ -39,7 +39,8 @@ class Job:
 class Found(Generic[R]):
     """One record that an operation found, and its arrays. ``name``: the capture that it is of, or
     its number; where it is not to be ``stored``, that of its file. ``files``: what else was
-    written, ``notes`` on it in words.
+    written, ``notes`` on it in words. ``settings``: with what was chosen for want of any, where
+    these are not the operation's.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Found(Generic[R]):
     files: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     stored: bool = True
+    settings: Any = None
 
 
 class Findings(dict[str, R]):
@@ -164,7 +166,9 @@ class Operation(Generic[P, S, R]):
                 record = found.record
                 if not record.operation:
                     record = msgspec.structs.replace(
-                        record, operation=self.name, settings=plain_settings(settings)
+                        record,
+                        operation=self.name,
+                        settings=plain_settings(found.settings or settings),
                     )
                 if found.stored and job.store.is_writable:
                     save_record(job.store, found.name, record, found.arrays)

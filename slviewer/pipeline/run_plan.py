@@ -3,12 +3,15 @@
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
-from slviewer.pipeline.feedback import Progress
-from slviewer.pipeline.inspect_parts import FILES, inspect_surfaces, match_parts, write_inspection
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
+from slviewer.pipeline.inspect_parts import (
+    FILES,
+    inspect_surfaces,
+    match_parts,
+    part_loader,
+    write_inspection,
+)
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import next_number
 from slviewer.pipeline.operation import Found, Job, operation
@@ -46,19 +49,10 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
     """
     store = job.store
     plan = _use_own_nominal(store, read_plan(settings.plan))
-
-    def load(scan: str, progress: Progress) -> MeasuredSurface:
-        """Load the surface of a part."""
-        return load_surface(
-            store,
-            scan,
-            model=settings.model,
-            accept_rejected=settings.accept_rejected,
-            progress=progress,
-            warn=job.warn,
-        )
-
-    sources = [(name, partial(load, name)) for name in match_parts(store, settings.scans)]
+    sources = [
+        (name, part_loader(store, name, settings.model, settings.accept_rejected, job.warn))
+        for name in match_parts(store, settings.scans)
+    ]
     found = inspect_surfaces(plan, sources, job.progress)
     with ExitStack() as placed:
         write_inspection(found, [placed.enter_context(store.staged_export(name)) for name in FILES])

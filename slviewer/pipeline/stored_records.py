@@ -10,6 +10,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
 from slviewer.pipeline.scale import scale_factor
+from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.record import Record
@@ -78,9 +79,8 @@ def load_stored(store: Session, kind: type[R], name: str) -> Stored[R]:
         noun = kind.title.lower().removesuffix("s")
         raise InputError(f"there is no {noun} {name!r}: there are {', '.join(there) or 'none'}")
     record, labels = load_record(store, kind, name), store.valid_decision(kind.labels) or {}
-    return Stored(
-        name, str(labels.get(name) or record.label(name)), record, not is_up_to_date(store, result)
-    )
+    label = str(labels.get(name) or record.label(name))
+    return Stored(name, label, record, not _is_current(store, result, record))
 
 
 def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
@@ -113,12 +113,22 @@ def is_up_to_date(store: Session, result: str) -> bool:
     """Whether a record's inputs are as they were, and no correction of scale has changed since,
     also in records that it was made from; other results are taken to be."""
     kind, _, name = result.partition("/")
-    if kind not in RECORDS:
-        return True
-    if store.state_of(result) != "fresh":
-        return False
-    record = load_record(store, RECORDS[kind], name)
-    has_scales = all(
-        scale_factor(store, model) == factor for model, factor in record.scales.items()
+    return kind not in RECORDS or _is_current(
+        store, result, load_record(store, RECORDS[kind], name)
     )
-    return has_scales and all(is_up_to_date(store, each) for each in record.inputs)
+
+
+def _is_current(store: Session, result: str, record: Record) -> bool:
+    """Whether a record that was loaded is up to date."""
+    return store.state_of(result) == "fresh" and _has_scales(store, record)
+
+
+def _has_scales(store: Session, record: Record) -> bool:
+    """Whether the corrections of scale in a record, and in those that it was made from, are in
+    force; calibrations are made without any."""
+    made_from = (each.partition("/") for each in record.inputs)
+    return all(scale_factor(store, model) == used for model, used in record.scales.items()) and all(
+        _has_scales(store, load_record(store, RECORDS[kind], name))
+        for kind, _, name in made_from
+        if kind in RECORDS and kind != ModelCalibration.kind
+    )

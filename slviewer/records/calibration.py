@@ -138,7 +138,7 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
     """The joint adjustment. Residuals by "camera" and the projector's axes "x" and "y":
     ``noise_px``, and ``residuals_over_noise``, times their predicted noise. ``cells_lit``: share of
     each device's cells that target poses illuminated. ``weights`` of each pose in camera and
-    projector, 0 to 1. ``left_out``: {pose: why}; ``turned``: poses numbered from the board's other
+    projector, 0 to 1. ``excluded``: {pose: why}; ``turned``: poses numbered from the board's other
     end."""
 
     steps: Count
@@ -150,7 +150,7 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
     cells_lit: dict[str, Share]
     sigma_volume_mm: VolumeSigma
     weights: dict[str, tuple[float, float]] = {}
-    left_out: dict[str, str] = {}
+    excluded: dict[str, str] = {}
     turned: tuple[str, ...] = ()
 
     def summary(self) -> str:
@@ -211,7 +211,7 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
         notes += [f"{title}: {', '.join(names)}." for title, names in named.items() if names]
         notes += [
             f"{name} is excluded from the splined model: it {why}."
-            for name, why in self.left_out.items()
+            for name, why in self.excluded.items()
         ]
         columns = [Column("quantity", align="left"), Column("value")]
         return Table(columns, rows, f"Joint adjustment (splined), {self.steps} steps", notes)

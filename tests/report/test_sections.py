@@ -287,7 +287,7 @@ def test_how_good_a_calibration_is() -> None:
         board_offsets_rms_mm=0.01,
         cells_lit={"camera": 0.98, "projector": 0.6},
         sigma_volume_mm=VolumeSigma(0.01, 0.03, 0.7, (399.0, 0.0, 794.0), 0.9, (426.0, 794.0), "x"),
-        left_out={"pose_09": "contradicts the other poses"},
+        excluded={"pose_09": "contradicts the other poses"},
     )
     sides = {"within_95_mm": (-0.034, -0.026), "within_997_mm": (-0.036, -0.024)}
     figure = {

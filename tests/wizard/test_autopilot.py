@@ -112,7 +112,7 @@ def assert_all_is_measured(snapshot: Snapshot, acts: list[str]) -> None:
     splined = calibration.splined
     assert splined is not None and splined.noise_px["x"] < 0.03
     assert splined.cells_lit["camera"] > 0.8
-    assert set(splined.weights) == set(calibration.stereo.poses) and not splined.left_out
+    assert set(splined.weights) == set(calibration.stereo.poses) and not splined.excluded
     found = {each.name: each.record.models for each in session.list_records(Verification)}
     plane, sphere = found["plane_01"], found["sphere_01"]
     assert plane["splined"].rms_mm < plane["pixelwise"].rms_mm < plane["stereo"].rms_mm < 0.5  # type: ignore[operator]

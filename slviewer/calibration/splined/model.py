@@ -247,7 +247,7 @@ class SplinedModel:
             weights={
                 name: (fit.camera_trust, fit.projector_trust) for name, fit in bundle.fits.items()
             },
-            left_out=dict(bundle.excluded),
+            excluded=dict(bundle.excluded),
             turned=tuple(bundle.half_turned_poses),
         )
 
