@@ -41,7 +41,7 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
     crest = _local_extreme(cv2.dilate, modulation, pitch)
     bright = (modulation > 0.5 * crest) & (modulation > 0)
-    dark = cv2.morphologyEx(  # a lone pixel lost to noise is no edge
+    dark = cv2.morphologyEx(  # a lone pixel lost to noise is not an edge
         (~bright).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
     )
     sigma = edge_blur_px(phase, inside, pitch)
@@ -64,7 +64,7 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     modulation = np.asarray(phase.modulation, np.float32)
     crest, trough = (_local_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
     contrast = crest - trough
-    # the board's outline is no edge
+    # the board's outline is not an edge
     edged = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     edged &= contrast > 0.4 * crest
     level = np.clip((modulation - trough) / np.maximum(contrast, 1e-6), 0, 1)

@@ -180,12 +180,12 @@ def call(function: Callable[..., Any], **arguments: Any) -> Any:
             session, function.settings(**arguments), terminal.progress, terminal.warn
         )
     callbacks = {"progress": terminal.progress, "warn": terminal.warn}
-    heard = {
+    callbacks = {
         name: callbacks[name]
         for name in callbacks
         if name in inspect.signature(function).parameters
     }
-    return function(**arguments, **heard)
+    return function(**arguments, **callbacks)
 
 
 def write_json(path: Path | None, result: object) -> None:

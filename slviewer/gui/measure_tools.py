@@ -51,7 +51,7 @@ class Tool:
         again.
 
         A tool that fits replaces its point instead, until the operator accepts the region. The same
-        point again, as by a double click, is no second point.
+        point again, as by a double click, is not a second point.
         """
         if self.fits:
             self.picked = [place]

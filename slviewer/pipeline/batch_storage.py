@@ -36,7 +36,7 @@ def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
     if not is_remote(address):
         if not is_session(address):
             raise SessionError(
-                f"{address} is no session folder where the worker is: give one that all workers"
+                f"{address} is not a session folder where the worker is: give one that all workers"
                 " share, or an address"
             )
         yield Path(address)
@@ -58,7 +58,7 @@ def fetch_session(address: str, capture: str = "") -> Iterator[Path]:
             ) from error
         if not is_session(folder):
             raise SessionError(
-                f"{address} is no session (it holds no session.json): check the address"
+                f"{address} is not a session (it holds no session.json): check the address"
             )
         for inner in ("captures", "results"):
             Path(folder, inner).mkdir(exist_ok=True)

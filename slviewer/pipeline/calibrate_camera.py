@@ -79,7 +79,7 @@ def _list_pictures(source: Path) -> list[str]:
             return store.capture_names("calibration")
     if not source.is_dir():
         raise InputError(
-            f"{source} is no folder: give a folder of pictures of the board, or a session"
+            f"{source} is not a folder: give a folder of pictures of the board, or a session"
         )
     return [path.name for path in images_by_name(source)]
 

@@ -274,7 +274,7 @@ def check_exporter(exporter: Exporter) -> Iterator[str]:
     colours = rng.integers(0, 255, (4, 3)).astype(np.uint8)
     faces = np.array([[0, 1, 2], [1, 2, 3]], np.int32)
     if not (exporter.name == exporter.name.lower() and exporter.name.isalnum()):
-        yield "name is no plain suffix"
+        yield "name is not a plain suffix"
     shapes: list[PointSet | Mesh] = []
     if exporter.takes_points:
         shapes += [PointSet(points), PointSet(points, normals=normals, colours=colours)]

@@ -66,7 +66,7 @@ def fetch(
     known = datasets()
     if name not in known:
         also = (
-            "; letter is attached to releases, and this is no release: make it by"
+            "; letter is attached to releases, and this is not a release: make it by"
             " assets/make_sample_data.py letter"
         )
         raise InputError(

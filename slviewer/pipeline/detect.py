@@ -252,7 +252,7 @@ def _overlay_path(out: Path, photograph: Path, count: int) -> Path:
 
 
 def _write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write an image in the format of the suffix; InputError where that is no image format."""
+    """Write an image in the format of the suffix; InputError where that is not an image format."""
     path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(path.suffix, picture)
     if not done:

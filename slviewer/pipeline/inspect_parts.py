@@ -150,7 +150,8 @@ def list_sessions(folders: Sequence[Path]) -> list[Path]:
         )
         if not inner:
             raise UsageError(
-                f"{folder} is no session and holds none: give session folders, or a folder of them"
+                f"{folder} is not a session and holds none: give session folders, or a folder of"
+                " them"
             )
         listed += inner
     if not listed:

@@ -85,7 +85,7 @@ class MeasuredSurface:
         measured there."""
         if self.organised != isinstance(place, tuple):
             raise InputError(
-                f"{place} is no place on {self.source}: give"
+                f"{place} is not a place on {self.source}: give"
                 f" {'pixel (u, v)' if self.organised else 'an index'}"
             )
         index = (place[1], place[0]) if isinstance(place, tuple) else (place,)

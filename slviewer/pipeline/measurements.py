@@ -78,7 +78,7 @@ def export_measurements(session: SessionLike, out: Path | str) -> int:
     """Write all measurements to a CSV file; returns how many it holds."""
     out = Path(out)
     if out.suffix.lower() != ".csv":
-        raise InputError(f"{out.name} is no table: end its name in .csv")
+        raise InputError(f"{out.name} is not a table: end its name in .csv")
     found = load_measurements(session)
     replace_file(out.absolute(), format_measurements(found).encode("utf-8-sig"))
     return len(found)

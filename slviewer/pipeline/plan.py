@@ -99,7 +99,7 @@ def make_plan(
     if datums:
         if missing := [each for each in datums if each not in fits]:
             raise InputError(
-                f"{', '.join(missing)} is no fit to align by: there are {', '.join(fits)}"
+                f"{', '.join(missing)} is not a fit to align by: there are {', '.join(fits)}"
             )
         T = datum_frame([features[each] for each in datums])
         start = tuple(map(tuple, T.round(9).tolist()))

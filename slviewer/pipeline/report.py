@@ -80,7 +80,7 @@ def report(
     Returns where it is, in words.
     """
     if Path(out).suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{out} is no HTML file: end its name in .html")
+        raise InputError(f"{out} is not an HTML file: end its name in .html")
     with opened(session) as store:
         progress(0.1, "reading the session")
         data = _collect_data(store)

@@ -113,11 +113,11 @@ def check_choice(choice: Choice, where: str) -> None:
             or (not value and key != "settle_ms")
         ):
             raise InputError(
-                f"{where}: {key} = {value!r} is no number above 0, up to {largest:g}: correct it"
+                f"{where}: {key} = {value!r} is not a number above 0, up to {largest:g}: correct it"
             )
     name = choice.get("name", "")
     if not isinstance(name, str) or not name.isprintable():
-        raise InputError(f"{where}: name = {name!r} is no text that can be printed: correct it")
+        raise InputError(f"{where}: name = {name!r} is not text that can be printed: correct it")
     if "turntable" in choice:
         _check_device(choice, "turntable", where)
     if "driver" in choice:
@@ -155,7 +155,7 @@ def _read_preset(name: str, path: Path) -> Preset:
     choice = read_toml(path)
     what = choice.pop("what", "")
     if not isinstance(what, str):
-        raise InputError(f"{path}: what = {what!r} is no text: correct it")
+        raise InputError(f"{path}: what = {what!r} is not text: correct it")
     check_choice(choice, str(path))
     return Preset(name, what, choice, path)
 
@@ -188,7 +188,7 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     parameters = inspect.signature(make, eval_str=True).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
-    # the program supplies these; they are no entries of a file
+    # the program supplies these; they are not entries of a file
     provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
     known = [parameter for parameter in parameters if parameter.name not in provided]
     accepted = [parameter.name for parameter in known]
@@ -208,7 +208,7 @@ def _check_type(parameter: inspect.Parameter, options: Mapping[str, Any], where:
     that is finite."""
     value = options.get(parameter.name, parameter.default)
     if isinstance(value, float) and not isfinite(value):
-        raise InputError(f"{where}: {parameter.name} = {value!r} is no number: correct it")
+        raise InputError(f"{where}: {parameter.name} = {value!r} is not a number: correct it")
     if parameter.name not in options or parameter.annotation is parameter.empty:
         return
     try:

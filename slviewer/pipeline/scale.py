@@ -77,7 +77,7 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
     factor = before / (1 + 1e-6 * acceptance.scale.ppm)
     if not 1 / LARGEST_FACTOR <= factor <= LARGEST_FACTOR:  # False for NaN
         raise InputError(
-            f"the scale factor would be {factor:.6g}, which is no correction (at most"
+            f"the scale factor would be {factor:.6g}, which is not a correction (at most"
             f" {LARGEST_FACTOR:g}): check the certificate's length, temperature and expansion, and"
             " that its captures show this artefact"
         )

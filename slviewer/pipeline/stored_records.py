@@ -80,7 +80,8 @@ def load_stored(store: Session, kind: type[R], name: str) -> Stored[R]:
         raise InputError(f"there is no {noun} {name!r}: there are {', '.join(there) or 'none'}")
     record, labels = load_record(store, kind, name), store.valid_decision(kind.labels) or {}
     label = str(labels.get(name) or record.label(name))
-    return Stored(name, label, record, not _is_current(store, result, record))
+    is_current = store.state_of(result) == "fresh" and _has_scales(store, record)
+    return Stored(name, label, record, stale=not is_current)
 
 
 def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
@@ -113,14 +114,10 @@ def is_up_to_date(store: Session, result: str) -> bool:
     """Whether a record's inputs are as they were, and no correction of scale has changed since,
     also in records that it was made from; other results are taken to be."""
     kind, _, name = result.partition("/")
-    return kind not in RECORDS or _is_current(
-        store, result, load_record(store, RECORDS[kind], name)
-    )
-
-
-def _is_current(store: Session, result: str, record: Record) -> bool:
-    """Whether a record that was loaded is up to date."""
-    return store.state_of(result) == "fresh" and _has_scales(store, record)
+    if kind not in RECORDS:
+        return True
+    is_fresh = store.state_of(result) == "fresh"
+    return is_fresh and _has_scales(store, load_record(store, RECORDS[kind], name))
 
 
 def _has_scales(store: Session, record: Record) -> bool:

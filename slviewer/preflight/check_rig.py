@@ -114,12 +114,12 @@ def preflight(
     """
     began, shown = clock.now(), 0
     checks: list[Check] = []
-    heard = progress or ignore_progress
+    report = progress or ignore_progress
 
     def tick(doing: str) -> None:
         """Report progress by one more image."""
         nonlocal shown
-        heard(min(0.99, shown / _EXPECTED_IMAGES), doing)
+        report(min(0.99, shown / _EXPECTED_IMAGES), doing)
         shown += 1
 
     def add(*results: Check) -> None:
@@ -161,5 +161,5 @@ def preflight(
     if rig.turntable is not None:
         tick("turning the turntable")
         add(check_turning(rig.turntable))
-    heard(1.0, "checked")
+    report(1.0, "checked")
     return Preflight(tuple(checks), settle_ms, levels, exposure_ms, clock.now() - began)

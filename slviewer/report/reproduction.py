@@ -228,8 +228,8 @@ def _spheres_section(data: ReproductionData) -> Section:
         ]
     return Section(
         "Experiment 2b: spheres",
-        "Flatness is no measure of scale: a projector turned by a tenth of a milliradian leaves a"
-        " plane flat and distorts scale. A sphere of known radius, and the distances between"
+        "Flatness is not a measure of scale: a projector turned by a tenth of a milliradian leaves"
+        " a plane flat and distorts scale. A sphere of known radius, and the distances between"
         " spheres, show it. The fitted radius is free. All error maps of this experiment share one"
         " colour scale.",
         items,

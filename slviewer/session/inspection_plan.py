@@ -178,7 +178,7 @@ def read_plan(path: Path | str) -> Plan:
     try:
         plan = from_plain(data, Plan)
     except InputError as error:
-        raise InputError(f"{path} is no inspection plan ({error}): correct it there") from error
+        raise InputError(f"{path} is not an inspection plan ({error}): correct it there") from error
     if plan.alignment.nominal is None:
         return plan
     nominal = Path(path).expanduser().absolute().parent / plan.alignment.nominal

@@ -52,7 +52,7 @@ class WriterLock:
         """Remove the lock's files and release it: a writer that waits for it then begins with a new
         file.
 
-        Only for a folder that is no session any more.
+        Only for a folder that is a session no more.
         """
         with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
             self._holder.unlink(missing_ok=True)

@@ -32,7 +32,7 @@ class CaptureRequests(ResultRequests):
         """Capture the board in place of a pose; the old one goes to the trash once the new one is
         saved."""
         if self._engine.store.load_capture(name).role != "calibration":
-            raise InputError(f"{name} is no target pose: capture another scan instead")
+            raise InputError(f"{name} is not a target pose: capture another scan instead")
         self._engine.hands_free.note_capture()
         self._capture_pose(name, retake=True)
 

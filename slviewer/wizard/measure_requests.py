@@ -99,7 +99,7 @@ class MeasureRequests(RequestHandler):
 
         if not name.lower().endswith(".toml"):
             raise InputError(
-                f"{name} is no plan: choose the .toml file that Make plan or slviewer plan wrote"
+                f"{name} is not a plan: choose the .toml file that Make plan or slviewer plan wrote"
             )
         self._save_upload("Reading the plan", PLANS, name, content, describe)
 

@@ -173,8 +173,8 @@ class CalibrationView:
 
 @dataclass(frozen=True, eq=False)
 class ScanView:
-    """One capture that is no target pose. `cloud`: whether it is reconstructed: no, yes, or by an
-    older calibration; `label` is the operator's name for it.
+    """One capture that is not a target pose. `cloud`: whether it is reconstructed: no, yes, or by
+    an older calibration; `label` is the operator's name for it.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The worker's jobs that are no operations yet, one function each.
+"""The worker's jobs that are not operations yet, one function each.
 
 What they save names its inputs, so that stale results are detected. The frames of a capture are
 compared with each other by a job of their own (`engine`), which no cloud waits for.

@@ -102,8 +102,8 @@ def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
     """Detect the (columns, rows) of the grid of circles in an image, whatever the board's own; None
     without a grid.
 
-    The longer side is given as the board's longer side. None for boards that are no regular grid of
-    circles.
+    The longer side is given as the board's longer side. None for boards that are not a regular grid
+    of circles.
     """
     if board.kind != "circles":
         return None
