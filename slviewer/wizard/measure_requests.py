@@ -154,7 +154,11 @@ class MeasureRequests(RequestHandler):
                 f"there is no nominal model {nominal!r} in the session: upload it first"
             )
         settings = CompareSettings(on, path, tolerance_mm, units, load=self._loader(on))
-        failed = lambda error: self._engine.notices.add_failure(COMPARING, _reword(error))  # noqa: E731
+
+        def failed(error: BaseException) -> None:
+            """Report why, in the words of the panel."""
+            self._engine.notices.add_failure(COMPARING, _reword(error))
+
         self._run(COMPARING, compare, settings, "measurements", failed)
 
     @request("Renaming")
