@@ -1,6 +1,7 @@
 """HTML of measurements: the list, one in full, and the histogram of a deviation."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,7 +36,11 @@ def measurements_table(measured: Sequence[Stored[Measurement]], labels: Mapping[
         f"{each.label} ({each.name}{', stale' if each.stale else ''})": each.record
         for each in reversed(measured)
     }
-    return report_table(relabel(list_quantities(named), labels))
+    listed = relabel(list_quantities(named), labels)
+    # a panel is too narrow for a column of scans
+    rows = [[f"{name} on {scan}", what, scan, *rest] for name, what, scan, *rest in listed.rows]
+    shown = [column for column in listed.columns if column.title != "scan"]
+    return report_table(replace(listed, rows=rows).select(shown))
 
 
 def measurement_html(measured: Stored[Measurement], labels: Mapping[str, str]) -> Html:

@@ -148,7 +148,7 @@ class Inspection(Record, frozen=True, kw_only=True):
             Column("characteristic", align="left"),
             Column("type", align="left", detail=True),
             Column("value", digits=4),
-            Column("U (k = 2)", digits=4),
+            Column("U (k=2)", digits=4),
             Column("unit", align="left"),
             *(Column(limit, digits=4, detail=True) for limit in ("nominal", "lower", "upper")),
             Column("decision", align="left"),
