@@ -1,0 +1,487 @@
+"""Faults of simulated captures: of the order of the frames, of their description, of the light and
+of the scene."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from zlib import crc32
+
+import numpy as np
+
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
+from slviewer.validation.simulated_capture import (
+    AXES,
+    BLACK,
+    FOREIGN,
+    KINDS,
+    CaptureKind,
+    CaptureSetup,
+    draw_setup,
+    gray_code,
+    pattern_levels,
+)
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class FaultyCapture:
+    """A faulty capture, and ``sound``: the same one without the fault.
+
+    ``causes``: each of them names the fault rightly. ``frames``: of which a finding must name one
+    if the fault is of one frame; else empty.
+    """
+
+    setup: CaptureSetup
+    sound: CaptureSetup
+    causes: frozenset[str]
+    frames: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class CaptureFault:
+    """``strike`` puts the fault into a sound capture; ``kinds``: captures that can have it."""
+
+    strike: Callable[[CaptureSetup, Rng], FaultyCapture]
+    kinds: tuple[CaptureKind, ...]
+
+
+ANY = KINDS
+PHASE: tuple[CaptureKind, ...] = tuple(k for k in KINDS if k != "gray")
+CODED: tuple[CaptureKind, ...] = ("p18", "complementary")
+"""With phase steps and Gray bits."""
+BITS: tuple[CaptureKind, ...] = (*CODED, "gray")
+LEVELS: tuple[CaptureKind, ...] = ("multifrequency", "heterodyne", "micro")
+FEW: tuple[CaptureKind, ...] = ("complementary", *LEVELS)
+"""With three or four phase steps."""
+
+
+def _faulty(
+    sound: CaptureSetup,
+    causes: Sequence[str],
+    frames: Sequence[int] = (),
+    **changes: object,
+) -> FaultyCapture:
+    """The capture with ``changes`` of its setup."""
+    changed = replace(sound, **changes)  # type: ignore[arg-type]
+    return FaultyCapture(changed, sound, frozenset(causes), tuple(frames))
+
+
+def _count(setup: CaptureSetup) -> int:
+    """Number of images."""
+    return len(setup.shown.frames)
+
+
+def _coded(setup: CaptureSetup) -> list[int]:
+    """Indices of the frames that decoding needs."""
+    return [i for i, frame in enumerate(setup.shown.frames) if frame.kind != "texture"]
+
+
+def _steps(sequence: PatternSequence) -> list[tuple[int, ...]]:
+    """Indices of the phase steps of each period and axis."""
+    return [indices for axis in sequence.axes for _, indices in sequence.phase_shifts(axis)]
+
+
+def _is_same_pattern(setup: CaptureSetup, a: int, b: int) -> bool:
+    """Whether two frames show the same, as two bits that are black all over the projector."""
+    first, second = setup.shown.frames[a], setup.shown.frames[b]
+    shown = [pattern_levels(setup.shown, f, setup.wave) for f in (first, second)]
+    if first.axis == second.axis:
+        return bool(np.array_equal(shown[0], shown[1]))
+    return all(np.ptp(levels) == 0 for levels in shown) and shown[0][0] == shown[1][0]
+
+
+def _same_run(setup: CaptureSetup, k: int) -> list[int]:
+    """The frames about ``k`` that show the same as it, without a gap."""
+    first = last = k
+    while first > 0 and _is_same_pattern(setup, first - 1, k):
+        first -= 1
+    while last + 1 < _count(setup) and _is_same_pattern(setup, last + 1, k):
+        last += 1
+    return list(range(first, last + 1))
+
+
+def _draw_middle(setup: CaptureSetup, rng: Rng, low: float = 0.25, high: float = 0.75) -> int:
+    """A coded frame from the middle of the capture."""
+    n = _count(setup)
+    return int(rng.choice([i for i in _coded(setup) if low * n <= i < high * n]))
+
+
+def _draw_axes(rng: Rng) -> tuple[Axis, ...]:
+    """One axis or both."""
+    choices: tuple[tuple[Axis, ...], ...] = (("x",), ("y",), ("x", "y"))
+    return choices[rng.integers(3)]
+
+
+def _set_axes(values: Mapping[Axis, float], default: float) -> PerAxis[float]:
+    """A pair of values, ``default`` for an axis that is missing."""
+    return PerAxis(*(values.get(axis, default) for axis in AXES))
+
+
+def _cover(setup: CaptureSetup) -> CaptureSetup:
+    """The capture of a plane that reaches beyond the projector's field on all sides, so that all
+    coordinates occur."""
+    view = replace(setup.view, scene="plane", field=0.85)
+    return replace(setup, view=view)
+
+
+def _linear(setup: CaptureSetup) -> CaptureSetup:
+    """The capture with a linear projector."""
+    return replace(setup, gamma=1.0)
+
+
+# The order of the frames
+
+
+def _late_from_start(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """Each image shows the pattern before its own; the first shows none, or the last."""
+    n = _count(setup)
+    first = BLACK if rng.random() < 0.5 else n - 1
+    return _faulty(setup, ["frame-lag"], order=(first, *range(n - 1)))
+
+
+def _late_from_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """From one image on, which repeats the one before, all come one late."""
+    n, k = _count(setup), _draw_middle(setup, rng)
+    order = (*range(k), *range(k - 1, n - 1))
+    places = [i + 1 for i in _same_run(setup, k - 1)]
+    return _faulty(setup, ["frame-lag", "duplicate-frame"], places, order=order)
+
+
+def _missing_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """One frame is missing, later ones are early, and the last is repeated or black."""
+    n, k = _count(setup), _draw_middle(setup, rng)
+    last = BLACK if rng.random() < 0.5 else n - 1
+    order = (*range(k), *range(k + 1, n), last)
+    return _faulty(setup, ["missing-frame"], _same_run(setup, k), order=order)
+
+
+def _is_same_shift(setup: CaptureSetup, a: int, b: int) -> bool:
+    """Whether two frames are steps of one period."""
+    return any(a in steps and b in steps for steps in _steps(setup.shown))
+
+
+def _exchange(setup: CaptureSetup, a: int, b: int) -> FaultyCapture:
+    """Two frames have changed places."""
+    order = list(range(_count(setup)))
+    order[a], order[b] = b, a
+    causes = ["frame-order"]
+    first, second = setup.shown.frames[a], setup.shown.frames[b]
+    if _is_same_shift(setup, a, b):
+        causes.append("step-order")
+    elif first.kind == second.kind == "gray" and first.axis == second.axis:
+        causes.append("bit-order")  # the same images
+    return _faulty(setup, causes, [a, b], order=tuple(order))
+
+
+def _exchange_neighbours(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """Two neighbouring frames have changed places."""
+    pairs = [
+        (a, b)
+        for a, b in pairwise(_coded(setup))
+        if b == a + 1 and not _is_same_pattern(setup, a, b)
+    ]
+    return _exchange(setup, *(int(k) for k in rng.choice(pairs)))
+
+
+def _exchange_distant(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """Two frames have changed places, with several between them."""
+    coded = _coded(setup)
+    while True:
+        a, b = sorted(int(k) for k in rng.choice(coded, 2, replace=False))
+        if b - a >= 4 and not _is_same_pattern(setup, a, b):
+            return _exchange(setup, a, b)
+
+
+def _repeat_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """One frame shows the pattern before its own, or is a copy of the image before."""
+    k = int(rng.choice([k for k in _coded(setup)[1:] if not _is_same_pattern(setup, k, k - 1)]))
+    if rng.random() < 0.5:
+        return _faulty(setup, ["duplicate-frame"], [k], copies=((k, k - 1),))
+    order = list(range(_count(setup)))
+    order[k] = k - 1
+    return _faulty(setup, ["duplicate-frame"], [k], order=tuple(order))
+
+
+def _replace_frame(setup: CaptureSetup, rng: Rng, pattern: int) -> FaultyCapture:
+    """One frame shows something else."""
+    frames, wave = setup.shown.frames, setup.wave
+    usable = [k for k in _coded(setup) if pattern_levels(setup.shown, frames[k], wave).any()]
+    k = int(rng.choice(usable))
+    order = list(range(_count(setup)))
+    order[k] = pattern
+    return _faulty(setup, ["duplicate-frame", "frame-order"], [k], order=tuple(order))
+
+
+def _order_steps(setup: CaptureSetup, permute: Callable[[int], Sequence[int]]) -> FaultyCapture:
+    """The steps of every period are shown in the order ``permute(steps)``."""
+    order, orders = list(range(_count(setup))), dict[int, Sequence[int]]()
+    for steps in _steps(setup.shown):
+        shown = orders.setdefault(len(steps), permute(len(steps)))
+        for place, step in zip(steps, shown, strict=True):
+            order[place] = steps[step]
+    return _faulty(setup, ["step-order"], order=tuple(order))
+
+
+def _reverse_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The steps of every period are shown from the last to the first."""
+    return _order_steps(setup, lambda n: range(n - 1, -1, -1))
+
+
+def _permute_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The steps of every period are shown in an order that is no shift and no reversal."""
+
+    def permute(n: int) -> list[int]:
+        """A random order."""
+        while True:
+            order = rng.permutation(n)
+            differences = {int(d) for d in np.diff(order, append=order[0]) % n}
+            if differences not in ({1}, {n - 1}):
+                return [int(k) for k in order]
+
+    return _order_steps(setup, permute)
+
+
+# The description
+
+
+def _describe(setup: CaptureSetup, causes: Sequence[str], **changes: object) -> FaultyCapture:
+    """The capture whose description has ``changes``."""
+    described = replace(setup.described, **changes)  # type: ignore[arg-type]
+    return _faulty(setup, causes, described=described)
+
+
+def _flip_sign(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The phase sign of an axis is wrong; without Gray code that is the same as a mirrored axis."""
+    # phase steps alone, reversed along both axes, are those of a projector upside down
+    axes = _draw_axes(rng) if setup.kind in CODED else (AXES[rng.integers(2)],)
+    causes = ["step-order"] if setup.kind in CODED else ["step-order", "axis-reversed"]
+    sign = PerAxis(*(-1 if axis in axes else 1 for axis in AXES))
+    return _describe(setup, causes, phase_sign=sign)
+
+
+def _omit_offset(setup: CaptureSetup, rng: Rng, offset: float) -> FaultyCapture:
+    """The phase steps begin elsewhere than described."""
+    causes = ["phase-offset"]
+    if setup.kind in CODED and abs(offset) > 3:
+        causes.append("gray-origin")  # half a period: the same images
+    values = _set_axes({axis: offset for axis in _draw_axes(rng)}, 0.0)
+    return _faulty(setup, causes, shown=replace(setup.shown, phase_offset_rad=values))
+
+
+def _move_origin(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The Gray code begins half a period earlier than described."""
+    half = setup.shown.period_px("x") / 2
+    values = _set_axes({axis: -0.5 - half for axis in _draw_axes(rng)}, -0.5)
+    shown = replace(setup.shown, gray_origin_px=values)
+    return _faulty(setup, ["gray-origin", "phase-offset"], shown=shown)
+
+
+def _scale_cell(setup: CaptureSetup, rng: Rng, factor: float) -> FaultyCapture:
+    """The Gray cells are described ``factor`` times as wide as they are."""
+    cell = factor * setup.shown.gray_cell("x")
+    causes = ["gray-cell"]
+    # without fringes, codes outside the projector are all that shows
+    causes += ["fringe-period"] if setup.kind in CODED else ["projector-size"]
+    return _describe(_cover(setup), causes, gray_cell_px=cell)
+
+
+def _renumber_bits(frames: Sequence[Frame], renumber: Callable[[Frame], int]) -> tuple[Frame, ...]:
+    """The frames with other numbers of bits."""
+    return tuple(
+        replace(f, bit=renumber(f)) if f.kind in ("gray", "inverse") else f for f in frames
+    )
+
+
+def _reverse_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The bits are numbered from the least significant one."""
+    frames = _renumber_bits(setup.described.frames, lambda f: f.bits - 1 - f.bit)
+    return _describe(setup, ["bit-order"], frames=frames)
+
+
+def _exchange_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The numbers of two bits are exchanged, along both axes."""
+    fewest = min(f.bits for f in setup.shown.frames if f.kind == "gray")
+    # the first bits of p18 may be the same all over a small projector
+    a, b = (int(k) for k in fewest - 1 - rng.choice(min(fewest, 4), 2, replace=False))
+    number = {a: b, b: a}
+    bits = {f.axis: f.bits for f in setup.shown.frames if f.kind == "gray"}
+
+    def renumber(frame: Frame) -> int:
+        """The described number, counted back from the least significant bit."""
+        shift = bits[frame.axis] - fewest
+        return number.get(frame.bit - shift, frame.bit - shift) + shift
+
+    frames = _renumber_bits(setup.described.frames, renumber)
+    return _describe(setup, ["bit-order", "frame-order"], frames=frames)
+
+
+def _scale_period(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The finest period is described 12 % longer than it is.
+
+    With Gray code half of the captures state the width of the cells; in the others it is the
+    described period, so that all coordinates are too large.
+    """
+    finest = {axis: setup.shown.periods_px(axis)[-1] for axis in AXES}
+    frames = tuple(
+        replace(f, period_px=1.12 * f.period_px)
+        if f.kind == "phase" and f.axis and f.period_px == finest[f.axis]
+        else f
+        for f in setup.described.frames
+    )
+    if setup.kind not in CODED:
+        return _describe(setup, ["fringe-period"], frames=frames)
+    if rng.random() < 0.5:
+        cell = setup.shown.gray_cell("x")
+        return _describe(setup, ["fringe-period", "gray-cell"], frames=frames, gray_cell_px=cell)
+    return _describe(_cover(setup), ["fringe-period", "projector-size"], frames=frames)
+
+
+def _exchange_axes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The frames of x are described as those of y, and the other way round."""
+    other: dict[Axis | None, Axis] = {"x": "y", "y": "x"}
+    frames = tuple(replace(f, axis=other[f.axis]) if f.axis else f for f in setup.described.frames)
+    return _describe(setup, ["axes-swapped"], frames=frames)
+
+
+def _mirror_projector(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The projector shows everything mirrored along one axis."""
+    causes = ["axis-reversed"] if setup.kind in BITS else ["axis-reversed", "step-order"]
+    return _faulty(setup, causes, reversed=(AXES[rng.integers(2)],))
+
+
+def _scale_projector(setup: CaptureSetup, rng: Rng, factor: float) -> FaultyCapture:
+    """The projector is described ``factor`` times as large as it is."""
+    size = tuple(round(factor * extent) for extent in setup.shown.projector)
+    return _describe(_cover(setup), ["projector-size"], projector_size=size)
+
+
+# The light
+
+
+def _drift(setup: CaptureSetup, rng: Rng, share: float) -> FaultyCapture:
+    """The exposure drifts by ``share`` over the capture."""
+    n = _count(setup)
+    gains = np.linspace(1, 1 - share, n)
+    gains = gains[::-1] if rng.random() < 0.5 else gains
+    return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
+
+
+def _vary_exposure(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The exposure of each image differs at random by 5 %."""
+    gains = 1 + 0.05 * np.clip(rng.standard_normal(_count(setup)), -2.5, 2.5)
+    return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
+
+
+def _flicker(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The light of the projector and of the room varies by 10 % along the rows."""
+    return _faulty(setup, ["flicker"], flicker=0.1)
+
+
+def _switch_lamp(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """A lamp is switched on in the middle, of 30 % of the mean grey level."""
+    k = _draw_middle(setup, rng, 0.35, 0.65)
+    return _faulty(setup, ["room-light"], room_step=(k, 0.3))
+
+
+def _saturate(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """White saturates 30 % of the illuminated pixels."""
+    return _faulty(setup, ["saturation"], clipped_share=0.3)
+
+
+def _darken(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The brightest pixels reach 2.5 % of full scale."""
+    return _faulty(setup, ["dark"], exposure=0.025)
+
+
+def _bend_response(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The projector has a gamma of 2.2, which few steps do not average out."""
+    return _faulty(_linear(setup), ["gamma"], gamma=2.2)
+
+
+def _clip_sine(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The cosines are 40 + 200 cos, clipped to 0 ... 255."""
+    return _faulty(_linear(setup), ["gamma", "saturation"], wave=(40.0, 200.0))
+
+
+# The scene
+
+
+def _move(setup: CaptureSetup, rng: Rng, steadily: bool) -> FaultyCapture:
+    """The scene moves by 1.5 camera pixels in the middle, or by 0.15 in each image, and as far
+    along the optical axis."""
+    n = _count(setup)
+    angle = rng.uniform(0, 2 * np.pi)
+    direction = (float(np.cos(angle)), float(np.sin(angle)), float(rng.choice([-1.0, 1.0])))
+    k = _draw_middle(setup, rng, 0.35, 0.65)
+    motion = 0.15 * np.arange(n) if steadily else 1.5 * (np.arange(n) >= k)
+    return _faulty(setup, ["moved"], motion_px=tuple(float(s) for s in motion), direction=direction)
+
+
+def _ghost(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """Each image holds 15 % of the one before."""
+    return _faulty(setup, ["ghosting"], ghost=0.15)
+
+
+def _narrow_stripes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+    """The stripes of the last three bits are too narrow for the camera.
+
+    The sound capture is of the same projector, in cells as wide as its camera resolves.
+    """
+    camera = setup.view.camera
+    view = replace(setup.view, projector=(6 * camera[0], 6 * camera[1]), field=1.0)
+    full_scale = setup.shown.full_scale
+    fine, coarse = (
+        replace(gray_code(view.projector, cell), full_scale=full_scale) for cell in (1.0, 8.0)
+    )
+    sound = replace(setup, view=view, shown=coarse, described=coarse, blur_px=0.5)
+    return _faulty(sound, ["blur"], shown=fine, described=fine)
+
+
+CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
+    "late from the start": CaptureFault(_late_from_start, ANY),
+    "late from one frame on": CaptureFault(_late_from_frame, ANY),
+    "frame missing": CaptureFault(_missing_frame, ANY),
+    "neighbours exchanged": CaptureFault(_exchange_neighbours, ANY),
+    "distant frames exchanged": CaptureFault(_exchange_distant, ANY),
+    "frame repeated": CaptureFault(_repeat_frame, ANY),
+    "foreign frame": CaptureFault(lambda s, rng: _replace_frame(s, rng, FOREIGN), ANY),
+    "black frame": CaptureFault(lambda s, rng: _replace_frame(s, rng, BLACK), ANY),
+    "steps reversed": CaptureFault(_reverse_steps, PHASE),
+    # each order of three steps is a shift or a reversal
+    "steps permuted": CaptureFault(_permute_steps, (*CODED, "micro")),
+    "phase sign flipped": CaptureFault(_flip_sign, PHASE),
+    "offset of a quarter period": CaptureFault(
+        lambda s, rng: _omit_offset(s, rng, np.pi / 2), PHASE
+    ),
+    "offset of half a period": CaptureFault(lambda s, rng: _omit_offset(s, rng, np.pi), PHASE),
+    "Gray origin moved": CaptureFault(_move_origin, CODED),
+    "Gray cell halved": CaptureFault(lambda s, rng: _scale_cell(s, rng, 0.5), BITS),
+    "Gray cell doubled": CaptureFault(lambda s, rng: _scale_cell(s, rng, 2.0), BITS),
+    "bits reversed": CaptureFault(_reverse_bits, BITS),
+    "two bits exchanged": CaptureFault(_exchange_bits, BITS),
+    "period 12 % too long": CaptureFault(_scale_period, PHASE),
+    "axes exchanged": CaptureFault(_exchange_axes, ANY),
+    "axis mirrored": CaptureFault(_mirror_projector, ANY),
+    "projector too small": CaptureFault(lambda s, rng: _scale_projector(s, rng, 0.7), ANY),
+    "projector too large": CaptureFault(lambda s, rng: _scale_projector(s, rng, 1.5), ANY),
+    "drift of 8 %": CaptureFault(lambda s, rng: _drift(s, rng, 0.08), ANY),
+    "drift of 30 %": CaptureFault(lambda s, rng: _drift(s, rng, 0.3), ANY),
+    "random exposure": CaptureFault(_vary_exposure, ANY),
+    "flicker": CaptureFault(_flicker, ANY),
+    "lamp switched on": CaptureFault(_switch_lamp, ANY),
+    "saturated": CaptureFault(_saturate, ANY),
+    "dark": CaptureFault(_darken, ANY),
+    "gamma 2.2": CaptureFault(_bend_response, FEW),
+    "clipped cosine": CaptureFault(_clip_sine, PHASE),
+    "moved once": CaptureFault(lambda s, rng: _move(s, rng, False), ANY),
+    "moved steadily": CaptureFault(lambda s, rng: _move(s, rng, True), ANY),
+    "ghosting": CaptureFault(_ghost, ANY),
+    "narrow stripes": CaptureFault(_narrow_stripes, ("gray",)),
+}
+
+
+def draw_faulty(fault: str, kind: CaptureKind, seed: int) -> FaultyCapture:
+    """A capture of a kind with a fault, the same for the same seed."""
+    own = crc32(f"{fault} {seed}".encode())  # other qualities for each fault
+    return CAPTURE_FAULTS[fault].strike(draw_setup(kind, own), np.random.default_rng(own))
