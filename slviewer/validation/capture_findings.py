@@ -1,0 +1,108 @@
+"""What the program finds in a capture, and what it decodes: all that the proof of captures uses of
+it."""
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.fringe.suspect import Suspect
+from slviewer.pipeline.capture_phases import check_capture, decode_frames
+from slviewer.pipeline.exposure_check import check_capture_exposure
+from slviewer.pipeline.frame_check import check_frames
+
+Severity = Literal["bad", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("bad", "warning", "note")
+SLIGHT = 5.0
+"""Percent of variation of the light, below which a corrected one is only a note."""
+_CAUSES_OF_SUSPECTS = {
+    "late": "duplicate-frame",
+    "early": "frame-order",
+    "swapped": "frame-order",
+    "dropped": "missing-frame",
+    "lag": "frame-lag",
+}
+_LIGHT = ("exposure-drift", "flicker", "room-light", "gamma")
+_OF_FRAMES = ("frame-lag", "missing-frame", "frame-order", "duplicate-frame", "room-light")
+_REFUSALS = (
+    (r"are saturated", "saturation"),
+    (r"light from other surfaces", "indirect-light"),
+    (r"outside the projector|which the projector spans", "projector-size"),
+    (r"modulation is", "dark"),
+    (r"rows and between the frames", "flicker"),
+    (r"light of the room", "room-light"),
+    (r"brightness varies", "exposure-drift"),
+)
+"""Causes that messages of refusals state in words."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """A finding: its cause, the frames that it names (from 0, none for all), and its severity."""
+
+    cause: str
+    frames: tuple[int, ...]
+    severity: Severity
+    message: str = ""
+
+
+def examine(sequence: PatternSequence, stack: np.ndarray) -> list[Named]:
+    """What the program finds in a capture (n, h, w): the worst first, else in its own order."""
+    try:
+        phases = decode_frames("capture", sequence, stack)
+    except InputError as error:
+        return [_name_refusal(error)]
+    check = check_frames(sequence, stack)
+    found = [
+        Named(
+            c.cause,
+            (int(c.value),) if c.cause in _OF_FRAMES and c.value is not None else (),
+            "bad",
+            c.message,
+        )
+        for c in check.contradictions
+    ]
+    found += [_name_suspect(suspect) for suspect in check.suspects]
+    if not check.contradictions:
+        try:
+            check_capture("capture", sequence, stack, phases, check)
+        except InputError as error:
+            found.append(_name_refusal(error))
+    exposure = check_capture_exposure(sequence, stack, phases)
+    if exposure.verdict in ("bad", "warning"):
+        cause = "saturation" if "saturated." in exposure.sentence else "dark"
+        severity: Severity = "bad" if exposure.verdict == "bad" else "warning"
+        found.append(Named(cause, (), severity, exposure.sentence))
+    return sorted(found, key=lambda named: SEVERITIES.index(named.severity))
+
+
+def decode_coordinates(sequence: PatternSequence, stack: np.ndarray) -> dict[Axis, np.ndarray]:
+    """The decoded coordinate (h, w) px of each axis, NaN where masked; empty where it is
+    refused."""
+    try:
+        phases = decode_frames("capture", sequence, stack)
+    except InputError:
+        return {}
+    return {axis: phase.coordinate for axis, phase in phases.items()}
+
+
+def _name_suspect(suspect: Suspect) -> Named:
+    """The finding of a frame that contradicts the others, or of the light."""
+    sentence = suspect.sentence
+    if suspect.fault in _LIGHT:
+        stated = re.search(r"(?:by|is) ([\d.]+) %", sentence)
+        is_slight = "corrected" in sentence and stated and float(stated[1]) < SLIGHT
+        return Named(suspect.fault, (suspect.frame,), "note" if is_slight else "warning", sentence)
+    cause = "ghosting" if "ghosting" in sentence else "duplicate-frame"
+    cause = _CAUSES_OF_SUSPECTS.get(suspect.fault, cause)
+    return Named(cause, (suspect.frame,), "bad", sentence)
+
+
+def _name_refusal(error: InputError) -> Named:
+    """The finding of a capture that is refused; "unreadable" where the message names no cause."""
+    text = str(error)
+    cause = next((cause for words, cause in _REFUSALS if re.search(words, text)), "unreadable")
+    return Named(cause, (), "bad", text)

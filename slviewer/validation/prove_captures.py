@@ -1,0 +1,268 @@
+"""Whether faults of captures are named, harmful ones never pass unnoticed, and sound captures raise
+no alarm.
+
+Small captures of six kinds are simulated, some with one fault each. The truth is that of the
+simulation; how the faults are made does not depend on how they are searched for.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+
+from slviewer.evaluation.render import Row
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.validation.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
+from slviewer.validation.capture_findings import Named, decode_coordinates, examine
+from slviewer.validation.proof import BandCheck, Proof, prove_checks
+from slviewer.validation.simulated_capture import (
+    KINDS,
+    CaptureKind,
+    SimulatedCapture,
+    draw_setup,
+    render_capture,
+)
+
+SOUND, REPEATS = 420, 3
+"""Sound captures, and captures of each fault and kind, at full size."""
+NO_FAULT = "none"
+MOST_OVER_FLOOR = 1.5
+"""Times the error of the same capture without the fault, within which a fault is harmless."""
+LEAST_LEFT = 0.9
+"""Share of the pixels of the capture without the fault that a harmless one decodes."""
+
+Outcome = Literal["right", "harmless", "wrong", "HARMFUL", "LOST", "CRASH", "sound", "FALSE ALARM"]
+OF_FAULTS: tuple[Outcome, ...] = ("right", "harmless", "wrong", "HARMFUL", "LOST", "CRASH")
+OF_SOUND: tuple[Outcome, ...] = ("sound", "FALSE ALARM", "CRASH")
+PASSED: tuple[Outcome, ...] = ("right", "harmless", "sound")
+LEAST_NAMED, MOST_HARMFUL, MOST_ALARMS = 0.9, 0.02, 0.02
+"""Share of faults that are named or harmless; of those that are neither noticed nor harmless; and
+of sound captures with an alarm."""
+
+Examine = Callable[[PatternSequence, np.ndarray], list[Named]]
+
+
+@dataclass(frozen=True)
+class CaptureCase:
+    """One examined capture. ``expected``: causes and frames that are right; ``quality`` in
+    words."""
+
+    fault: str
+    kind: CaptureKind
+    seed: int
+    outcome: Outcome
+    expected: str
+    named: tuple[Named, ...]
+    quality: str
+    seconds: float
+
+    def text(self) -> str:
+        """The case in one line, with the call that repeats it."""
+        named = ", ".join(_name_finding(n) for n in self.named) or "nothing"
+        return (
+            f"{self.outcome}: {self.fault}, {self.kind}, seed {self.seed}: named {named}, expected"
+            f" {self.expected} ({self.quality})"
+        )
+
+
+def _name_finding(named: Named) -> str:
+    """A finding in few words, frames counted from 0."""
+    frames = " " + "+".join(map(str, named.frames)) if named.frames else ""
+    note = " (note)" if named.severity == "note" else ""
+    return f"{named.cause}{frames}{note}"
+
+
+def prove_captures(
+    scale: float = 1.0,
+    *,
+    kinds: Sequence[CaptureKind] = KINDS,
+    faults: Sequence[str] = (NO_FAULT, *CAPTURE_FAULTS),
+    seeds: Sequence[int] = (),
+    seed: int = 0,
+    progress: Progress = ignore_progress,
+) -> Proof:
+    """Examine sound captures, and captures with every fault of every kind, and count the outcomes.
+
+    ``scale``: share of the captures of a full run. ``seeds``: instead, one capture of each of these
+    seeds for every fault and kind.
+    """
+    plan = list(plan_cases(scale, kinds, faults, seeds, seed))
+    cases: list[CaptureCase] = []
+    for i, (fault, kind, each) in enumerate(plan):
+        progress(i / len(plan), f"{fault}, {kind}")
+        cases.append(examine_case(fault, kind, each))
+    return summarize_cases(cases, scale)
+
+
+def plan_cases(
+    scale: float,
+    kinds: Sequence[CaptureKind],
+    faults: Sequence[str],
+    seeds: Sequence[int] = (),
+    seed: int = 0,
+) -> Iterator[tuple[str, CaptureKind, int]]:
+    """Yield (fault, kind, seed) of each capture; see `prove_captures`."""
+    for number, fault in enumerate(faults):
+        own = [k for k in kinds if fault == NO_FAULT or k in CAPTURE_FAULTS[fault].kinds]
+        if seeds:
+            yield from ((fault, kind, each) for each in seeds for kind in own)
+            continue
+        full = SOUND if fault == NO_FAULT else REPEATS * len(own)
+        count = round(scale * full)
+        if own:
+            for i in range(max(1, count)):
+                # a part of the kinds, another one for each fault
+                kind = own[(i + number) % len(own)]
+                yield fault, kind, 1000 * seed + i // len(own)
+
+
+def examine_case(
+    fault: str, kind: CaptureKind, seed: int, examiner: Examine = examine
+) -> CaptureCase:
+    """Render one capture, sound where ``fault`` is "none", examine it, and judge the result."""
+    if fault == NO_FAULT:
+        setup = draw_setup(kind, seed)
+        faulty = FaultyCapture(setup, setup, frozenset())
+    else:
+        faulty = draw_faulty(fault, kind, seed)
+    setup = faulty.setup
+    capture = render_capture(setup)
+    start = perf_counter()
+    try:
+        named: list[Named] | None = examiner(setup.described, capture.stack)
+    except Exception as error:  # the other cases still have to run
+        named, crash = None, f"{type(error).__name__}: {error}"
+    seconds = perf_counter() - start
+    frames = " of frame " + " or ".join(map(str, faulty.frames)) if faulty.frames else ""
+    expected = (" or ".join(sorted(faulty.causes)) or "nothing") + frames
+    if named is None:
+        outcome: Outcome = "CRASH"
+        named = [Named(crash, (), "bad")]
+    else:
+        outcome = judge_findings(named, faulty) or judge_errors(faulty, capture)
+    return CaptureCase(fault, kind, seed, outcome, expected, tuple(named), setup.text(), seconds)
+
+
+def judge_findings(named: Sequence[Named], faulty: FaultyCapture) -> Outcome | None:
+    """The outcome of a capture, of a fault without findings None: it depends on the errors.
+
+    Findings of what is true of the capture without the fault do not count, and notes only where
+    they are right.
+    """
+    tolerated = faulty.sound.tolerated - faulty.causes
+    counted = [n for n in named if n.cause not in tolerated]
+    serious = [n for n in counted if n.severity != "note"]
+    if not faulty.causes:
+        return "FALSE ALARM" if serious else "sound"
+    if serious:
+        return "right" if _is_right(serious[0], faulty) else "wrong"
+    return "right" if any(_is_right(n, faulty) for n in counted) else None
+
+
+def _is_right(named: Named, faulty: FaultyCapture) -> bool:
+    """Whether a finding names the cause, and the frame of a fault of one frame."""
+    is_frame_right = not faulty.frames or bool(set(named.frames) & set(faulty.frames))
+    return named.cause in faulty.causes and is_frame_right
+
+
+def judge_errors(faulty: FaultyCapture, capture: SimulatedCapture) -> Outcome:
+    """The outcome of a fault that is not named, by its errors and those without the fault."""
+    sound = render_capture(faulty.sound)
+    floor = decode_coordinates(faulty.sound.described, sound.stack)
+    decoded = decode_coordinates(faulty.setup.described, capture.stack)
+    return compare_errors(_list_errors(decoded, capture.truth), _list_errors(floor, sound.truth))
+
+
+def compare_errors(errors: Mapping[Axis, np.ndarray], floor: Mapping[Axis, np.ndarray]) -> Outcome:
+    """The outcome by the absolute errors px of the decoded pixels of each axis; ``floor``: those
+    without the fault."""
+    for axis, least in floor.items():
+        found = errors.get(axis, np.empty(0))
+        if len(found) < LEAST_LEFT * len(least):
+            # what is left may be wrong as well
+            is_worse = len(found) and _exceeds(found, least)
+            return "HARMFUL" if is_worse else "LOST"
+        if _exceeds(found, least):
+            return "HARMFUL"
+    return "harmless"
+
+
+def _exceeds(errors: np.ndarray, floor: np.ndarray) -> bool:
+    """Whether the median or the 95th percentile exceeds `MOST_OVER_FLOOR` times the floor's."""
+    found, least = (np.quantile(each, [0.5, 0.95]) for each in (errors, floor))
+    return bool((found > MOST_OVER_FLOOR * least).any())
+
+
+def _list_errors(
+    decoded: Mapping[Axis, np.ndarray], truth: Mapping[Axis, np.ndarray]
+) -> dict[Axis, np.ndarray]:
+    """Absolute errors px of each axis, of the pixels that are decoded and whose truth is known."""
+    errors = {axis: np.abs(decoded[axis] - truth[axis]) for axis in decoded}
+    return {axis: each[np.isfinite(each)] for axis, each in errors.items()}
+
+
+def summarize_cases(cases: Sequence[CaptureCase], scale: float) -> Proof:
+    """The table of outcomes by fault and kind, the shares that must lie within bounds, and the
+    cases that failed."""
+    faulty = [case for case in cases if case.fault != NO_FAULT]
+    sound = [case for case in cases if case.fault == NO_FAULT]
+    rows = [
+        _list_row(fault, [c for c in cases if c.fault == fault])
+        for fault in dict.fromkeys(c.fault for c in cases)
+    ]
+    named = Counter(case.outcome for case in faulty)
+    checks = []
+    if faulty:
+        passed = (named["right"] + named["harmless"]) / len(faulty)
+        harmful = (named["HARMFUL"] + named["LOST"] + named["CRASH"]) / len(faulty)
+        checks += [
+            BandCheck("faults", "share that is named or harmless", passed, LEAST_NAMED, 1.0),
+            BandCheck("faults", "share that is harmful", harmful, 0.0, MOST_HARMFUL),
+        ]
+    if sound:
+        alarms = sum(case.outcome != "sound" for case in sound) / len(sound)
+        checks.append(BandCheck("sound", "share with an alarm", alarms, 0.0, MOST_ALARMS))
+    lines = list(_list_totals(faulty, sound))
+    lines += [case.text() for case in cases if case.outcome not in PASSED]
+    return prove_checks(checks, scale, rows, {"cases": cases}, below=lines)
+
+
+def _list_row(fault: str, cases: Sequence[CaptureCase]) -> Row:
+    """The row of a fault: outcomes of each kind as counts and initials, then totals."""
+    outcomes = OF_SOUND if fault == NO_FAULT else OF_FAULTS
+    row: Row = {"fault": fault}
+    for kind in KINDS:
+        own = Counter(case.outcome for case in cases if case.kind == kind)
+        row[kind] = " ".join(f"{own[o]} {o}" for o in outcomes if own[o]) or "-"
+    total = Counter(case.outcome for case in cases)
+    passed = sum(total[outcome] for outcome in PASSED)
+    row["right %"] = 100 * passed / len(cases)
+    row["harmful"] = total["HARMFUL"] + total["LOST"]
+    row["s"] = float(np.mean([case.seconds for case in cases]))
+    return row
+
+
+def _list_totals(faulty: Sequence[CaptureCase], sound: Sequence[CaptureCase]) -> Iterator[str]:
+    """Yield the totals of all faults and of all sound captures in words."""
+    for name, cases, outcomes in (("faults", faulty, OF_FAULTS), ("sound", sound, OF_SOUND)):
+        if not cases:
+            continue
+        total = Counter(case.outcome for case in cases)
+        counts = ", ".join(f"{total[o]} {o}" for o in outcomes)
+        passed = 100 * sum(total[outcome] for outcome in PASSED) / len(cases)
+        seconds = np.quantile([case.seconds for case in cases], [0.5, 0.95])
+        yield (
+            f"{len(cases)} {name}: {counts}; {passed:.1f} % right; {seconds[0]:.2f} s to examine in"
+            f" the median, {seconds[1]:.2f} s in 95 %"
+        )
+    alarms = Counter(
+        next((n.cause for n in case.named if n.severity != "note"), "none")
+        for case in sound
+        if case.outcome == "FALSE ALARM"
+    )
+    if alarms:
+        yield "false alarms: " + ", ".join(f"{n} {cause}" for cause, n in alarms.most_common())

@@ -1,0 +1,202 @@
+"""Simulated captures with faults: what the simulation states is true, and outcomes are counted
+rightly; a share of what `prove_captures` runs."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from facts import missing_facts
+
+from slviewer.fringe.patterns import profile
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.validation.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
+from slviewer.validation.capture_findings import Named, decode_coordinates
+from slviewer.validation.prove_captures import (
+    NO_FAULT,
+    CaptureCase,
+    compare_errors,
+    examine_case,
+    judge_findings,
+    plan_cases,
+    summarize_cases,
+)
+from slviewer.validation.simulated_capture import (
+    KINDS,
+    CaptureKind,
+    draw_setup,
+    pattern_levels,
+    render_capture,
+)
+
+CELLS = [(fault, kind) for fault, own in CAPTURE_FAULTS.items() for kind in own.kinds]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_simulated_patterns_are_those_of_the_projector(kind: CaptureKind) -> None:
+    sequence = draw_setup(kind, 5).shown
+    for i, frame in enumerate(sequence.frames):
+        assert np.array_equal(pattern_levels(sequence, frame), profile(sequence, i)[1]), frame
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_true_coordinates_are_those_of_the_images(kind: CaptureKind) -> None:
+    setup = replace(draw_setup(kind, 5), noise=0.5, blur_px=0.5, jpeg=0, gamma=1.0)
+    capture = render_capture(setup)
+    decoded = decode_coordinates(setup.described, capture.stack)
+    for axis in setup.shown.axes:
+        difference = (decoded[axis] - capture.truth[axis])[np.isfinite(capture.truth[axis])]
+        assert np.isfinite(difference).mean() > 0.9
+        # Gray code alone gives the cell
+        unit = setup.shown.gray_cell(axis) if kind == "gray" else 0.1
+        assert 0 < np.nanmedian(np.abs(difference)) < 0.3 * unit
+        assert abs(np.nanmedian(difference)) < 0.05 * unit
+
+
+@pytest.mark.computes
+def test_a_capture_is_the_same_for_the_same_seed() -> None:
+    one, same, other = (render_capture(draw_setup("micro", seed)) for seed in (3, 3, 4))
+    assert np.array_equal(one.stack, same.stack)
+    assert one.stack.shape != other.stack.shape or not np.array_equal(one.stack, other.stack)
+
+
+@pytest.mark.parametrize(("fault", "kind"), CELLS)
+def test_every_fault_changes_what_is_shown_or_described(fault: str, kind: CaptureKind) -> None:
+    faulty = draw_faulty(fault, kind, 2)
+    assert faulty == draw_faulty(fault, kind, 2)
+    assert faulty.setup != faulty.sound and faulty.causes
+    assert len(faulty.setup.order) in (0, len(faulty.setup.shown.frames))
+    assert all(0 <= frame < len(faulty.setup.shown.frames) for frame in faulty.frames)
+
+
+def fault(causes: Sequence[str] = (), frames: Sequence[int] = ()) -> FaultyCapture:
+    """A capture of which the causes and frames are what matters."""
+    setup = replace(draw_setup("p18", 0), gamma=1.0)
+    return FaultyCapture(setup, setup, frozenset(causes), tuple(frames))
+
+
+@pytest.mark.parametrize(
+    ("named", "causes", "frames", "outcome"),
+    [
+        ([Named("frame-lag", (), "bad")], ["frame-lag"], [], "right"),
+        ([Named("frame-lag", (4,), "bad")], ["frame-lag", "duplicate-frame"], [4, 5], "right"),
+        ([Named("frame-lag", (3,), "bad")], ["frame-lag"], [4], "wrong"),
+        ([Named("frame-lag", (), "bad")], ["frame-lag"], [4], "wrong"),
+        (
+            [Named("dark", (), "warning"), Named("frame-lag", (), "bad")],
+            ["frame-lag"],
+            [],
+            "wrong",
+        ),
+        (
+            [Named("exposure-drift", (2,), "note"), Named("dark", (), "warning")],
+            ["dark"],
+            [],
+            "right",
+        ),
+        ([Named("exposure-drift", (2,), "note")], ["exposure-drift"], [], "right"),
+        ([Named("exposure-drift", (2,), "note")], ["flicker"], [], None),
+        ([], ["flicker"], [], None),
+        ([], [], [], "sound"),
+        ([Named("exposure-drift", (2,), "note")], [], [], "sound"),
+        ([Named("exposure-drift", (2,), "warning")], [], [], "FALSE ALARM"),
+    ],
+)
+def test_findings_are_judged_by_the_first_of_weight(
+    named: list[Named], causes: list[str], frames: list[int], outcome: str | None
+) -> None:
+    assert judge_findings(named, fault(causes, frames)) == outcome
+
+
+def test_what_is_true_without_the_fault_is_no_false_alarm() -> None:
+    setup = replace(draw_setup("multifrequency", 0), gamma=1.6)
+    faulty = FaultyCapture(setup, setup, frozenset())
+    gamma, drift = Named("gamma", (0,), "warning"), Named("exposure-drift", (0,), "warning")
+    assert judge_findings([gamma], faulty) == "sound"
+    assert judge_findings([gamma, drift], faulty) == "FALSE ALARM"
+
+
+@pytest.mark.parametrize(
+    ("scale", "share", "outcome"),
+    [
+        (1.0, 1.0, "harmless"),
+        (1.4, 0.95, "harmless"),
+        (1.6, 1.0, "HARMFUL"),
+        (1.0, 0.8, "LOST"),
+        (9.0, 0.8, "HARMFUL"),
+        (1.0, 0.0, "LOST"),
+    ],
+)
+def test_errors_are_compared_with_those_without_the_fault(
+    scale: float, share: float, outcome: str
+) -> None:
+    least = np.linspace(0, 0.1, 1001)
+    errors = scale * least[: round(share * len(least))] / max(share, 0.1)
+    assert compare_errors({"x": least, "y": errors}, {"x": least, "y": least}) == outcome
+
+
+def test_few_wrong_pixels_are_harmful() -> None:
+    least = np.linspace(0, 0.1, 1001)
+    errors = np.where(np.arange(1001) > 940, 30.0, least)
+    assert compare_errors({"x": errors}, {"x": least}) == "HARMFUL"
+    assert compare_errors({}, {"x": least}) == "LOST"
+
+
+@pytest.mark.computes
+def test_each_case_is_examined_and_judged() -> None:
+    def find(*found: Named) -> CaptureCase:
+        return examine_case("late from the start", "multifrequency", 0, lambda *_: list(found))
+
+    assert find(Named("frame-lag", (), "bad")).outcome == "right"
+    assert find(Named("gamma-ray", (), "bad")).outcome == "wrong"
+    assert find().outcome in ("HARMFUL", "LOST")
+
+    def crash(sequence: PatternSequence, stack: np.ndarray) -> list[Named]:
+        raise ZeroDivisionError("a fault of the program")
+
+    case = examine_case(NO_FAULT, "gray", 0, crash)
+    assert case.outcome == "CRASH" and missing_facts(case.text(), "ZeroDivisionError") == []
+
+
+@pytest.mark.computes
+def test_a_fault_that_changes_nothing_is_harmless() -> None:
+    case = examine_case("steps reversed", "p18", 0, lambda *_: [])
+    assert case.outcome == "HARMFUL"
+    case = examine_case("drift of 8 %", "gray", 0, lambda *_: [])
+    assert case.outcome == "harmless", "the inverse of each bit follows it at once"
+
+
+def test_the_plan_holds_every_fault_of_every_kind() -> None:
+    cells = list(plan_cases(1.0, KINDS, (NO_FAULT, *CAPTURE_FAULTS)))
+    assert len(cells) == len(set(cells))
+    assert all(sum(c[:2] == cell for c in cells) == 3 for cell in CELLS)
+    assert sum(c[0] == NO_FAULT for c in cells) >= 400
+    part = list(plan_cases(0.1, KINDS, (NO_FAULT, *CAPTURE_FAULTS)))
+    assert {c[0] for c in part} == {c[0] for c in cells} and len(part) < 0.12 * len(cells)
+    assert list(plan_cases(1.0, ("gray",), ("flicker",), seeds=(7, 9))) == [
+        ("flicker", "gray", 7),
+        ("flicker", "gray", 9),
+    ]
+
+
+def test_outcomes_are_counted_by_fault_and_in_total() -> None:
+    named = (Named("dark", (3,), "bad"),)
+    cases = [
+        CaptureCase(name, "p18", seed, outcome, "flicker", named, "a plane", 0.5)
+        for name, seed, outcome in (
+            ("flicker", 0, "right"),
+            ("flicker", 1, "HARMFUL"),
+            ("dark", 0, "wrong"),
+            (NO_FAULT, 0, "sound"),
+            (NO_FAULT, 1, "FALSE ALARM"),
+        )
+    ]
+    proof = summarize_cases(cases, 1.0)
+    assert not proof.holds
+    row = next(row for row in proof.rows if row["fault"] == "flicker")
+    assert (row["right %"], row["harmful"], row["s"]) == (50.0, 1, 0.5)
+    text = proof.text()
+    assert missing_facts(text, "3 faults", "2 sound", "1 HARMFUL", "1 dark", "seed 1") == []
+    assert len(json.loads(json.dumps(proof.to_json()))["cases"]) == 5
