@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy
+from slviewer.validation.prove_captures import prove_captures
 from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_edges import prove_edges
 from slviewer.validation.prove_guidance import prove_guidance
@@ -27,9 +28,25 @@ Claim = Literal[
     "surfaces",
     "uncertainty",
 ]
+
+
+def prove_named_faults(scale: float, *, seed: int, progress: Progress) -> Proof:
+    """Faults of calibrations, then faults of captures."""
+    calibrations = prove_causes(scale, seed=seed, progress=part(progress, 0, 0.5))
+    captures = prove_captures(scale, seed=seed, progress=part(progress, 0.5, 1))
+    return Proof(
+        calibrations.holds and captures.holds,
+        scale,
+        captures.rows,
+        {**calibrations.record, "captures": captures.to_json()},
+        [calibrations.text(), "", "faults of captures", "", *captures.above],
+        captures.below,
+    )
+
+
 CLAIMS: Mapping[Claim, tuple[str, Callable[..., Proof]]] = {
     "accuracy": ("accuracy at the noise floor", prove_accuracy),
-    "causes": ("faults called by their names", prove_causes),
+    "causes": ("faults called by their names", prove_named_faults),
     "edges": ("printed edges without ridges", prove_edges),
     "guidance": ("guided poses", prove_guidance),
     "hostile": ("captures of a hostile rig", prove_hostile),
@@ -91,10 +108,10 @@ def prove(
 
     Args:
         quick: A quarter of the camera's resolution; its figures are its own.
-        only: What to prove: accuracy on planes and spheres, causes of bad calibrations, printed
-            edges, guidance of an operator to good poses, captures of a hostile rig, tolerances of
-            an inspection plan, registration of scans, surfaces that light themselves, uncertainty
-            against true errors; by default all.
+        only: What to prove: accuracy on planes and spheres, causes of bad calibrations and
+            captures, printed edges, guidance of an operator to good poses, captures of a hostile
+            rig, tolerances of an inspection plan, registration of scans, surfaces that light
+            themselves, uncertainty against true errors; by default all.
         cases: Of the hostile rig only these faults, such as flicker, jpeg:mild or
             gamma:severe:scan.
         seed: Another seed proves it on other rigs of the same kinds.
