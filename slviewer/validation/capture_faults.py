@@ -215,12 +215,16 @@ def _replace_frame(setup: CaptureSetup, rng: Rng, pattern: int) -> FaultyCapture
 
 def _order_steps(setup: CaptureSetup, permute: Callable[[int], Sequence[int]]) -> FaultyCapture:
     """The steps of every period are shown in the order ``permute(steps)``."""
-    order, orders = list(range(_count(setup))), dict[int, Sequence[int]]()
+    order = list(range(_count(setup)))
+    counts = {len(steps) for steps in _steps(setup.shown)}
+    orders = {n: permute(n) for n in sorted(counts)}
     for steps in _steps(setup.shown):
-        shown = orders.setdefault(len(steps), permute(len(steps)))
-        for place, step in zip(steps, shown, strict=True):
+        for place, step in zip(steps, orders[len(steps)], strict=True):
             order[place] = steps[step]
-    return _faulty(setup, ["step-order"], order=tuple(order))
+    causes = ["step-order"]
+    if all(sum(k != step for k, step in enumerate(orders[n])) == 2 for n in counts):
+        causes.append("frame-order")  # two steps of each period have changed places
+    return _faulty(setup, causes, order=tuple(order))
 
 
 def _reverse_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -408,12 +412,16 @@ def _clip_sine(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
 
 
 def _move(setup: CaptureSetup, rng: Rng, steadily: bool) -> FaultyCapture:
-    """The scene moves by 1.5 camera pixels in the middle, or by 0.15 in each image, and as far
-    along the optical axis."""
-    n = _count(setup)
-    angle = rng.uniform(0, 2 * np.pi)
-    direction = (float(np.cos(angle)), float(np.sin(angle)), float(rng.choice([-1.0, 1.0])))
-    k = _draw_middle(setup, rng, 0.35, 0.65)
+    """The scene moves by 1.5 camera pixels, or by 0.15 in each image, beside the optical axis and
+    along it, so that the pattern on it moves as far.
+
+    The one movement is during the steps of the finest period along the baseline, if there are any.
+    """
+    n, (beside, above) = _count(setup), setup.view.baseline
+    angle, depth = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0]) / np.hypot(beside, above)
+    direction = (float(np.cos(angle)), float(np.sin(angle)), float(depth))
+    shifts = setup.shown.phase_shifts("x" if beside else "y")
+    k = int(rng.choice(shifts[-1][1][1:])) if shifts else _draw_middle(setup, rng, 0.35, 0.65)
     motion = 0.15 * np.arange(n) if steadily else 1.5 * (np.arange(n) >= k)
     return _faulty(setup, ["moved"], motion_px=tuple(float(s) for s in motion), direction=direction)
 
@@ -474,8 +482,8 @@ CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
     "dark": CaptureFault(_darken, ANY),
     "gamma 2.2": CaptureFault(_bend_response, FEW),
     "clipped cosine": CaptureFault(_clip_sine, PHASE),
-    "moved once": CaptureFault(lambda s, rng: _move(s, rng, False), ANY),
-    "moved steadily": CaptureFault(lambda s, rng: _move(s, rng, True), ANY),
+    "moved": CaptureFault(lambda s, rng: _move(s, rng, False), ANY),
+    "moving": CaptureFault(lambda s, rng: _move(s, rng, True), ANY),
     "ghosting": CaptureFault(_ghost, ANY),
     "narrow stripes": CaptureFault(_narrow_stripes, ("gray",)),
 }

@@ -30,7 +30,10 @@ _OF_FRAMES = ("frame-lag", "missing-frame", "frame-order", "duplicate-frame", "r
 _REFUSALS = (
     (r"are saturated", "saturation"),
     (r"light from other surfaces", "indirect-light"),
-    (r"outside the projector|which the projector spans", "projector-size"),
+    (r"outside the projector", "projector-size"),
+    (r"which the projector spans", "fringe-period|projector-size"),
+    (r"which a Gray cell spans", "gray-cell|fringe-period"),
+    (r"Gray bits number", "fringe-period|gray-cell|projector-size"),
     (r"modulation is", "dark"),
     (r"rows and between the frames", "flicker"),
     (r"light of the room", "room-light"),
@@ -41,7 +44,8 @@ _REFUSALS = (
 
 @dataclass(frozen=True)
 class Named:
-    """A finding: its cause, the frames that it names (from 0, none for all), and its severity."""
+    """A finding: its cause, or the causes between which it leaves the choice, joined by "|"; the
+    frames that it names (from 0, none for all); and its severity."""
 
     cause: str
     frames: tuple[int, ...]

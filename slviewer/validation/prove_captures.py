@@ -48,8 +48,8 @@ Examine = Callable[[PatternSequence, np.ndarray], list[Named]]
 
 @dataclass(frozen=True)
 class CaptureCase:
-    """One examined capture. ``expected``: causes and frames that are right; ``quality`` in
-    words."""
+    """One examined capture. ``expected``: causes and frames that are right; ``errors`` of a fault
+    that was not named, and ``quality``, in words."""
 
     fault: str
     kind: CaptureKind
@@ -57,6 +57,7 @@ class CaptureCase:
     outcome: Outcome
     expected: str
     named: tuple[Named, ...]
+    errors: str
     quality: str
     seconds: float
 
@@ -65,7 +66,7 @@ class CaptureCase:
         named = ", ".join(_name_finding(n) for n in self.named) or "nothing"
         return (
             f"{self.outcome}: {self.fault}, {self.kind}, seed {self.seed}: named {named}, expected"
-            f" {self.expected} ({self.quality})"
+            f" {self.expected}{self.errors and ': '}{self.errors} ({self.quality})"
         )
 
 
@@ -136,15 +137,19 @@ def examine_case(
         named: list[Named] | None = examiner(setup.described, capture.stack)
     except Exception as error:  # the other cases still have to run
         named, crash = None, f"{type(error).__name__}: {error}"
-    seconds = perf_counter() - start
+    seconds, errors = perf_counter() - start, ""
     frames = " of frame " + " or ".join(map(str, faulty.frames)) if faulty.frames else ""
     expected = (" or ".join(sorted(faulty.causes)) or "nothing") + frames
     if named is None:
         outcome: Outcome = "CRASH"
         named = [Named(crash, (), "bad")]
+    elif (judged := judge_findings(named, faulty)) is not None:
+        outcome = judged
     else:
-        outcome = judge_findings(named, faulty) or judge_errors(faulty, capture)
-    return CaptureCase(fault, kind, seed, outcome, expected, tuple(named), setup.text(), seconds)
+        outcome, errors = judge_errors(faulty, capture)
+    return CaptureCase(
+        fault, kind, seed, outcome, expected, tuple(named), errors, setup.text(), seconds
+    )
 
 
 def judge_findings(named: Sequence[Named], faulty: FaultyCapture) -> Outcome | None:
@@ -166,15 +171,28 @@ def judge_findings(named: Sequence[Named], faulty: FaultyCapture) -> Outcome | N
 def _is_right(named: Named, faulty: FaultyCapture) -> bool:
     """Whether a finding names the cause, and the frame of a fault of one frame."""
     is_frame_right = not faulty.frames or bool(set(named.frames) & set(faulty.frames))
-    return named.cause in faulty.causes and is_frame_right
+    return is_frame_right and not faulty.causes.isdisjoint(named.cause.split("|"))
 
 
-def judge_errors(faulty: FaultyCapture, capture: SimulatedCapture) -> Outcome:
-    """The outcome of a fault that is not named, by its errors and those without the fault."""
+def judge_errors(faulty: FaultyCapture, capture: SimulatedCapture) -> tuple[Outcome, str]:
+    """The outcome of a fault that is not named, by its errors and those without the fault, and both
+    in words."""
     sound = render_capture(faulty.sound)
-    floor = decode_coordinates(faulty.sound.described, sound.stack)
-    decoded = decode_coordinates(faulty.setup.described, capture.stack)
-    return compare_errors(_list_errors(decoded, capture.truth), _list_errors(floor, sound.truth))
+    floor = _list_errors(decode_coordinates(faulty.sound.described, sound.stack), sound.truth)
+    errors = _list_errors(decode_coordinates(faulty.setup.described, capture.stack), capture.truth)
+    texts = [_describe_errors(axis, errors.get(axis, np.empty(0)), floor[axis]) for axis in floor]
+    return compare_errors(errors, floor), "; ".join(texts)
+
+
+def _describe_errors(axis: Axis, errors: np.ndarray, floor: np.ndarray) -> str:
+    """The errors of an axis in words, with those without the fault."""
+    both = [np.quantile(e, [0.5, 0.95]) if len(e) else [np.nan] * 2 for e in (errors, floor)]
+    (median, most), (least, least_most) = both
+    share = 100 * len(errors) / max(len(floor), 1)
+    return (
+        f"{axis}: {median:.3g} px in the median and {most:.3g} in 95 %, not {least:.3g} and"
+        f" {least_most:.3g}, of {share:.0f} % of the pixels"
+    )
 
 
 def compare_errors(errors: Mapping[Axis, np.ndarray], floor: Mapping[Axis, np.ndarray]) -> Outcome:

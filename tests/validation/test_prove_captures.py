@@ -184,7 +184,7 @@ def test_the_plan_holds_every_fault_of_every_kind() -> None:
 def test_outcomes_are_counted_by_fault_and_in_total() -> None:
     named = (Named("dark", (3,), "bad"),)
     cases = [
-        CaptureCase(name, "p18", seed, outcome, "flicker", named, "a plane", 0.5)
+        CaptureCase(name, "p18", seed, outcome, "flicker", named, "", "a plane", 0.5)
         for name, seed, outcome in (
             ("flicker", 0, "right"),
             ("flicker", 1, "HARMFUL"),
