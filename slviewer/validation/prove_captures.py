@@ -62,7 +62,7 @@ class CaptureCase:
     seconds: float
 
     def text(self) -> str:
-        """The case in one line, with the call that repeats it."""
+        """The case in one line; `examine_case` of its fault, kind and seed repeats it."""
         named = ", ".join(_name_finding(n) for n in self.named) or "nothing"
         return (
             f"{self.outcome}: {self.fault}, {self.kind}, seed {self.seed}: named {named}, expected"

@@ -20,6 +20,7 @@ from slviewer.validation.prove_captures import (
     examine_case,
     judge_findings,
     plan_cases,
+    prove_captures,
     summarize_cases,
 )
 from slviewer.validation.simulated_capture import (
@@ -200,3 +201,15 @@ def test_outcomes_are_counted_by_fault_and_in_total() -> None:
     text = proof.text()
     assert missing_facts(text, "3 faults", "2 sound", "1 HARMFUL", "1 dark", "seed 1") == []
     assert len(json.loads(json.dumps(proof.to_json()))["cases"]) == 5
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+def test_a_tenth_of_the_captures_is_judged_as_well_as_measured() -> None:
+    proof = prove_captures(0.1)
+    assert len(proof.rows) == 1 + len(CAPTURE_FAULTS)
+    named, harmful, alarms = (check["value"] for check in proof.to_json()["checks"])
+    assert 0.68 <= named <= 1.0
+    assert 0.0 <= harmful <= 0.05
+    assert 0.0 <= alarms <= 0.01
+    assert not [case for case in proof.record["cases"] if case.outcome == "CRASH"]
