@@ -193,7 +193,10 @@ def test_gamma_from_its_harmonic() -> None:
     light = (0.5 + 0.5 * np.cos(phase)) ** 2.2
     first, second = (np.mean(light * np.cos(m * phase)) for m in (1, 2))
     assert gamma_from_harmonic(second / first) == pytest.approx(2.2, abs=1e-6)
-    assert causes(*(pose(k, axes={"x": axis(harmonic=0.28)}) for k in range(8))) == ("gamma",)
+    for harmonic in (0.28, 1.0, 2.0, -0.6):  # no power has the last three
+        assert causes(*(pose(k, axes={"x": axis(harmonic=harmonic)}) for k in range(8))) == (
+            "gamma",
+        )
 
 
 def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
