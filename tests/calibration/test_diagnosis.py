@@ -70,6 +70,16 @@ def test_a_sound_calibration_is_good() -> None:
     assert len(found.observations) == 8 and not found.excluded
 
 
+@pytest.mark.computes
+def test_cells_that_are_not_square_are_named() -> None:
+    scaled = np.array([1, 1 / 0.7, 1])
+    poses = [dataclasses.replace(o, points=o.points * scaled) for o in observations(8)]
+    found = attempt(poses)
+    assert found.verdict.causes[0] == "board-size" and found.verdict.level != "good"
+    assert missing_facts(found.verdict.findings[0].sentence, "0.70") == []
+    assert "fringe-period" not in found.verdict.causes
+
+
 @pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
