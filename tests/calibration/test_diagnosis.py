@@ -80,6 +80,24 @@ def test_cells_that_are_not_square_are_named() -> None:
     assert "fringe-period" not in found.verdict.causes
 
 
+@pytest.mark.computes
+@pytest.mark.parametrize(("tilt_deg", "level"), [(6, "doubtful"), (25, "good")])
+def test_boards_near_one_plane_leave_focal_lengths_uncertain(tilt_deg: float, level: str) -> None:
+    """A board that is bent by 0.3 mm disturbs the fits by more than its features' noise."""
+    poses = [
+        observation(TRUE, T, f"pose_{k:02d}", 0.05, bend_per_mm=4.7e-5)
+        for k, T in enumerate(board_poses(10, max_tilt_deg=tilt_deg))
+    ]
+    found = attempt(poses)
+    assert found.stereo is not None and found.verdict.level == level
+    for device, f in (("camera", 890), ("projector", 700)):
+        lens = getattr(found.stereo.rig, device)
+        assert abs(lens.K[0, 0] - f) < 3 * found.stereo.focal_sigma_px[device]
+    if level != "good":
+        assert "parallel-poses" in found.verdict.causes
+        assert not missing_facts(found.verdict.text(), "degrees", 15)
+
+
 @pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
