@@ -68,6 +68,8 @@ ABSOLUTE = {
     "three periods": mixed((90.0, 30.0, 10.0), cell=45.0, phase_sign=-1),
     "cells of a beat": mixed((20.0, 18.0), cell=90.0, steps=8),
     "two periods, the first a tenth longer than the projector": mixed((550.0, 20.0), cell=20.0),
+    "a beat of two beats": mixed(tuple(500 / k for k in (31, 36, 42)), steps=3),
+    "a beat, rounded to less than the projector": mixed((20.8333, 19.9999), steps=8),
 }
 RELATIVE = {
     "one period": (mixed((40.0,), relative=True), 40.0),
@@ -111,6 +113,8 @@ def assert_measured(sequence, axis, truth, least_coverage=0.99, **light):
         "no simple ratio",
         "half a period, complementary",
         "three periods",
+        "a beat of two beats",
+        "a beat, rounded to less than the projector",
     ),
 )
 def test_the_coordinate_comes_back(name):
