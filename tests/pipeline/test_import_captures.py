@@ -86,6 +86,38 @@ def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Pat
     assert status == 1 and not missing_facts(err, "'capture_2'")
 
 
+GRAY = (
+    'projector = "120x90"\norder = "name"\n'
+    + "".join(
+        f'[[frames]]\nkind = "gray"\naxis = "{axis}"\nbits = 7\ninverse = true\n' for axis in "xy"
+    )
+    + '[[frames]]\nkind = "white"\n[[frames]]\nkind = "black"\n'
+)
+
+
+@pytest.mark.parametrize("layout", ["procam-calibration", "auto"])
+def test_a_scan_takes_size_and_description_of_the_session(
+    run: Run, tmp_path: Path, layout: str
+) -> None:
+    pose, scan = write_captures(tmp_path, 2)
+    session = tmp_path / "session"
+    if layout == "auto":
+        for folder in (pose, scan):
+            for file in folder.iterdir():
+                file.rename(folder / file.name[-6:])
+        (tmp_path / "gray.toml").write_text(GRAY)
+        given: tuple = ("frames", pose, session, "--sequence", tmp_path / "gray.toml")
+        assert run("import", "auto", scan, session, "--role", "scan")[0] != 0
+    else:
+        given = (layout, pose, session, "--projector", "120x90")
+    assert run("import", *given)[0] == 0
+    status, _, err = run("import", layout, scan, session, "--role", "scan")
+    assert status == 0 and not missing_facts(err, "--sequence" if layout == "auto" else "120x90")
+    with Session.open(session) as store:
+        first, second = (store.load_capture(folder.name) for folder in (pose, scan))
+        assert first.sequence == second.sequence and second.role == "scan"
+
+
 @pytest.fixture
 def faulty(tmp_path: Path) -> Path:
     """Five captures: one with a file cut short, one with a missing file, one in the dark, two
