@@ -11,9 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
+
 from slviewer.errors import InputError
+from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
-from slviewer.fringe.sequence import PerAxis, parse_size
+from slviewer.fringe.phase import Reason
+from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
@@ -44,6 +48,8 @@ from slviewer.session.store import Session
 
 Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]
+MAX_OUTSIDE = 0.01
+"""Part of the pixels whose codes may lie outside of the projector: misread ones."""
 
 
 def import_captures(
@@ -358,6 +364,26 @@ def _list_assumptions(recording: ImportableRecording, capture: NewCapture) -> It
         )
 
 
+def _centre_code(
+    sequence: PatternSequence, frames: np.ndarray, axis: Axis
+) -> PatternSequence | None:
+    """Return a sequence whose Gray code alone is centred on the projector along an axis; None
+    unless the codes in view exceed the projector without that, and do not with it."""
+    if sequence.projector_size is None:
+        return None
+    origins = {"x": sequence.origin_px("x"), "y": sequence.origin_px("y")}
+    excess = 2 ** len(sequence.find("gray", axis)) * sequence.gray_cell(axis) - sequence.extent(
+        axis
+    )
+    origins[axis] = -0.5 - excess / 2
+    centred = replace(sequence, gray_origin_px=PerAxis(**origins))
+    outside = [
+        (phase.reason == Reason.OUTSIDE).sum() / max(1, int(phase.illuminated.sum()))
+        for phase in (decode(each, frames, axis) for each in (sequence, centred))
+    ]
+    return centred if outside[1] < MAX_OUTSIDE < outside[0] else None
+
+
 def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
     """The capture, with its Gray origin estimated if it was not given; InputError where its frames
     contradict its description.
@@ -387,6 +413,13 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             )
             listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
             warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
+        for axis in (each for each in sequence.axes if not sequence.periods_px(each)):
+            if (centred := _centre_code(sequence, capture.frames, axis)) is not None:
+                sequence = centred
+                warn(
+                    f"{capture.name}: the codes along {axis} fit the projector if they are centred"
+                    f" on it: gray_origin is taken for {sequence.origin_px(axis):g} px"
+                )
     phases = decode_frames(capture.name, sequence, capture.frames)
     check_capture(capture.name, sequence, capture.frames, phases, files=capture.files)
     warn_of_exposure(capture.name, sequence, capture.frames, phases, warn)
