@@ -308,7 +308,7 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
     Ripples (m, 1025) float32, rad, are to be added to the m wrapped phases from -pi to pi: those of
     longer periods of three or four steps, with the amplitude for which the levels agree best; (m,
     0) where none makes them agree twice as well. Misfit, in periods: `limits.LEVEL_MISFIT`, or less
-    where the levels scatter by so much that a wrong order were as likely as 1 in 10,000.
+    where the levels scatter by so much that a wrong order were as likely as 1 in 1000.
     """
     layout, stack = task.layout, task.stack
     none = np.zeros((len(layout.shifts), 0), np.float32)
@@ -347,7 +347,7 @@ def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
             best, least = ripples, loss
     turns = measure_turns(best)
     sigma = 1.4826 * np.median(np.abs(turns - np.rint(turns)), axis=1).max()
-    return best, float(np.clip(0.5 - np.log(1e4) * sigma**2, 0.05, limits.LEVEL_MISFIT))
+    return best, float(np.clip(0.5 - np.log(1000) * sigma**2, 0.02, limits.LEVEL_MISFIT))
 
 
 def _add_ripples(wrapped: list[np.ndarray], ripples: np.ndarray) -> list[np.ndarray]:

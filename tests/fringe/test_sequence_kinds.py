@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from facts import raises
-from fringe_scene import capture, coverage, slope, variants
+from fringe_scene import capture, coverage, slope, variants, wrong
+from scipy.ndimage import gaussian_filter
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, decode_reference
@@ -209,6 +210,17 @@ def test_dim_blurred_and_clipped_pixels_are_masked_rather_than_wrong(name):
     assert phase.mask[:, 42:98].mean() > 0.95
     off = np.abs(phase.coordinate - truth) > 0.4 * phase.period_px
     assert np.count_nonzero(off & phase.mask) <= 2
+
+
+def test_levels_that_scatter_leave_fewer_pixels_but_no_wrong_fringe():
+    """An error of the long period of 20 % of a fringe, as of light that changed."""
+    frames = [*phase_steps("x", 6, 512.0), *phase_steps("x", 6, 32.0)]
+    sequence, truth = PatternSequence((512, 500), tuple(frames)), slope()
+    stack = capture(sequence, truth)
+    error = gaussian_filter(np.random.default_rng(5).normal(size=truth.shape), 15)
+    stack[:6] = capture(sequence, truth + 0.2 * 32 / error.std() * error)[:6]
+    phase = decode(sequence, stack, "x")
+    assert wrong(phase, truth) == 0 and 0.2 < phase.mask.mean() < 0.7
 
 
 @pytest.mark.slow
