@@ -40,7 +40,8 @@ class StereoModel:
     residuals of "camera", "projector" and "stereo" (both together); ``pose_rms_px``: (camera,
     projector) of each pose. ``excluded``: poses not used, with the reason. ``depth_range_mm``:
     nearest and farthest feature; None for a calibration made elsewhere. ``focal_sigma_px``:
-    standard deviation of the focal length by device. ``features_excluded``: number of outliers
+    standard deviation of the focal length by device, or the difference of the fits with and without
+    the other device where that is larger. ``features_excluded``: number of outliers
     among the features. ``residuals_px`` (n, 4): camera and projector residuals of each pose's
     features, NaN where excluded or not measured.
     """
@@ -241,6 +242,7 @@ class _Solution:
                 )
             intrinsics.append((K, D))
         (K_c, D_c), (K_p, D_p) = intrinsics
+        alone = [np.diag(K).copy() for K in (K_c, K_p)]  # OpenCV overwrites both
         _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
             objects,
             cameras,
@@ -262,6 +264,10 @@ class _Solution:
                     " as no lens has: check the target's notation, the projector's size, the"
                     " fringe period, and that x and y are not exchanged"
                 )
+        for device, f, K in zip(sigma, alone, (K_c, K_p), strict=True):
+            # systematic errors, which the standard deviations lack, change the two fits differently
+            change = np.abs(f / np.diag(K) - 1).max()
+            sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
         camera = Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size)
         projector = Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size)
         poses = {

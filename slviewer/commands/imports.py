@@ -1,6 +1,7 @@
 """`slviewer import`: one command a layout, and the calibrations that other tools made."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -47,8 +48,9 @@ def run_import(layout: str, import_captures: Callable[..., Any], arguments: dict
     from slviewer.pipeline.import_captures import describe_import, detect_layout
 
     if layout == "detect":
-        layout = detect_layout(arguments["source"])
-        terminal.print_result(f"layout {layout}")
+        with suppress(InputError):  # the session may describe the files
+            layout = detect_layout(arguments["source"])
+            terminal.print_result(f"layout {layout}")
     names = call(import_captures, layout=layout, **arguments)
     terminal.print_result(describe_import(names, arguments["role"]))
 
@@ -143,14 +145,13 @@ def make_import_command() -> Callable[..., Callable[[], None]]:
         "p18": _make_captures_command(
             "p18",
             "Import folders of the p18 layout: pose_XX/{V,H}/P18_FNN.PNG, 18 phase steps and 7 Gray"
-            " bits an axis.",
-            projector="912x1140",
+            " bits an axis.\n\nA projector of 912x1140 pixels is assumed in a new session.",
         ),
         "procam-calibration": _make_captures_command(
             "procam-calibration",
             "Import folders of the procam-calibration layout: capture_N/graycode_NN.*, Gray code"
-            " with inverses, white, black.",
-            projector="1024x768",
+            " with inverses, white, black.\n\nA projector of 1024x768 pixels is assumed in a new"
+            " session.",
         ),
         "opencv-graycode": _make_captures_command(
             "opencv-graycode",

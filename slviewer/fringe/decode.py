@@ -27,6 +27,7 @@ from slviewer.fringe.reference import (
     complete_map,
     dark_sigmas,
     decode_reference,
+    estimate_level_errors,
     phase_shift,
 )
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -65,6 +66,8 @@ def decode(
         )
     else:
         ladder = pack_levels(layout, fringe_mean(layout, stack) if layout.gray else MIDDLE)
+        ripples, misfit = estimate_level_errors(task)
+        ladder = ladder._replace(ripples=ripples, misfit=misfit)
         kernels_levels.decode_levels(stack, pack_shifts(layout), ladder, scale, maps)
     _repair_spikes(layout, maps[0], maps[-1])
     return complete_map(task, maps, mask_indirect)
@@ -189,4 +192,5 @@ def pack_levels(layout: Layout, mean: float = MIDDLE) -> kernels_levels.Ladder:
         layout.gray_origin_px,
         code_cell_px(layout),
         mean,
+        np.zeros((len(layout.shifts), 0), np.float32),
     )

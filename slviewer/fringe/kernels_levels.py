@@ -31,8 +31,8 @@ class Ladder(NamedTuple):
     """Levels by which several periods are unwrapped to one absolute phase.
 
     ``weights`` (levels, m) of the m wrapped phases and ``periods`` (levels,) px describe the
-    levels, longest first. ``misfit`` and ``cell_misfit``: see `limits.LEVEL_MISFIT` and
-    `levels.cell_misfit`.
+    levels, longest first. ``misfit``, and ``ripples`` (m, k) that are added to the wrapped phases:
+    see `reference.estimate_level_errors`; ``cell_misfit``: see `levels.cell_misfit`.
 
     The first level begins at ``low`` px, or, where there are Gray ``bits``, is unwrapped by the
     cells that they number: frames (b,), most significant bit first, and of their ``inverses``, -1
@@ -49,6 +49,7 @@ class Ladder(NamedTuple):
     origin: float
     cell: float
     mean: float
+    ripples: np.ndarray
 
 
 @numba.njit(inline="always")
@@ -211,6 +212,17 @@ def phases_row(stack, shifts, scale, row, psi, out, B, A, peak, buffers):
         B[x] = np.sqrt(fma(cosine[x], cosine[x], sine[x] * sine[x])) * per_two
 
 
+@numba.njit
+def add_ripple_row(psi, ripple):
+    """Add a ripple, given from -pi to pi, to the wrapped phases (w,) of one period."""
+    last = len(ripple) - 1
+    per_rad = last * PER_RAD
+    for x in range(len(psi)):
+        place = (psi[x] + np.pi) * per_rad
+        k = min(max(int(place), 0), last - 1)
+        psi[x] += ripple[k] + np.float32(place - k) * (ripple[k + 1] - ripple[k])
+
+
 @kernel()
 def levels_rows(
     stack, shifts, ladder, scale, first, phase, wrapped, modulation, background, reason
@@ -227,6 +239,9 @@ def levels_rows(
     for i in range(len(phase)):
         B, A = modulation[i], background[i]
         phases_row(stack, shifts, scale, first + i, psi, wrapped[i], B, A, peak, buffers)
+        if ladder.ripples.shape[1]:
+            for k in range(count):
+                add_ripple_row(psi[k], ladder.ripples[k])
         if bits:
             cell_row(stack, first + i, B, A, ladder, heights, cell, worst)
         levels_row(

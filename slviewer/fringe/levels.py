@@ -2,16 +2,14 @@
 cell, to the finest."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, pairwise
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.layout import SAME_WIDTH, Layout
+from slviewer.fringe.layout import Layout
 from slviewer.fringe.limits import LEVEL_SIGMA
-
-LONGEST = 3
-"""How many of the longest periods may be combined to a beat."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +24,11 @@ class Level:
 WHOLE = 1e-3
 """How far from whole a ratio of periods may be: over fifty repetitions it comes to a twentieth of a
 period."""
+SAME_RANGE = 1 - 5e-4
+"""Part of a length that a period must have to cover it: periods rounded to a hundred thousandth
+change the beat of two that differ by a fiftieth so much."""
+LONGEST_BEAT_PX = 1e6
+"""Beats of equal frequencies come out longer, by rounding."""
 
 
 def layout_levels(layout: Layout) -> tuple[Level, ...]:
@@ -39,7 +42,7 @@ def layout_levels(layout: Layout) -> tuple[Level, ...]:
     if layout.gray:
         cell = code_cell_px(layout)
         try:
-            return plan_levels(periods, cell * (1 - SAME_WIDTH))
+            return plan_levels(periods, cell)
         except InputError as error:
             raise InputError(
                 f"{where}{error}, which a Gray cell spans: set gray_cell_px if the cells are"
@@ -62,7 +65,7 @@ def unambiguous_px(layout: Layout) -> float:
     if layout.gray or not layout.shifts:
         return np.inf
     reach = layout_levels(layout)[0].period_px
-    return np.inf if reach >= layout.extent else reach
+    return np.inf if reach >= SAME_RANGE * layout.extent else reach
 
 
 def lowest_coordinate(period_px: float, extent: float) -> float:
@@ -86,54 +89,36 @@ def cell_misfit(layout: Layout) -> float:
     return 0.25 * (1 + code_cell_px(layout) / layout_levels(layout)[0].period_px)
 
 
+@lru_cache(64)
 def plan_levels(periods_px: tuple[float, ...], extent: float) -> tuple[Level, ...]:
     """Plan the levels from one whose period covers ``extent`` px down to the finest; weights are
     per period, as given.
 
-    ``periods_px`` are longest first. Where none covers the extent, beats of two, then of three of
-    the longest take their place (heterodyne). Raises InputError where these do not cover it either.
+    ``periods_px`` are longest first. Where none covers the extent, those beats of two of them, and
+    beats of two beats, take their place that need the least modulation (heterodyne). Raises
+    InputError where these do not cover it either.
     """
-    singles = [_combine_periods(periods_px, {i: 1}) for i in range(len(periods_px))]
-    if periods_px[0] >= extent:
-        return tuple(singles)
-    every = _list_beats(periods_px)
-    covering = [beat for beat in every if extent <= beat.period_px < np.inf]
-    if len(periods_px) > LONGEST and covering:
-        return (
-            *_chain_beats(min(covering, key=lambda level: level.period_px), every, singles[0]),
-            *singles,
-        )
-    beats = _list_beats(periods_px, LONGEST)
-    covering = [beat for beat in beats if beat.period_px >= extent]
-    if covering:
-        return (min(covering, key=lambda level: level.period_px), *singles)
-    if len(periods_px) >= LONGEST:
-        both = _combine_periods(periods_px, {0: 1, 1: -2, 2: 1})
-        if extent <= both.period_px < np.inf:
-            beat = min(beats, key=lambda level: level.period_px if level.weights[1] else np.inf)
-            return (both, beat, *singles)
-    reached = max([periods_px[0], *(beat.period_px for beat in beats)])
+    singles = tuple(_combine_periods(periods_px, weights) for weights in np.eye(len(periods_px)))
+    if periods_px[0] >= SAME_RANGE * extent:
+        return singles
+    beats = [beat for beat in _list_beats(periods_px) if beat.period_px > periods_px[0]]
+    paths: list[tuple[float, int, tuple[Level, ...]]] = []
+    for level in (*beats, singles[0]):
+        options = [
+            (max(spread, _measure_spread(path[-1], level)), length + 1, (*path, level))
+            for spread, length, path in paths
+        ]
+        if level.period_px >= SAME_RANGE * extent:
+            options.append((0.0, 1, (level,)))
+        if options:
+            paths.append(min(options, key=lambda option: option[:2]))
+    if paths:
+        return (*paths[-1][2][:-1], *singles)
+    reached = max(level.period_px for level in (*beats, singles[0]))
     raise InputError(
         f"fringe periods of {_join_periods(periods_px)} px tell only {reached:.0f} px apart, not"
         f" {extent:g}"
     )
-
-
-def _chain_beats(longest: Level, beats: list[Level], single: Level) -> tuple[Level, ...]:
-    """Return levels from ``longest`` down to above ``single``: of the beats those between which the
-    largest ratio of periods, and then the number of levels, is least."""
-    nodes = sorted(
-        {b for b in beats if single.period_px < b.period_px < longest.period_px},
-        key=lambda b: -b.period_px,
-    )
-    best: list[tuple[float, int, tuple[Level, ...]]] = []
-    for level in (longest, *nodes, single):
-        options = [
-            (max(ratio, path[-1].period_px / level.period_px), length + 1, (*path, level))
-            for ratio, length, path in best
-        ]
-        best.append(min(options, key=lambda option: option[:2]) if options else (1.0, 0, (level,)))
-    return best[-1][2][:-1]
 
 
 def unwrap_levels(
@@ -167,13 +152,13 @@ def find_common_range(periods_px: tuple[float, ...]) -> float:
     """Return the range px after which all phases of the periods repeat, and within which
     coordinates are unambiguous.
 
-    It is the longest period or a beat of two. Raises InputError where no such range holds whole
+    It is the longest period or a beat. Raises InputError where no such range holds whole
     numbers of all periods.
     """
-    beats = _list_beats(periods_px, LONGEST)
-    for reach in sorted({periods_px[0], *(beat.period_px for beat in beats)}, reverse=True):
+    beats = [beat.period_px for beat in _list_beats(periods_px)]
+    for reach in sorted([periods_px[0], *beats], reverse=True):
         turns = reach / np.array(periods_px)
-        if reach < np.inf and (np.abs(turns - np.rint(turns)) <= WHOLE).all():
+        if (np.abs(turns - np.rint(turns)) <= WHOLE).all():
             return float(reach)
     raise InputError(
         f"fringe periods of {_join_periods(periods_px)} px share no range of which each is a whole"
@@ -188,23 +173,26 @@ def required_modulation(levels: tuple[Level, ...], steps: int) -> float:
 
     ``steps``: phase steps of the period with the fewest.
     """
-    spread = max(
-        (
-            np.hypot(
-                np.linalg.norm(longer.weights) * longer.period_px / level.period_px,
-                np.linalg.norm(level.weights),
-            )
-            for longer, level in pairwise(levels)
-        ),
-        default=0.0,
-    )
+    spread = max((_measure_spread(*both) for both in pairwise(levels)), default=0.0)
     return float(spread * np.sqrt(2 / steps) / (2 * np.pi * LEVEL_SIGMA))
 
 
-def _list_beats(periods_px: tuple[float, ...], most: int | None = None) -> list[Level]:
-    """Return the beats of two of the periods, of the ``most`` longest ones if given."""
-    pairs = combinations(range(len(periods_px))[:most], 2)
-    return [_combine_periods(periods_px, {j: 1, i: -1}) for i, j in pairs]
+def _measure_spread(longer: Level, level: Level) -> float:
+    """Return the standard deviation, in periods of ``level``, of the step to it from the one
+    before, per that of the phases in periods."""
+    own, before = np.linalg.norm(level.weights), np.linalg.norm(longer.weights)
+    return float(np.hypot(before * longer.period_px / level.period_px, own))
+
+
+def _list_beats(periods_px: tuple[float, ...]) -> list[Level]:
+    """Return the beats of two of the periods, and the beats of two of those of the five longest,
+    longest first."""
+    units = np.eye(len(periods_px))
+    twos, some = ([i - j for i, j in combinations(each, 2)] for each in (units, units[:5]))
+    fours = [i + sign * j for i, j in combinations(some, 2) for sign in (1, -1)]
+    beats = {_combine_periods(periods_px, weights) for weights in twos + fours}
+    finite = [beat for beat in beats if beat.period_px < LONGEST_BEAT_PX]
+    return sorted(finite, key=lambda beat: (-beat.period_px, beat.weights))
 
 
 def _join_periods(periods_px: tuple[float, ...]) -> str:
@@ -212,9 +200,8 @@ def _join_periods(periods_px: tuple[float, ...]) -> str:
     return ", ".join(f"{p:g}" for p in periods_px)
 
 
-def _combine_periods(periods_px: tuple[float, ...], weights: dict[int, int]) -> Level:
-    """Return the beat of several periods whose phases are added with integer weights."""
-    frequency = sum(w / periods_px[i] for i, w in weights.items())
-    sign = 1 if frequency >= 0 else -1
-    period = 1 / abs(frequency) if frequency else np.inf
-    return Level(period, tuple(sign * weights.get(i, 0) for i in range(len(periods_px))))
+def _combine_periods(periods_px: tuple[float, ...], weights: np.ndarray) -> Level:
+    """Return the beat of several periods whose phases are added with integer weights (m,)."""
+    frequency = float(weights @ (1 / np.array(periods_px)))
+    weights = weights * np.sign(frequency)
+    return Level(1 / max(abs(frequency), 1e-9), tuple(weights.astype(int).tolist()))

@@ -3,7 +3,12 @@
 import numpy as np
 
 from slviewer.fringe import limits
-from slviewer.fringe.aliased_harmonics import correct_harmonics, estimate_aliased_harmonics
+from slviewer.fringe.aliased_harmonics import (
+    MOST_STEPS,
+    AliasedHarmonics,
+    correct_harmonics,
+    estimate_aliased_harmonics,
+)
 from slviewer.fringe.decoding_task import DecodingTask, prepare_decoding
 from slviewer.fringe.indirect_light import mask_indirect_light
 from slviewer.fringe.layout import Layout
@@ -18,11 +23,19 @@ from slviewer.fringe.levels import (
 )
 from slviewer.fringe.phase import Noise, PhaseMap, Reason
 from slviewer.fringe.reference_spikes import repair_spikes
+from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.scatter import with_scatter
 from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.threshold import fringe_mean
 
 TWO_PI = 2 * np.pi
+LEVEL_PIXELS = 4000
+"""Pixels from which the agreement of several periods is estimated."""
+AGREEMENT = 0.02
+"""Loss, 1 less the mean cosine of a step, of levels that agree: a scatter of 3 % of a period."""
+AMPLITUDES = np.linspace(-0.4, 0.4, 33)
+"""Of ripples that are tried: a gamma of 2.2 has one of 0.29 in three steps."""
+_ARGUMENTS = np.linspace(-np.pi, np.pi, 1025)
 
 
 def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
@@ -50,7 +63,9 @@ def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -
             )
         else:
             cell = _decode_cell(layout, stack, modulation, background) if layout.gray else None
-            order, inconsistent = _unwrap_by_levels(layout, [psi for psi, _, _, _ in shifted], cell)
+            ripples, misfit = estimate_level_errors(task)
+            wrapped_all = _add_ripples([psi for psi, _, _, _ in shifted], ripples)
+            order, inconsistent = _unwrap_by_levels(layout, wrapped_all, cell, misfit)
         phase = (wrapped + TWO_PI * order).astype(np.float32)
         dark = np.zeros(phase.shape, bool)
     dark |= weakest < dark_limit(background, noise, task.full_scale, dark_sigmas(layout))
@@ -260,21 +275,89 @@ def code_bits(layout: Layout) -> Indices:
 
 
 def _unwrap_by_levels(
-    layout: Layout, wrapped: list[np.ndarray], cell: tuple[np.ndarray, np.ndarray] | None
+    layout: Layout,
+    wrapped: list[np.ndarray],
+    cell: tuple[np.ndarray, np.ndarray] | None,
+    misfit: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the periods to add to the finest wrapped phase, and where levels or cell are
     inconsistent, (h, w) each.
 
-    ``cell``: see `_decode_cell`, None without Gray code.
+    ``cell``: see `_decode_cell`, None without Gray code; ``misfit``: see `estimate_level_errors`.
     """
-    levels = layout_levels(layout)
-    low = lowest_coordinate(levels[0].period_px, min(layout.extent, unambiguous_px(layout)))
-    _, order, turns = unwrap_levels(levels, wrapped, low, None if cell is None else cell[0])
+    order, turns = _unwrap(layout, wrapped, None if cell is None else cell[0])
     inconsistent = np.zeros(order.shape, bool) if cell is None else cell[1]
     for k, each in enumerate(turns):
-        largest = cell_misfit(layout) if cell is not None and k == 0 else limits.LEVEL_MISFIT
+        largest = cell_misfit(layout) if cell is not None and k == 0 else misfit
         inconsistent = inconsistent | (np.abs(each - np.rint(each)) > largest)
     return order, inconsistent
+
+
+def _unwrap(
+    layout: Layout, wrapped: list[np.ndarray], near: np.ndarray | None
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return order and turns of `levels.unwrap_levels` for the levels of a layout."""
+    levels = layout_levels(layout)
+    low = lowest_coordinate(levels[0].period_px, min(layout.extent, unambiguous_px(layout)))
+    return unwrap_levels(levels, wrapped, low, near)[1:]
+
+
+def estimate_level_errors(task: DecodingTask) -> tuple[np.ndarray, float]:
+    """Estimate how gamma disturbs the steps from level to level; returns ripples and misfit.
+
+    Ripples (m, 1025) float32, rad, are to be added to the m wrapped phases from -pi to pi: those of
+    longer periods of three or four steps, with the amplitude for which the levels agree best; (m,
+    0) where none makes them agree twice as well. Misfit, in periods: `limits.LEVEL_MISFIT`, or less
+    where the levels scatter by so much that a wrong order were as likely as 1 in 1000.
+    """
+    layout, stack = task.layout, task.stack
+    none = np.zeros((len(layout.shifts), 0), np.float32)
+    stack = np.ascontiguousarray(
+        stack[:, select_rows(stack.shape[1], stack.shape[2], LEVEL_PIXELS)]
+    )
+    shifted = [
+        phase_shift(stack, shift.indices, layout.sign, layout.offset_rad) for shift in layout.shifts
+    ]
+    valid = np.ones(stack.shape[1:], bool)
+    for _, B, A, peak in shifted:
+        dark = dark_limit(A, task.noise, task.full_scale, dark_sigmas(layout))
+        valid &= (dark <= B) & (peak < task.white)
+    near = _decode_cell(layout, stack, *shifted[-1][1:3])[0][valid] if layout.gray else None
+    wrapped = [psi[valid] for psi, _, _, _ in shifted]
+    if len(wrapped[0]) < FEWEST or len(layout_levels(layout)) < 2:
+        return none, limits.LEVEL_MISFIT
+
+    def measure_turns(ripples: np.ndarray) -> np.ndarray:
+        """Return the steps (levels, p), in periods, whole where the levels agree."""
+        turns = _unwrap(layout, _add_ripples(wrapped, ripples), near)[1]
+        return np.array(turns[layout.gray != () :])
+
+    def measure_loss(ripples: np.ndarray) -> float:
+        """Return by how much the steps disagree, 0 to 2."""
+        return float(1 - np.cos(TWO_PI * measure_turns(ripples)).mean(axis=1).min())
+
+    steps = [len(shift.indices) for shift in layout.shifts[:-1]]
+    best, least = none, max(measure_loss(none) / 2, AGREEMENT)
+    for d in AMPLITUDES if least > AGREEMENT and min(steps) <= MOST_STEPS else ():
+        ripples = np.zeros((len(steps) + 1, len(_ARGUMENTS)), np.float32)
+        for ripple, n in zip(ripples, steps, strict=False):  # the finest has its own correction
+            if n <= MOST_STEPS:
+                ripple[:] = AliasedHarmonics(n, d, d).correction(_ARGUMENTS + layout.offset_rad)
+        if (loss := measure_loss(ripples)) < least:
+            best, least = ripples, loss
+    turns = measure_turns(best)
+    sigma = 1.4826 * np.median(np.abs(turns - np.rint(turns)), axis=1).max()
+    return best, float(np.clip(0.5 - np.log(1000) * sigma**2, 0.02, limits.LEVEL_MISFIT))
+
+
+def _add_ripples(wrapped: list[np.ndarray], ripples: np.ndarray) -> list[np.ndarray]:
+    """Add ripples, see `estimate_level_errors`, to the wrapped phases of all periods."""
+    if not ripples.size:
+        return wrapped
+    return [
+        psi + np.interp(psi, _ARGUMENTS, ripple).astype(np.float32)
+        for psi, ripple in zip(wrapped, ripples, strict=True)
+    ]
 
 
 def _decode_gray_alone(

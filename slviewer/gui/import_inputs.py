@@ -74,7 +74,7 @@ class ImportInputs:
         change(self._codec, visible=name == "slstudio")
         size = layout.projector if layout else None
         if size is not None:
-            empty = f"{size[0]}x{size[1]}, of this layout"
+            empty = f"of the session, else {size[0]}x{size[1]}"
         elif name == "frames":
             empty = "of the TOML"
         else:

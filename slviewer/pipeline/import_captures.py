@@ -11,20 +11,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
+
 from slviewer.errors import InputError
+from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
-from slviewer.fringe.sequence import PerAxis, parse_size
+from slviewer.fringe.phase import Reason
+from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.frame_check import describe_contradictions, load_or_save_check
 from slviewer.pipeline.models import available_models
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
-from slviewer.session.capture import NewCapture
+from slviewer.session.capture import Capture, NewCapture
 from slviewer.session.importers import guessed_description
 from slviewer.session.importers.guessed_description import GuessedDescription
 from slviewer.session.importers.images import Channel
-from slviewer.session.importers.imported import ImportableRecording, Imports, Skipped, none_usable
+from slviewer.session.importers.imported import (
+    FolderLayout,
+    ImportableRecording,
+    Imports,
+    Skipped,
+    define_layout,
+    none_usable,
+)
 from slviewer.session.importers.layouts import (
     LAYOUT_PLUGINS,
     detect_layout,
@@ -37,6 +48,8 @@ from slviewer.session.store import Session
 
 Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]
+MAX_OUTSIDE = 0.01
+"""Part of the pixels whose codes may lie outside of the projector: misread ones."""
 
 
 def import_captures(
@@ -63,8 +76,8 @@ def import_captures(
         session: Session folder; made if it does not exist.
         role: calibration for target poses, scan for anything else.
         prefix: Put before each capture's name: planes gives planes_pose_03.
-        projector: Width x height of the projector, px; by default what the layout or the images'
-            TOML states, else what the session knows.
+        projector: Width x height of the projector, px; by default what the images' TOML states,
+            else as in the session, else what the layout implies.
         channel: Of colour images; green where nothing states it.
         force: Replace captures of the same name (the old ones go to the session's trash).
         strict: Import nothing where one capture cannot be used, instead of skipping it with a
@@ -72,9 +85,10 @@ def import_captures(
 
     ``layout`` is one of `layouts.layouts()`, or "detect": the one that the file names show.
     Captures are named after their folders. ``sequence`` is the TOML of the layout frames, by
-    default the one in ``source``; where Gray code 0 begins is estimated from the images if it does
-    not state that. ``origin`` is recorded as where the captures come from, by default their
-    folders. ``options`` are those of the layout's `read`.
+    default the one in ``source``, else what the session knows of files of the same names; where
+    Gray code 0 begins is estimated from the images if it does not state that. ``origin`` is
+    recorded as where the captures come from, by default their folders. ``options`` are those of the
+    layout's `read`.
 
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason.
     Raises InputError where none is left, or, with ``strict``, for the first of them; nothing is
@@ -199,35 +213,42 @@ def find_captures(
     warn: Warn = ignore_warnings,
     **options: Any,
 ) -> Imports:
-    """The captures of a folder, not yet read; ``session`` knows the projector's size where it is
-    not stated."""
+    """The captures of a folder, not yet read; ``session`` knows the projector's size, and what
+    files of the same names show, where it is not stated."""
     source = expand_user(source)
+    same = _layout_of_session(session, source)
     if layout == "detect":
-        layout = "frames" if sequence is not None else detect_layout(source)
+        layout = "frames" if sequence is not None else _detect_layout(source, same)
     known = layouts()
     if layout not in known:
         raise InputError(
             f"the layout {layout!r} is unknown: use"
             f" {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
         )
-    size = known[layout].projector if projector is None else parse_size(projector)
+    size = None if projector is None else parse_size(projector)
     assumed = None
     if layout == "frames":
         toml = sequence or find_description(source)
-        if toml is None:
+        if toml is not None:
+            options["toml"] = Path(toml)
+        elif same is not None:
+            known = {layout: same}
+            warn("the images are described as those of the session: --sequence to describe them")
+        else:
             raise InputError(
                 f"{source} holds no TOML that describes the images: add one, or give --sequence"
             )
-        options["toml"] = Path(toml)
-    elif size is None and session is not None:
+    elif size is None:
         assumed = _known_projector_size(session)
+        size = assumed or known[layout].projector
     try:
-        imports = known[layout].read(source, prefix=prefix, projector=size or assumed, **options)
+        imports = known[layout].read(source, prefix=prefix, projector=size, **options)
     except InputError:
         _warn_of_assumed_size(assumed, warn)  # it may be why
         raise
     sizes = {recording.sequence.projector_size for recording in imports.recordings}
-    if assumed in sizes:  # a layout that states the size itself does not use it
+    # a layout that states the size itself does not use the assumed one
+    if assumed in sizes - {known[layout].projector}:
         _warn_of_assumed_size(assumed, warn)
     if channel is not None:
         imports = replace(
@@ -273,10 +294,50 @@ def _warn_of_assumed_size(size: tuple[int, int] | None, warn: Warn) -> None:
         )
 
 
-def _known_projector_size(session: SessionLike) -> tuple[int, int] | None:
+def _detect_layout(source: Path, same: FolderLayout | None) -> str:
+    """The name of the layout of a folder; frames where only the session describes it."""
+    try:
+        return detect_layout(source)
+    except InputError:
+        if same is None:
+            raise
+        return "frames"
+
+
+def _layout_of_session(session: SessionLike | None, source: Path) -> FolderLayout | None:
+    """The layout of folders whose files are named like, and show the same as, those of an imported
+    capture of the session; None where the source holds no such folder."""
+    if session is None or not (isinstance(session, Session) or is_session(expand_user(session))):
+        return None
+    with opened(session) as store:
+        captures = [each for each in store.captures() if each.files and not each.exposures_ms]
+
+    def find_same(folder: Path) -> Capture | None:
+        """Return a capture whose files the folder holds."""
+        named = (each for each in captures if all((folder / f).is_file() for f in each.files))
+        return next(named, None)
+
+    def describe(
+        folder: Path, name: str, projector: tuple[int, int] | None
+    ) -> tuple[ImportableRecording, list[str]]:
+        """Return the recording of a folder."""
+        same = find_same(folder)
+        assert same is not None
+        sequence = replace(same.sequence, projector_size=projector or same.sequence.projector_size)
+        files = tuple(folder / file for file in same.files)
+        channel = same.meta.get("settings", {}).get("channel")
+        return ImportableRecording(name, sequence, files, folder, channel=channel), []
+
+    if not source.is_dir() or not any(map(find_same, (source, *source.iterdir()))):
+        return None
+    holds = "files named as in the session"
+    return define_layout("frames", holds, describe, lambda folder: find_same(folder) is not None)
+
+
+def _known_projector_size(session: SessionLike | None) -> tuple[int, int] | None:
     """The projector's size by the session's captures, else by its imported calibration; None where
     both are missing."""
-    if not isinstance(session, Session) and not is_session(expand_user(session)):
+    if session is None or not (isinstance(session, Session) or is_session(expand_user(session))):
         return None
     with opened(session) as store:
         sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
@@ -301,6 +362,26 @@ def _list_assumptions(recording: ImportableRecording, capture: NewCapture) -> It
             ' or reconstruct them import them again with projector = "912x1140" in the TOML, or'
             " --projector"
         )
+
+
+def _centre_code(
+    sequence: PatternSequence, frames: np.ndarray, axis: Axis
+) -> PatternSequence | None:
+    """Return a sequence whose Gray code alone is centred on the projector along an axis; None
+    unless the codes in view exceed the projector without that, and do not with it."""
+    if sequence.projector_size is None:
+        return None
+    origins = {"x": sequence.origin_px("x"), "y": sequence.origin_px("y")}
+    excess = 2 ** len(sequence.find("gray", axis)) * sequence.gray_cell(axis) - sequence.extent(
+        axis
+    )
+    origins[axis] = -0.5 - excess / 2
+    centred = replace(sequence, gray_origin_px=PerAxis(**origins))
+    outside = [
+        (phase.reason == Reason.OUTSIDE).sum() / max(1, int(phase.illuminated.sum()))
+        for phase in (decode(each, frames, axis) for each in (sequence, centred))
+    ]
+    return centred if outside[1] < MAX_OUTSIDE < outside[0] else None
 
 
 def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
@@ -332,6 +413,13 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             )
             listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
             warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
+        for axis in (each for each in sequence.axes if not sequence.periods_px(each)):
+            if (centred := _centre_code(sequence, capture.frames, axis)) is not None:
+                sequence = centred
+                warn(
+                    f"{capture.name}: the codes along {axis} fit the projector if they are centred"
+                    f" on it: gray_origin is taken for {sequence.origin_px(axis):g} px"
+                )
     phases = decode_frames(capture.name, sequence, capture.frames)
     check_capture(capture.name, sequence, capture.frames, phases, files=capture.files)
     warn_of_exposure(capture.name, sequence, capture.frames, phases, warn)

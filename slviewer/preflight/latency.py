@@ -53,7 +53,7 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
             None,
         )
     begin_s = [bench.grab_timed()[0] for _ in range(6)]
-    bench.frame_ms = 1000 * float(np.median(np.diff(begin_s)))
+    bench.frame_ms = max(1000 * float(np.median(np.diff(begin_s))), 1e-3)
     changes = [_time_change(bench, i) for i in range(_CHANGE_COUNT)]
     lost = sum(not change.arrived for change in changes)
     if lost:
@@ -77,7 +77,7 @@ def measure_latency(bench: RigUnderTest) -> tuple[Check, float | None]:
     figures = {
         "latency_ms": round(max(fresh), 1),
         "median_ms": round(float(np.median(fresh)), 1),
-        "latency_frames": round(max(fresh) / bench.frame_ms, 2) if bench.frame_ms else 0.0,
+        "latency_frames": round(max(fresh) / bench.frame_ms, 2),
         "images_before_it": max(0, *images),
         "frame_ms": round(bench.frame_ms, 2),
         "settle_ms": settle,

@@ -33,13 +33,15 @@ def rig() -> StereoRig:
     return StereoRig(camera, projector, R, -R @ np.array([180.0, 5.0, 8.0]))
 
 
-def board_poses(count: int, seed: int = 0) -> list[np.ndarray]:
-    """(4, 4) board to camera, 500 to 700 mm away, tilted by up to 25 degrees."""
+def board_poses(count: int, seed: int = 0, max_tilt_deg: float = 25) -> list[np.ndarray]:
+    """(4, 4) board to camera, 500 to 700 mm away, tilted by up to 25 degrees about each axis."""
     rng = np.random.default_rng(seed)
     poses = []
     for k in range(count):
         T = np.eye(4)
-        T[:3, :3] = cv2.Rodrigues(np.radians(rng.uniform([-25, -25, -8], [25, 25, 8])))[0]
+        T[:3, :3] = cv2.Rodrigues(
+            np.radians(rng.uniform(-1, 1, 3) * [max_tilt_deg, max_tilt_deg, 8])
+        )[0]
         z = 500 + 200 * (k + 0.5) / count
         middle = BOARD.points.mean(0)
         T[:3, 3] = np.array([rng.uniform(-25, 25), rng.uniform(-20, 20), z]) - T[:3, :3] @ middle
@@ -54,10 +56,13 @@ def observation(
     noise_px: float = 0.02,
     seed: int = 0,
     axes: tuple[str, ...] = ("x", "y"),
+    bend_per_mm: float = 0.0,
 ) -> Observation:
-    """The board at pose T as camera and projector see it, with Gaussian noise on every feature."""
+    """The board, bent along x to z = bend_per_mm x^2, at pose T as camera and projector see it,
+    with Gaussian noise on every feature."""
     rng = np.random.default_rng([seed, sum(map(ord, name))])
-    X = BOARD.points @ T[:3, :3].T + T[:3, 3]
+    bend = bend_per_mm * (BOARD.points[:, :1] - BOARD.points[:, 0].mean()) ** 2
+    X = (BOARD.points + bend * [0, 0, 1]) @ T[:3, :3].T + T[:3, 3]
     camera, projector = (
         cv_project(true.camera, X),
         cv_project(true.projector, X @ true.R.T + true.t),

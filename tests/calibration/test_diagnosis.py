@@ -70,6 +70,34 @@ def test_a_sound_calibration_is_good() -> None:
     assert len(found.observations) == 8 and not found.excluded
 
 
+@pytest.mark.computes
+def test_cells_that_are_not_square_are_named() -> None:
+    scaled = np.array([1, 1 / 0.7, 1])
+    poses = [dataclasses.replace(o, points=o.points * scaled) for o in observations(8)]
+    found = attempt(poses)
+    assert found.verdict.causes[0] == "board-size" and found.verdict.level != "good"
+    assert missing_facts(found.verdict.findings[0].sentence, "0.70") == []
+    assert "fringe-period" not in found.verdict.causes
+
+
+@pytest.mark.computes
+@pytest.mark.parametrize(("tilt_deg", "level"), [(6, "doubtful"), (25, "good")])
+def test_boards_near_one_plane_leave_focal_lengths_uncertain(tilt_deg: float, level: str) -> None:
+    """A board that is bent by 0.3 mm disturbs the fits by more than its features' noise."""
+    poses = [
+        observation(TRUE, T, f"pose_{k:02d}", 0.05, bend_per_mm=4.7e-5)
+        for k, T in enumerate(board_poses(10, max_tilt_deg=tilt_deg))
+    ]
+    found = attempt(poses)
+    assert found.stereo is not None and found.verdict.level == level
+    for device, f in (("camera", 890), ("projector", 700)):
+        lens = getattr(found.stereo.rig, device)
+        assert abs(lens.K[0, 0] - f) < 3 * found.stereo.focal_sigma_px[device]
+    if level != "good":
+        assert "parallel-poses" in found.verdict.causes
+        assert not missing_facts(found.verdict.text(), "degrees", 15)
+
+
 @pytest.mark.slow
 @pytest.mark.computes
 @pytest.mark.parametrize(
@@ -193,7 +221,10 @@ def test_gamma_from_its_harmonic() -> None:
     light = (0.5 + 0.5 * np.cos(phase)) ** 2.2
     first, second = (np.mean(light * np.cos(m * phase)) for m in (1, 2))
     assert gamma_from_harmonic(second / first) == pytest.approx(2.2, abs=1e-6)
-    assert causes(*(pose(k, axes={"x": axis(harmonic=0.28)}) for k in range(8))) == ("gamma",)
+    for harmonic in (0.28, 1.0, 2.0, -0.6):  # no power has the last three
+        assert causes(*(pose(k, axes={"x": axis(harmonic=harmonic)}) for k in range(8))) == (
+            "gamma",
+        )
 
 
 def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:

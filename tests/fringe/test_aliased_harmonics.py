@@ -4,14 +4,15 @@ taken for it."""
 import numpy as np
 import pytest
 from facts import missing_facts
-from fringe_scene import capture, slope, variants
+from fringe_scene import capture, slope, variants, wrong
 
+from slviewer.fringe import decode as decode_module
 from slviewer.fringe import reference
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
 from slviewer.fringe.decode import decode, decode_reference
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.presets import complementary, multifrequency
+from slviewer.fringe.presets import complementary, multifrequency, phase_steps
 from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.simulation.boards import Pose, printed_board
@@ -86,6 +87,21 @@ def test_the_definition_and_levels_are_corrected_alike():
     assert fast.model_error_rad == definition.model_error_rad > 0
     np.testing.assert_allclose(fast.phase, definition.phase, atol=1e-4)
     assert np.abs(np.exp(1j * (fast.phase - fast.wrapped)) - 1)[fast.mask].max() < 1e-3
+
+
+@pytest.mark.parametrize("gamma", variants([1.8, 2.2, 1 / 2.2], 1.8))
+def test_gamma_in_a_long_period_moves_no_fringe(monkeypatch, gamma):
+    """An error of 0.2 rad of one period is half a fringe of sixteen."""
+    frames = [*phase_steps("x", 3, 512.0), *phase_steps("x", 3, 32.0)]
+    sequence = PatternSequence(PROJECTOR, tuple(frames))
+    stack = capture(sequence, TRUTH, gamma=gamma, shot=0.02)
+    phase, definition = decode(sequence, stack, "x"), decode_reference(sequence, stack, "x")
+    assert wrong(phase, TRUTH) == 0 and phase.mask.mean() > 0.97
+    np.testing.assert_array_equal(phase.reason, definition.reason)
+    np.testing.assert_allclose(phase.phase, definition.phase, atol=1e-4)
+    uncorrected = (np.zeros((2, 0), np.float32), 0.4)
+    monkeypatch.setattr(decode_module, "estimate_level_errors", lambda _: uncorrected)
+    assert decode(sequence, stack, "x").mask.mean() < 0.9
 
 
 V, U = np.mgrid[:240, :320]

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from facts import raises
-from fringe_scene import capture, coverage, slope, variants
+from fringe_scene import capture, coverage, slope, variants, wrong
+from scipy.ndimage import gaussian_filter
 
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode, decode_reference
@@ -68,6 +69,8 @@ ABSOLUTE = {
     "three periods": mixed((90.0, 30.0, 10.0), cell=45.0, phase_sign=-1),
     "cells of a beat": mixed((20.0, 18.0), cell=90.0, steps=8),
     "two periods, the first a tenth longer than the projector": mixed((550.0, 20.0), cell=20.0),
+    "a beat of two beats": mixed(tuple(500 / k for k in (31, 36, 42)), steps=3),
+    "a beat, rounded to less than the projector": mixed((20.8333, 19.9999), steps=8),
 }
 RELATIVE = {
     "one period": (mixed((40.0,), relative=True), 40.0),
@@ -111,6 +114,8 @@ def assert_measured(sequence, axis, truth, least_coverage=0.99, **light):
         "no simple ratio",
         "half a period, complementary",
         "three periods",
+        "a beat of two beats",
+        "a beat, rounded to less than the projector",
     ),
 )
 def test_the_coordinate_comes_back(name):
@@ -205,6 +210,17 @@ def test_dim_blurred_and_clipped_pixels_are_masked_rather_than_wrong(name):
     assert phase.mask[:, 42:98].mean() > 0.95
     off = np.abs(phase.coordinate - truth) > 0.4 * phase.period_px
     assert np.count_nonzero(off & phase.mask) <= 2
+
+
+def test_levels_that_scatter_leave_fewer_pixels_but_no_wrong_fringe():
+    """An error of the long period of 20 % of a fringe, as of light that changed."""
+    frames = [*phase_steps("x", 6, 512.0), *phase_steps("x", 6, 32.0)]
+    sequence, truth = PatternSequence((512, 500), tuple(frames)), slope()
+    stack = capture(sequence, truth)
+    error = gaussian_filter(np.random.default_rng(5).normal(size=truth.shape), 15)
+    stack[:6] = capture(sequence, truth + 0.2 * 32 / error.std() * error)[:6]
+    phase = decode(sequence, stack, "x")
+    assert wrong(phase, truth) == 0 and 0.2 < phase.mask.mean() < 0.7
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def test_uploaded_zip_becomes_poses_and_its_faults_are_listed(
     click(page, "3. Poses")
     page.get_by_text("Import captures", exact=True).click()
     choose(page, "Layout", "procam-calibration")
-    expect(page.get_by_text("Default size: 1024x768, of this layout.")).to_be_visible()
+    expect(page.get_by_text("Default size: of the session, else 1024x768.")).to_be_visible()
     opened.enter("Projector", "120x90")
     for name, content in (("broken.zip", b"no zip"), ("set.zip", zip_of_captures())):
         with page.expect_file_chooser() as chooser:

@@ -4,6 +4,7 @@ is said of it."""
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from facts import missing_facts
 
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray, phase_steps
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import PatternSequence, PerAxis
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.import_captures import find_captures
 from slviewer.session.importers.imported import (
@@ -84,6 +85,52 @@ def test_an_import_that_is_repeated_adds_what_is_missing(run: Run, tmp_path: Pat
     assert cv2.imwrite(str(image), cv2.imread(str(image), cv2.IMREAD_UNCHANGED) // 2 * 2)
     status, _, err = run("import", "procam-calibration", tmp_path / "source", session, *options)
     assert status == 1 and not missing_facts(err, "'capture_2'")
+
+
+GRAY = (
+    'projector = "120x90"\norder = "name"\n'
+    + "".join(
+        f'[[frames]]\nkind = "gray"\naxis = "{axis}"\nbits = 7\ninverse = true\n' for axis in "xy"
+    )
+    + '[[frames]]\nkind = "white"\n[[frames]]\nkind = "black"\n'
+)
+
+
+@pytest.mark.parametrize("layout", ["procam-calibration", "auto"])
+def test_a_scan_takes_size_and_description_of_the_session(
+    run: Run, tmp_path: Path, layout: str
+) -> None:
+    pose, scan = write_captures(tmp_path, 2)
+    session = tmp_path / "session"
+    if layout == "auto":
+        for folder in (pose, scan):
+            for file in folder.iterdir():
+                file.rename(folder / file.name[-6:])
+        (tmp_path / "gray.toml").write_text(GRAY)
+        given: tuple = ("frames", pose, session, "--sequence", tmp_path / "gray.toml")
+        assert run("import", "auto", scan, session, "--role", "scan")[0] != 0
+    else:
+        given = (layout, pose, session, "--projector", "120x90")
+    assert run("import", *given)[0] == 0
+    status, _, err = run("import", layout, scan, session, "--role", "scan")
+    assert status == 0 and not missing_facts(err, "--sequence" if layout == "auto" else "120x90")
+    with Session.open(session) as store:
+        first, second = (store.load_capture(folder.name) for folder in (pose, scan))
+        assert first.sequence == second.sequence and second.role == "scan"
+
+
+def test_a_code_that_is_centred_on_the_projector(run: Run, tmp_path: Path) -> None:
+    """128 codes for 90 rows: code 0 begins 19 px before the first one."""
+    sequence = replace(gray(PROJECTOR), gray_origin_px=PerAxis(-4.5, -19.5))
+    for number, frame in enumerate(photographed(sequence, 0)):
+        (tmp_path / "scan").mkdir(exist_ok=True)
+        assert cv2.imwrite(str(tmp_path / "scan" / f"{number:02d}.png"), frame)
+    (tmp_path / "scan" / "gray.toml").write_text(GRAY)
+    status, _, err = run("import", "auto", tmp_path / "scan", tmp_path / "session")
+    assert status == 0 and not missing_facts(err, "-19.5 px", "-4.5 px", "gray_origin")
+    with Session.open(tmp_path / "session") as store:
+        capture = store.load_capture("scan")
+        assert capture.sequence.gray_origin_px == PerAxis(-4.5, -19.5)
 
 
 @pytest.fixture

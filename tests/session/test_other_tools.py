@@ -1,6 +1,7 @@
 """The patterns of other tools, made here by their own formulae: a camera that sees them decodes its
 own pixels."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -114,6 +115,17 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
     (capture,) = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
+    if shadow:
+        for number, pattern in enumerate([*patterns[:-2], *patterns[:-3:-1]], 1):
+            write(tmp_path / "black_first" / f"pattern_cam1_im{number}.png", pattern)
+        (other,) = opencv_graycode.LAYOUT.read(tmp_path / "black_first", projector=SIZE)
+        assert other.frames[-2].mean() > 2 * other.frames[-1].mean()
+        for number, pattern in enumerate([*patterns[:-2:2], *patterns[1:-2:2], *patterns[-2:]], 1):
+            write(tmp_path / "block" / f"pattern_cam1_im{number}.png", pattern)
+        with raises(InputError, *(f"pattern_cam1_im{n}.png" for n in (1, 2, 18)), "--guess"):
+            opencv_graycode.LAYOUT.read(tmp_path / "block", projector=SIZE)
+        shutil.rmtree(tmp_path / "black_first")
+        shutil.rmtree(tmp_path / "block")
     write(tmp_path / "scan" / "pattern_cam2_im1.png", U / COLUMNS)
     with raises(InputError, "pattern_cam1_imN", "pattern_cam2_imN", '--files "pattern_cam1_im'):
         opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)

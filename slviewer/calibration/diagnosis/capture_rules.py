@@ -164,17 +164,22 @@ def diagnose_period(e: Evidence) -> Iterator[Finding]:
             " the phase at the Gray code's edges",
             "correct period_px in the description, or project the patterns without scaling",
         )
-    elif e.solution is not None and e.solution.aspect > 0 and not e.tilts_undetermined:
-        ratio = min((e.solution.aspect / a for a in ASPECTS), key=lambda r: abs(np.log(r)))
-        if abs(ratio - 1) > MAX_ASPECT_ERROR:
+    elif e.solution is not None and not (e.tilts_undetermined or any(_diagnose_cells(e))):
+        aspect = e.solution.aspects[1]
+        if abs(aspect / _nearest_aspect(aspect) - 1) > MAX_ASPECT_ERROR:
             yield Finding(
                 "fringe-period",
                 "doubtful",
-                f"the projector's rows appear {e.solution.aspect:.2f} times as dense as its"
-                " columns, as no pixels are",
+                f"the projector's rows appear {aspect:.2f} times as dense as its columns, as no"
+                " pixels are",
                 "compare the fringe period of each axis with its description, and turn off the"
                 " projector's scaling",
             )
+
+
+def _nearest_aspect(aspect: float) -> float:
+    """Return the aspect of a projector's pixels that is nearest to the measured one."""
+    return min(ASPECTS, key=lambda each: abs(np.log(aspect / each)))
 
 
 def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
@@ -218,8 +223,27 @@ def diagnose_description(e: Evidence) -> Iterator[Finding]:
         )
 
 
+def _diagnose_cells(e: Evidence) -> Iterator[Finding]:
+    """Yield a finding where camera and projector share an aspect that is not of their pixels."""
+    if e.solution is None or e.tilts_undetermined:
+        return
+    camera, projector = e.solution.aspects
+    projector /= _nearest_aspect(projector / camera)
+    if min(abs(camera - 1), abs(projector - 1)) > MAX_ASPECT_ERROR > abs(projector / camera - 1):
+        yield Finding(
+            "board-size",
+            "doubtful",
+            "camera and projector alike appear to have pixels of another aspect: seen upright, the"
+            f" board's cells are {np.sqrt(camera * projector):.2f} times as high as wide",
+            "measure the board's pitch along both directions, and use a board whose cells are"
+            " square",
+        )
+
+
 def diagnose_board_size(e: Evidence) -> Iterator[Finding]:
-    """Yield a finding where most poses show a board of other columns and rows than those given."""
+    """Yield a finding where the board's cells are not square, and where most poses show a board of
+    other columns and rows than those given."""
+    yield from _diagnose_cells(e)
     kind, _, rest = e.board.partition(":")
     grids = Counter(pose.grid for pose in e.poses if pose.grid is not None and pose.refused)
     if kind != "circles" or not grids:

@@ -85,8 +85,8 @@ class SolutionEvidence:
     ``median_pose_rms_px``: median over the poses of (camera, projector) reprojection RMS.
     ``focal_sigma``: relative standard deviation of the focal length by device; ``tilt_spread_deg``:
     the largest angle between two boards; ``empty_corners``: corners of the image that the projector
-    illuminates and no pose covers; ``aspect``: fy / fx of the projector. ``ripple``: residuals that
-    repeat with the fringe, by axis.
+    illuminates and no pose covers; ``aspects``: fy / fx of camera and projector. ``ripple``:
+    residuals that repeat with the fringe, by axis.
     """
 
     used: tuple[str, ...]
@@ -96,7 +96,7 @@ class SolutionEvidence:
     focal_sigma: Mapping[str, float]
     tilt_spread_deg: float
     empty_corners: tuple[str, ...]
-    aspect: float
+    aspects: tuple[float, float]
     ripple: Mapping[Axis, Ripple] = field(default_factory=dict)
 
 

@@ -219,8 +219,12 @@ def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np
 
 def gamma_from_harmonic(harmonic: float) -> float:
     """Return the exponent for which a power of a sinusoidal fringe has this ratio of second
-    harmonic to first."""
-    return float((1 + 2 * harmonic) / (1 - harmonic))
+    harmonic to first.
+
+    Powers have ratios from -0.5 to 1; others are taken for the nearest of these.
+    """
+    harmonic = float(np.clip(harmonic, -0.49, 0.99))
+    return (1 + 2 * harmonic) / (1 - harmonic)
 
 
 def fit_mean_turn(

@@ -24,7 +24,7 @@ from slviewer.calibration.soundness import MIN_POSES, MIN_TILT_SPREAD_DEG
 from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
 from slviewer.records.verdict import Finding, Verdict
 
-MIN_TILT_DEG = 12.0
+MIN_TILT_DEG = 15.0
 MAX_FOCAL_UNCERTAINTY = 0.02
 HIGH_REPROJECTION_PX = 1.0
 
@@ -60,7 +60,7 @@ def diagnose_parallel_poses(e: Evidence) -> Iterator[Finding]:
         "parallel-poses",
         "rejected" if rejected else "doubtful",
         f"all {len(e.solution.used if e.solution else e.usable)} poses are nearly parallel "
-        f"(tilts differ by {spread:.1f} degrees)",
+        f"(tilts differ by {spread:.1f} degrees, and should by {MIN_TILT_DEG:.0f} at least)",
         "tilt the board by 15 to 30 degrees, in different directions",
     )
 
@@ -102,7 +102,8 @@ def diagnose_uncertainty(e: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "uncertain",
                 "doubtful" if is_misfit or sigma < MAX_FOCAL_SIGMA else "rejected",
-                f"the poses leave the {device}'s focal length uncertain by {100 * sigma:.1f} %",
+                f"the poses, whose tilts differ by {e.solution.tilt_spread_deg:.0f} degrees, leave"
+                f" the {device}'s focal length uncertain by {100 * sigma:.1f} %",
                 "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
             )
 

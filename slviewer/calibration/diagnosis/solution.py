@@ -28,7 +28,9 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
     """Measure the evidence of a stereo calibration; ``observations``: all, those that the fit
     excluded too."""
     used = [o for o in observations if o.name in stereo.poses]
-    K = stereo.rig.projector.K
+    (fx, fy), (projector_fx, projector_fy) = (
+        np.diag(lens.K)[:2].tolist() for lens in (stereo.rig.camera, stereo.rig.projector)
+    )
     normals = np.array([T[:3, 2] * np.sign(T[2, 2] or 1) for T in stereo.poses.values()])
     camera, projector = np.array([stereo.pose_rms_px[o.name] for o in used]).T
     return SolutionEvidence(
@@ -39,14 +41,12 @@ def measure_solution(observations: Sequence[Observation], stereo: StereoModel) -
         reprojection_px=stereo.reprojection_rms_px["stereo"],
         median_pose_rms_px=(float(np.median(camera)), float(np.median(projector))),
         focal_sigma={
-            "camera": (
-                stereo.focal_sigma_px["camera"] / float(min(np.diag(stereo.rig.camera.K)[:2]))
-            ),
-            "projector": stereo.focal_sigma_px["projector"] / float(min(np.diag(K)[:2])),
+            "camera": stereo.focal_sigma_px["camera"] / min(fx, fy),
+            "projector": stereo.focal_sigma_px["projector"] / min(projector_fx, projector_fy),
         },
         tilt_spread_deg=largest_angle_deg(normals),
         empty_corners=list_empty_corners(used, stereo),
-        aspect=float(K[1, 1] / K[0, 0]),
+        aspects=(fy / fx, projector_fy / projector_fx),
         ripple=measure_ripple(used, stereo),
     )
 

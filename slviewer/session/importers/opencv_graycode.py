@@ -1,9 +1,9 @@
 """The images of OpenCV's structured_light GrayCodePattern, in the order in which it generates them.
 
 Gray code of every projector column, then row; each bit, most significant first, as the pattern and
-its inverse; then, in most programs, white and black. The images are taken in natural order of their
-names. Source: opencv_contrib, modules/structured_light, src/graycodepattern.cpp and
-samples/cap_pattern.cpp (`pattern_cam1_im1.png`, ...).
+its inverse; then, in most programs, white and black, or black and white. The images are taken in
+natural order of their names. Source: opencv_contrib, modules/structured_light,
+src/graycodepattern.cpp and samples/cap_pattern.cpp (`pattern_cam1_im1.png`, ...).
 """
 
 import re
@@ -30,6 +30,9 @@ _ILLUMINATED, _MOSTLY = 0.25, 0.9
 """Share of the largest difference from which on a pixel counts; share of these in which white is
 brighter than black: all of them but for a few that something disturbs, and half of them between two
 stripes."""
+_PAIRED = 0.25
+"""Mean difference of pattern + inverse and white + black, as a share of white - black: noise, and
+half of it for two patterns."""
 _SAMPLE = re.compile(r"pattern_(cam\d+_)?(im)?\d+", re.IGNORECASE)
 
 
@@ -65,7 +68,7 @@ def _read(
                 f'it holds images named {shown}: choose one with --files "{min(kinds)}*"'
             )
         shown_sequence = _fit_sequence(sequence, len(files))
-        _check_shadow_images(files, shown_sequence)
+        files = _order_shadow_images(files, shown_sequence)
         recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
         return recording, unknown_files_warning(
             folder, [file for file in images_by_name(folder) if file not in files]
@@ -84,20 +87,21 @@ def _read(
     )
 
 
-def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
-    """Raise InputError where white and black images are in place of stripes, or the other way
-    round.
+def _order_shadow_images(files: list[Path], sequence: PatternSequence) -> list[Path]:
+    """Return the files with white before black.
 
-    A projector of another size may take two images more or less, as many as white and black are. In
-    a pair of the finest stripes the first image is the brighter in half of the places, in white and
-    black everywhere.
+    Raises InputError where white and black images are in place of stripes, or the other way round,
+    and where the first two images are not a pattern and its inverse. A projector of another size
+    may take two images more or less, as many as white and black are. In a pair of the finest
+    stripes the first image is the brighter in half of the places, in white and black everywhere.
     """
-    first, second = read_frames(files[-2:]).stack.astype(np.int32)
-    difference = first - second
+    half = len(files) // 2 - 1
+    stack = read_frames([*files[:2], files[half], *files[-2:]]).stack.astype(np.int32)
+    difference = stack[-2] - stack[-1]
     illuminated = np.abs(difference) > _ILLUMINATED * np.abs(difference).max()
     brighter = float((difference[illuminated] > 0).mean()) if illuminated.any() else 0.5
     ends_in_white = sequence.frames[-1].kind == "black"
-    if ends_in_white != (brighter > _MOSTLY):
+    if ends_in_white != (abs(brighter - 0.5) > _MOSTLY - 0.5):
         there, expected = (
             ("stripes", "white and black") if ends_in_white else ("white and black", "stripes")
         )
@@ -106,6 +110,25 @@ def _check_shadow_images(files: list[Path], sequence: PatternSequence) -> None:
             f"the last two images show {there}, and {expected} are expected of a {width}x{height}"
             " projector: it has another size, or images are missing or too many"
         )
+    if not ends_in_white:
+        return files
+
+    def are_inverse(first: int, second: int) -> bool:
+        """Return whether two images sum up to white and black."""
+        rest = np.abs(stack[first] + stack[second] - stack[-2] - stack[-1])[illuminated]
+        return bool(rest.mean() < _PAIRED * np.abs(difference[illuminated]).mean())
+
+    if not are_inverse(0, 1):
+        block = (
+            f", but {files[half].name} is: the inverses are a block of their own"
+            if are_inverse(0, 2)
+            else ""
+        )
+        raise InputError(
+            f"{files[1].name} is not the inverse of {files[0].name}{block}: describe the images in"
+            " a TOML, which `slviewer import frames --guess` proposes"
+        )
+    return files if brighter > 0.5 else [*files[:-2], files[-1], files[-2]]
 
 
 def _fit_sequence(sequence: PatternSequence, images: int) -> PatternSequence:
