@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from slviewer.errors import SlviewerError
     from slviewer.evaluation.plane import evaluate_plane
     from slviewer.evaluation.sphere import evaluate_sphere
+    from slviewer.examination.examine import examine
     from slviewer.fringe.decode import decode, texture
-    from slviewer.fringe.description_check import check_description
     from slviewer.fringe.phase import PhaseMap, Reason
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
@@ -124,7 +124,6 @@ _EXPORTS = {
     "capture": "pipeline.capture",
     "capture_frames": "devices.capture",
     "check": "pipeline.check",
-    "check_description": "fringe.description_check",
     "compare": "pipeline.compare",
     "complementary": "fringe.presets",
     "datasets": "pipeline.datasets:*",
@@ -133,6 +132,7 @@ _EXPORTS = {
     "draw_error_maps": "report.maps",
     "evaluate_plane": "evaluation.plane",
     "evaluate_sphere": "evaluation.sphere",
+    "examine": "examination.examine",
     "export": "pipeline.export",
     "fuse_clouds": "surface.fuse:fuse",
     "gray": "fringe.presets",
@@ -169,10 +169,10 @@ __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan",
     "PatternSequence", "PhaseMap", "Pose", "Quantity", "Reason", "Session", "SimulatedWorld",
     "SlviewerError", "Verification", "accept", "align", "align_clouds", "batch", "calibrate",
-    "calibrate_frames", "capture", "capture_frames", "check", "check_description", "compare",
-    "complementary", "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane",
-    "evaluate_sphere", "export", "fuse_clouds", "gray", "import_captures", "letter_rig",
-    "load_arrays", "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
+    "calibrate_frames", "capture", "capture_frames", "check", "compare", "complementary",
+    "datasets", "decode", "detect_board", "draw_error_maps", "evaluate_plane", "evaluate_sphere",
+    "examine", "export", "fuse_clouds", "gray", "import_captures", "letter_rig", "load_arrays",
+    "load_calibration", "measure", "merge", "mesh", "mesh_cloud", "micro",
     "multifrequency", "one_axis", "p18", "plugins", "read_captures", "read_ply", "reconstruct",
     "reconstruct_cloud", "report", "run_plan", "save_calibration", "simulate", "simulated_rig",
     "texture", "verify", "write_ply",

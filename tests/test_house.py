@@ -18,6 +18,7 @@ PACKAGES = [
     "records",
     "geometry",
     "fringe",
+    "examination",
     "target",
     "calibration",
     "reconstruction",

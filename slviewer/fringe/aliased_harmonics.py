@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.fringe import limits
+from slviewer.fringe.cosines import fit_cosine, select_rows
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.phase import Noise
-from slviewer.fringe.residual_sample import fit_cosine, select_rows
-from slviewer.fringe.suspect import Suspect
 
 MOST_STEPS = 4
 """From five steps on, harmonics below the fourth cause no error, and blur removes most of the
@@ -125,27 +124,6 @@ def correct_harmonics(
     turned = wrapped + added
     turned -= np.float32(2 * np.pi) * np.rint(turned * np.float32(0.5 / np.pi))
     return phase + added, turned
-
-
-def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> list[Suspect]:
-    """Return a suspect that reports a significant ripple to the operator; empty without one."""
-    if not harmonics.is_significant:
-        return []
-    per_rad = layout.period_px / (2 * np.pi)
-    theta = np.linspace(0, 2 * np.pi, 361)
-    largest = float(np.abs(harmonics.correction(theta)).max()) * per_rad
-    outcome = (
-        "corrected"
-        if harmonics.is_corrected
-        else "it could not be measured well enough to correct it"
-    )
-    text = (
-        f"the projector response is nonlinear (gamma): with {harmonics.steps} phase steps this"
-        f" shifts the coordinates of axis {layout.axis} by up to {largest:.2g} px: {outcome}, and"
-        f" {harmonics.error_rad * per_rad:.2g} px was added to the uncertainty; make the responses"
-        " of projector and camera linear, or use 5 phase steps or more"
-    )
-    return [Suspect(layout.shifts[-1].indices[0], "gamma", text)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,6 @@ from slviewer.fringe.light_sample import (
     sample_light,
 )
 from slviewer.fringe.sequence import Indices, PatternSequence
-from slviewer.fringe.suspect import Fault, Suspect
 
 LEAST_GAIN = 0.005
 """rms variation of the gains below which they are not corrected: a camera's response and blur
@@ -83,13 +82,17 @@ CYCLES = np.arange(0.5, 8.25, 0.25)
 """Waves along the image's height that are tried."""
 FINE = 0.05
 """Share of pixels inside stripes below which a coded frame has fine stripes throughout."""
-REPORTED = 3.0
-"""Percent of brightness, from the darkest to the brightest frame, that the operator should know
-about."""
 FEW_STEPS = 4
 """Largest number of steps between which a change of room light is not corrected reliably: with four
 steps on a textured board, light of a quarter of the mean caused an error of 1.4 px when modelled as
 uniform."""
+REFUTED, REFUTED_LEAST = 1.5, 0.004
+"""Factor, and share of the brightness, by which a correction may worsen the equality of means."""
+CONFIRMED, CONFIRMED_LEAST = 0.4, 0.01
+"""Factor by which a correction improves it that is accepted although blur or the projector's
+response leave residuals; and variation that is not a matter of too few fringes in view."""
+MEAN_ROWS, MEAN_COLUMNS = 16, 4
+"""Every so many rows and columns are averaged: enough for a thousandth."""
 FARTHEST = 0.7
 """Logarithm of a gain beyond which a frame shows something else."""
 CLIPPED = 65535.0
@@ -126,6 +129,15 @@ class FrameLight:
         """Whether the light differs between the frames by more than can be neglected."""
         return bool(self.terms)
 
+    def count_open_steps(self, sequence: PatternSequence, k: int) -> int:
+        """Return the number of phase steps of the period during which the room's light changes
+        before frame ``k``; 0 where there are none, or enough to tell uniform light from light in
+        proportion to the albedo."""
+        for steps in list_shifts(sequence):
+            if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
+                return len(steps)
+        return 0
+
 
 def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
     """Estimate the light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them
@@ -152,14 +164,49 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     fit = _choose_model(coarse, sample, gains)
     if fit is not gains and not _needs_correction(sample, fit):
         fit = gains
-    if not _explains_frames(sample, fit):
-        return replace(steady, unexplained=fit.terms if _explains_most(sample, fit) else ())
     light = _estimate_fine_stripes(sample, _fill_unknown_frames(sample, fit))
     used = list(fit.informed)
     room_light = _compute_room_light(sample, light, used)
+    room_light = room_light - room_light[used].min()
+    before, after, claimed = _measure_unequal_means(sequence, stack, fit.light.gain, room_light)
+    is_confirmed = before > CONFIRMED_LEAST and after < CONFIRMED * before
+    if not (_explains_frames(sample, fit) or is_confirmed):
+        return replace(steady, unexplained=fit.terms if _explains_most(sample, fit) else ())
+    if after > REFUTED * before + REFUTED_LEAST or claimed > 3 * before + CONFIRMED_LEAST:
+        return steady
     drift = float(np.std(np.log(fit.light.gain[used])))
     wave = float(np.sqrt(np.mean(light.wave[used] ** 2)))
-    return FrameLight(light, fit.terms, drift, wave, room_light - room_light[used].min())
+    return FrameLight(light, fit.terms, drift, wave, room_light)
+
+
+def _measure_unequal_means(
+    sequence: PatternSequence, stack: np.ndarray, gain: np.ndarray, room: np.ndarray
+) -> tuple[float, float, float]:
+    """Measure the relative standard deviation of means of frames that are equal under equal light:
+    as captured, and without these gains (n,) and room light (n,), a share of the mean; and that of
+    the gains, which room light would have to balance where the means do not vary.
+
+    Equal are the steps of the finest period of an axis, and the sums of a bit and its inverse. A
+    surface that moves, and blur, imitate varying light, but not in these means.
+    """
+    means = stack[:, ::MEAN_ROWS, ::MEAN_COLUMNS].mean(axis=(1, 2))
+    groups: list[list[tuple[int, ...]]] = []
+    for axis in sequence.axes:
+        groups += [[(i,) for i in steps] for _, steps in sequence.phase_shifts(axis)[-1:]]
+        bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
+        groups.append([*zip(bits, inverse, strict=False)])
+
+    def spread(values: np.ndarray) -> float:
+        """Return the largest standard deviation inside a group, a share of its mean as captured:
+        without the light of the room the mean is smaller, and the differences are the same."""
+        sums = [
+            np.array([[v[[*pair]].sum() for pair in group] for v in (values, means)])
+            for group in groups
+            if group
+        ]
+        return max((float(s[0].std() / max(s[1].mean(), 1e-6)) for s in sums), default=0.0)
+
+    return spread(means), spread((means - room * means.mean()) / gain), spread(gain)
 
 
 def equalize_frames(
@@ -215,91 +262,6 @@ def equalize_frames(
         out,
         scale,
     )
-
-
-def describe_disturbance(terms: Sequence[Term]) -> tuple[Fault, str]:
-    """Return the fault that these ``terms`` of the light stand for, and the message: what differs,
-    and what to do.
-
-    The message is for light that differs by more than can be corrected.
-    """
-    if "wave" in terms:
-        return (
-            "flicker",
-            (
-                "the light varies along the image rows and between the frames by more than can be"
-                " corrected (lamps or a projector that flicker, under a rolling shutter): make the"
-                " exposure time a multiple of 10 ms (8.33 ms where the mains have 60 Hz) and of the"
-                " projector's frame, and switch off the lamps of the room"
-            ),
-        )
-    if len(terms) > 1:
-        return (
-            "room-light",
-            (
-                "the light of the room changes between the frames by more than can be corrected:"
-                " keep it constant, or switch it off"
-            ),
-        )
-    return (
-        "exposure-drift",
-        (
-            "the brightness varies from frame to frame by more than can be corrected (automatic"
-            " exposure, or an unsteady lamp): lock the camera's exposure, gain and white balance"
-        ),
-    )
-
-
-def detect_light_faults(sequence: PatternSequence, light: FrameLight) -> list[Suspect]:
-    """Return a suspect for each variation of the light that the operator should correct."""
-    out = []
-    used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
-    gain = light.light.gain[used]
-    span = 100 * (float(gain.max() / gain.min()) - 1)
-    if "gain" in light.terms and span > REPORTED:
-        text = (
-            f"the brightness of the frames varies by {span:.1f} % (automatic exposure, or an"
-            " unsteady lamp): corrected; lock the camera's exposure, gain and white balance"
-        )
-        out.append(Suspect(used[int(np.argmax(np.abs(np.log(gain))))], "exposure-drift", text))
-    if "wave" in light.terms and light.wave > LEAST_WAVE:
-        text = (
-            f"the light varies along the image rows by {100 * np.sqrt(2) * light.wave:.0f} %, in"
-            f" {light.light.cycles:.1f} waves per image (mains flicker under a rolling shutter):"
-            " corrected; make the exposure time a multiple of 10 ms (8.33 ms where the mains have"
-            " 60 Hz)"
-        )
-        out.append(Suspect(used[0], "flicker", text))
-    if light.room is not None and ("uniform" in light.terms or "albedo" in light.terms):
-        for k in light.light.changes:
-            change = 100 * float(light.room[k] - light.room[k - 1])
-            more = "brighter" if change > 0 else "darker"
-            steps = _count_steps_across_change(sequence, k)
-            outcome = "corrected; keep the light of the room constant, or switch it off"
-            if steps:
-                outcome = (
-                    f"between {steps} phase steps this cannot be corrected reliably; capture again"
-                    " in constant room light"
-                )
-            text = (
-                f"the light of the room changed: from frame {k + 1} on the scene is"
-                f" {abs(change):.0f} % {more}"
-            )
-            out.append(Suspect(k, "room-light", f"{text}: {outcome}"))
-    return out
-
-
-def _count_steps_across_change(sequence: PatternSequence, k: int) -> int:
-    """Return the number of phase steps of the period during which the light changes before frame
-    ``k``.
-
-    0 if there is no such period, or if it has enough steps to separate uniform light from light in
-    proportion to the albedo.
-    """
-    for steps in list_shifts(sequence):
-        if len(steps) <= FEW_STEPS and min(steps) < k <= max(steps):
-            return len(steps)
-    return 0
 
 
 def _is_light_varying(sample: LightSample) -> bool:

@@ -16,14 +16,14 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import block_diag
 
-from slviewer.fringe.light_sample import LightSample
-from slviewer.fringe.residual_sample import (
+from slviewer.fringe.cosines import (
     ONE_SIDED,
     cosine_columns,
     fit_common_harmonics,
     fit_cosine,
     measure_concentration,
 )
+from slviewer.fringe.light_sample import LightSample
 from slviewer.fringe.sequence import Indices
 
 Term = Literal["gain", "wave", "uniform", "albedo"]

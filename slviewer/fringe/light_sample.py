@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from slviewer.fringe import limits
+from slviewer.fringe.cosines import estimate_roughness, fit_cosine
 from slviewer.fringe.layout import white_level
-from slviewer.fringe.residual_sample import estimate_roughness, fit_cosine
 from slviewer.fringe.sequence import Indices, Kind, PatternSequence
 
 ROWS, COLUMNS = 48, 88

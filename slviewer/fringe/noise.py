@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 from scipy.optimize import nnls
 
+from slviewer.fringe.cosines import cosine_columns, fit_common_harmonics, fit_cosine
 from slviewer.fringe.layout import Layout
-from slviewer.fringe.residual_sample import cosine_columns, fit_common_harmonics, fit_cosine
 
 ROWS = 20
 """Image rows that are sampled."""

@@ -1,27 +1,42 @@
-"""Estimation of the origin of another tool's Gray code from its own frames."""
+"""Phase at which a Gray code begins, from the phases at its edges."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.axis_agreement import FEWEST_EDGES, measure_agreement
-from slviewer.fringe.axis_reader import AxisReader, described_frames
 from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
-from slviewer.fringe.layout import axis_layout, check_stack
-from slviewer.fringe.line_sample import coded_frames, sample_lines
+from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
+from slviewer.fringe.noise import measure_noise
+from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
 from slviewer.fringe.sequence import Axis, PatternSequence
 
-MIN_EDGES = FEWEST_EDGES
+LINES = 150
+"""Image lines along which the edges are located."""
+MIN_EDGES = 50
 """Smallest number of code edges between neighbouring pixels."""
 MIN_CONCENTRATION = 0.7
-"""Length of the mean unit vector of the phases at code edges, weighed by modulation; 1 where all
-edges fall at one phase, 0 anywhere."""
+"""Share of the edges inside which a phase must lie, or length of the mean unit vector of their
+phases; 1 where all edges fall at one phase."""
 MIN_RISING = 0.8
 """Share of code edges at which the phase must rise with the code."""
 LATEST_TURNS = 0.25
 """Where code 0 begins at the latest, in periods."""
-PIXELS = 60_000
-"""Number of pixels on rows, and on columns: the origin is then accurate to a few hundredths of a
-pixel."""
+_CANDIDATES = 4000  # phases per period
+_BEST_SHARE = 0.97  # phases inside this share of the largest number of intervals are averaged
+
+
+@dataclass(frozen=True)
+class CodeOrigin:
+    """Phase at which a code begins.
+
+    ``turns``: in periods, -0.5 to 0.5, NaN where the edges do not agree; ``edges``: their number;
+    ``rising``: share of them at which the phase rises with the code.
+    """
+
+    turns: float
+    edges: int
+    rising: float
 
 
 def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
@@ -48,24 +63,75 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
             f"axis {axis}: the origin of a Gray code shows only beside a phase shift: there is none"
             " to compare"
         )
-    reader = AxisReader(sample_lines(sequence, stack, PIXELS), coded_frames(sequence, axis))
-    frames = described_frames(sequence, axis)
-    agreement = measure_agreement(reader, frames)
-    assert frames.fringe is not None
-    if agreement.edges < MIN_EDGES:
+    white = white_level(sequence, stack, sequence.select(axis))
+    found = measure_code_origin(layout, stack, white)
+    if found.edges < MIN_EDGES:
         raise InputError(
-            f"axis {axis}: {agreement.edges} code edges are in view, too few to tell where the code"
+            f"axis {axis}: {found.edges} code edges are in view, too few to tell where the code"
             " begins"
         )
-    if agreement.rising < 1 - MIN_RISING:
+    if found.rising < 1 - MIN_RISING:
         raise InputError(
             f"axis {axis}: the code falls where the phase rises: set phase_sign to"
             f" {-sequence.sign(axis)}, or correct the order of the steps"
         )
-    if not (agreement.common >= MIN_CONCENTRATION and agreement.rising >= MIN_RISING):
+    if not np.isfinite(found.turns):
         raise InputError(
             f"axis {axis}: the code edges fall at no common phase: check the period, the order of"
             " the bits, and which frames belong together"
         )
-    turns = agreement.begin_turns
-    return float((turns - np.ceil(turns - LATEST_TURNS)) * frames.fringe[0])
+    turns = found.turns - np.ceil(found.turns - LATEST_TURNS)
+    return float(turns * layout.period_px)
+
+
+def measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> CodeOrigin:
+    """Measure the phase at which the codes of a stack (n, h, w) start, whose pixels clip at
+    ``white``.
+
+    An edge is at a phase between those of two neighbouring pixels. The result is the phase inside
+    the largest number of these intervals, which is more precise than any one of them.
+    """
+    along_x = layout.axis == "x"
+    step = max(1, stack.shape[1 if along_x else 2] // LINES)
+    stack = np.ascontiguousarray(stack[:, ::step] if along_x else stack[:, :, ::step])
+    wrapped, modulation, background, _ = phase_shift(
+        stack, layout.shifts[-1].indices, layout.sign, layout.offset_rad
+    )
+    noise = measure_noise(layout, stack, white)
+    illuminated = modulation >= dark_limit(background, noise, white, dark_sigmas(layout))
+    code, digit = np.zeros(illuminated.shape, np.int32), np.zeros(illuminated.shape, np.int32)
+    for i in [*layout.gray] + ([] if layout.complementary is None else [layout.complementary]):
+        digit ^= bit_heights(layout, stack, i, background) > 0
+        code = 2 * code + digit
+    first, second = (np.s_[:, :-1], np.s_[:, 1:]) if along_x else (np.s_[:-1], np.s_[1:])
+    origins, lengths = [], []
+    for here, there in ((first, second), (second, first)):
+        edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
+        below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
+        # the cell that starts here is the second half of a period if odd
+        if layout.complementary is not None:
+            below = below - (code[there][edge] & 1) * np.pi
+            above = above - (code[there][edge] & 1) * np.pi
+        origins.append(below)
+        lengths.append(np.angle(np.exp(1j * (above - below))))
+    origin, length = np.concatenate(origins), np.concatenate(lengths)
+    rising = float(np.mean(length > 0)) if len(length) else 0.0
+    none = CodeOrigin(np.nan, len(origin), rising)
+    if len(origin) < MIN_EDGES or rising < MIN_RISING:
+        return none
+    origin, length = origin[length > 0], length[length > 0]
+    places = np.linspace(-np.pi, np.pi, _CANDIDATES, endpoint=False)
+    start = np.mod((origin + np.pi) / (2 * np.pi), 1.0) * _CANDIDATES
+    change = np.zeros(3 * _CANDIDATES)
+    np.add.at(change, np.ceil(start).astype(int), 1.0)
+    np.add.at(change, np.floor(start + length / (2 * np.pi) * _CANDIDATES).astype(int) + 1, -1.0)
+    count = np.cumsum(change).reshape(3, _CANDIDATES).sum(0)
+    if count.max() < MIN_CONCENTRATION * len(origin):  # blurred edges lie beside their pixels
+        middle = np.exp(1j * (origin + length / 2))
+        common = complex(middle.mean())
+        if abs(common) < MIN_CONCENTRATION:
+            return none
+        near = np.abs(np.angle(middle / common)) < np.pi / 4
+        return CodeOrigin(float(np.angle(middle[near].mean()) / (2 * np.pi)), len(origin), rising)
+    best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
+    return CodeOrigin(float(np.angle(best.mean()) / (2 * np.pi)), len(origin), rising)

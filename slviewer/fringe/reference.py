@@ -9,6 +9,7 @@ from slviewer.fringe.aliased_harmonics import (
     correct_harmonics,
     estimate_aliased_harmonics,
 )
+from slviewer.fringe.cosines import FEWEST, select_rows
 from slviewer.fringe.decoding_task import DecodingTask, prepare_decoding
 from slviewer.fringe.indirect_light import mask_indirect_light
 from slviewer.fringe.layout import Layout
@@ -23,7 +24,6 @@ from slviewer.fringe.levels import (
 )
 from slviewer.fringe.phase import Noise, PhaseMap, Reason
 from slviewer.fringe.reference_spikes import repair_spikes
-from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.scatter import with_scatter
 from slviewer.fringe.sequence import Axis, Indices, PatternSequence
 from slviewer.fringe.threshold import fringe_mean

@@ -21,7 +21,7 @@ from slviewer.pipeline.calibration_verdict import (
     rejection_error,
     save_verdict,
 )
-from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
+from slviewer.pipeline.capture_phases import decode_or_explain, texture_8bit
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
     Model,
@@ -188,7 +188,7 @@ def calibrate_frames(
     def read() -> Iterator[Judged]:
         """Yield the examined pose of each set of frames, decoded one after the other."""
         for name, frames in poses.items():
-            phases = decode_frames(name, sequence, frames)
+            phases = decode_or_explain(name, sequence, frames)
             pose = DecodedPose(
                 name, sequence, frames, phases, texture_8bit(sequence, frames), board
             )

@@ -24,9 +24,9 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
+from slviewer.pipeline.examination import save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Warn, ignore_warnings, part
-from slviewer.pipeline.frame_check import save_check
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, set_up
 from slviewer.pipeline.rig_presets import RigLike, load_rig
@@ -197,7 +197,7 @@ def _check_saved(store: Session, saved: Capture, captured: CapturedFrames, warn:
     """Warn where the frames of a saved capture contradict each other, or are too bright or too
     dark."""
     try:
-        for sentence in save_check(store, saved).warnings():
+        for sentence in save_examination(store, saved).warnings():
             warn(f"{saved.name}: {sentence}")
     except SlviewerError as error:  # it is saved, and can be looked at later
         warn(f"{saved.name} is saved, and its frames could not be checked: {error}")

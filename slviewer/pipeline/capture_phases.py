@@ -7,21 +7,22 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.examination.findings import describe_disturbance
 from slviewer.fringe.decode import decode, texture
-from slviewer.fringe.frame_light import describe_disturbance, estimate_frame_light
+from slviewer.fringe.frame_light import estimate_frame_light
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import axis_layout, to_eight_bits, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.frame_check import (
-    FrameCheck,
-    describe_contradictions,
-    load_check,
-    load_or_save_check,
+from slviewer.pipeline.examination import (
+    examine_frames,
+    load_examination,
+    load_or_save_examination,
 )
+from slviewer.pipeline.feedback import Warn, ignore_warnings
+from slviewer.records.examination import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
@@ -62,7 +63,7 @@ def decode_capture(
     Raises InputError for a phase that is not absolute, unless a ``relative`` one will do.
     """
     frames = capture.frames if frames is None else frames
-    phases = decode_frames(capture.name, capture.sequence, frames)
+    phases = decode_or_explain(capture.name, capture.sequence, frames, capture.files)
     for axis, phase in phases.items():
         if phase.is_relative and not relative:
             raise InputError(
@@ -84,27 +85,58 @@ def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> d
         raise InputError(f"{name}: {error}") from error
 
 
+def decode_or_explain(
+    name: str, sequence: PatternSequence, frames: np.ndarray, files: Sequence[str] = ()
+) -> dict[Axis, PhaseMap]:
+    """Decode as `decode_frames` does; where that fails, raise InputError with what the examination
+    of the frames rejects, if it does."""
+    try:
+        return decode_frames(name, sequence, frames)
+    except InputError:
+        raise_rejected(name, examine_frames(sequence, frames, files))
+        raise
+
+
+def decode_examined(
+    name: str,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    files: Sequence[str] = (),
+    examination: Examination | None = None,
+) -> dict[Axis, PhaseMap]:
+    """Examine the frames (n, h, w), decode them, and check what was decoded.
+
+    Raises InputError like `check_capture`, and for frames that cannot be decoded; what the
+    examination rejects comes first, as it explains the others. ``examination``: of these frames,
+    made here if None.
+    """
+    examination = examination or examine_frames(sequence, frames, files)
+    raise_rejected(name, examination)
+    phases = decode_frames(name, sequence, frames)
+    check_capture(name, sequence, frames, phases, examination)
+    return phases
+
+
+def raise_rejected(name: str, examination: Examination) -> None:
+    """Raise InputError where the examination of a capture rejects it."""
+    if examination.rejected:
+        raise InputError(f"{name}: {'; '.join(f.text() for f in examination.rejected)}")
+
+
 def check_capture(
     name: str,
     sequence: PatternSequence,
     frames: np.ndarray,
     phases: Mapping[Axis, PhaseMap],
-    check: FrameCheck | None = None,
+    examination: Examination | None = None,
     files: Sequence[str] = (),
 ) -> None:
     """Raise InputError where the frames (n, h, w) contradict their description, or next to nothing
     of them decodes.
 
-    ``check``: of these frames; without it, their description is compared here. ``files``: names of
-    the frames' files.
+    ``examination``: of these frames, made here if None. ``files``: names of the frames' files.
     """
-    contradictions = (
-        check.contradictions if check else describe_contradictions(sequence, frames, files)
-    )
-    if contradictions:
-        first, *others = contradictions
-        alternatives = "".join(f". Or else: {c.message}" for c in others if c.axis == first.axis)
-        raise InputError(f"{name}: {first.message}{alternatives}")
+    raise_rejected(name, examination or examine_frames(sequence, frames, files))
     for axis, phase in phases.items():
         illuminated, decoded = np.count_nonzero(phase.illuminated), np.count_nonzero(phase.mask)
         if decoded and decoded >= MIN_DECODED * illuminated:
@@ -124,7 +156,7 @@ def check_capture(
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
             raise InputError(
                 f"{name}: no pixel carries a readable {axis} pattern:"
-                f" {describe_disturbance(unexplained)[1]}"
+                f" {describe_disturbance(unexplained).text()}"
             )
         middle = float(np.median(phase.modulation))
         raise InputError(
@@ -163,7 +195,7 @@ def loss_warnings(
         )
         if modulation < NEAR_DARK * float(least[0]):
             if unexplained := estimate_frame_light(sequence, frames).unexplained:
-                cause = describe_disturbance(unexplained)[1]
+                cause = describe_disturbance(unexplained).text()
                 messages.append(
                     f"{cause}; pixels of a modulation below {float(least[0]):.1f} are masked"
                 )
@@ -246,9 +278,9 @@ def decode_captures(
         phases = decode_capture(capture, frames, relative=relative)
         if warn is not ignore_warnings:
             compared = (
-                load_or_save_check(session, capture, frames)
+                load_or_save_examination(session, capture, frames)
                 if check
-                else load_check(session, capture.name)
+                else load_examination(session, capture.name)
             )
             for message in compared.warnings() if compared else ():
                 warn(f"{capture.name}: {message}")

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from slviewer.fringe.cosines import select_rows
 from slviewer.fringe.layout import white_level
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.residual_sample import select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.pipeline.feedback import Warn

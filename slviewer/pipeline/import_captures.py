@@ -18,10 +18,10 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
-from slviewer.pipeline.capture_phases import check_capture, decode_frames
+from slviewer.pipeline.capture_phases import decode_examined
+from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.frame_check import describe_contradictions, load_or_save_check
 from slviewer.pipeline.models import available_models
 from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
 from slviewer.session.capture import Capture, NewCapture
@@ -169,7 +169,7 @@ def import_captures(
             )
         for name in names:
             progress(1.0, f"looking at {name}")
-            for sentence in load_or_save_check(store, store.load_capture(name)).warnings():
+            for sentence in load_or_save_examination(store, store.load_capture(name)).warnings():
                 warn(f"{name}: {sentence}")
     progress(1.0, "imported")
     return names
@@ -401,10 +401,10 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             origins = {axis: estimate_gray_origin(sequence, capture.frames, axis) for axis in axes}
         except InputError:
             # Frames out of order and changed light leave no common origin; name the cause.
-            unstated = ("gray-origin", "phase-offset", "unreadable")
-            for contradiction in describe_contradictions(sequence, capture.frames, capture.files):
-                if contradiction.cause not in unstated:
-                    raise InputError(contradiction.message) from None
+            unstated = ("gray-origin", "phase-offset")
+            for finding in examine_frames(sequence, capture.frames, capture.files).rejected:
+                if finding.cause not in unstated:
+                    raise InputError(finding.text()) from None
             raise
         if origins:
             first = next(iter(origins.values()))
@@ -420,7 +420,6 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
                     f"{capture.name}: the codes along {axis} fit the projector if they are centred"
                     f" on it: gray_origin is taken for {sequence.origin_px(axis):g} px"
                 )
-    phases = decode_frames(capture.name, sequence, capture.frames)
-    check_capture(capture.name, sequence, capture.frames, phases, files=capture.files)
+    phases = decode_examined(capture.name, sequence, capture.frames, capture.files)
     warn_of_exposure(capture.name, sequence, capture.frames, phases, warn)
     return replace(capture, sequence=sequence)

@@ -17,14 +17,14 @@ from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import Observation, pitch_px
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.frame_check import FrameCheck
+from slviewer.records.examination import Examination
 from slviewer.records.plain import to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
-EVIDENCE_VERSION = 3
+EVIDENCE_VERSION = 4
 """Version of the examination; evidence that was stored by another version is computed again."""
 
 
@@ -43,17 +43,16 @@ class DecodedPose:
 
 def gather_evidence(
     pose: DecodedPose,
-    check: FrameCheck,
+    examination: Examination,
     detection: Detection | None,
     observation: Observation | None,
     refused: str = "",
 ) -> PoseEvidence:
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
-    None where they could not be read, for the reason ``refused``; ``check``: of its frames.
+    None where they could not be read, for the reason ``refused``; ``examination``: of its frames.
     """
     sequence, frames, board = pose.sequence, pose.frames, pose.board
     on_board = board_mask(board, detection, pose.texture.shape) if detection is not None else None
-    suspects = {suspect.frame: suspect for suspect in check.suspects}
     return PoseEvidence(
         name=pose.name,
         refused=refused,
@@ -62,7 +61,7 @@ def gather_evidence(
             axis: measure_axis(sequence, frames, phase, on_board)
             for axis, phase in pose.phases.items()
         },
-        suspects=tuple(suspects[i] for i in sorted(suspects)),
+        findings=examination.findings,
         displaced=measure_white_delay(sequence, frames),
         moved_px=(
             np.nan
@@ -76,7 +75,6 @@ def gather_evidence(
             if observation is None
             else fit_mean_turn(observation.camera, observation.projector)
         ),
-        contradictions=check.contradictions if refused else (),
     )
 
 

@@ -18,13 +18,14 @@ from slviewer.pipeline.capture_phases import (
     decode_capture,
     read_ahead,
 )
-from slviewer.pipeline.frame_check import FrameCheck, check_frames, load_or_save_check
+from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.pipeline.pose_evidence import (
     DecodedPose,
     gather_evidence,
     load_evidence,
     save_evidence,
 )
+from slviewer.records.examination import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
@@ -45,12 +46,12 @@ def read_pose(
     pose: DecodedPose,
     smoothing: Smoothing,
     examine: bool = False,
-    check: Callable[[], FrameCheck] | None = None,
+    examined: Callable[[], Examination] | None = None,
     observed: Callable[[Observation], None] = lambda observation: None,
 ) -> Judged:
     """Return the observation of a decoded target pose, or the reason why there is none.
 
-    ``examine``: with the evidence of its frames, of which ``check`` returns the check (computed if
+    ``examine``: with the evidence of its frames, which ``examined`` returns (computed if
     None). ``observed`` is called with the observation before the frames are checked, after which
     the pose may still be refused.
     """
@@ -64,7 +65,7 @@ def read_pose(
         observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
-    checked = (check or partial(check_frames, sequence, frames))() if examine else None
+    checked = (examined or partial(examine_frames, sequence, frames))() if examine else None
     if observation is not None:
         try:
             check_capture(name, sequence, frames, phases, checked)
@@ -91,8 +92,8 @@ def read_stored_pose(
     pose = DecodedPose(
         capture.name, capture.sequence, frames, phases, capture_texture(capture, frames), board
     )
-    check = partial(load_or_save_check, store, capture, frames)
-    judged = read_pose(pose, smoothing, examine, check, observed)
+    examined = partial(load_or_save_examination, store, capture, frames)
+    judged = read_pose(pose, smoothing, examine, examined, observed)
     if judged.evidence is not None:
         save_evidence(store, capture, board, judged.evidence)
     meta = {

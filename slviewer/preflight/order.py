@@ -6,12 +6,12 @@ import numpy as np
 
 from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import stated_full_scale
+from slviewer.examination.examine import examine
 from slviewer.fringe.presets import phase_steps
-from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.fringe.suspect import LIGHT_FAULTS
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
+from slviewer.records.examination import ORDER_CAUSES
 
 _BEFORE, _AFTER = (1, 0, 0, 1, 0, 1), (0, 1, 1, 0)
 _STEPS = 12
@@ -28,7 +28,8 @@ def check_order(bench: RigUnderTest) -> tuple[Check, Check]:
         *phase_steps("x", _STEPS, max(4.0, projector[0] / _PERIODS)),
         *(levels[on] for on in _AFTER),
     )
-    sequence = PatternSequence(projector, frames, full_scale=stated_full_scale(bench.rig.camera))
+    full_scale = stated_full_scale(bench.rig.camera)
+    sequence = PatternSequence(projector, frames, full_scale=full_scale, relative=True)
     bench.show(None, "order of the frames")
     bench.wait()
     stack = capture_frames(
@@ -55,32 +56,28 @@ def _judge_order(bench: RigUnderTest, sequence: PatternSequence, stack: np.ndarr
     errors = {i: abs(shares[i] - on) for i, on in levels.items()}
     wrong = [i for i, error in errors.items() if error > 0.4]
     mixed = [i for i, error in errors.items() if max(0.08, 5 * bench.unsteady) < error <= 0.4]
-    residuals = frame_residuals(sequence, stack, "x")
-    # Where the light flickers, a frame that fits no step needs no other explanation.
-    ignored = (*LIGHT_FAULTS, "strange") if bench.unsteady > 0.01 else LIGHT_FAULTS
-    misplaced = [s for s in residuals.suspects if s.fault not in ignored]
+    misplaced = [f for f in examine(sequence, stack).findings if f.cause in ORDER_CAUSES]
     figures = {
         "frames": n,
         "light": [round(shares[i], 3) for i in sorted(shares)],
-        "misplaced_frames": sorted({*(i + 1 for i in wrong), *(s.frame + 1 for s in misplaced)}),
+        "misplaced_frames": sorted(
+            {*(i + 1 for i in wrong), *(i + 1 for f in misplaced for i in f.frames)}
+        ),
     }
     if wrong and (lag := next((lag for lag in _LAGS if _is_lagging_by(shares, levels, lag)), 0)):
         many = "one image" if lag == 1 else f"{lag} images"
         sentence = f"Every frame is {many} late: frame k shows pattern k - {lag}."
         remedy = "Switch the camera's buffering off, or wait longer between showing and grabbing."
         return Check("order", "bad", sentence, remedy, figures | {"lag": lag})
-    verdict, sentence, remedy = _describe_order(
-        n, wrong, mixed, [s.sentence for s in misplaced], residuals.message
-    )
+    verdict, sentence, remedy = _describe_order(n, wrong, mixed, [f.sentence for f in misplaced])
     return Check("order", verdict, sentence, remedy, figures)
 
 
 def _describe_order(
-    n: int, wrong: list[int], mixed: list[int], misplaced: list[str], unknown: str
+    n: int, wrong: list[int], mixed: list[int], misplaced: list[str]
 ) -> tuple[CheckVerdict, str, str]:
     """Verdict, sentence and remedy for ``n`` frames that do not lag: indices of frames of a wrong
-    level of light, and of those that mix two; sentences on misplaced ones, and why the order cannot
-    be proved."""
+    level of light, and of those that mix two; sentences on misplaced ones."""
     if wrong or misplaced:
         sentence = (
             "; ".join(misplaced[:3]) or f"frame {wrong[0] + 1} shows the wrong level of light"
@@ -97,8 +94,6 @@ def _describe_order(
             sentence,
             "Wait longer between showing and grabbing, or lock the camera to the projector.",
         )
-    if unknown:
-        return "unknown", f"The order could not be proved: {unknown}.", ""
     return "good", f"All {n} coded frames came in order.", ""
 
 

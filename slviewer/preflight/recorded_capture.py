@@ -12,21 +12,21 @@ from slviewer.errors import InputError
 from slviewer.fringe.layout import axis_layout, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
-from slviewer.fringe.residual import FrameResiduals
 from slviewer.fringe.response import measure_nonlinearity, predict_phase_error
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import NEAR_DARK, check_capture, decode_frames
 from slviewer.pipeline.check_results import Check, CheckVerdict, Preflight
+from slviewer.pipeline.examination import examine_frames, name_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.frame_check import FrameCheck, check_frames, name_frames
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import check_repeats
+from slviewer.records.examination import LIGHT_CAUSES, ORDER_CAUSES, Examination
+from slviewer.records.verdict import Cause
 from slviewer.session.capture import Capture
 
-_LIGHT_FAULTS = ("light", "flicker", "exposure-drift")
-_ROOM_FAULTS = ("room-light",)
-_RESPONSE_FAULTS = ("gamma",)
+_MISPLACING_CAUSES = (*ORDER_CAUSES, "ghosting")
+_CAUSES_ELSEWHERE = (*_MISPLACING_CAUSES, *LIGHT_CAUSES)
 _FEW, _TOO_FEW = 0.75, 0.25
 """Shares of the illuminated pixels that must decode: below the first a warning, below the other
 most is lost."""
@@ -40,29 +40,31 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
     began = time.monotonic()
     progress(0.0, "reading frames")
     frames, sequence = capture.stack(), capture.sequence
-    progress(0.2, "decoding")
+    progress(0.2, "comparing the frames")
+    examination = examine_frames(sequence, frames, capture.files)
+    compared = (
+        _check_order(sequence, examination),
+        _check_light(examination),
+        _check_ambient_light(examination),
+    )
+    progress(0.6, "decoding")
     try:
         phases = decode_frames(capture.name, sequence, frames)
     except InputError as error:
-        failed = Check(
-            "description",
-            "bad",
-            f"The frames cannot be decoded: {error}.",
-            "Correct the description.",
-            {},
-        )
-        return Preflight((failed,), None, None, None, time.monotonic() - began)
-    progress(0.5, "comparing the frames")
-    check = check_frames(sequence, frames, capture.files)
-    fits, repeats = check.axes, check_repeats(sequence, frames)
+        description = _check_description(capture.name, examination, error)
+        return Preflight((description, *compared), None, None, None, time.monotonic() - began)
+    repeats = check_repeats(sequence, frames)
+    try:
+        check_capture(capture.name, sequence, frames, phases, examination)
+        description = _check_description(capture.name, examination)
+    except InputError as error:
+        description = _check_description(capture.name, examination, error)
     checks = (
-        _check_description(capture.name, sequence, frames, phases, check),
-        _check_order(sequence, fits),
+        description,
+        *compared,
         replace(repeats, sentence=name_frames(repeats.sentence, sequence, capture.files)),
         check_capture_exposure(sequence, frames, phases),
-        _check_light(fits),
-        _check_ambient_light(fits),
-        _check_response(sequence, frames, fits),
+        _check_response(sequence, frames, examination),
         _check_noise(sequence, frames, phases),
         _check_decoded(phases),
     )
@@ -71,100 +73,71 @@ def preflight_capture(capture: Capture, progress: Progress = ignore_progress) ->
 
 
 def _check_description(
-    name: str,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    phases: Mapping[Axis, PhaseMap],
-    check: FrameCheck,
+    name: str, examination: Examination, error: InputError | None = None
 ) -> Check:
-    """Check that the frames (n, h, w) agree with the description of their patterns."""
-    try:
-        check_capture(name, sequence, frames, phases, check)
-    except InputError as error:
-        text = str(error).removeprefix(f"{name}: ")
-        return Check(
-            "description",
-            "bad",
-            f"{text}.",
-            "Correct the description of the capture, then import again.",
-            {},
-        )
+    """Check that the frames agree with the description of their patterns, and contradict each other
+    in nothing that another check reports; ``error``: by which they were refused."""
+    others = [f for f in examination.findings if f.cause not in _CAUSES_ELSEWHERE]
+    found = examination.rejected or (() if error else tuple(others))
+    if found:
+        verdict: CheckVerdict = "bad" if examination.rejected else "warning"
+        remedy = "; ".join(dict.fromkeys(f.remedy for f in found))
+        sentence = _join_findings([f.sentence for f in found])
+        return Check("description", verdict, sentence, _format_remedy(remedy), {})
+    if error:
+        text, _, remedy = str(error).removeprefix(f"{name}: ").rpartition(": ")
+        return Check("description", "bad", _join_findings([text]), _format_remedy(remedy), {})
     return Check(
         "description", "good", "The frames agree with the description of the patterns.", "", {}
     )
 
 
-def _check_order(sequence: PatternSequence, fits: Sequence[FrameResiduals]) -> Check:
+def _check_order(sequence: PatternSequence, examination: Examination) -> Check:
     """Check that every frame shows the pattern of its place in the sequence."""
-    others = _LIGHT_FAULTS + _ROOM_FAULTS + _RESPONSE_FAULTS
-    suspects = [s for fit in fits for s in fit.suspects if s.fault not in others]
+    found = [f for f in examination.findings if f.cause in _MISPLACING_CAUSES]
     n = len(sequence.frames)
-    figures = {"frames": n, "misplaced_frames": sorted({s.frame + 1 for s in suspects})}
-    if suspects:
-        findings = "; ".join(dict.fromkeys(s.sentence for s in suspects[:3]))
-        remedy = (
-            "Capture again with a longer delay between showing and grabbing, or put the files in"
-            " order."
-        )
-        return Check("order", "bad", f"Of {n} frames, {findings}.", remedy, figures)
-    unknown = "; ".join(fit.message for fit in fits if fit.message)
-    if unknown:
+    misplaced = sorted({i + 1 for f in found for i in f.frames})
+    figures = {"frames": n, "misplaced_frames": misplaced}
+    if found:
+        findings = "; ".join(dict.fromkeys(f.sentence for f in found[:3]))
         return Check(
-            "order",
-            "unknown",
-            f"The order of some frames cannot be checked: {unknown}.",
-            "",
-            figures,
+            "order", "bad", f"Of {n} frames, {findings}.", _format_remedy(found[0].remedy), figures
         )
     return Check("order", "good", f"All {n} frames are in order.", "", figures)
 
 
-def _check_light(fits: Sequence[FrameResiduals]) -> Check:
+def _check_light(examination: Examination) -> Check:
     """Check that the projector's light and the exposure are constant over the frames."""
-    known = np.array([f.light for fit in fits for f in fit.frames if np.isfinite(f.light)])
-    spread = float(np.sqrt(np.mean((known - 1) ** 2))) if known.size else None
-    figures = {"rms_from_frame_to_frame": None if spread is None else round(spread, 5)}
-    suspects = _list_suspects(fits, _LIGHT_FAULTS)
-    if suspects:
+    spread = examination.light_rms
+    figures = {"rms_from_frame_to_frame": round(spread, 5)}
+    if found := _list_sentences(examination, "exposure-drift", "flicker"):
         remedy = (
             "Lock the camera's exposure, gain and white balance; make the exposure a multiple of 10"
             " ms (8.33 ms where the mains have 60 Hz)."
         )
-        return Check("flicker", "warning", _join_findings(suspects[:3]), remedy, figures)
-    if spread is None:
-        return Check(
-            "flicker", "good", "No frame is brighter or darker than the others.", "", figures
-        )
-    return Check(
-        "flicker",
-        "good",
-        f"The light is steady to {100 * spread:.2f} % from frame to frame.",
-        "",
-        figures,
-    )
+        return Check("flicker", "warning", _join_findings(found[:3]), remedy, figures)
+    return Check("flicker", "good", "No frame is brighter or darker than the others.", "", figures)
 
 
-def _check_ambient_light(fits: Sequence[FrameResiduals]) -> Check:
+def _check_ambient_light(examination: Examination) -> Check:
     """Check that the ambient light is constant over the frames."""
-    suspects = _list_suspects(fits, _ROOM_FAULTS)
-    if suspects:
+    if found := _list_sentences(examination, "room-light"):
         remedy = "Keep lamps, doors and daylight as they are while capturing."
-        return Check("ambient", "warning", _join_findings(suspects), remedy, {})
+        return Check("ambient", "warning", _join_findings(found), remedy, {})
     return Check(
         "ambient", "good", "The light of the room did not change between the frames.", "", {}
     )
 
 
 def _check_response(
-    sequence: PatternSequence, frames: np.ndarray, fits: Sequence[FrameResiduals]
+    sequence: PatternSequence, frames: np.ndarray, examination: Examination
 ) -> Check:
     """Check the linearity of the projector's response by the second harmonic of the fringes."""
     remedy = "Straighten the projector's response, or use more steps."
-    suspects = _list_suspects(fits, _RESPONSE_FAULTS)
     harmonics = {axis: measure_second_harmonic(sequence, frames, axis) for axis in sequence.axes}
     known = {axis: value for axis, value in harmonics.items() if np.isfinite(value)}
-    if suspects:
-        return Check("gamma", "warning", _join_findings(suspects), remedy, {})
+    if found := _list_sentences(examination, "gamma"):
+        return Check("gamma", "warning", _join_findings(found), remedy, {})
     if not known:
         why = "fewer than five phase steps, or too few pixels that see fringes"
         return Check("gamma", "unknown", f"The response cannot be measured: {why}.", "", {})
@@ -266,9 +239,14 @@ def _check_decoded(phases: Mapping[Axis, PhaseMap]) -> Check:
     return Check("decoding", verdict, _join_findings(lines), remedy, figures)
 
 
-def _list_suspects(fits: Sequence[FrameResiduals], faults: Sequence[str]) -> list[str]:
-    """List the sentences of the suspects of these faults."""
-    return [suspect.sentence for fit in fits for suspect in fit.suspects if suspect.fault in faults]
+def _list_sentences(examination: Examination, *causes: Cause) -> list[str]:
+    """List the observations of the findings of these causes."""
+    return [f.sentence for f in examination.findings if f.cause in causes]
+
+
+def _format_remedy(text: str) -> str:
+    """Return a remedy as a sentence."""
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _join_findings(findings: Sequence[str]) -> str:

@@ -1,4 +1,5 @@
-"""Verdict on a calibration: good, doubtful or rejected, with causes and remedies."""
+"""Findings on a capture or a calibration, with causes and remedies; and the verdict on a
+calibration: good, doubtful or rejected."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,7 +14,9 @@ not be used."""
 Cause = Literal[
     "frame-lag",
     "missing-frame",
+    "duplicate-frame",
     "frame-order",
+    "ghosting",
     "bit-order",
     "step-order",
     "phase-offset",
@@ -21,6 +24,10 @@ Cause = Literal[
     "gray-cell",
     "dark",
     "saturation",
+    "blur",
+    "room-light",
+    "flicker",
+    "exposure-drift",
     "axes-swapped",
     "axis-reversed",
     "fringe-period",
@@ -44,13 +51,19 @@ CAUSES: tuple[Cause, ...] = get_args(Cause)
 @dataclass(frozen=True)
 class Finding:
     """A detected fault: its cause and severity, the observation (``sentence``), the ``remedy``, and
-    the poses."""
+    where it is: the poses, or the frames of one capture, counted from 0, and the axis.
+
+    ``value``: what fits instead of a described value, in the unit of the sentence.
+    """
 
     cause: Cause
     severity: Severity
     sentence: str
     remedy: str
     poses: tuple[str, ...] = ()
+    frames: tuple[int, ...] = ()
+    axis: Literal["x", "y"] | None = None
+    value: float | None = None
 
     def text(self) -> str:
         """Return observation and remedy in one line."""

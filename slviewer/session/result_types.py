@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 import msgspec
 
 from slviewer.errors import DamagedError
+from slviewer.records.examination import Examination
 from slviewer.records.kinds import RECORDS
 from slviewer.records.plain import from_plain
 
@@ -99,12 +100,11 @@ class _Evidence(ResultMeta, total=False):
     evidence: dict[str, Any]
 
 
-class _FrameCheck(ResultMeta, total=False):
+class _Examination(ResultMeta, total=False):
     """`trust/*`."""
 
     version: int
-    axes: list[dict[str, Any]]
-    contradictions: list[dict[str, Any]]
+    examination: Examination
 
 
 class _Edit(TypedDict):
@@ -143,7 +143,7 @@ _TYPES: dict[str, Any] = {
     "compiled/splined": _Compiled,
     "poses": _Pose,
     "evidence": _Evidence,
-    "trust": _FrameCheck,
+    "trust": _Examination,
     "edits": _Edits,
     "scale": _Scale,
 }

@@ -9,24 +9,13 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.fringe.suspect import Suspect
 from slviewer.pipeline.capture_phases import check_capture, decode_frames
+from slviewer.pipeline.examination import examine_frames
 from slviewer.pipeline.exposure_check import check_capture_exposure
-from slviewer.pipeline.frame_check import check_frames
 
 Severity = Literal["bad", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("bad", "warning", "note")
-SLIGHT = 5.0
-"""Percent of variation of the light, below which a corrected one is only a note."""
-_CAUSES_OF_SUSPECTS = {
-    "late": "duplicate-frame",
-    "early": "frame-order",
-    "swapped": "frame-order",
-    "dropped": "missing-frame",
-    "lag": "frame-lag",
-}
-_LIGHT = ("exposure-drift", "flicker", "room-light", "gamma")
-_OF_FRAMES = ("frame-lag", "missing-frame", "frame-order", "duplicate-frame", "room-light")
+_SEVERITIES: dict[str, Severity] = {"rejected": "bad", "doubtful": "warning", "note": "note"}
 _REFUSALS = (
     (r"are saturated", "saturation"),
     (r"light from other surfaces", "indirect-light"),
@@ -55,26 +44,17 @@ class Named:
 
 def examine(sequence: PatternSequence, stack: np.ndarray) -> list[Named]:
     """What the program finds in a capture (n, h, w): the worst first, else in its own order."""
+    examination = examine_frames(sequence, stack)
+    found = [
+        Named(f.cause, f.frames, _SEVERITIES[f.severity], f.sentence) for f in examination.findings
+    ]
+    if examination.rejected:
+        return found
     try:
         phases = decode_frames("capture", sequence, stack)
+        check_capture("capture", sequence, stack, phases, examination)
     except InputError as error:
-        return [_name_refusal(error)]
-    check = check_frames(sequence, stack)
-    found = [
-        Named(
-            c.cause,
-            (int(c.value),) if c.cause in _OF_FRAMES and c.value is not None else (),
-            "bad",
-            c.message,
-        )
-        for c in check.contradictions
-    ]
-    found += [_name_suspect(suspect) for suspect in check.suspects]
-    if not check.contradictions:
-        try:
-            check_capture("capture", sequence, stack, phases, check)
-        except InputError as error:
-            found.append(_name_refusal(error))
+        return [_name_refusal(error), *found]
     exposure = check_capture_exposure(sequence, stack, phases)
     if exposure.verdict in ("bad", "warning"):
         cause = "saturation" if "saturated." in exposure.sentence else "dark"
@@ -91,18 +71,6 @@ def decode_coordinates(sequence: PatternSequence, stack: np.ndarray) -> dict[Axi
     except InputError:
         return {}
     return {axis: phase.coordinate for axis, phase in phases.items()}
-
-
-def _name_suspect(suspect: Suspect) -> Named:
-    """The finding of a frame that contradicts the others, or of the light."""
-    sentence = suspect.sentence
-    if suspect.fault in _LIGHT:
-        stated = re.search(r"(?:by|is) ([\d.]+) %", sentence)
-        is_slight = "corrected" in sentence and stated and float(stated[1]) < SLIGHT
-        return Named(suspect.fault, (suspect.frame,), "note" if is_slight else "warning", sentence)
-    cause = "ghosting" if "ghosting" in sentence else "duplicate-frame"
-    cause = _CAUSES_OF_SUSPECTS.get(suspect.fault, cause)
-    return Named(cause, (suspect.frame,), "bad", sentence)
 
 
 def _name_refusal(error: InputError) -> Named:

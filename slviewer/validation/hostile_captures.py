@@ -12,9 +12,8 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.evaluation.letter import SPHERE_RADIUS_MM
-from slviewer.fringe.description_check import check_description
+from slviewer.examination.examine import examine
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
-from slviewer.fringe.residual import capture_residuals
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.calibration_verdict import load_last_verdict
@@ -216,40 +215,19 @@ def write_images(folder: Path, frames: np.ndarray) -> list[str]:
     return names
 
 
-_SUSPECTED: dict[str, frozenset[str]] = {
-    "lag": frozenset({"frame-lag"}),
-    "late": frozenset({"duplicate-frame"}),
-    "early": frozenset({"missing-frame"}),
-    "dropped": frozenset({"missing-frame"}),
-    "swapped": frozenset({"frame-order"}),
-    "light": frozenset({"exposure-drift", "flicker", "room-light"}),
-    "strange": frozenset(
-        {"missing-frame", "duplicate-frame", "flicker", "exposure-drift", "motion"}
-    ),
-}
-"""What a frame's suspected fault says, in the words of causes; several where it leaves that
-open."""
-
-
 def named_causes(
     sequence: PatternSequence, captures: Mapping[str, np.ndarray], messages: Sequence[str]
 ) -> list[frozenset[str]]:
-    """The causes that messages about captures name: those of the program's own suspects and
-    contradictions whose sentence is part of a message.
-    """
+    """The causes that messages about captures name: those of the program's own findings whose
+    sentence is part of a message."""
     named: dict[frozenset[str], None] = {}
     for name, frames in captures.items():
         about = [message for message in messages if name in message]
         if not about:
             continue
-        suspects = [
-            suspect for axis in capture_residuals(sequence, frames) for suspect in axis.suspects
-        ]
-        known = [(s.sentence, _SUSPECTED.get(s.fault, frozenset({s.fault}))) for s in suspects]
-        known += [(c.message, frozenset({c.cause})) for c in check_description(sequence, frames)]
         named |= {
-            causes: None
-            for sentence, causes in known
-            if any(sentence in message for message in about)
+            frozenset({finding.cause}): None
+            for finding in examine(sequence, frames).findings
+            if any(finding.sentence in message for message in about)
         }
     return list(named)

@@ -22,7 +22,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
 from slviewer.pipeline.capture import measure_space, warn_of_captured
 from slviewer.pipeline.check_results import Preflight
-from slviewer.pipeline.frame_check import load_check, load_or_save_check
+from slviewer.pipeline.examination import load_examination, load_or_save_examination
 from slviewer.pipeline.poses import read_stored_poses
 from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.pipeline.rig_presets import save_rig
@@ -349,13 +349,13 @@ class Engine:
             self.publisher.mark_changed(session=True)
         session = reader.session.guarded(report.saving)
         report(0.0, f"reading {capture.name}")
-        is_new = load_check(session, capture.name) is None
+        is_new = load_examination(session, capture.name) is None
         try:
             if reader.needs_judging(capture, reader.target()):
                 self._judge_pose(reader, session, capture)
         finally:
             if is_new:
-                for sentence in load_or_save_check(session, capture).warnings():
+                for sentence in load_or_save_examination(session, capture).warnings():
                     self.notices.add("warning", f"{capture.name}: {sentence}", "frames")
                 warn_of_captured(
                     capture.name,

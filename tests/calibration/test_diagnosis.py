@@ -15,8 +15,6 @@ from slviewer.calibration.diagnosis.frames import fit_mean_turn, gamma_from_harm
 from slviewer.calibration.diagnosis.numbering import describe_misnumbering
 from slviewer.calibration.diagnosis.rules import judge_evidence
 from slviewer.calibration.observe import Observation
-from slviewer.fringe.contradiction import Contradiction
-from slviewer.fringe.suspect import Suspect
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import CAUSES, Finding, Verdict
@@ -185,21 +183,18 @@ def test_a_projector_upside_down_is_sound() -> None:
 
 
 def test_the_root_cause_hides_its_consequences() -> None:
-    late = Suspect(0, "lag", "from frame 1 on the camera is one image behind the projector")
-    spoilt = {"refused": "no board", "suspects": (late,), "axes": {"x": axis(period_seen_px=7.0)}}
+    late = Finding("frame-lag", "rejected", "all frames are one image late", "wait longer")
+    spoilt = {"refused": "no board", "findings": (late,), "axes": {"x": axis(period_seen_px=7.0)}}
     assert causes(*(pose(k, **spoilt) for k in range(6)), refusal="0 usable poses") == (
         "frame-lag",
     )
     # codes beyond the projector: of another size, or of other fringes
-    beyond = (
-        Contradiction(
-            "projector-size", "10 % of the x codes lie outside: give the size", "x", 1000.0
-        ),
-    )
-    assert causes(*(pose(k, contradictions=beyond, refused="codes") for k in range(6))) == (
+    text, remedy = "10 % of the x codes lie outside", "give the size"
+    beyond = (Finding("projector-size", "rejected", text, remedy, axis="x", value=1000.0),)
+    assert causes(*(pose(k, findings=beyond, refused="codes") for k in range(6))) == (
         "projector-size",
     )
-    wrong = {"axes": {"x": axis(period_px=20.0)}, "refused": "codes", "contradictions": beyond}
+    wrong = {"axes": {"x": axis(period_px=20.0)}, "refused": "codes", "findings": beyond}
     assert causes(*(pose(k, **wrong) for k in range(6))) == ("fringe-period",)
     # a board that is never found says why before it says that too few are left
     assert causes(*(pose(k, refused="336 of 352", grid=(20, 16)) for k in range(6))) == (
@@ -208,12 +203,16 @@ def test_the_root_cause_hides_its_consequences() -> None:
 
 
 def test_a_frame_that_is_white_too_early_or_late_tells_which_way() -> None:
-    strange = (Suspect(50, "strange", "frame 51 does not fit the other bits"),)
-    assert (
-        causes(*(pose(k, suspects=strange, displaced=-1) for k in range(6)))[0] == "missing-frame"
-    )
-    assert causes(*(pose(k, suspects=strange, displaced=1) for k in range(6)))[0] == "frame-lag"
-    assert causes(*(pose(k, suspects=strange) for k in range(6))) == ()
+    assert causes(*(pose(k, displaced=-1) for k in range(6)))[0] == "missing-frame"
+    assert causes(*(pose(k, displaced=1) for k in range(6)))[0] == "frame-lag"
+    # what the other frames show comes first
+    swapped = (Finding("frame-order", "rejected", "frames 3 and 4 have changed places", "sort"),)
+    assert causes(*(pose(k, findings=swapped, displaced=1) for k in range(6)))[0] == "frame-order"
+
+
+def test_findings_that_harm_little_refuse_no_calibration() -> None:
+    harmless = (Finding("room-light", "doubtful", "brighter", "keep it constant"),)
+    assert causes(*(pose(k, findings=harmless) for k in range(6))) == ()
 
 
 def test_gamma_from_its_harmonic() -> None:
@@ -248,8 +247,8 @@ def test_features_numbered_otherwise_are_seen_through_any_lens() -> None:
 
 
 def test_evidence_and_verdicts_survive_saving() -> None:
-    suspect = Suspect(3, "late", "frame 4 shows the pattern of frame 3")
-    kept = pose(1, suspects=(suspect,), grid=(21, 16), moved_px=np.nan)
+    late = Finding("duplicate-frame", "rejected", "frame 4 repeats", "look", frames=(3,), value=2.0)
+    kept = pose(1, findings=(late,), grid=(21, 16), moved_px=np.nan)
     again = PoseEvidence.from_json(json.loads(json.dumps(to_plain(kept))))
     assert np.isnan(again.moved_px)
     assert dataclasses.replace(again, moved_px=0.0) == dataclasses.replace(kept, moved_px=0.0)

@@ -6,6 +6,7 @@ import pytest
 from facts import missing_facts
 from fringe_scene import capture, slope, variants, wrong
 
+from slviewer.examination.examine import examine
 from slviewer.fringe import decode as decode_module
 from slviewer.fringe import reference
 from slviewer.fringe.aliased_harmonics import AliasedHarmonics
@@ -13,7 +14,6 @@ from slviewer.fringe.decode import decode, decode_reference
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.presets import complementary, multifrequency, phase_steps
-from slviewer.fringe.residual import frame_residuals
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.renderer import Renderer
@@ -45,7 +45,8 @@ def share_within(phase, truth, sigmas=3.0):
 
 
 def gamma_suspects(sequence, stack, axis="x"):
-    return [s for s in frame_residuals(sequence, stack, axis).suspects if s.fault == "gamma"]
+    found = examine(sequence, stack).findings
+    return [f for f in found if f.cause == "gamma" and f.axis == axis]
 
 
 GAMMAS = [(3, 2.2, 6), (3, 1 / 2.2, 3), (3, 1.4, 3), (4, 1 / 2.2, 1.7)]

@@ -5,8 +5,9 @@ import pytest
 from facts import missing_facts
 from fringe_scene import capture, coverage, slope, variants, wrong
 
+from slviewer.examination.findings import describe_light
 from slviewer.fringe.decode import decode, decode_reference
-from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
+from slviewer.fringe.frame_light import estimate_frame_light
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, gray, p18
 from slviewer.fringe.sequence import PatternSequence
@@ -62,8 +63,8 @@ def test_gains_are_those_that_were_applied(name):
     steps = [i for i, f in enumerate(sequence.frames) if f.kind == "phase"]
     ratio = light.light.gain[steps] / gain[steps, 0, 0]
     assert ratio.std() / ratio.mean() < 0.004
-    (suspect,) = detect_light_faults(sequence, light)
-    assert suspect.fault == "exposure-drift" and not missing_facts(suspect.sentence, "corrected")
+    (found,) = describe_light(sequence, light)
+    assert found.cause == "exposure-drift" and not missing_facts(found.sentence, "corrected")
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
@@ -71,7 +72,7 @@ def test_gains_are_those_that_were_applied(name):
 def test_a_steady_capture_is_left_as_it_is(name, gamma):
     sequence = SEQUENCES[name]
     light = estimate_frame_light(sequence, capture(sequence, TRUTH, shot=0.02, gamma=gamma))
-    assert not light.is_significant and detect_light_faults(sequence, light) == []
+    assert not light.is_significant and not [*describe_light(sequence, light)]
 
 
 @pytest.mark.slow
@@ -82,7 +83,7 @@ def test_mains_flicker_under_a_rolling_shutter():
     flickering = relit(stack, 1 + 0.05 * np.sin(2 * np.pi * (3.2 * v + 0.37 * k)))
     light = estimate_frame_light(sequence, flickering)
     assert light.light.cycles == pytest.approx(3.2, abs=0.05)
-    assert [s.fault for s in detect_light_faults(sequence, light)] == ["flicker"]
+    assert [f.cause for f in describe_light(sequence, light)] == ["flicker"]
     assert rms_px(decode(sequence, flickering, "x")) < 1.15 * rms_px(decode(sequence, stack, "x"))
 
 
@@ -92,8 +93,8 @@ def test_room_light_that_is_switched_on(first):
     stack = capture(sequence, TRUTH, shot=0.02, gain=140)
     illuminated = relit(stack, 1, np.where(np.arange(len(stack)) >= first, 40, 0)[:, None, None])
     light = estimate_frame_light(sequence, illuminated)
-    (suspect,) = detect_light_faults(sequence, light)
-    assert (suspect.fault, suspect.frame) == ("room-light", first)
+    (found,) = describe_light(sequence, light)
+    assert (found.cause, found.frames) == ("room-light", (first,))
     phase = decode(sequence, illuminated, "x")
     assert coverage(phase) > 0.99 and rms_px(phase) < 1.15 * rms_px(decode(sequence, stack, "x"))
 

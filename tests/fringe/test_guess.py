@@ -15,7 +15,7 @@ from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
-from slviewer.fringe.guess import guess_sequence
+from slviewer.examination.guess import guess_sequence
 from slviewer.fringe.presets import (
     AXES,
     bits_for,

@@ -8,7 +8,6 @@ from typing import get_args
 
 from slviewer import wizard
 from slviewer.fringe.phase import Reason as PixelReason
-from slviewer.fringe.suspect import Fault
 from slviewer.gui.calibration_html import verdict_html
 from slviewer.gui.help_links import FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link, step_help_link
 from slviewer.gui.merge_html import merge_failure_html
@@ -20,7 +19,6 @@ from slviewer.server.help_pages import HelpPages, docs_folder
 from slviewer.wizard.steps import STEPS
 
 FINDINGS = {
-    *(f"frame-{fault}" for fault in get_args(Fault)),
     *(f"pixel-{reason.name.lower()}" for reason in PixelReason if reason != PixelReason.VALID),
     *(f"check-{name}" for name in CHECK_NAMES),
     *CAUSES,

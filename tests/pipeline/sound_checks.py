@@ -1,6 +1,8 @@
-"""Stored checks of sound captures, so that commands need not compute them again."""
+"""Stored examinations of sound captures, so that commands need not compute them again."""
 
-from slviewer.pipeline.frame_check import VERSION, FrameCheck
+from slviewer.pipeline.examination import VERSION
+from slviewer.records.examination import Examination
+from slviewer.records.plain import to_plain
 from slviewer.session.store import Session
 
 
@@ -11,6 +13,6 @@ def save_sound_checks(store: Session) -> None:
         meta = {
             "inputs": {capture.name: capture.hash},
             "version": VERSION,
-            **FrameCheck((), ()).to_json(),
+            "examination": to_plain(Examination()),
         }
         store.save_result(f"trust/{capture.name}", meta, {})

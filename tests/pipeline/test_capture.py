@@ -272,10 +272,10 @@ def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(
     def refused(*_: object) -> list[str]:
         raise SessionError("the disk is full: free some space")
 
-    monkeypatch.setattr(module, "save_check", interrupted)
+    monkeypatch.setattr(module, "save_examination", interrupted)
     with raises(KeyboardInterrupt):
         capture(tmp_path / "fresh", "a", {"driver": "simulated", "scale": 0.1})
-    monkeypatch.setattr(module, "save_check", refused)
+    monkeypatch.setattr(module, "save_examination", refused)
     said: list[str] = []
     capture(tmp_path / "fresh", "b", {"driver": "simulated", "scale": 0.1}, warn=said.append)
     assert len(said) == 1 and not missing_facts(

@@ -11,8 +11,14 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.capture_phases import check_capture, decode_frames
-from slviewer.pipeline.frame_check import FrameCheck, check_frames
+from slviewer.pipeline.capture_phases import (
+    check_capture,
+    decode_examined,
+    decode_frames,
+    decode_or_explain,
+)
+from slviewer.pipeline.examination import examine_frames
+from slviewer.records.examination import Examination
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -29,16 +35,16 @@ def frames() -> np.ndarray:
 
 @pytest.mark.computes
 def test_a_sound_capture_passes(frames: np.ndarray) -> None:
-    check = check_frames(SEQUENCE, frames)
-    assert check.warnings() == []
-    check_capture("pose_01", SEQUENCE, frames, decode_frames("pose_01", SEQUENCE, frames), check)
+    examination = examine_frames(SEQUENCE, frames)
+    assert examination.warnings() == []
+    assert {*decode_examined("pose_01", SEQUENCE, frames, (), examination)} == {"x"}
 
 
 @pytest.mark.computes
 def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> None:
     wrong = replace(SEQUENCE, gray_origin_px=8.5)
-    check = check_frames(wrong, frames)
-    assert any("gray_origin" in message for message in check.warnings())
+    examination = examine_frames(wrong, frames)
+    assert {finding.axis for finding in examination.rejected} == {"x"}
     with raises(InputError, "pose_01", "gray_origin", "phase_offset") as refusal:
         check_capture("pose_01", wrong, frames, decode_frames("pose_01", wrong, frames))
     stated = {
@@ -48,7 +54,17 @@ def test_the_most_probable_contradiction_is_the_reason(frames: np.ndarray) -> No
         )
     }
     assert -0.6 < stated["gray_origin"] < -0.4 and 3.1 < abs(stated["phase_offset"]) < 3.2
-    assert "gray_origin" in check.contradictions[0].message
+    assert "phase_offset" in examination.warnings()[0]
+
+
+@pytest.mark.computes
+def test_frames_that_do_not_decode_are_explained(frames: np.ndarray) -> None:
+    wide = replace(SEQUENCE, gray_cell_px=36.0)
+    with pytest.raises(InputError):
+        decode_frames("pose_01", wide, frames)
+    for decode in (decode_examined, decode_or_explain):
+        with raises(InputError, "pose_01", "gray_cell_px = 18"):
+            decode("pose_01", wide, frames)
 
 
 def seen(decoded: float, otherwise: Reason) -> PhaseMap:
@@ -70,10 +86,10 @@ def seen(decoded: float, otherwise: Reason) -> PhaseMap:
 def test_a_capture_of_which_next_to_nothing_decodes_is_refused(
     decoded: float, otherwise: Reason, facts: list[str]
 ) -> None:
-    phases, check = {"x": seen(decoded, otherwise)}, FrameCheck((), ())
+    phases, sound = {"x": seen(decoded, otherwise)}, Examination()
     frames = np.zeros((len(SEQUENCE.frames), 40, 40), np.uint8)
     if not facts:
-        check_capture("scan", SEQUENCE, frames, phases, check)
+        check_capture("scan", SEQUENCE, frames, phases, sound)
         return
     with raises(InputError, "scan", *facts):
-        check_capture("scan", SEQUENCE, frames, phases, check)
+        check_capture("scan", SEQUENCE, frames, phases, sound)

@@ -55,9 +55,10 @@ def gained(stack: np.ndarray, gain: float | np.ndarray, offset: float = 0.0) -> 
 )
 def test_a_sound_capture_is_good(tmp_path: Path, sequence_of: Callable) -> None:
     found = checked(tmp_path / "session", *frames_of(sequence_of))
-    assert found.verdict == "good", [
-        vars(check) for check in found.checks if check.verdict != "good"
-    ]
+    # a camera of 320 pixels does not resolve stripes one projector pixel wide
+    unresolved = {"description"} if sequence_of is gray else set()
+    assert {check.name for check in found.checks if check.verdict == "warning"} == unresolved
+    assert found.verdict == ("warning" if unresolved else "good")
     names = {
         "description",
         "order",

@@ -11,7 +11,7 @@ from facts import missing_facts, raises
 from slviewer.errors import CalibrationRejected, DamagedError, InputError, SessionError
 from slviewer.pipeline import poses
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.frame_check import load_or_save_check
+from slviewer.pipeline.examination import load_or_save_examination
 from slviewer.pipeline.inspect import inspect
 from slviewer.session.store import Session
 
@@ -125,11 +125,11 @@ def test_results_without_checksums_are_read(session):
 
 def test_what_is_computed_from_a_capture_survives_its_own_damage(session, sequence, frames):
     capture = session.save_capture("a", "scan", sequence, frames, source="")
-    check = load_or_save_check(session, capture)
+    examination = load_or_save_examination(session, capture)
     for text in ("", "{", "[]"):
         (session.folder / "results/trust/a/meta.json").write_text(text)
         assert session.load_fresh("trust/a") is None
-        assert load_or_save_check(session, capture) == check
+        assert load_or_save_examination(session, capture) == examination
         assert session.state_of("trust/a") == "fresh"
 
 

@@ -3,6 +3,7 @@ findings of one cause."""
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from slviewer.calibration.observe import AXES
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import unit_vectors
-from slviewer.records.verdict import CAUSES, Cause, Finding, Severity
+from slviewer.records.verdict import Cause, Finding, Severity
 
 MAX_SATURATED = 0.12
 REJECTED_SATURATED = 0.3
@@ -202,24 +203,25 @@ def _describe_wrong_period(e: Evidence, axis: Axis) -> str:
 def diagnose_description(e: Evidence) -> Iterator[Finding]:
     """Yield the contradictions between frames and description that no other rule explains."""
     first = {
-        pose.name: pose.contradictions[0] for pose in list_ordered_poses(e) if pose.contradictions
+        pose.name: pose.findings[0]
+        for pose in list_ordered_poses(e)
+        if pose.refused and pose.findings and pose.findings[0].severity == "rejected"
     }
-    for cause in dict.fromkeys(contradiction.cause for contradiction in first.values()):
-        if cause not in CAUSES or cause in _CAUSES_IN_POSES:
+    for cause in dict.fromkeys(finding.cause for finding in first.values()):
+        if cause in _CAUSES_IN_POSES:
             continue
         # Codes beyond the projector may be those of another axis or of another period.
         if cause in _SYMPTOMS and (
             any(diagnose_mirroring(e)) or any(f.severity == "rejected" for f in diagnose_period(e))
         ):
             continue
-        names = tuple(name for name, contradiction in first.items() if contradiction.cause == cause)
-        sentence, _, remedy = first[names[0]].message.rpartition(": ")
-        yield Finding(
-            cause,
-            rate_severity(e, names, is_excluded=True),
-            f"{format_poses(e, names)} {sentence}",
-            remedy,
-            names,
+        names = tuple(name for name, finding in first.items() if finding.cause == cause)
+        shown = first[names[0]]
+        yield replace(
+            shown,
+            severity=rate_severity(e, names, is_excluded=True),
+            sentence=f"{format_poses(e, names)} {shown.sentence}",
+            poses=names,
         )
 
 
@@ -312,7 +314,7 @@ def diagnose_ripple(e: Evidence) -> Iterator[Finding]:
 def _list_aliased_gamma_poses(e: Evidence) -> tuple[str, ...]:
     """List the poses in which gamma shifts the phase of three or four steps; empty unless they are
     the majority."""
-    names = tuple(pose.name for pose in e.poses if any(s.fault == "gamma" for s in pose.suspects))
+    names = tuple(pose.name for pose in e.poses if any(f.cause == "gamma" for f in pose.findings))
     return names if len(names) > COMMON_SHARE * len(e.poses) else ()
 
 

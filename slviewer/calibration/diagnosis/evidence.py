@@ -8,10 +8,9 @@ import numpy as np
 
 from slviewer.calibration.diagnosis.ripple import Ripple
 from slviewer.calibration.soundness import MIN_TILT_SPREAD_DEG
-from slviewer.fringe.contradiction import Contradiction
 from slviewer.fringe.sequence import Axis
-from slviewer.fringe.suspect import Suspect
 from slviewer.records.plain import from_plain
+from slviewer.records.verdict import Finding
 
 
 @dataclass(frozen=True)
@@ -38,24 +37,22 @@ class PoseEvidence:
     """Evidence of one capture of the target.
 
     ``refused``: why its board or phase could not be read, "" where they could. ``grid``: columns
-    and rows of the grid of circles detected where the given board does not fit it. ``suspects``:
-    frames that contradict the others. ``displaced``: number of frames by which the white frame is
+    and rows of the grid of circles detected where the given board does not fit it. ``findings``:
+    of the examination of its frames. ``displaced``: number of frames by which the white frame is
     late (positive) or early. ``moved_px``: motion of the features in the camera between the frames
     of the two axes. ``numbering``: how the features are misnumbered, "" where they are not.
     ``turn`` (2, 2): mean Jacobian of the projector coordinates by camera pixels over the board.
-    ``contradictions``: between a refused capture and the sequence's description.
     """
 
     name: str
     refused: str = ""
     grid: tuple[int, int] | None = None
     axes: Mapping[str, AxisEvidence] = field(default_factory=dict)
-    suspects: tuple[Suspect, ...] = ()
+    findings: tuple[Finding, ...] = ()
     displaced: int = 0
     moved_px: float = np.nan
     numbering: str = ""
     turn: tuple[tuple[float, float], tuple[float, float]] | None = None
-    contradictions: tuple[Contradiction, ...] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":

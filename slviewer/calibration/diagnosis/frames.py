@@ -4,22 +4,16 @@ import cv2
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import AxisEvidence
-from slviewer.fringe.layout import Layout, axis_layout, white_level
-from slviewer.fringe.noise import measure_noise
-from slviewer.fringe.origin import MIN_CONCENTRATION, MIN_EDGES, MIN_RISING
+from slviewer.fringe.cosines import FEWEST, select_rows
+from slviewer.fringe.layout import axis_layout, white_level
+from slviewer.fringe.origin import measure_code_origin
 from slviewer.fringe.phase import PhaseMap, Reason
-from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
-from slviewer.fringe.residual_sample import FEWEST, select_rows
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.polynomial import fit_slopes
 from slviewer.geometry.vectors import finite_rows, lengths
 
-ORIGIN_ROWS = 150
-"""Image lines along which the Gray code's edges are located."""
 MIN_ORIGIN_PX = 0.2
 """px: a Gray code whose origin is nearer to a column's middle does not determine the period."""
-_ORIGIN_CANDIDATES = 4000  # candidate phases per period
-_BEST_SHARE = 0.97  # phases inside this share of the largest number of intervals are averaged
 _WHITE_LEVEL = 0.8  # of a pixel's brightest value over all frames
 _WHITE_SHARE = 0.97  # share of the pixels above that level in a white frame
 _ILLUMINATED_LEVEL = 0.5  # of the brightest pixels: illuminated by the projector
@@ -93,59 +87,11 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
     layout = axis_layout(sequence, axis)
     if not (layout.shifts and layout.gray) or abs(layout.gray_origin_px) < MIN_ORIGIN_PX:
         return np.nan
-    size = stack.shape[2 if axis == "y" else 1]
-    step = max(1, size // ORIGIN_ROWS)
-    thin = np.ascontiguousarray(stack[:, :, ::step] if axis == "y" else stack[:, ::step])
-    origin = _measure_code_origin(layout, thin, white_level(sequence, stack, sequence.select(axis)))
+    white = white_level(sequence, stack, sequence.select(axis))
+    origin = measure_code_origin(layout, stack, white).turns
     turns = layout.gray_origin_px / layout.period_px
     ratio = turns / origin if np.isfinite(origin) and abs(origin) > 1e-3 else np.nan
     return float(layout.period_px * ratio) if 0.1 < ratio < 10 else np.nan
-
-
-def _measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> float:
-    """Return the phase at which the codes start, in periods, -0.5 to 0.5; NaN where the edges do
-    not agree.
-
-    An edge is at a phase between those of two neighbouring pixels. The result is the phase inside
-    the largest number of these intervals, which is more precise than any one of them.
-    """
-    wrapped, modulation, background, _ = phase_shift(
-        stack, layout.shifts[0].indices, layout.sign, layout.offset_rad
-    )
-    illuminated = modulation >= dark_limit(
-        background, measure_noise(layout, stack, white), white, dark_sigmas(layout)
-    )
-    code, digit = np.zeros(illuminated.shape, np.int32), np.zeros(illuminated.shape, np.int32)
-    for i in [*layout.gray] + ([] if layout.complementary is None else [layout.complementary]):
-        digit ^= bit_heights(layout, stack, i, background) > 0
-        code = 2 * code + digit
-    first, second = (np.s_[:, :-1], np.s_[:, 1:]) if layout.axis == "x" else (np.s_[:-1], np.s_[1:])
-    origins, lengths = [], []
-    for here, there in ((first, second), (second, first)):
-        edge = illuminated[here] & illuminated[there] & (code[there] == code[here] + 1)
-        below, above = wrapped[here][edge].astype(float), wrapped[there][edge].astype(float)
-        # the cell that starts here is the second half of a period if odd
-        if layout.complementary is not None:
-            below = below - (code[there][edge] & 1) * np.pi
-            above = above - (code[there][edge] & 1) * np.pi
-        origins.append(below)
-        lengths.append(np.angle(np.exp(1j * (above - below))))
-    origin, length = np.concatenate(origins), np.concatenate(lengths)
-    if len(origin) < MIN_EDGES or np.mean(length > 0) < MIN_RISING:
-        return np.nan
-    origin, length = origin[length > 0], length[length > 0]
-    places = np.linspace(-np.pi, np.pi, _ORIGIN_CANDIDATES, endpoint=False)
-    start = np.mod((origin + np.pi) / (2 * np.pi), 1.0) * _ORIGIN_CANDIDATES
-    change = np.zeros(3 * _ORIGIN_CANDIDATES)
-    np.add.at(change, np.ceil(start).astype(int), 1.0)
-    np.add.at(
-        change, np.floor(start + length / (2 * np.pi) * _ORIGIN_CANDIDATES).astype(int) + 1, -1.0
-    )
-    count = np.cumsum(change).reshape(3, _ORIGIN_CANDIDATES).sum(0)
-    if count.max() < MIN_CONCENTRATION * len(origin):
-        return np.nan
-    best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
-    return float(np.angle(best.mean()) / (2 * np.pi))
 
 
 def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:

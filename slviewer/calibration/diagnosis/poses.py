@@ -1,13 +1,11 @@
 """Rules on single poses: frame order, motion, numbering, and residuals; and the poses to exclude
 before a fit."""
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import Evidence, ExcludedPose, PoseEvidence
-from slviewer.fringe.suspect import LIGHT_FAULTS
 from slviewer.records.verdict import Cause, Finding, Severity
 
 COMMON_SHARE = 0.5
@@ -25,6 +23,9 @@ ORDERS: dict[Cause, str] = {
     "frame-order": "frames show patterns that are not theirs",
 }
 """Descriptions of the causes by which frames are out of order."""
+_ORDER_CAUSES: dict[Cause, Cause] = {
+    **{cause: cause for cause in ORDERS}, "duplicate-frame": "frame-order"
+}  # fmt: skip
 
 
 def reason_to_exclude(pose: PoseEvidence, limit_px: float) -> str:
@@ -34,9 +35,7 @@ def reason_to_exclude(pose: PoseEvidence, limit_px: float) -> str:
     """
     order = classify_frame_order(pose)
     if order:
-        sentence = next(
-            (s.sentence for s in pose.suspects if s.fault not in (*LIGHT_FAULTS, "strange")), ""
-        )
+        sentence = next((f.sentence for f in pose.findings if f.cause in _ORDER_CAUSES), "")
         return f"its frames are out of order ({sentence or ORDERS[order]}): capture the pose again"
     if pose.moved_px > limit_px:
         return (
@@ -65,18 +64,13 @@ def motion_limit_px(poses: Sequence[PoseEvidence]) -> float:
 def classify_frame_order(pose: PoseEvidence) -> Cause | None:
     """Return the cause by which the frames of a pose are out of order; None where they are in
     order."""
-    orders: dict[str, Cause] = {cause: cause for cause in ORDERS} | {
-        "duplicate-frame": "frame-order"
-    }
-    for contradiction in pose.contradictions[:1]:
-        if contradiction.cause in orders:
-            return orders[contradiction.cause]
-    faults = Counter(s.fault for s in pose.suspects)
-    if pose.displaced > 0 or (faults["lag"] and pose.displaced >= 0):
-        return "frame-lag"
-    if pose.displaced < 0 or faults["dropped"]:
-        return "missing-frame"
-    return "frame-order" if faults["late"] + faults["early"] + faults["swapped"] else None
+    for finding in pose.findings:
+        if finding.cause in _ORDER_CAUSES:
+            return _ORDER_CAUSES[finding.cause]
+    # the white frame, which decoding does not need
+    if pose.displaced:
+        return "frame-lag" if pose.displaced > 0 else "missing-frame"
+    return None
 
 
 def list_ordered_poses(e: Evidence) -> list[PoseEvidence]:

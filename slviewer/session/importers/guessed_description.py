@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slviewer.errors import InputError
-from slviewer.fringe.guess import Guess, guess_sequence
+from slviewer.examination.guess import Guess, guess_sequence
 from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
 from slviewer.session.importers.imported import visible

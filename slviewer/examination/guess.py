@@ -8,13 +8,11 @@ from itertools import pairwise
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.agreement_tests import MAX_CELL, SURE, is_proven, wrap
-from slviewer.fringe.axis_agreement import Agreement, fit_turns, measure_agreement
-from slviewer.fringe.axis_reader import AxisFrames, AxisReader, described_frames
-from slviewer.fringe.description_change import LINES, step_turns
-from slviewer.fringe.description_check import LEAST_ILLUMINATED, check_description
-from slviewer.fringe.frame_blocks import (
-    Bit,
+from slviewer.examination import limits
+from slviewer.examination.evaluate import Evaluator, described
+from slviewer.examination.examine import examine
+from slviewer.examination.findings import LINES
+from slviewer.examination.frame_blocks import (
     BlockReader,
     Doubt,
     FrameBlocks,
@@ -22,13 +20,14 @@ from slviewer.fringe.frame_blocks import (
     PhaseRun,
     group_frames,
 )
-from slviewer.fringe.line_sample import LineSample, coded_frames, sample_frames
+from slviewer.examination.hypotheses import change_conventions
+from slviewer.examination.line_sample import sample_lines
+from slviewer.examination.sample import sample_capture
 from slviewer.fringe.sequence import (
     Axis,
     Frame,
     Indices,
     PatternSequence,
-    PerAxis,
     Size,
     select_axis_value,
 )
@@ -40,11 +39,20 @@ DIAGONAL = (0.67, 1.5)
 WHOLE = 0.02
 """Tolerance of a measured ratio that should be a whole number: its uncertainty over some ten
 fringes is less."""
-SAME_PERIOD = 0.05
+SAME_PERIOD = 0.015
 TURN = 2 * np.pi
 WINDOW = 24
 """Camera px over which two phases are compared."""
 FINEST_PX = 2.0
+MOST_EXPLAINED = 0.7
+"""Share of the pixels that a code explains that is sure: depth edges and shadows take a tenth."""
+SNAPPED = 0.06
+"""Periods within which an offset is a quarter or a step."""
+NO_OFFSET = 0.1
+"""Periods up to which an offset is the origin of the code, half a projector pixel before its
+first."""
+CELL_ERROR = 0.15
+"""Uncertainty of a cell's width by the number of edges in view."""
 
 
 @dataclass(frozen=True)
@@ -100,12 +108,11 @@ def guess_sequence(stack: np.ndarray, projector: Size | None = None) -> Guess:
             f"a stack of shape {stack.shape} is not a capture: give three or more images of one"
             " size"
         )
-    sample = sample_frames(stack, list(range(len(stack))))
-    reader = BlockReader(sample)
+    reader = BlockReader(sample_lines(stack))
     everything = tuple(range(len(stack)))
     frames: list[Frame | None] = [None] * len(stack)
     share = float(reader.illuminated.mean())
-    if share < LEAST_ILLUMINATED or reader.count < 500:
+    if share < limits.LEAST_LIT or reader.count < 500:
         text = (
             f"{100 * share:.1f} % of the pixels vary from image to image by more than the noise:"
             " too dark to be read"
@@ -124,15 +131,16 @@ def guess_sequence(stack: np.ndarray, projector: Size | None = None) -> Guess:
     except InputError as error:
         findings.doubts.append((everything, str(error)))
         return findings.guess(None, frames)
+    evaluator = Evaluator(sample_capture(sequence, stack))
     for axis in sequence.axes:
-        sequence = _apply_conventions(sequence, axis, axes[axis], sample, reader, findings)
+        sequence = _apply_conventions(sequence, axis, axes[axis], evaluator, reader, findings)
     if not findings.doubts:
         findings.doubts.extend(
-            (everything, found.message) for found in check_description(sequence, stack)
+            (everything, found.text()) for found in examine(sequence, stack).rejected
         )
     if not findings.doubts:
         for axis in sequence.axes:
-            sequence = _scale_to_projector(sequence, axis, sample, projector, findings)
+            sequence = _scale_to_projector(sequence, axis, evaluator, projector, findings)
         sequence = replace(sequence, projector_size=projector)
     findings.evidence.sort()
     return findings.guess(sequence, sequence.frames)
@@ -246,7 +254,14 @@ def _refine_period_ratio(fine: np.ndarray, coarse: np.ndarray, rough: float) -> 
     angle = (np.angle(coarse) - cut) % TURN
     span = float(np.quantile(angle, 0.99) - np.quantile(angle, 0.01)) / TURN
     reach = min(0.04, 0.4 / (rough * max(span, 0.05)) + 0.01)
-    return fit_turns(np.angle(fine), angle, rough * np.linspace(1 - reach, 1 + reach, 401))
+    ratios = rough * np.linspace(1 - reach, 1 + reach, 401)
+    # from one ratio to the next each unit vector rotates by the same angle
+    unit = np.exp(1j * (np.angle(fine) - ratios[0] * angle))
+    turn, lengths = np.exp(1j * (ratios[0] - ratios[1]) * angle), []
+    for _ in ratios:
+        lengths.append(abs(complex(unit.sum())))
+        unit *= turn
+    return float(ratios[int(np.argmax(lengths))])
 
 
 def _detect_empty_phase(phasor: np.ndarray) -> float | None:
@@ -304,8 +319,8 @@ def _apply_conventions(
     sequence: PatternSequence,
     axis: Axis,
     parts: _AxisBlocks,
-    sample: LineSample,
-    blocks_reader: BlockReader,
+    evaluator: Evaluator,
+    reader: BlockReader,
     findings: _Findings,
 ) -> PatternSequence:
     """Return the sequence with the conventions of one axis that follow from its code and fringes.
@@ -313,36 +328,119 @@ def _apply_conventions(
     These are the complementary bit, the width of the Gray cells, and sign and offset of the phase.
     """
     if parts.code is None:
-        return _check_fringes(sequence, axis, parts.runs, blocks_reader, findings)
-    images = tuple(coded_frames(sequence, axis))
-    reader = AxisReader(sample, list(images))
+        return _check_fringes(sequence, axis, parts.runs, reader, findings)
+    images = _list_images(sequence, axis)
     if not parts.runs:
         findings.notes.append(
             f"axis {axis}: Gray code alone, taken to number the projector's {LINES[axis]} one"
             " by one"
         )
-    elif not np.isfinite(_measure(sequence, axis, reader)[1].turns_per_cell):
-        text = (
-            f"too few edges of the code of axis {axis} are in view to compare it with the fringes"
-        )
-        findings.doubts.append((images, text))
-        return sequence
     else:
-        sequence = _fit_gray_cells(sequence, axis, parts.code.bits[-1], reader, findings)
-        sequence = _fit_phase(sequence, axis, parts.runs[-1], reader, findings)
-    _check_code(images, axis, *_measure(sequence, axis, reader), findings)
+        sequence = _fit_code(sequence, axis, parts, evaluator, findings)
+    explained = _measure_explained(sequence, axis, evaluator)
+    if explained < MOST_EXPLAINED:
+        text = f"axis {axis}: {100 * explained:.0f} % of the pixels fit this code"
+        findings.doubts.append((images, f"{text}, of {100 * MOST_EXPLAINED:.0f} % at least"))
     if parts.runs and parts.runs[-1].gradient["xy".index(axis)] * sequence.sign(axis) < 0:
         text = _describe_reversal(axis, "the code falls", "or a most significant bit is missing")
         findings.doubts.append((images, text))
     return sequence
 
 
-def _measure(
-    sequence: PatternSequence, axis: Axis, reader: AxisReader
-) -> tuple[AxisFrames, Agreement]:
-    """Return the frames of an axis as the sequence describes them, and their agreement."""
-    frames = described_frames(sequence, axis)
-    return frames, measure_agreement(reader, frames)
+def _list_images(sequence: PatternSequence, axis: Axis) -> Indices:
+    """Return the images that show a pattern along an axis."""
+    return tuple(i for i, frame in enumerate(sequence.frames) if frame.axis == axis)
+
+
+def _measure_explained(sequence: PatternSequence, axis: Axis, evaluator: Evaluator) -> float:
+    """Return the share of the pixels that the frames of an axis explain."""
+    m = evaluator.match(described(sequence), axis)
+    return 0.0 if m is None else float(np.mean(m.misfit < limits.GOOD))
+
+
+def _fit_code(
+    sequence: PatternSequence,
+    axis: Axis,
+    parts: _AxisBlocks,
+    evaluator: Evaluator,
+    findings: _Findings,
+) -> PatternSequence:
+    """Return the sequence with the cells of the code, and the sign and the offset of the phase,
+    that explain the images of the axis best."""
+    assert parts.code is not None
+    last = parts.code.bits[-1]
+    marked = [_mark_complementary(sequence, axis, last.image)] if last.inverse is None else []
+    widths = [change_conventions(sequence, axis, gray_cell_px=w) for w in _list_cells(parts)]
+    kinds = [[sequence], marked, widths]
+    steps = len(parts.runs[-1].images)
+    kind, found = _choose_code(kinds, axis, steps, evaluator)
+    if kind == 1:
+        text = "its edges lie half way: 0.5 fringes per cell of all bits"
+        findings.evidence.append((last.image, text))
+    elif kind == 2:
+        ratio = found.gray_cell(axis) / sequence.periods_px(axis)[-1]
+        findings.evidence.append((last.image, f"{ratio:.3g} fringes per Gray cell"))
+    if found.sign(axis) < 0:
+        text = "the phase falls where the code rises"
+        findings.evidence.append((parts.runs[-1].images[0], text))
+    if offset := found.offset_rad(axis):
+        findings.notes.append(
+            f"axis {axis}: the phase is {offset:g} rad where the Gray code begins; written as"
+            " phase_offset, it may as well be gray_origin"
+        )
+    return found
+
+
+def _choose_code(
+    kinds: Sequence[Sequence[PatternSequence]], axis: Axis, steps: int, evaluator: Evaluator
+) -> tuple[int, PatternSequence]:
+    """Return the kind of the candidates that explains the images best, the first of about equal
+    ones; and the best of it, with the sign and the offset of its phase of so many ``steps``."""
+
+    def rate(candidate: PatternSequence, sample: Evaluator = evaluator) -> float:
+        """Return the misfit of a candidate."""
+        m = sample.match(described(candidate), axis)
+        return 1.0 if m is None else float(m.misfit.mean())
+
+    def turn(candidate: PatternSequence, sign: int, turns: float) -> PatternSequence:
+        """Return a candidate with a sign of the phase, and an offset of a share of the period."""
+        offset = float(f"{TURN * wrap(turns):.4g}")
+        return change_conventions(candidate, axis, phase_sign=sign, phase_offset_rad=offset)
+
+    best = {}
+    for kind, candidates in enumerate(kinds):
+        turned = [turn(c, sign, k / 8) for c in candidates for sign in (1, -1) for k in range(8)]
+        if turned:
+            best[kind] = min(turned, key=lambda c: rate(c, evaluator.coarse))
+    losses = {kind: rate(candidate) for kind, candidate in best.items()}
+    most = 2 * min(losses.values()) + 10 * limits.CHANGE_COST
+    kind = min(kind for kind, loss in losses.items() if loss <= most)
+    found, sign = best[kind], best[kind].sign(axis)
+    near = found.offset_rad(axis) / TURN + np.arange(-4, 5) / 64
+    exact = float(min(near, key=lambda turns: rate(turn(found, sign, turns))))
+    usual = [k / m for m in (4, steps) for k in range(m)]
+    snapped = min(usual, key=lambda turns: abs(wrap(exact - turns)))
+    exact = snapped if abs(wrap(exact - snapped)) < SNAPPED else exact
+    return kind, turn(found, sign, exact if abs(wrap(exact)) > NO_OFFSET else 0.0)
+
+
+def _list_cells(parts: _AxisBlocks) -> list[float]:
+    """Return widths of the Gray cells, px, that are possible by the edges of the code and the phase
+    gradient of the finest fringes; in steps of a third of a period over the whole code."""
+    assert parts.code is not None
+    bits = parts.code.bits
+    b, bit = [(b, bit) for b, bit in enumerate(bits) if bit.is_readable and bit.even is None][-1]
+    cell = 1 / (2.0 ** (len(bits) - b) * max(bit.edges))  # two cells from edge to edge of the last
+    turns = cell * _compute_fringe_frequency(parts.runs[-1]) / TURN
+    count = int(np.clip(3 * 2 ** len(bits) * turns * CELL_ERROR, 4, 40))
+    around = turns * (1 + CELL_ERROR * np.arange(-count, count + 1) / count)
+    whole = [float(round(turns))] if turns > 0.9 else []
+    return [float(f"{ASSUMED_PX * each:.4g}") for each in (*whole, *around)]
+
+
+def wrap(turns: float) -> float:
+    """Wrap a number of periods to the range -0.5 ... 0.5."""
+    return float((turns + 0.5) % 1 - 0.5)
 
 
 def _check_fringes(
@@ -356,7 +454,7 @@ def _check_fringes(
     period."""
     if runs[-1].gradient["xy".index(axis)] < 0:
         text = _describe_reversal(axis, "the phase falls", "or phase_sign is -1")
-        findings.doubts.append((tuple(coded_frames(sequence, axis)), text))
+        findings.doubts.append((_list_images(sequence, axis), text))
     if len(runs) == 1:
         findings.notes.append(
             f"axis {axis}: one period without Gray code gives a phase that is not absolute"
@@ -368,60 +466,10 @@ def _check_fringes(
     return sequence
 
 
-def _fit_gray_cells(
-    sequence: PatternSequence, axis: Axis, last: Bit, reader: AxisReader, findings: _Findings
-) -> PatternSequence:
-    """Return the sequence with the ``last`` bit as the complementary one, or with the measured
-    width of the cells."""
-    frames, a = _measure(sequence, axis, reader)
-    # ``turns`` of the finest-like period that described_frames compares, per cell of all bits
-    turns = a.turns_per_cell
-    assert frames.fringe is not None
-    if abs(2 * turns - 1) < MAX_CELL / 2 + WHOLE:
-        if last.inverse is None:
-            sequence = _mark_complementary(sequence, axis, last.image)
-            text = f"its edges lie half way: {turns:.2f} fringes per cell of all bits"
-            findings.evidence.append((last.image, text))
-        return sequence
-    cell = frames.fringe[0] * (
-        round(turns) if turns > 0.9 and abs(turns - round(turns)) < MAX_CELL else turns
-    )
-    if abs(cell - sequence.gray_cell(axis)) > 0.01 * cell:
-        sequence = replace(
-            sequence, gray_cell_px=_replace_axis(sequence.gray_cell_px, axis, float(f"{cell:.4g}"))
-        )
-    findings.evidence.append((last.image, f"{turns:.3g} fringes per Gray cell"))
-    return sequence
-
-
-def _fit_phase(
-    sequence: PatternSequence, axis: Axis, finest: PhaseRun, reader: AxisReader, findings: _Findings
-) -> PatternSequence:
-    """Return the sequence with the sign and the offset of the phase that follow from the Gray
-    code."""
-    if _measure(sequence, axis, reader)[1].rising < 0.5:
-        sequence = replace(sequence, phase_sign=_replace_axis(sequence.phase_sign, axis, -1))
-        findings.evidence.append((finest.images[0], "the phase falls where the code rises"))
-    frames, a = _measure(sequence, axis, reader)
-    late = wrap(a.begin_turns)
-    if abs(late) > 0.1 and frames.fringe is not None:
-        snapped = min(step_turns(len(frames.fringe[1])), key=lambda turns: abs(wrap(late - turns)))
-        turns = snapped if abs(wrap(late - snapped)) < 0.06 else late
-        offset = float(f"{TURN * turns:.4g}")
-        sequence = replace(
-            sequence, phase_offset_rad=_replace_axis(sequence.phase_offset_rad, axis, offset)
-        )
-        findings.notes.append(
-            f"axis {axis}: the phase is {offset:g} rad where the Gray code begins; written as"
-            " phase_offset, it may as well be gray_origin"
-        )
-    return sequence
-
-
 def _scale_to_projector(
     sequence: PatternSequence,
     axis: Axis,
-    sample: LineSample,
+    evaluator: Evaluator,
     projector: Size | None,
     findings: _Findings,
 ) -> PatternSequence:
@@ -441,7 +489,9 @@ def _scale_to_projector(
             )
         return sequence
     extent = projector["xy".index(axis)]
-    reach = _measure(sequence, axis, AxisReader(sample, coded_frames(sequence, axis)))[1].reach_px
+    m = evaluator.match(described(sequence), axis)
+    assert m is not None
+    reach = float(np.quantile(m.coordinate[m.misfit < limits.GOOD], 0.995))
     covered = sequence.gray_cell(axis) * 2**bits if bits else periods[0]
     if not periods:
         if covered < extent or reach > extent + 1:
@@ -469,27 +519,11 @@ def _scale_to_projector(
         )
         for f in sequence.frames
     )
-    cells = sequence.gray_cell_px
-    if (cell := select_axis_value(cells, axis)) is not None:
-        cells = _replace_axis(cells, axis, float(f"{cell * scale:.4g}"))
-    return replace(sequence, frames=scaled, gray_cell_px=cells)
-
-
-def _check_code(
-    images: Indices, axis: Axis, frames: AxisFrames, a: Agreement, findings: _Findings
-) -> None:
-    """Add a doubt where the Gray code and the fringes of an axis do not agree."""
-    if not is_proven(frames, a):
-        shares = (
-            f"{100 * a.rule:.0f} % of the edges obey the Gray code"
-            if np.isfinite(a.rule)
-            else "no edges are read"
-        )
-        if np.isfinite(a.common):
-            shares += f", {100 * a.common:.0f} % of them fall at one phase"
-        findings.doubts.append(
-            (images, f"axis {axis}: {shares}, of {100 * SURE:.0f} % that would be sure")
-        )
+    cell = select_axis_value(sequence.gray_cell_px, axis)
+    sequence = replace(sequence, frames=scaled)
+    if cell is None:
+        return sequence
+    return change_conventions(sequence, axis, gray_cell_px=float(f"{cell * scale:.4g}"))
 
 
 def _mark_complementary(sequence: PatternSequence, axis: Axis, image: int) -> PatternSequence:
@@ -512,9 +546,3 @@ def _describe_reversal(axis: Axis, observation: str, other: str) -> str:
         f"axis {axis}: {observation} {side} in the camera: camera or projector is turned by half a"
         f" turn, {other}"
     )
-
-
-def _replace_axis(values: object, axis: Axis, value: float) -> PerAxis:  # type: ignore[type-arg]
-    """Return a pair of values with that of one axis replaced."""
-    both = values if isinstance(values, PerAxis) else PerAxis(values, values)
-    return both._replace(**{axis: value})

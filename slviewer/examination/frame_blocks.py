@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from slviewer.fringe.line_sample import LineSample
-from slviewer.fringe.residual_sample import evaluate_cosine, fit_cosine, measure_concentration
+from slviewer.examination.line_sample import LineSample
+from slviewer.fringe.cosines import evaluate_cosine, fit_cosine, measure_concentration
 from slviewer.fringe.sequence import Indices
 
 MOST_STEPS = 36

@@ -1,68 +1,17 @@
-"""Sample of the pixels with fringes, and the cosine fitted to each of them."""
+"""Cosines fitted to phase steps, and the sample of rows that statistics of frames come from."""
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-
-from slviewer.fringe import limits
-from slviewer.fringe.layout import Shift
-from slviewer.fringe.phase import Noise
 
 PIXELS = 60_000
 """Number of sampled pixels: their statistics are accurate to half a percent."""
 FEWEST = 500
 """Number of valid pixels below which a frame is not judged."""
-BESIDE = 2
-"""Number of frames before and after those of a period that are compared with them."""
 HIGHEST = 6
 """The highest harmonic of the fringe that is attributed to gamma."""
 ONE_SIDED = 0.5
 """Length of the mean unit phasor from which pixels do not cover all phases of the fringe."""
-# a frame that alone clips more of the pixels shows something else, and does not count as clipped
-_OUTLIER_CLIPS = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Fringe:
-    """Frames of one period at p valid pixels, float32 grey levels.
-
-    ``seen``, ``frames`` and ``fitted`` (n, p): as captured; less the harmonics that gamma adds to
-    all of them; and background + modulation cos. ``beside``: frames shown right before and after
-    these, by index, (p,) each. ``phasor`` (p,) complex64, modulation e^(i phase). ``own``: number
-    of harmonics fitted per pixel. ``noise``: (a, b), see `noise.measure_noise`. ``roughness``: grey
-    levels by which neighbouring pixels differ, noise and texture.
-    """
-
-    shift: Shift
-    seen: np.ndarray
-    frames: np.ndarray
-    fitted: np.ndarray
-    beside: dict[int, np.ndarray]
-    phasor: np.ndarray
-    own: int
-    noise: Noise
-    roughness: float
-
-    @property
-    def steps(self) -> int:
-        """Number of phase steps."""
-        return len(self.frames)
-
-    @property
-    def keep(self) -> np.ndarray:
-        """Matrix (n, n) that projects frames onto their residual.
-
-        It removes a background and the harmonics up to ``own``.
-        """
-        basis, _ = np.linalg.qr(cosine_columns(np.arange(self.steps), self.steps, self.own))
-        return np.eye(self.steps) - basis @ basis.T
-
-    @property
-    def turns(self) -> bool:
-        """Whether the pixels cover all phases of the fringe; only then can light and phase changes
-        be separated."""
-        return measure_concentration(self.phasor) < ONE_SIDED
 
 
 def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
@@ -80,43 +29,6 @@ def select_rows(height: int, width: int, pixels: int = PIXELS) -> np.ndarray:
     """Return the indices of evenly spread rows that hold about ``pixels`` pixels."""
     count = min(height, max(1, round(pixels / width)))
     return np.unique(np.linspace(0, height - 1, count).round().astype(int))
-
-
-def sample_fringe(stack: np.ndarray, shift: Shift, noise: Noise, white: float) -> Fringe | None:
-    """Return the sampled fringes of one period of a stack (n, h, w); None where too few pixels are
-    modulated.
-
-    ``noise``: (a, b) of the grey levels; ``white``: level at which the camera clips.
-    """
-    rows = select_rows(*stack.shape[1:])
-    frames = np.stack([stack[i][rows].ravel() for i in shift.indices])
-    clipped = (frames >= white) | (frames == 0)
-    frames = frames.astype(np.float32)
-    n = len(frames)
-    background, phasor = fit_cosine(frames)
-    rough = estimate_roughness(frames, stack.shape[2])
-    least = max(limits.DARK_LEVELS * white / 255, limits.DARK_SIGMAS * rough)
-    modulated = np.abs(phasor) > least
-    if np.count_nonzero(modulated) < FEWEST:
-        return None
-    shares = clipped[:, modulated].mean(axis=1)
-    counts = shares <= max(_OUTLIER_CLIPS, 2 * float(np.median(shares)))
-    valid = modulated & ~clipped[counts].any(axis=0)
-    if np.count_nonzero(valid) < FEWEST:
-        return None
-    levels, background, phasor = frames[:, valid], background[valid], phasor[valid]
-    frames = levels
-    # Harmonics are fitted to each pixel as long as enough degrees of freedom remain.
-    own = 2 if n >= 10 else 1
-    if n > 3:
-        frames = levels - fit_common_harmonics(levels, phasor, own)
-        background, phasor = fit_cosine(frames)
-    fitted = evaluate_cosine(background, phasor, n)
-    neighbours = {
-        i: stack[i][rows].ravel()[valid].astype(np.float32)
-        for i in _list_adjacent_frames(shift.indices, len(stack))
-    }
-    return Fringe(shift, levels, frames, fitted, neighbours, phasor, own, noise, rough)
 
 
 def estimate_roughness(frames: np.ndarray, width: int) -> float:
@@ -215,12 +127,3 @@ def _list_common_harmonics(
             waves.append(np.stack([np.cos(angle), -np.sin(angle)]))
             aliases.append((np.float32((1 if 2 * q == n else 2) / n), direct, mirrored))
     return np.concatenate(waves).astype(np.float32), aliases
-
-
-def _list_adjacent_frames(indices: tuple[int, ...], count: int) -> list[int]:
-    """Return the frames up to ``BESIDE`` before and after a period; none if its frames are not
-    consecutive."""
-    if indices != tuple(range(indices[0], indices[0] + len(indices))):
-        return []
-    first, last = max(indices[0] - BESIDE, 0), min(indices[-1] + BESIDE + 1, count)
-    return [*range(first, indices[0]), *range(indices[-1] + 1, last)]

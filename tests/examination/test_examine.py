@@ -1,5 +1,5 @@
-"""What a description says is compared with the frames, and the hypothesis that explains them is
-named."""
+"""Faults of the order of the frames and of their description are named, and sound captures raise no
+alarm."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,11 +15,8 @@ from slviewer.devices.capture import capture_frames
 from slviewer.devices.protocols import Rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
+from slviewer.examination.examine import examine
 from slviewer.fringe.decode import decode
-from slviewer.fringe.description_check import check_description
-from slviewer.fringe.frame_light import detect_light_faults, estimate_frame_light
-from slviewer.fringe.frame_likeness import FrameLikeness
-from slviewer.fringe.line_sample import sample_lines
 from slviewer.fringe.presets import (
     AXES,
     bits_for,
@@ -31,6 +28,7 @@ from slviewer.fringe.presets import (
     phase_steps,
 )
 from slviewer.fringe.sequence import Frame, PatternSequence, PerAxis
+from slviewer.records.verdict import Finding
 from slviewer.simulation.rig import letter
 
 pytestmark = pytest.mark.computes
@@ -81,7 +79,7 @@ def rig_before(thing: Thing, gamma: float) -> Rig:
 
 
 @cache
-def taken(name: str, thing: Thing = "board", gamma: float = 1.0) -> Capture:
+def captured(name: str, thing: Thing = "board", gamma: float = 1.0) -> Capture:
     rig, sequence = rig_before(thing, gamma), SEQUENCES[name]()
     with rig.opened():
         frames = capture_frames(rig, sequence)
@@ -90,18 +88,28 @@ def taken(name: str, thing: Thing = "board", gamma: float = 1.0) -> Capture:
 
 
 def causes(sequence: PatternSequence, frames: np.ndarray) -> list[tuple[str, str | None]]:
-    return [(c.cause, c.axis) for c in check_description(sequence, np.array(frames))]
+    """Cause and axis of what rejects a capture."""
+    return [(f.cause, f.axis) for f in examine(sequence, frames).rejected]
+
+
+def root(sequence: PatternSequence, frames: np.ndarray) -> Finding:
+    return examine(sequence, frames).rejected[0]
 
 
 @pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
 @pytest.mark.parametrize(("thing", "gamma"), [("board", 1.0), ("object", 2.2)])
-def test_a_right_description_is_not_doubted(name: str, thing: Thing, gamma: float) -> None:
-    sequence, frames = taken(name, thing, gamma)
-    assert causes(sequence, frames) == []
+def test_a_sound_capture_is_not_accused(name: str, thing: Thing, gamma: float) -> None:
+    sequence, frames = captured(name, thing, gamma)
     dim = np.rint(frames * 0.15 + 20).astype(np.uint8)
-    assert causes(sequence, dim) == []
     blurred = np.stack([cv2.GaussianBlur(frame, (0, 0), 0.8) for frame in frames])
-    assert causes(sequence, blurred) == []
+    # a camera of a quarter of the pixels does not resolve stripes of single projector pixels
+    is_known = {"blur"} if name in ("gray", "white") else set()
+    is_known |= {"gamma"} if name in ("three", "complementary") and gamma != 1 else set()
+    for stack in (frames, dim, blurred):
+        assert causes(sequence, stack) == []
+    found = examine(sequence, frames).findings
+    assert {f.cause for f in found} <= is_known
+    assert ("gamma" in {f.cause for f in found}) == (name == "three" and gamma != 1) or is_known
 
 
 def late(frames: np.ndarray) -> np.ndarray:
@@ -114,9 +122,9 @@ def early(frames: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
 def test_frames_that_are_all_late_are_named(name: str) -> None:
-    sequence, frames = taken(name)
-    found = check_description(sequence, late(frames))
-    assert [(c.cause, c.value) for c in found] == [("frame-lag", 1.0)]
+    sequence, frames = captured(name)
+    found = examine(sequence, late(frames)).rejected
+    assert [(f.cause, f.value) for f in found] == [("frame-lag", 1.0)]
 
 
 @pytest.mark.parametrize(
@@ -124,9 +132,9 @@ def test_frames_that_are_all_late_are_named(name: str) -> None:
 )
 def test_frames_that_are_all_early_are_named(name: str) -> None:
     """Of three steps the first may be missed, and nothing is left of that phase."""
-    sequence, frames = taken(name)
-    found = check_description(sequence, early(frames))
-    assert [(c.cause, c.value) for c in found] == [("frame-lag", -1.0)]
+    sequence, frames = captured(name)
+    found = examine(sequence, early(frames)).rejected
+    assert [(f.cause, f.value) for f in found] == [("frame-lag", -1.0)]
 
 
 EXCHANGED = [("p18", 4), ("gray", 24), ("complementary", 5), ("multifrequency", 20)]
@@ -134,12 +142,12 @@ EXCHANGED = [("p18", 4), ("gray", 24), ("complementary", 5), ("multifrequency", 
 
 @pytest.mark.parametrize(("name", "frame"), variants(EXCHANGED, ("complementary", 5)))
 def test_exchanged_frames_are_named(name: str, frame: int) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     order = list(range(len(frames)))
     order[frame], order[frame + 1] = frame + 1, frame
-    found = check_description(sequence, frames[order])
-    assert found[0].cause == "frame-order"
-    assert not missing_facts(found[0].message, f"frames {frame + 1} and {frame + 2}")
+    finding = root(sequence, frames[order])
+    assert (finding.cause, finding.frames) == ("frame-order", (frame, frame + 1))
+    assert not missing_facts(finding.sentence, frame + 1, frame + 2)  # counted from 1
 
 
 @pytest.mark.parametrize(
@@ -147,10 +155,10 @@ def test_exchanged_frames_are_named(name: str, frame: int) -> None:
     variants([("gray", 24), ("complementary", 16), ("white", 3)], ("complementary", 16)),
 )
 def test_a_missing_frame_is_named(name: str, frame: int) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     short = np.concatenate([np.delete(frames, frame, axis=0), frames[-1:]])
-    found = check_description(sequence, short)
-    assert (found[0].cause, found[0].value) == ("missing-frame", frame)
+    finding = root(sequence, short)
+    assert (finding.cause, finding.frames) == ("missing-frame", (frame,))
 
 
 REPEATED = [("gray", 25), ("gray", 26), ("complementary", 7), ("inverses", 14)]
@@ -158,24 +166,24 @@ REPEATED = [("gray", 25), ("gray", 26), ("complementary", 7), ("inverses", 14)]
 
 @pytest.mark.parametrize(("name", "frame"), variants(REPEATED, ("complementary", 7)))
 def test_a_repeated_image_is_named(name: str, frame: int) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     repeated = frames.copy()
     repeated[frame] = frames[frame - 1]
-    found = check_description(sequence, repeated)
-    assert [(c.cause, c.value) for c in found] == [("duplicate-frame", float(frame))]
-    assert not missing_facts(found[0].message, f"frame {frame + 1}", f"frame {frame}")
+    found = examine(sequence, repeated).rejected
+    assert [(f.cause, f.frames) for f in found] == [("duplicate-frame", (frame,))]
+    assert not missing_facts(found[0].sentence, frame + 1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", [5, 6])
 def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
-    sequence, frames = taken("complementary")
+    sequence, frames = captured("complementary")
     brighter = np.minimum(
         0.7 * frames + 60 * (np.arange(len(frames)) >= frame)[:, None, None], 255
     ).astype(np.uint8)
-    assert check_description(sequence, brighter) == ()
-    suspects = detect_light_faults(sequence, estimate_frame_light(sequence, brighter))
-    assert [(s.fault, s.frame) for s in suspects] == [("room-light", frame)]
+    (finding,) = examine(sequence, brighter).findings
+    assert (finding.cause, finding.severity) == ("room-light", "doubtful")
+    assert finding.frames == (frame,)
     for axis in AXES:
         # Copies, as kernels are compiled anew for arrays that cannot be written.
         truth, seen = (
@@ -190,7 +198,7 @@ def test_room_light_among_gray_frames_is_corrected(frame: int) -> None:
     "name", variants([name for name in SEQUENCES if name != "multifrequency"], "three")
 )
 def test_bits_in_reverse_order_are_named(name: str) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     frames = frames.copy()
     for axis in AXES:
         for kind in ("gray", "inverse"):
@@ -201,19 +209,19 @@ def test_bits_in_reverse_order_are_named(name: str) -> None:
 
 @pytest.mark.parametrize("name", variants(["gray", "inverses"], "inverses"))
 def test_inverses_taken_for_patterns_are_named(name: str) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     frames = frames.copy()
     for axis in AXES:
         pattern, inverse = sequence.find("gray", axis), sequence.find("inverse", axis)
         frames[pattern + inverse] = frames[inverse + pattern]
-    found = check_description(sequence, frames)
-    assert [(c.cause, c.axis) for c in found] == [("bit-order", "x"), ("bit-order", "y")]
-    assert not any(missing_facts(c.message, "inverse") for c in found)
+    found = examine(sequence, frames).rejected
+    assert [(f.cause, f.axis) for f in found] == [("bit-order", "x"), ("bit-order", "y")]
+    assert not any(missing_facts(f.sentence, "inverses") for f in found)
 
 
 @pytest.mark.parametrize("name", variants(SEQUENCES, "three"))
 def test_exchanged_axes_are_named(name: str) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     other = {"x": "y", "y": "x", None: None}
     exchanged = replace(
         sequence, frames=tuple(replace(f, axis=other[f.axis]) for f in sequence.frames)
@@ -225,7 +233,7 @@ def test_exchanged_axes_are_named(name: str) -> None:
     "kinds", [["phase"], pytest.param(["gray", "complementary"], marks=pytest.mark.slow)]
 )
 def test_steps_or_bits_of_the_other_axis_are_named(kinds: list[str]) -> None:
-    sequence, frames = taken("complementary")
+    sequence, frames = captured("complementary")
     x, y = (
         [i for i, f in enumerate(sequence.frames) if f.axis == axis and f.kind in kinds]
         for axis in AXES
@@ -237,7 +245,7 @@ def test_steps_or_bits_of_the_other_axis_are_named(kinds: list[str]) -> None:
 
 @pytest.mark.slow
 def test_bits_in_reverse_order_after_the_complementary_one_are_named() -> None:
-    sequence, frames = taken("complementary")
+    sequence, frames = captured("complementary")
     order = np.arange(len(frames))
     for axis in AXES:
         places = [
@@ -254,97 +262,116 @@ def test_bits_in_reverse_order_after_the_complementary_one_are_named() -> None:
     "steps", [[*range(0, 18, 2), *range(1, 18, 2)], [k // 2 + 9 * (k % 2) for k in range(18)]]
 )
 def test_all_steps_in_another_order_are_named(steps: list[int]) -> None:
-    sequence, frames = taken("p18")
+    sequence, frames = captured("p18")
     order = np.arange(len(frames))
     places = np.array(sequence.find("phase", "y"))
     order[places] = places[steps]
-    (contradiction,) = check_description(sequence, frames[order])
-    assert (contradiction.cause, contradiction.axis) == ("step-order", "y")
-    assert not missing_facts(contradiction.message, ", ".join(map(str, steps)))
+    (finding,) = examine(sequence, frames[order]).findings
+    assert finding.cause == "step-order"
+    # the described numbers of the images of y; those of x are in order
+    places = sequence.find("phase", "x"), places[np.argsort(steps)]
+    assert not missing_facts(finding.remedy, *(", ".join(map(str, p)) for p in places))
 
 
 @pytest.mark.slow
 def test_a_lamp_that_saturates_the_later_frames_is_named() -> None:
-    sequence, frames = taken("p18")
+    sequence, frames = captured("p18")
     lamp = np.where(np.arange(len(frames)) >= 20, 170, 0)[:, None, None]
     switched_on = np.clip(frames.astype(int) + lamp, 0, 255).astype(np.uint8)
-    (contradiction,) = check_description(sequence, switched_on)
-    assert (contradiction.cause, contradiction.value) == ("room-light", 20.0)
-    assert not missing_facts(contradiction.message, "frame 21")
+    assert causes(sequence, switched_on) == [("saturation", None)]
 
 
 @pytest.mark.parametrize("name", variants(STEPS_AND_CODE, "three"))
 def test_the_sign_of_one_axis_is_named(name: str) -> None:
-    sequence, frames = taken(name)
-    found = check_description(replace(sequence, phase_sign=PerAxis(1, -1)), frames)
-    assert [(c.cause, c.axis, c.value) for c in found] == [("step-order", "y", 1.0)]
+    sequence, frames = captured(name)
+    found = examine(replace(sequence, phase_sign=PerAxis(1, -1)), frames).findings
+    assert [(f.cause, f.axis, f.value) for f in found] == [("step-order", "y", 1.0)]
 
 
 @pytest.mark.slow
 def test_the_sign_of_one_axis_mirrors_a_phase_without_code() -> None:
-    sequence, frames = taken("multifrequency")
-    found = check_description(replace(sequence, phase_sign=PerAxis(-1, 1)), frames)
-    assert (found[0].cause, found[0].axis, found[0].value) == ("step-order", "x", 1.0)
+    sequence, frames = captured("multifrequency")
+    finding = root(replace(sequence, phase_sign=PerAxis(-1, 1)), frames)
+    # the same as a projector that shows its columns from the other end
+    assert (finding.cause, finding.axis) in [("step-order", "x"), ("axis-reversed", "x")]
 
 
 @pytest.mark.parametrize("name", variants(STEPS_AND_CODE, "three"))
 def test_steps_in_reverse_order_are_named(name: str) -> None:
-    sequence, frames = taken(name)
+    sequence, frames = captured(name)
     steps = tuple(
         replace(f, step=f.steps - 1 - f.step) if f.kind == "phase" else f for f in sequence.frames
     )
-    found = check_description(replace(sequence, frames=steps), frames)
-    assert [(c.cause, c.axis) for c in found] == [("step-order", "x"), ("step-order", "y")]
-    assert not any(missing_facts(c.message, "reverse") for c in found)
+    found = examine(replace(sequence, frames=steps), frames).findings
+    assert {f.cause for f in found} == {"step-order"}
+    # as an order of the images of both axes, or as another sign of each
+    assert {f.axis for f in found} in ({None}, {"x", "y"})
 
 
 @pytest.mark.parametrize("name", variants(["p18", "complementary", "three"], "three"))
 @pytest.mark.parametrize("turns", [0.25, 0.5])
 def test_a_stated_origin_is_compared_with_the_fringes(name: str, turns: float) -> None:
-    sequence, frames = taken(name)
-    period = sequence.period_px("x")
-    found = check_description(replace(sequence, gray_origin_px=-0.5 + turns * period), frames)
-    origins = [c.value for c in found if c.cause == "gray-origin"]
-    assert origins == pytest.approx([-0.5, -0.5], abs=0.15)
-    offsets = [c.value for c in found if c.cause == "phase-offset"]
-    assert np.abs(offsets) == pytest.approx(2 * np.pi * turns, abs=0.06)
-    assert found[0].cause == ("gray-origin" if turns == 0.5 else "phase-offset")
+    """Another origin, and another offset of the phase, fit the same images: columns are numbered
+    elsewhere from."""
+    sequence, frames = captured(name)
+    period, steps = sequence.period_px("x"), sequence.frames[0].steps
+    found = examine(replace(sequence, gray_origin_px=-0.5 + turns * period), frames).findings
+    assert [f.axis for f in found] == ["x", "y"]
+    for finding in found:
+        assert finding.cause in ("gray-origin", "phase-offset") and finding.value is not None
+        shift = -finding.value / (2 * np.pi)
+        if finding.cause == "gray-origin":
+            shift = turns - (finding.value + 0.5) / period
+        # to one of the steps that are tried
+        assert abs((shift - turns + 0.5) % 1 - 0.5) < 1 / steps + 0.01
 
 
 def test_steps_that_begin_later_are_named_with_the_offset() -> None:
-    sequence, frames = taken("complementary")
+    sequence, frames = captured("complementary")
     steps = tuple(
         replace(f, step=(f.step - 1) % 4) if f.kind == "phase" else f for f in sequence.frames
     )
-    found = check_description(replace(sequence, frames=steps), frames)
-    assert found[0].cause == "phase-offset"
-    assert found[0].value == pytest.approx(np.pi / 2, abs=0.03)
+    found = examine(replace(sequence, frames=steps), frames).findings
+    assert [(f.cause, f.axis) for f in found] == [("phase-offset", "x"), ("phase-offset", "y")]
+    assert [f.value for f in found] == pytest.approx([np.pi / 2] * 2, abs=0.03)
 
 
-CELLS = [("p18", 16.0), ("p18", 36.0), ("three", 20.25), ("complementary", 27.0)]
+CELLS = [("p18", 16.0), ("three", 20.25), ("complementary", 27.0)]
 
 
-@pytest.mark.parametrize(("name", "cell"), variants(CELLS, ("three", 20.25)))
-def test_cells_unlike_the_fringes_are_named(name: str, cell: float) -> None:
-    """The frames' cells are as wide as their period; described is a period for which they would not
-    be."""
-    sequence, frames = taken(name)
+def describe_cells(name: str, cell: float) -> tuple[PatternSequence, np.ndarray, float]:
+    """Describe a period for which the cells would not be as wide as it, as they are: sequence,
+    frames, and the true period."""
+    sequence, frames = captured(name)
     true = sequence.period_px("x")
     described = tuple(
         replace(f, period_px=true**2 / cell) if f.kind == "phase" else f for f in sequence.frames
     )
-    bits = replace(sequence, frames=described, gray_cell_px=true)
-    found = check_description(bits, frames)
-    assert found[0].cause == "gray-cell"
-    assert found[0].value == pytest.approx(true**2 / cell, rel=0.003)
+    return replace(sequence, frames=described, gray_cell_px=true), frames, true
+
+
+@pytest.mark.parametrize(("name", "cell"), variants(CELLS, ("three", 20.25)))
+def test_cells_unlike_the_fringes_are_named(name: str, cell: float) -> None:
+    """That the period is wrong fits as well as that the cells are: both become as wide."""
+    sequence, frames, true = describe_cells(name, cell)
+    found = examine(sequence, frames).findings
+    assert [(f.cause, f.axis) for f in found] == [("fringe-period", "x"), ("fringe-period", "y")]
+    assert [f.value for f in found] == pytest.approx([true] * 2, rel=0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="two periods in a cell fit any phases")
+def test_cells_of_two_periods_are_named() -> None:
+    sequence, frames, _ = describe_cells("p18", 36.0)
+    assert {f.cause for f in examine(sequence, frames).findings} <= {"gray-cell", "fringe-period"}
 
 
 @pytest.mark.parametrize("name", variants(["gray", "p18", "multifrequency", "three"], "three"))
 def test_a_projector_that_is_too_small_is_named(name: str) -> None:
-    sequence, frames = taken(name)
-    found = check_description(replace(sequence, projector_size=(600, 1140)), frames)
-    assert (found[0].cause, found[0].axis) == ("projector-size", "x")
-    assert 660 < (found[0].value or 0) < 700
+    sequence, frames = captured(name)
+    finding = root(replace(sequence, projector_size=(600, 1140)), frames)
+    assert (finding.cause, finding.axis) == ("projector-size", "x")
+    assert 660 < (finding.value or 0) < 700
 
 
 @pytest.mark.parametrize(
@@ -358,16 +385,17 @@ def test_a_projector_that_is_too_small_is_named(name: str) -> None:
 def test_frames_without_a_pattern_are_named(
     spoil: Callable[[np.ndarray], np.ndarray], cause: str
 ) -> None:
-    sequence, frames = taken("three")
-    found = check_description(sequence, spoil(frames))
-    assert [c.cause for c in found] == [cause]
-    assert not missing_facts(found[0].message, "0.0 %")
+    sequence, frames = captured("three")
+    found = examine(sequence, spoil(frames)).findings
+    assert [f.cause for f in found] == [cause]
+    share = "100 %" if cause == "saturation" else "0.0 %"
+    assert not missing_facts(found[0].sentence, share)
 
 
 def test_a_dim_wall_does_not_decide() -> None:
     """Half of the image sees the patterns by scattered light alone: dimly, and a third of a period
     away."""
-    sequence, frames = taken("complementary")
+    sequence, frames = captured("complementary")
     dim = np.rint(np.roll(frames, 41, axis=2) * 0.06 + 5).astype(np.uint8)
     both = np.concatenate([frames, dim], axis=2)
     assert causes(sequence, both) == []
@@ -375,33 +403,32 @@ def test_a_dim_wall_does_not_decide() -> None:
 
 @pytest.mark.slow
 def test_frames_of_no_pattern_that_was_described_are_unreadable() -> None:
-    sequence, frames = taken("complementary")
+    sequence, frames = captured("complementary")
     order = np.random.default_rng(3).permutation(len(frames))
-    assert [cause for cause, _ in causes(sequence, frames[order])][-1] in (
-        "unreadable",
-        "frame-order",
-    )
+    assert "unreadable" in [cause for cause, _ in causes(sequence, frames[order])]
 
 
-def test_three_frames_may_be_saturated_and_repeated() -> None:
+@pytest.mark.parametrize("amplitude", [100.0, 130.0])
+def test_three_frames_are_enough_to_notice_a_copy(amplitude: float) -> None:
+    """The larger amplitude saturates."""
     sequence = PatternSequence((320, 240), tuple(phase_steps("x", 3, 360.0)))
-    angle = 2 * np.pi * np.arange(320) / 360
-    frames = np.stack(
-        [np.tile(140 + 130 * np.cos(angle - 2 * np.pi * k / 3), (240, 1)) for k in (0, 1, 1)]
-    )
-    found = check_description(sequence, np.clip(frames, 0, 255).astype(np.uint8))
-    assert found and found[0].cause in ("saturation", "frame-repeated", "step-order", "unreadable")
+    angle = 2 * np.pi * (np.arange(320) / 360 - np.arange(3)[:, None] / 3)
+    levels = np.clip(140 + amplitude * np.cos(angle), 0, 255).astype(np.uint8)
+    frames = np.repeat(levels[:, None], 240, axis=1)
+    assert causes(sequence, frames) == []
+    finding = root(sequence, frames[[0, 1, 1]])
+    assert (finding.cause, finding.frames) == ("duplicate-frame", (2,))
 
 
 def test_inverses_may_be_captured_in_another_order_than_their_bits() -> None:
-    sequence, frames = taken("inverses")
-    blurred = np.stack([cv2.GaussianBlur(frame, None, 16.0) for frame in frames])
+    sequence, frames = captured("inverses")
+    blurred = np.stack([cv2.GaussianBlur(frame, None, 4.0) for frame in frames])
     last = [i for axis in AXES for i in reversed(sequence.find("inverse", axis))]
     order = [*(i for i in range(len(frames)) if i not in last), *last]
     turned = replace(sequence, frames=tuple(sequence.frames[i] for i in order))
-    as_captured, by_bit = (
-        FrameLikeness(each, sample_lines(each, stack))._finest
-        for each, stack in ((turned, blurred[order]), (sequence, blurred))
+    by_bit, as_captured = (
+        [(f.cause, f.axis, {*f.frames}) for f in examine(each, stack).findings]
+        for each, stack in ((sequence, blurred), (turned, blurred[order]))
     )
-    # the finest bits are blurred to one grey
-    assert as_captured == by_bit and max(by_bit.values()) < 6
+    expected = [(cause, axis, {order.index(i) for i in own}) for cause, axis, own in by_bit]
+    assert as_captured == expected and len(by_bit) < 3

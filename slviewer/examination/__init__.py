@@ -1,0 +1,1 @@
+"""Examination of a capture: which explanation of all its frames fits them best."""

@@ -1,0 +1,85 @@
+"""Patterns of an axis as functions of the projector coordinate."""
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from slviewer.errors import InputError
+from slviewer.examination import limits
+from slviewer.fringe.levels import find_common_range
+from slviewer.fringe.sequence import Axis, Frame, PatternSequence
+
+
+@dataclass(frozen=True, eq=False)
+class Atoms:
+    """Values (k, u) float32 from 0, dark, to 1, bright, of the k frames of an axis at coordinates
+    ``start_px + step_px * i``.
+
+    ``frames`` (k,): their indices in the sequence; ``groups`` (k,): a number for all steps of one
+    period, -1 for stripes and for even frames.
+    """
+
+    frames: list[int]
+    groups: np.ndarray
+    values: np.ndarray
+    start_px: float
+    step_px: float
+
+    def at(self, coordinate: np.ndarray) -> np.ndarray:
+        """Return the values (k, p) at coordinates (p,) px, interpolated."""
+        place = (coordinate - self.start_px) / self.step_px
+        place = np.clip(place, 0, self.values.shape[1] - 1.001)
+        below = place.astype(int)
+        part = (place - below).astype(np.float32)
+        return self.values[:, below] * (1 - part) + self.values[:, below + 1] * part
+
+
+def tabulate_atoms(sequence: PatternSequence, axis: Axis) -> Atoms:
+    """Tabulate the patterns of an axis over all coordinates that they distinguish."""
+    frames = [i for i in sequence.select(axis) if sequence.frames[i].kind != "texture"]
+    start, end, step = _find_range(sequence, axis)
+    u = np.arange(start, end + step, step)
+    values = [evaluate_frame(sequence, axis, sequence.frames[i], u) for i in frames]
+    periods = sequence.periods_px(axis)
+    kinds = [sequence.frames[i] for i in frames]
+    groups = [periods.index(f.period_px) if f.kind == "phase" else -1 for f in kinds]
+    return Atoms(frames, np.array(groups), np.stack(values).astype(np.float32), start, step)
+
+
+def evaluate_frame(
+    sequence: PatternSequence, axis: Axis, frame: Frame, u: np.ndarray
+) -> np.ndarray:
+    """Return the pattern of one frame, 0 to 1, at projector coordinates ``u`` px."""
+    if frame.kind in ("white", "texture", "black"):
+        return np.full(u.shape, float(frame.kind != "black"))
+    if frame.kind == "phase":
+        turns = u / frame.period_px + sequence.sign(axis) * frame.step / frame.steps
+        return np.asarray(0.5 + 0.5 * np.cos(2 * np.pi * turns + sequence.offset_rad(axis)))
+    half = frame.kind == "complementary"
+    cells = (1 + half) * (u - sequence.origin_px(axis)) / sequence.gray_cell(axis)
+    code = np.floor(cells).astype(np.int64)
+    place = 0 if half else len(sequence.find("gray", axis)) - 1 - frame.bit
+    bit = ((code ^ (code >> 1)) >> place) & 1
+    return np.asarray(bit == (frame.kind != "inverse"), float)
+
+
+def _find_range(sequence: PatternSequence, axis: Axis) -> tuple[float, float, float]:
+    """Return the least and the largest coordinate that the patterns distinguish, and the step of
+    the table, px."""
+    periods, bits = sequence.periods_px(axis), len(sequence.find("gray", axis))
+    extent = float(sequence.extent(axis)) if sequence.projector_size else inf
+    if bits:
+        cell = sequence.gray_cell(axis)
+        step = periods[-1] / limits.STEPS_PER_PERIOD if periods else cell
+        start = sequence.origin_px(axis) + step / 2  # edges are between two steps
+        return start, start + min(2**bits * cell, limits.BEYOND_CODE * extent), step
+    step = periods[-1] / limits.STEPS_PER_PERIOD
+    if extent < inf:
+        span = max(limits.BEYOND * extent, periods[0])
+        start = -0.5 - (span - extent) / 2
+        return start, start + span, step
+    try:
+        return -0.5, max(periods[0], find_common_range(periods)), step
+    except InputError:
+        return -0.5, periods[0], step

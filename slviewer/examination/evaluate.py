@@ -1,0 +1,186 @@
+"""Evaluation of hypotheses about a capture on its sample."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from slviewer.examination import limits
+from slviewer.examination.atoms import Atoms, tabulate_atoms
+from slviewer.examination.match import Match, match
+from slviewer.examination.sample import CaptureSample
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.records.verdict import Cause
+
+Images = tuple[int | None, ...]
+"""Image that shows each frame of a sequence, None for a missing one."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What the images of a capture show: image ``images[i]`` shows frame i of ``sequence``.
+
+    ``cause``: the fault that it stands for, None for the capture as described; ``frames``: those
+    that it names; ``axis``: that it concerns, None for all; ``value``: of the description, where it
+    changes one; ``cost``: misfit that simpler hypotheses are allowed before this one is chosen.
+    """
+
+    cause: Cause | None
+    sequence: PatternSequence
+    images: Images
+    frames: tuple[int, ...] = ()
+    axis: Axis | None = None
+    value: float | None = None
+    cost: float = 0.0
+
+    @property
+    def changed(self) -> list[int]:
+        """Pattern frames that are seen in another image than their own, or in none."""
+        kinds = self.sequence.frames
+        return [i for i, j in enumerate(self.images) if j != i and kinds[i].kind != "texture"]
+
+    @property
+    def loses_images(self) -> bool:
+        """Whether no image shows one of the pattern frames."""
+        return any(self.images[i] is None for i in self.changed)
+
+    @property
+    def excluded(self) -> int | None:
+        """The one frame that no image shows, if all others are in place; else None."""
+        changed = self.changed
+        return changed[0] if len(changed) == 1 and self.images[changed[0]] is None else None
+
+
+def described(sequence: PatternSequence) -> Hypothesis:
+    """Return the hypothesis that all images show what the description says."""
+    return Hypothesis(None, sequence, tuple(range(len(sequence.frames))))
+
+
+@dataclass(eq=False)
+class Evaluator:
+    """Matches of a sample under hypotheses; those that several share are computed once."""
+
+    sample: CaptureSample
+    _atoms: dict[object, Atoms] = field(default_factory=dict)
+    _matches: dict[object, Match] = field(default_factory=dict)
+
+    @cached_property
+    def coarse(self) -> "Evaluator":
+        """The same on a small part of the sample."""
+        by_axis = {axis: sample.coarse for axis, sample in self.sample.by_axis.items()}
+        return Evaluator(replace(self.sample, by_axis=by_axis), self._atoms)
+
+    def atoms(self, hypothesis: Hypothesis, axis: Axis) -> Atoms:
+        """Return the patterns of an axis."""
+        key = _list_conventions(hypothesis.sequence, axis)
+        if key not in self._atoms:
+            self._atoms[key] = tabulate_atoms(hypothesis.sequence, axis)
+        return self._atoms[key]
+
+    def match(self, hypothesis: Hypothesis, axis: Axis) -> Match | None:
+        """Return the match of one axis; None where it has fewer than four images."""
+        atoms = self.atoms(hypothesis, axis)
+        images = tuple(hypothesis.images[i] for i in atoms.frames)
+        if axis not in self.sample.by_axis or len(images) - images.count(None) < 4:
+            return None
+        key = _list_conventions(hypothesis.sequence, axis), images
+        if key not in self._matches:
+            self._matches[key] = match(self.sample.by_axis[axis], atoms, list(images))
+        return self._matches[key]
+
+    def compare(self, base: Hypothesis, other: Hypothesis) -> "Comparison":
+        """Compare a hypothesis with the ``base``; on the images of both, where one is left out."""
+        gains, losses = [], []
+        for axis, sample in self.sample.by_axis.items():
+            a, b = self.match(base, axis), self.match(other, axis)
+            if a is None or b is None:
+                gains.append(np.zeros(len(sample.swing)))
+                losses.append(np.zeros(0) if a is None else a.misfit)
+            elif len(a.images) == len(b.images):
+                gains.append(a.misfit - b.misfit)
+                losses.append(a.misfit)
+            else:
+                common = [i for i in a.images if i in b.images]
+                total = np.maximum(sample.levels[common, 1].var(axis=0) * len(common), 1e-6)
+                loss = []
+                for m in (a, b):
+                    residual = m.residual(sample)[[m.images.index(i) for i in common]]
+                    loss.append(np.minimum(np.einsum("kp,kp->p", residual, residual) / total, 1))
+                gains.append(loss[0] - loss[1])
+                losses.append(loss[0])
+        gain = np.concatenate(gains)
+        mean, error = float(gain.mean()), float(gain.std()) / np.sqrt(len(gain))
+        every = np.concatenate(losses)
+        return Comparison(float(every.mean()) if every.size else 1.0, mean, mean / (error + 1e-9))
+
+    def residuals(self, hypothesis: Hypothesis) -> np.ndarray:
+        """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,
+        NaN where it is not matched."""
+        out = np.full(len(hypothesis.images), np.nan)
+        for axis, sample in self.sample.by_axis.items():
+            if (m := self.match(hypothesis, axis)) is not None:
+                least = 1e-3 + limits.LEAST_CONTRAST / 3 * sample.swing
+                relative = m.residual(sample) / np.maximum(m.contrast, least)
+                out[m.images] = np.fmax(out[m.images], np.minimum(relative**2, 1).mean(axis=1))
+        return out
+
+    def jacobian(self, hypotheses: Sequence[Hypothesis]) -> np.ndarray | None:
+        """Return the change (2, 2) of projector column and row with the camera's, over the image;
+        None where one of them is not known.
+
+        Each axis under that of the hypotheses which is about it, else under the first.
+        """
+        slopes = []
+        for axis, sample in self.sample.by_axis.items():
+            own = next((h for h in hypotheses if h.axis == axis), hypotheses[0])
+            m = self.match(own, axis)
+            if m is None or np.count_nonzero(sure := m.good(sample)) < limits.FEWEST_PIXELS / 2:
+                return None
+            design, good = np.c_[np.ones(len(sure)), sample.place], sure
+            for _ in range(4):  # without the surfaces before or behind most
+                fit, *_ = np.linalg.lstsq(design[good], m.coordinate[good], rcond=None)
+                off = np.abs(design @ fit - m.coordinate)
+                good = sure & (off < 3 * np.median(off[good]) + 1)
+            slopes.append(fit[:0:-1])
+        return np.array(slopes) if len(slopes) == 2 else None
+
+    def list_folded(self, hypotheses: Sequence[Hypothesis]) -> list[Axis]:
+        """Return the axes whose coordinates fall from neighbour to neighbour where they rise over
+        the image, or the other way round, under the hypotheses."""
+        J, out = self.jacobian(hypotheses), list[Axis]()
+        for i, (axis, sample) in enumerate(self.sample.by_axis.items() if J is not None else ()):
+            own = next((h for h in hypotheses if h.axis == axis), hypotheses[0])
+            m = self.match(own, axis)
+            if m is not None and J is not None:
+                local = float(np.median(m.rise[m.good(sample)]))
+                if local * J[i, 1 - sample.direction] < 0:
+                    out.append(axis)
+        return out
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """By how much a hypothesis explains the images better than another.
+
+    ``loss``: mean share of the images' variance that the other leaves; ``gain``: by how much less
+    the first leaves; ``sigmas``: the gain in standard errors.
+    """
+
+    loss: float
+    gain: float
+    sigmas: float
+
+    @property
+    def left(self) -> float:
+        """Mean share of the variance that the first leaves."""
+        return self.loss - self.gain
+
+
+def _list_conventions(sequence: PatternSequence, axis: Axis) -> tuple[object, ...]:
+    """Return all of a description that the patterns of an axis depend on."""
+    return (
+        axis, tuple(sequence.frames[i] for i in sequence.select(axis)), sequence.projector_size,
+        sequence.sign(axis), sequence.offset_rad(axis), sequence.origin_px(axis),
+        sequence.gray_cell(axis),
+    )  # fmt: skip

@@ -1,0 +1,165 @@
+"""Examination of a capture: what its frames contradict, by the best explanation of all of them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from slviewer.errors import InputError
+from slviewer.examination import limits
+from slviewer.examination.evaluate import Evaluator, Hypothesis, described
+from slviewer.examination.explain import Explanation, explain, list_unresolved
+from slviewer.examination.findings import (
+    REMEDIES,
+    describe,
+    describe_gamma,
+    describe_ghost,
+    describe_light,
+    describe_mirroring,
+    describe_missing_pattern,
+    describe_motion,
+    describe_reach,
+    describe_unreadable,
+    describe_unresolved,
+)
+from slviewer.examination.ghost import has_ghost
+from slviewer.examination.motion import measure_motion
+from slviewer.examination.sample import sample_capture
+from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
+from slviewer.fringe.decoding_task import prepare_decoding
+from slviewer.fringe.frame_light import FrameLight, equalize_frames, estimate_frame_light
+from slviewer.fringe.layout import axis_layout, check_stack
+from slviewer.fringe.levels import layout_levels
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.records.examination import Examination
+from slviewer.records.verdict import Finding
+
+
+def examine(
+    sequence: PatternSequence, stack: np.ndarray, light: FrameLight | None = None
+) -> Examination:
+    """Examine the frames (n, h, w) uint8 or uint16 of a capture.
+
+    Every hypothesis (an order of the images, another convention of the description) predicts the
+    grey levels of sampled pixels from their neighbours; the one that explains all frames best is
+    named, and nothing where the description explains them as well. ``light``: estimated if None.
+    Raises InputError for a stack that does not match the sequence.
+    """
+    check_stack(sequence, stack)
+    if not sequence.axes:
+        return Examination()
+    light = light or estimate_frame_light(sequence, stack)
+    evaluator, base = _prepare(sequence, stack, light), described(sequence)
+    sample = evaluator.sample
+    if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
+        return Examination((describe_missing_pattern(sample),), light.drift)
+    with threadpool_limits(1, "blas"):  # its products are too small for more
+        findings = _judge(evaluator, base, stack, light)
+    return Examination(tuple(findings), light.drift)
+
+
+def _judge(
+    evaluator: Evaluator, base: Hypothesis, stack: np.ndarray, light: FrameLight
+) -> Sequence[Finding]:
+    """Return the findings of a sample that shows patterns."""
+    sequence = base.sequence
+    ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
+    found = explain(evaluator, base)
+    # the first image has none before it, and stands out from those that have a ghost
+    is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
+    if found and motion and _is_moving_still(evaluator, found, motion):
+        found = ()
+    if found and not (ghost and is_first):
+        return [describe(hypothesis, sequence) for hypothesis in found]
+    if motion and not ghost:
+        return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
+    judged = [*_judge_readability(evaluator, base), *_judge_coordinates(evaluator, base)]
+    # the image before imitates other light
+    return [*judged, *([describe_ghost(ghost)] if ghost else _judge_light(sequence, stack, light))]
+
+
+def _prepare(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> Evaluator:
+    """Return the evaluator of a capture; without the change of the room's light, which makes
+    surfaces vary that the patterns do not reach, if that leaves nothing to explain."""
+    evaluator = Evaluator(sample_capture(sequence, stack))
+    if light.is_significant and light.light.changes:
+        equal_sequence, equal, _ = equalize_frames(sequence, stack, light)
+        corrected, base = Evaluator(sample_capture(equal_sequence, equal)), described(sequence)
+        if corrected.sample.is_usable and not (
+            explain(corrected, base)
+            or measure_motion(corrected, base)
+            or has_ghost(corrected, base)
+        ):
+            return corrected
+    return evaluator
+
+
+def _is_moving_still(
+    evaluator: Evaluator, found: Explanation, motion: Mapping[Axis, float]
+) -> bool:
+    """Return whether the steps are displaced also where an explanation is true: then it accounts
+    only for a part of what motion does."""
+    for hypothesis in found:
+        own = {a: px for a, px in motion.items() if hypothesis.axis in (a, None)}
+        whole = described(hypothesis.sequence)
+        without = tuple(None if i in hypothesis.frames else i for i in whole.images)
+        images = hypothesis.images or without
+        left = measure_motion(evaluator, replace(hypothesis, images=images))
+        if any(abs(left.get(axis, 0.0)) > 0.5 * abs(px) for axis, px in own.items()):
+            return True
+    return False
+
+
+def _judge_readability(evaluator: Evaluator, base: Hypothesis) -> Iterator[Finding]:
+    """Yield the findings of an axis that no hypothesis makes readable, and of stripes that the
+    camera does not resolve."""
+    for axis, sample in evaluator.sample.by_axis.items():
+        m = evaluator.match(base, axis)
+        if m is not None and m.misfit.mean() > limits.UNREADABLE:
+            is_weak = np.median(sample.swing) < limits.WEAK * evaluator.sample.noise
+            yield describe_unreadable(axis, is_weak)
+    if unresolved := list_unresolved(evaluator, base):
+        yield describe_unresolved(base.sequence, unresolved)
+
+
+def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Finding]:
+    """Yield the finding of mirrored coordinates, else of codes that the description cannot hold, or
+    that lie beyond the projector."""
+    sequence = base.sequence
+    jacobian = evaluator.jacobian((base,))
+    mirrored = [] if jacobian is None else [*describe_mirroring(sequence, jacobian)]
+    yield from mirrored
+    for axis in sequence.axes if sequence.projector_size and not mirrored else ():
+        try:
+            layout = axis_layout(sequence, axis)
+            if layout.shifts and not layout.numbers_periods:
+                layout_levels(layout)
+        except InputError as error:
+            text, _, remedy = str(error).removeprefix(f"axis {axis}: ").partition(": ")
+            remedy = remedy or REMEDIES["projector-size"]
+            yield Finding("projector-size", "rejected", text, remedy, (), (), axis)
+            continue
+        m = evaluator.match(base, axis)
+        if m is None:
+            continue
+        u, extent = m.coordinate[m.misfit < limits.GOOD], sequence.extent(axis)
+        share = float(np.mean(u > extent + 0.5)) if u.size else 0.0
+        if share > limits.OUTSIDE:
+            yield describe_reach(axis, extent, u, share)
+
+
+def _judge_light(
+    sequence: PatternSequence, stack: np.ndarray, light: FrameLight
+) -> Iterator[Finding]:
+    """Yield the findings of light that varies, and of a projector response that is not linear."""
+    yield from describe_light(sequence, light)
+    for axis in sequence.axes:
+        if not 0 < min((len(s) for _, s in sequence.phase_shifts(axis)), default=0) <= MOST_STEPS:
+            continue
+        try:
+            task = prepare_decoding(sequence, stack, axis, light)
+        except InputError:  # decoding reports it, with the remedy
+            continue
+        harmonics = estimate_aliased_harmonics(task.layout, task.stack, task.white, task.noise)
+        yield from describe_gamma(harmonics, task.layout)

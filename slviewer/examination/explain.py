@@ -1,0 +1,382 @@
+"""Search for the hypothesis that explains the images of a capture best."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import numpy as np
+
+from slviewer.examination import limits
+from slviewer.examination.evaluate import Comparison, Evaluator, Hypothesis, described
+from slviewer.examination.hypotheses import (
+    exchange,
+    list_descriptions,
+    list_neighbours,
+    list_orders,
+    recover_orders,
+)
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.records.verdict import Cause
+
+Explanation = tuple[Hypothesis, ...]
+"""One hypothesis, or one for each axis."""
+
+
+def explain(evaluator: Evaluator, base: Hypothesis) -> Explanation:
+    """Return what explains the images better than the description ``base``; empty where nothing
+    does, and where the description explains them well."""
+    found: Explanation = ()
+    if _is_doubtful(evaluator, base):
+        found = _search(evaluator, base)
+        # three steps of which two are alike fit a changed description as well
+        if found and (found[0].axis or found[0].cause == "step-order"):
+            copies = _list_copies(evaluator, base.sequence)
+            if 0 < len(copies) <= limits.MOST_SINGLE:
+                return tuple(_repeat(base.sequence, *pair) for pair in copies)
+    return found or tuple(_explain_single_images(evaluator, base))
+
+
+def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
+    """Return the frames of the finest Gray bits whose stripes the camera does not resolve."""
+    sequence, out = base.sequence, list[int]()
+    for axis, sample in evaluator.sample.by_axis.items():
+        m = evaluator.match(base, axis)
+        if m is None or np.count_nonzero(good := m.good(sample)) < limits.FEWEST_PIXELS:
+            continue
+        bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
+        residual = (m.residual(sample) / m.contrast.clip(1e-3))[:, good].clip(-1, 1)
+        for i in reversed(bits):
+            k = m.images.index(i)
+            own = m.predicted[k, good] - m.predicted[k, good].mean()
+            contrast = 1 + float(own @ residual[k]) / max(float(own @ own), 1e-6)
+            if not abs(contrast) < limits.UNRESOLVED:
+                break
+            out += [i, *(inverse[b] for b, j in enumerate(bits) if j == i and inverse)]
+    return out
+
+
+def _is_doubtful(evaluator: Evaluator, base: Hypothesis) -> bool:
+    """Return whether the description leaves more than noise, in all images or in one."""
+    residuals = evaluator.residuals(base)
+    for axis in evaluator.sample.by_axis:
+        m = evaluator.match(base, axis)
+        if m is None or m.misfit.mean() > limits.SMALL_LOSS:
+            return True
+        groups = evaluator.atoms(base, axis).groups[m.places]
+        for group in {*groups.tolist()}:
+            own = residuals[np.array(m.images)[groups == group]]
+            if own.max() > limits.STANDS_OUT * np.median(own) + limits.STANDS_OUT_LEAST:
+                return True
+    return False
+
+
+def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
+    """Choose the best of all hypotheses."""
+    unresolved = {*list_unresolved(evaluator, base)}
+    gained = _turned(evaluator, (base,))
+    rated = [
+        r
+        for r in sorted(_rate_all(evaluator, base), key=_net, reverse=True)
+        if r.comparison.sigmas > _least_sigmas(evaluator, r, gained)
+        and r.net + gained > 0
+        and (r.hypotheses[0].axis or not unresolved.issuperset(r.hypotheses[0].changed))
+    ]
+    if not rated:
+        return ()
+    # one that accounts for all images, rather than one that leaves some out
+    first, *others = rated
+    most = limits.LEFT_OF_RIVAL * first.comparison.left + limits.LEFT_LEAST
+    complete = [
+        r
+        for r in others
+        if r.net + gained > limits.RIVAL * (first.net + gained)
+        and r.comparison.left < most
+        and not r.hypotheses[0].loses_images
+    ]
+    for each in (first, *complete):
+        is_single = each.hypotheses[0].excluded is not None
+        if not is_single and _is_explained(evaluator, base, each, gained):
+            return _locate(evaluator, rated, each)
+    return () if first.hypotheses[0].excluded is None else _choose_strange(evaluator, rated)
+
+
+def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
+    """Compare all hypotheses on the small sample, and return the best of them, compared on all
+    pixels."""
+    sequence = base.sequence
+    orders = _rank(evaluator, base, [*list_orders(sequence), *recover_orders(evaluator, sequence)])
+    pairs = _rank(evaluator, base, _list_pairs(evaluator, base, orders))
+    kept = sorted([*orders, *pairs], key=lambda ranked: -ranked[0])[: limits.KEPT]
+    rated = [_rate(evaluator, base, (h,)) for _, h in kept]
+    by_axis = [
+        _rank(evaluator, base, list_descriptions(sequence, axis))[: limits.KEPT // 2]
+        for axis in evaluator.sample.by_axis
+    ]
+    rated += [_rate(evaluator, base, (h,)) for ranked in by_axis for _, h in ranked]
+    joint = (
+        [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]
+        if (len(by_axis) == 2)
+        else []
+    )
+    rated += [r for r in joint if r.comparison.sigmas > limits.SIGMAS]
+    best = max(rated, key=_net).hypotheses[0]
+    return rated + [_rate(evaluator, base, (h,)) for h in list_neighbours(best)]
+
+
+def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") -> Explanation:
+    """Return an explanation; of lags that begin at about equally likely frames, the one whose image
+    repeats the one before it most closely."""
+    first = found.hypotheses[0]
+    if first.cause != "frame-lag" or not first.frames:
+        return found.hypotheses
+    sample = next(iter(evaluator.sample.by_axis.values()))
+
+    def differ(hypothesis: Hypothesis) -> float:
+        """Return the squared difference of the image that repeats from the one before it."""
+        k = hypothesis.frames[0]
+        return float(np.mean((sample.levels[k, 1] - sample.levels[k - 1, 1]) ** 2))
+
+    rivals = [
+        h
+        for each in rated
+        if each.net > limits.RIVAL * found.net
+        for h in each.hypotheses[:1]
+        if h.cause == "frame-lag" and h.frames
+    ]
+    return (min(rivals, key=differ),)
+
+
+@dataclass(frozen=True)
+class _Rated:
+    """Some hypotheses, compared with the description; ``net``: their gain less their cost."""
+
+    hypotheses: Explanation
+    comparison: Comparison
+    net: float
+
+
+def _least_sigmas(evaluator: Evaluator, rated: "_Rated", gained: float) -> float:
+    """Return the significance that an explanation needs: less where it gives coordinates that rise
+    in a possible direction, and the description, whose directions cost ``gained``, does not."""
+    is_impossible = gained >= min(limits.MIRRORED_COST, limits.FOLDED_COST)
+    if is_impossible and _turned(evaluator, rated.hypotheses) < gained:
+        return limits.SIGMAS_OF_IMPOSSIBLE
+    return limits.SIGMAS
+
+
+def _net(rated: _Rated) -> float:
+    """Return what an explanation is worth."""
+    return rated.net
+
+
+def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _Rated:
+    """Compare hypotheses of different axes with the description, on all pixels."""
+    each = [evaluator.compare(base, h) for h in hypotheses]
+    gain = sum(c.gain for c in each)
+    comparison = Comparison(each[0].loss, gain, min(c.sigmas for c in each))
+    cost = sum(h.cost for h in hypotheses) + _turned(evaluator, hypotheses)
+    return _Rated(hypotheses, comparison, gain - cost)
+
+
+def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
+    """Return the cost of the directions in which the coordinates rise: the same from neighbour to
+    neighbour and over the image; camera and projector both see the scene from the front, and mostly
+    stand upright."""
+    J = evaluator.jacobian(hypotheses)
+    if J is None:
+        return 0.0
+    folded = limits.FOLDED_COST * len(evaluator.list_folded(hypotheses))
+    if np.linalg.det(J) < 0:
+        return folded + limits.MIRRORED_COST
+    return folded + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
+
+
+def _is_explained(evaluator: Evaluator, base: Hypothesis, rated: _Rated, gained: float) -> bool:
+    """Return whether hypotheses leave much less of all images, or of those that they move.
+
+    ``gained``: cost of the description's directions.
+    """
+    first = rated.hypotheses[0]
+    images = [image for i in first.changed if (image := first.images[i]) is not None]
+    before, after = (evaluator.residuals(h)[images] for h in (base, first))
+    if first.cause == "frame-order" and (after > limits.LEFT_OF_EACH * before).any():
+        return False  # of two frames that have changed places, none shows what is described
+    if first.cause == "axes-swapped":
+        # half of the frames of an axis fit by themselves, whatever the others show
+        for axis in evaluator.sample.by_axis:
+            a, b = evaluator.match(base, axis), evaluator.match(first, axis)
+            if a is None or b is None or b.misfit.mean() > limits.EXPLAINED * a.misfit.mean():
+                return False
+        return True
+    if rated.net + gained > limits.EXPLAINED * rated.comparison.loss:
+        return True
+    is_less = np.nansum(after) < limits.LEFT_OF_FRAMES * np.nansum(before)
+    return len(rated.hypotheses) == 1 and bool(is_less)
+
+
+def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanation:
+    """Return, of frames without which the others fit about equally well, the one that fits least
+    itself; empty where blur or the projector's response explains why it does not fit."""
+    rivals = list[tuple[float, float, Hypothesis]]()
+    for each in rated:
+        first = each.hypotheses[0]
+        if first.excluded is not None and each.net > limits.RIVAL * rated[0].net:
+            residual = _measure_strangeness(evaluator, first, first.excluded)
+            share = each.net / each.comparison.loss
+            if share > limits.STRANGE_SHARE or residual > limits.VERY_STRANGE:
+                rivals.append((residual, each.comparison.left, first))
+    rivals = [rival for rival in rivals if rival[0] > 0]
+    if not rivals:
+        return ()
+    least = min(left for _, left, _ in rivals)
+    most = limits.AS_LITTLE * least + limits.AS_LITTLE_LEAST
+    likely = [rival for rival in rivals if rival[1] < most]
+    hypothesis = max(likely, key=lambda rival: rival[0])[2]
+    k, sequence = hypothesis.frames[0], hypothesis.sequence
+    j = _identify_pattern(evaluator, hypothesis, k)
+    cause: Cause = "frame-order" if j is not None and j > k else "duplicate-frame"
+    return (Hypothesis(cause, sequence, (), (k,), value=j),)
+
+
+def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> int | None:
+    """Return the other frame of its axis whose pattern image k shows, which the hypothesis leaves
+    out; None where it shows none."""
+    for axis, sample in evaluator.sample.by_axis.items():
+        atoms, m = evaluator.atoms(hypothesis, axis), evaluator.match(hypothesis, axis)
+        if k in atoms.frames and m is not None:
+            good = m.good(sample)
+            shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
+            values = atoms.at(m.coordinate[good])
+            residual = np.minimum((shown - values) ** 2, 1).mean(axis=1)
+            j = int(residual.argmin())
+            is_like = residual[j] < limits.UNLIKE_ANY_LEAST and values[j].std() > limits.FLAT / 2
+            return atoms.frames[j] if is_like and atoms.frames[j] != k else None
+    return None
+
+
+def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> float:
+    """Return the mean squared residual of image k, which the hypothesis leaves out, in squares of
+    the contrast; 0 where it shows its pattern, or what blur leaves of stripes."""
+    kind = hypothesis.sequence.frames[k].kind
+    usual = limits.STRANGE * np.nanmedian(evaluator.residuals(hypothesis))
+    for axis, sample in evaluator.sample.by_axis.items():
+        atoms, m = evaluator.atoms(hypothesis, axis), evaluator.match(hypothesis, axis)
+        if k not in atoms.frames or m is None:
+            continue
+        good = m.good(sample)
+        if np.count_nonzero(good) < limits.FEWEST_PIXELS:
+            continue
+        shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
+        own = atoms.at(m.coordinate[good])[atoms.frames.index(k)]
+        is_flat = np.median(np.abs(shown - 0.5)) < limits.FLAT
+        alike = np.corrcoef(shown, own)[0, 1] if own.std() > 0.05 else 0.0
+        if kind != "phase" and (is_flat or alike > limits.ALIKE):
+            return 0.0
+        residual = float(np.minimum((shown - own) ** 2, 1).mean())
+        return residual if residual > usual + limits.STRANGE_LEAST else 0.0
+    return 0.0
+
+
+def _explain_single_images(evaluator: Evaluator, base: Hypothesis) -> Iterator[Hypothesis]:
+    """Yield what single phase steps show instead of their own step; the others of their period
+    decode in spite of them, so that a search by the others does not find them."""
+    shows, strange = _read_steps(evaluator, base)
+    sequence = base.sequence
+    if not shows and not strange:
+        shows = dict(_list_copies(evaluator, sequence)[: limits.MOST_SINGLE])
+    if len(strange) == 2 and not shows:
+        swapped = exchange(sequence, *strange)
+        before, after = (evaluator.residuals(h)[strange] for h in (base, swapped))
+        if np.nansum(after) < limits.LEFT_OF_FRAMES * np.nansum(before):
+            yield swapped
+            return
+    if len(shows) + len(strange) > limits.MOST_SINGLE:
+        return
+    for i, j in shows.items():
+        if shows.get(j) != i:
+            yield _repeat(sequence, i, j)
+        elif i < j:
+            yield exchange(sequence, i, j)
+    if not shows and len(strange) < limits.MOST_SINGLE:
+        yield from (Hypothesis("duplicate-frame", sequence, (), (i,)) for i in strange)
+
+
+def _repeat(sequence: PatternSequence, i: int, j: int) -> Hypothesis:
+    """Return the hypothesis that image i shows the pattern of frame j."""
+    cause: Cause = "duplicate-frame" if j < i else "frame-order"
+    return Hypothesis(cause, sequence, (), (i,), value=j)
+
+
+def _list_copies(evaluator: Evaluator, sequence: PatternSequence) -> list[tuple[int, int]]:
+    """Return the phase steps whose image repeats that of the step before, each with that step.
+
+    Three steps fit any three images, but not as two that are alike and a third that is not. Where
+    the scene covers a small part of a period, steps are alike in sound captures.
+    """
+    out = []
+    base = described(sequence)
+    for axis, sample in evaluator.sample.by_axis.items():
+        m = evaluator.match(base, axis)
+        for period, steps in sequence.phase_shifts(axis):
+            if m is not None:
+                turns = m.coordinate[m.good(sample)] / period
+                if abs(np.exp(2j * np.pi * turns).sum()) > limits.CONCENTRATED * len(turns):
+                    continue
+            levels = sample.levels[list(steps), 1]
+            squares = np.mean(np.diff(levels, axis=0) ** 2, axis=1)
+            usual = float(squares.max() if len(steps) == 3 else np.median(squares))
+            most = limits.COPY * usual + limits.COPY_NOISE * 2 * evaluator.sample.noise**2
+            if most < usual / 4:
+                alike = np.flatnonzero(squares < most)
+                out += [(steps[k + 1], steps[k]) for k in alike]
+    return out
+
+
+def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int], list[int]]:
+    """Return the frame that each phase step shows which does not show its own, and the steps that
+    show none of their axis."""
+    shows, strange = dict[int, int](), list[int]()
+    for axis, sample in evaluator.sample.by_axis.items():
+        m = evaluator.match(base, axis)
+        if m is None or np.count_nonzero(good := m.good(sample)) < limits.FEWEST_PIXELS:
+            continue
+        groups = evaluator.atoms(base, axis).groups[m.places]
+        levels = sample.levels[m.images, 1][:, good]
+        shown = np.clip((levels - m.background[good]) / m.contrast[good], -1, 2)
+        own = m.predicted[:, good]
+        squares = [np.einsum("kp,kp->k", a, a) for a in (shown, own)]
+        residual = (squares[0][:, None] - 2 * shown @ own.T + squares[1]) / own.shape[1]
+        for group in range(groups.max() + 1):
+            steps = np.flatnonzero(groups == group)
+            usual = float(np.median(residual[steps, steps])) if len(steps) > 3 else np.inf
+            for k in steps:
+                j, left = int(residual[k].argmin()), float(residual[k, k])
+                if left < limits.MISPLACED * usual + limits.MISPLACED_LEAST:
+                    continue
+                if residual[k, j] < limits.LEFT_OF_FRAMES * left:
+                    shows[m.images[k]] = m.images[j]
+                elif left > limits.UNLIKE_ANY * usual + limits.UNLIKE_ANY_LEAST:
+                    strange.append(m.images[k])
+    return shows, strange
+
+
+def _list_pairs(
+    evaluator: Evaluator, base: Hypothesis, orders: Sequence[tuple[float, Hypothesis]]
+) -> Iterator[Hypothesis]:
+    """Yield exchanges of distant frames, of those without which the others fit best, or that fit
+    least themselves."""
+    alone = [h.frames[0] for _, h in orders if h.cause == "duplicate-frame"][: limits.KEPT]
+    worst = np.argsort(-np.nan_to_num(evaluator.residuals(base)))[: limits.KEPT]
+    kinds = base.sequence.frames
+    chosen = sorted(i for i in {*alone, *worst.tolist()} if kinds[i].kind != "texture")
+    for a, b in combinations(chosen, 2):
+        if b > a + 1:
+            yield exchange(base.sequence, a, b)
+
+
+def _rank(
+    evaluator: Evaluator, base: Hypothesis, hypotheses: Iterable[Hypothesis]
+) -> list[tuple[float, Hypothesis]]:
+    """Return the hypotheses by what they gain on the small sample less their cost, best first."""
+    gains = [(evaluator.coarse.compare(base, h).gain - h.cost, h) for h in hypotheses]
+    return sorted(gains, key=lambda ranked: -ranked[0])

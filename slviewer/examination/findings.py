@@ -1,0 +1,354 @@
+"""Findings in words: for each cause what was observed, and what to do."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from slviewer.examination import limits
+from slviewer.examination.evaluate import Hypothesis
+from slviewer.examination.sample import CaptureSample
+from slviewer.fringe.aliased_harmonics import AliasedHarmonics
+from slviewer.fringe.frame_light import FrameLight, Term
+from slviewer.fringe.layout import Layout
+from slviewer.fringe.origin import LATEST_TURNS
+from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.records.verdict import Cause, Finding, Severity
+
+LINES = {"x": "columns", "y": "rows"}
+REPORTED = 0.03
+"""Variation of the brightness, from the darkest to the brightest frame, that is reported."""
+REMEDIES: dict[Cause, str] = {
+    "missing-frame": "add the image, or capture again",
+    "duplicate-frame": "look at this image, and capture again",
+    "frame-order": "exchange these two files, or capture again",
+    "axes-swapped": "exchange the x and y (V and H) frames in the description",
+    "projector-size": "give the size of the projector that was used, or correct the periods",
+    "room-light": "keep the light of the room constant, or switch it off",
+    "flicker": (
+        "make the exposure time a multiple of 10 ms (8.33 ms where the mains have 60 Hz) and of the"
+        " projector's frame, and switch off the lamps of the room"
+    ),
+    "exposure-drift": "lock the camera's exposure, gain and white balance",
+    "gamma": ("make the responses of projector and camera linear, or use 5 phase steps or more"),
+    "ghosting": (
+        "the projector changes its image slowly, or the camera exposes during the change; wait"
+        " longer after each pattern"
+    ),
+    "dark": (
+        "raise the exposure or the projector's brightness, and check that the projector showed the"
+        " patterns"
+    ),
+    "moved": "hold scene, camera and projector still, and capture again",
+    "blur": "leave out these bits, or focus the camera and the projector",
+    "unreadable": (
+        "check that all frames belong to one capture, that nothing moved, and the periods, steps"
+        " and bits of the description"
+    ),
+    "saturation": "lower the exposure or the gain, and capture again",
+}
+"""What to do, where it does not depend on values."""
+
+
+def describe(hypothesis: Hypothesis, base: PatternSequence) -> Finding:
+    """Return the finding that a hypothesis stands for; ``base``: the sequence as described."""
+    cause = hypothesis.cause
+    assert cause is not None
+    if hypothesis.axis is None:
+        sentence, remedy = _describe_order(hypothesis)
+    else:
+        sentence, remedy = _describe_convention(hypothesis, base, hypothesis.axis)
+    value = None if hypothesis.value is None else float(hypothesis.value)
+    return Finding(
+        cause, "rejected", sentence, remedy, (), hypothesis.frames, hypothesis.axis, value
+    )
+
+
+def _describe_lag(hypothesis: Hypothesis) -> tuple[str, str]:
+    """Return observation and remedy of a lag of all images, or from a frame on."""
+    value = hypothesis.value or 1
+    if hypothesis.frames:
+        number = hypothesis.frames[0] + 1
+        return (
+            f"from frame {number} on the camera is one image behind the projector: image {number}"
+            " repeats the one before",
+            "let the camera wait longer after each pattern, and capture again",
+        )
+    count = "one image" if abs(value) == 1 else f"{abs(value):g} images"
+    if value > 0:
+        return (
+            f"all frames are {count} late, so that each shows the pattern before its own",
+            "let the camera wait longer after each pattern, or switch its buffering off, where it"
+            " hands out old images (the preflight shows which); capture again, or move the files"
+            f" by {count}",
+        )
+    return (
+        f"all frames are {count} early, so that each shows the pattern after its own, and the first"
+        " is missing",
+        f"let the camera begin with the first pattern; capture again, or move the files by {count}",
+    )
+
+
+def _describe_order(hypothesis: Hypothesis) -> tuple[str, str]:
+    """Return observation and remedy of an order of the images."""
+    cause, frames, value = hypothesis.cause, hypothesis.frames, hypothesis.value
+    numbers = [i + 1 for i in frames]
+    if cause == "frame-lag":
+        return _describe_lag(hypothesis)
+    if cause == "missing-frame":
+        text = f"frame {numbers[0]} is missing, and those that follow come one place too early"
+    elif cause == "axes-swapped":
+        kinds = hypothesis.sequence.frames
+        is_phase = kinds[hypothesis.changed[0]].kind == "phase"
+        kind = "phase steps" if is_phase else "Gray bits"
+        text = f"the {kind} of axis x show those of axis y, and the other way round"
+    elif cause == "step-order":
+        steps = [
+            ", ".join(str(hypothesis.images[i]) for i in indices)
+            for axis in hypothesis.sequence.axes
+            for _, indices in hypothesis.sequence.phase_shifts(axis)[-1:]
+        ]
+        return (
+            "the phase steps do not come in the described order",
+            f"number the frames so that the steps follow each other: {' and '.join(steps)}",
+        )
+    elif len(numbers) == 2:
+        text = f"frames {numbers[0]} and {numbers[1]} have changed places"
+    elif value is not None:
+        late = "late or repeated" if value < frames[0] else "too early"
+        text = f"frame {numbers[0]} shows the pattern of frame {int(value) + 1}: it is {late}"
+        return text, "put the frames in order, or capture again"
+    else:
+        text = f"frame {numbers[0]} does not show the pattern described for it"
+    assert cause is not None
+    return text, REMEDIES[cause]
+
+
+def _describe_convention(
+    hypothesis: Hypothesis, base: PatternSequence, axis: Axis
+) -> tuple[str, str]:
+    """Return observation and remedy of a convention of one axis."""
+    sequence, value = hypothesis.sequence, hypothesis.value
+    offset = sequence.offset_rad(axis)
+    turns = (offset - base.offset_rad(axis)) / (2 * np.pi)
+    if hypothesis.cause == "phase-offset":
+        remedy = f"set phase_offset = {offset:.3f} (rad; of a PatternSequence: phase_offset_rad)"
+        if base.find("gray", axis):
+            period = base.periods_px(axis)[-1]
+            begin = base.origin_px(axis) / period + turns
+            origin = (begin - np.ceil(begin - LATEST_TURNS)) * period
+            remedy += f", or gray_origin = {origin:.2f} (px; gray_origin_px) if the phase is right"
+        return (
+            f"the phase steps of axis {axis} begin {describe_turns(turns)} than described",
+            remedy,
+        )
+    if hypothesis.cause == "step-order":
+        also = f" and phase_offset = {offset:.3f}" if abs(turns) > 1e-6 else ""
+        order = ", or number the steps backwards" if also else ""
+        return (
+            f"the fringes of axis {axis} shift in the opposite direction to the description",
+            f"set phase_sign = {sequence.sign(axis)}{also} for axis {axis}{order}",
+        )
+    if hypothesis.cause == "bit-order" and sequence.find("gray", axis) != base.find("gray", axis):
+        return (
+            f"the Gray bits of axis {axis} and their inverses have changed places",
+            "exchange gray and inverse frames in the description",
+        )
+    if hypothesis.cause == "bit-order":
+        order = ", ".join(str(sequence.frames[i].bit) for i in base.bits("gray", axis))
+        return (
+            f"the Gray bits of axis {axis} do not have the described order",
+            f"number them {order} (0 is the most significant)",
+        )
+    if hypothesis.cause == "gray-cell":
+        period = base.period_px(axis)
+        widths = [f"{cell / period:.3g}" for cell in (value or 0.0, base.gray_cell(axis))]
+        return (
+            f"a cell of the Gray code of axis {axis} is {widths[0]} times as wide as a fringe, and"
+            f" {widths[1]} times by the description",
+            f"set gray_cell_px = {value:.4g}",
+        )
+    if hypothesis.cause == "gray-origin":
+        return (
+            f"the Gray code of axis {axis} begins elsewhere than described",
+            f"set gray_origin = {value:.2f} (px; of a PatternSequence: gray_origin_px)",
+        )
+    described = base.periods_px(axis)[-1]
+    cell = base.gray_cell(axis) * described / (value or described)
+    or_cell = f", or gray_cell_px = {cell:.4g} if the period is right"
+    return (
+        f"the finest fringe period of axis {axis} is {value:.3g} px, and the description says"
+        f" {described:.3g}",
+        f"set period_px = {value:.4g}{or_cell if base.find('gray', axis) else ''}",
+    )
+
+
+def describe_turns(turns: float) -> str:
+    """Return a share of a period with its direction as text: "a quarter period later"."""
+    turns = float((turns + 0.5) % 1 - 0.5)
+    share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
+    return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"
+
+
+def describe_mirroring(sequence: PatternSequence, jacobian: np.ndarray) -> Iterator[Finding]:
+    """Yield the finding of axes that are exchanged or reversed, by the change (2, 2) of the
+    projector's coordinates with the camera's; nothing where they are not mirrored.
+
+    Camera and projector both see the scene from the front, so that neither sees a mirror image.
+    """
+    if np.linalg.det(jacobian) > 0:
+        return
+    seen = "the projector's coordinates are a mirror image of what the camera sees"
+    if np.abs(np.diag(jacobian[::-1])).sum() > np.abs(np.diag(jacobian)).sum():
+        text = f"{seen}, as if x and y were exchanged"
+        yield Finding("axes-swapped", "rejected", text, REMEDIES["axes-swapped"])
+        return
+    axis: Axis = "x" if jacobian[0, 0] < 0 else "y"
+    text = f"{seen}, as if axis {axis} were reversed"
+    remedy = (
+        f"number the projector's {LINES[axis]} from the other end, or switch off its mirror or rear"
+        " mode"
+    )
+    if not sequence.find("gray", axis):
+        remedy = f"set phase_sign = {-sequence.sign(axis)} for axis {axis}, or {remedy}"
+    yield Finding("axis-reversed", "rejected", text, remedy, (), (), axis)
+
+
+def describe_reach(axis: Axis, extent: int, coordinate: np.ndarray, share: float) -> Finding:
+    """Return the finding of coordinates (p,) px of which a ``share`` lies beyond the projector."""
+    reach = float(np.quantile(coordinate, 0.995))
+    text = (
+        f"{100 * share:.0f} % of the {axis} codes lie outside the projector's {extent}"
+        f" {LINES[axis]} and reach {reach:.0f}"
+    )
+    return Finding(
+        "projector-size", "rejected", text, REMEDIES["projector-size"], (), (), axis, reach
+    )
+
+
+def describe_missing_pattern(sample: CaptureSample) -> Finding:
+    """Return the finding of a capture of which too few pixels show patterns."""
+    is_mostly = limits.LEAST_LIT <= sample.lit < 2 * sample.saturated
+    if sample.saturated > limits.MOSTLY or is_mostly:
+        text = (
+            f"{100 * sample.saturated:.0f} % of the pixels are saturated in a tenth of the frames"
+            " or more, so that too few carry a readable pattern"
+        )
+        return Finding("saturation", "rejected", text, REMEDIES["saturation"])
+    text = (
+        f"{100 * sample.lit:.1f} % of the pixels carry a readable pattern, and the median pixel"
+        f" changes by {sample.swing:.1f} grey levels over the frames"
+    )
+    return Finding("dark", "rejected", text, REMEDIES["dark"])
+
+
+def describe_unreadable(axis: Axis, is_weak: bool) -> Finding:
+    """Return the finding of an axis whose frames fit no pattern; ``is_weak``: for noise."""
+    if is_weak:
+        text = f"the {axis} patterns are hardly stronger than the noise of the images"
+        return Finding("dark", "rejected", text, REMEDIES["dark"], (), (), axis)
+    text = (
+        f"the frames of axis {axis} fit neither their description, nor another order, numbering or"
+        " size"
+    )
+    return Finding("unreadable", "rejected", text, REMEDIES["unreadable"], (), (), axis)
+
+
+def describe_unresolved(sequence: PatternSequence, frames: Sequence[int]) -> Finding:
+    """Return the finding of Gray bits, by their frames, whose stripes the camera does not
+    resolve."""
+    names = sorted({f"{sequence.frames[i].bit} of {sequence.frames[i].axis}" for i in frames})
+    text = f"the camera does not resolve the stripes of Gray bit {', '.join(names)}"
+    return Finding("blur", "doubtful", text, REMEDIES["blur"], (), tuple(frames))
+
+
+def describe_motion(sequence: PatternSequence, axis: Axis, displacement: float) -> Finding:
+    """Return the finding of a scene, or a rig, that moved during the phase steps of an axis;
+    ``displacement`` px of the projector."""
+    period = sequence.periods_px(axis)[-1]
+    is_much = abs(displacement) > limits.MUCH_MOTION * period
+    text = (
+        f"something moved: from the first to the last phase step the pattern of axis {axis} shifted"
+        f" by {abs(displacement):.1f} px of the projector"
+    )
+    severity: Severity = "rejected" if is_much else "doubtful"
+    return Finding("moved", severity, text, REMEDIES["moved"], (), (), axis, displacement)
+
+
+def describe_ghost(share: float) -> Finding:
+    """Return the finding of images that hold a share of the one before."""
+    text = f"the images hold {100 * share:.0f} % of the image before them (ghosting)"
+    return Finding("ghosting", "doubtful", text, REMEDIES["ghosting"])
+
+
+def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Finding]:
+    """Yield a finding for each variation of the light that the operator should correct."""
+    used = [i for i, f in enumerate(sequence.frames) if f.kind != "texture"]
+    gain = light.light.gain[used]
+    span = float(gain.max() / gain.min()) - 1
+    if "wave" in light.terms and light.wave > REPORTED / 3:
+        text = (
+            f"the light varies along the image rows by {100 * np.sqrt(2) * light.wave:.0f} %, in"
+            f" {light.light.cycles:.1f} waves per image (mains flicker under a rolling shutter),"
+            " which is corrected"
+        )
+        yield _of_light("flicker", text, used[0])
+    if "gain" in light.terms and span > REPORTED:
+        text = (
+            f"the brightness of the frames varies by {100 * span:.1f} % (automatic exposure, or an"
+            " unsteady lamp), which is corrected"
+        )
+        frame = used[int(np.argmax(np.abs(np.log(gain))))]
+        yield _of_light("exposure-drift", text, frame)
+    changes = light.light.changes if {"uniform", "albedo"} & {*light.terms} else ()
+    for k in changes:
+        assert light.room is not None
+        change = float(light.room[k] - light.room[k - 1])
+        text = (
+            f"the light of the room changed: from frame {k + 1} on the scene is"
+            f" {100 * abs(change):.0f} % {'brighter' if change > 0 else 'darker'}"
+        )
+        steps = light.count_open_steps(sequence, k)
+        text += (
+            f"; between {steps} phase steps this cannot be corrected reliably"
+            if steps
+            else (", which is corrected")
+        )
+        yield _of_light("room-light", text, k)
+
+
+def _of_light(cause: Cause, sentence: str, frame: int) -> Finding:
+    """Return the finding of light that differs from a frame on."""
+    return Finding(cause, "doubtful", sentence, REMEDIES[cause], (), (frame,))
+
+
+def describe_disturbance(terms: Sequence[Term]) -> Finding:
+    """Return the finding of light that varies by more than can be corrected; ``terms``: how."""
+    if "wave" in terms:
+        cause: Cause = "flicker"
+        text = "the light varies along the image rows and between the frames"
+    elif len(terms) > 1:
+        cause, text = "room-light", "the light of the room changes between the frames"
+    else:
+        cause, text = "exposure-drift", "the brightness varies from frame to frame"
+    return Finding(cause, "rejected", f"{text} by more than can be corrected", REMEDIES[cause])
+
+
+def describe_gamma(harmonics: AliasedHarmonics, layout: Layout) -> Iterator[Finding]:
+    """Yield the finding of a significant ripple of the phase by the projector's response."""
+    if not harmonics.is_significant:
+        return
+    per_rad = layout.period_px / (2 * np.pi)
+    theta = np.linspace(0, 2 * np.pi, 361)
+    largest = float(np.abs(harmonics.correction(theta)).max()) * per_rad
+    outcome = (
+        "corrected"
+        if harmonics.is_corrected
+        else "it could not be measured well enough to correct it"
+    )
+    text = (
+        f"the projector response is nonlinear (gamma): with {harmonics.steps} phase steps this"
+        f" shifts the coordinates of axis {layout.axis} by up to {largest:.2g} px ({outcome}, and"
+        f" {harmonics.error_rad * per_rad:.2g} px was added to the uncertainty)"
+    )
+    frames = layout.shifts[-1].indices[:1]
+    yield Finding("gamma", "doubtful", text, REMEDIES["gamma"], (), frames, layout.axis)

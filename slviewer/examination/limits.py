@@ -1,0 +1,116 @@
+"""Numbers that the examination of captures decides by, and where each comes from.
+
+"Measured" means on the sound and faulty captures of `slviewer prove --only causes`, and on
+photographs of real rigs.
+"""
+
+CENTRES = 6_000
+"""Pixels of the grid that samples are chosen from: 60 x 100 of an image."""
+EVEN, PER_FRAME = 700, 40
+"""Pixels chosen evenly, whose mean is known to 4 %, and at the edges of each frame."""
+COARSE = 6
+"""A small sample, which ranks hypotheses, has this part of the pixels."""
+REACH_PX = 4
+"""Distance of a neighbour: twice the blur of a camera in focus, less than the finest fringe."""
+VARIES = 1.5
+"""Mean difference of a pixel's neighbours over the noise, that noise alone leaves at 1.1."""
+STEEP = 0.4
+"""Change between a pixel's neighbours, as a share of its range, at an edge: noise makes less."""
+DARK_SHARE, DARK_SIGMAS = 6 / 255, 8.0
+"""Range of a pixel's levels, of full scale and in standard deviations of noise, that shows a
+pattern: in fifty frames of noise alone the range stays below seven in 99.99 % of the pixels."""
+FEW_FRAMES = 5
+"""Frames below which a pixel's range is that of all its levels: of five phase steps, the second
+largest and the second smallest differ by 0.56 of the range at least, of four by nothing."""
+OFTEN_CLIPPED = 0.1
+"""Share of the frames in which a pixel is saturated, from which it is not used."""
+FEWEST_PIXELS = 60
+"""Below, the mean misfit of a sample is known to no better than 15 %."""
+LEAST_LIT = 0.005
+"""Share of the image that must carry a pattern: half a percent is a board in a corner."""
+MOSTLY = 0.3
+"""Share of the image saturated too often, from which saturation is why no pattern shows."""
+
+STEPS_PER_PERIOD = 18
+"""Coordinates at which patterns are tabulated: between them a cosine is off by 0.4 %."""
+BEYOND = 1.25
+"""Range of coordinates over the projector's size: beyond, beats of fine periods repeat."""
+BEYOND_CODE = 2.2
+"""The same of a Gray code, whose cells may be half as wide as described."""
+NEAR = 6
+"""Steps of the table, a third of a period, within which two neighbours' coordinates join."""
+UNDECIDED = 0.6
+"""Share of one bit's variance that a pixel on the bit's edge leaves open: it is half bright."""
+CONTRASTS = (0.25, 1.5)
+"""Contrast of fringes over that of wide stripes: least that decodes, and most that gamma adds."""
+GOOD = 0.3
+"""Misfit, 1 - correlation^2, of a pixel that is explained: blur and gamma 2.2 leave 0.15."""
+LEAST_CONTRAST = 0.15
+"""Contrast over the range of a pixel's levels, below which the prediction misses them."""
+
+SMALL_LOSS, STANDS_OUT, STANDS_OUT_LEAST = 0.03, 2.5, 0.01
+"""Mean misfit, and residual of a frame over the median of its kind and squared contrast beyond it,
+up to which nothing is searched: measured, no fault that harms stays below all."""
+KEPT = 8
+"""Hypotheses that are compared on all pixels, of those that the small sample ranks best."""
+SIGMAS = 5.0
+"""Standard errors by which a hypothesis must explain more: one in two million by chance."""
+SIGMAS_OF_IMPOSSIBLE = 3.0
+"""The same where it explains coordinates that run in an impossible direction as well."""
+EXPLAINED = 0.25
+"""Share of the misfit that it must explain, or ..."""
+LEFT_OF_FRAMES = 0.6
+"""... of the residual of the frames that it moves that may be left: noise is."""
+LEFT_OF_EACH = 0.9
+"""The same of each of two frames that have changed places."""
+RIVAL = 0.5
+"""Share of the best gain, from which a frame is a rival for the one that shows something else."""
+LEFT_OF_RIVAL, LEFT_LEAST = 2.0, 0.01
+"""Share of what the best explanation leaves, and misfit beyond it, that another one may leave to be
+preferred for accounting for all images."""
+STRANGE, STRANGE_LEAST = 3.0, 0.005
+"""Residual of such a frame over the median of the others, and least squared contrast of it."""
+AS_LITTLE, AS_LITTLE_LEAST = 1.25, 0.002
+"""Share of the least misfit that the absence of a frame leaves, and misfit beyond it, up to which
+the absence of another frame explains as much."""
+STRANGE_SHARE, VERY_STRANGE = 0.1, 0.15
+"""Share of the misfit that its absence must remove, or squared contrast of its residual: the
+harmonics of a clipped cosine stay below both."""
+UNRESOLVED = 0.35
+"""Contrast of stripes, relative to wide ones, below which the camera does not resolve them."""
+COPY, COPY_NOISE = 0.1, 1.5
+"""Squared difference of two images over the usual one of neighbouring steps, and over twice the
+noise beside it, of an image that is handed out twice."""
+CONCENTRATED = 0.7
+"""Resultant of the phases, above which they cover less than about half of the period."""
+UNREADABLE, WEAK = 0.5, 16.0
+"""Misfit that no hypothesis lowers, with which nothing can be measured; and range of levels in
+standard deviations of noise, below which noise is the reason."""
+FLAT, ALIKE = 0.175, 0.4
+"""Median distance from grey, and correlation with the pattern, of stripes that blur has closed."""
+MISPLACED, MISPLACED_LEAST = 2.0, 0.003
+"""Residual of a phase step over the median of its period, and squared contrast beyond it, from
+which other steps are tried: of 18 steps a neighbour's has 0.06."""
+UNLIKE_ANY, UNLIKE_ANY_LEAST = 6.0, 0.05
+"""The same of a step that shows no pattern of its axis."""
+MOST_SINGLE = 3
+"""Single frames named; more have a common cause."""
+
+PER_FRAME_COST, CHANGE_COST = 1e-4, 1e-3
+"""Misfit that a hypothesis costs for each frame that it moves, and each value that it changes: of
+equal explanations the simplest is chosen."""
+LOST_COST = 1e-3
+"""The same for a missing image, which may be any."""
+MIRRORED_COST, TURNED_COST, FOLDED_COST = 0.02, 0.002, 0.02
+"""The same for coordinates that are a mirror image of what the camera sees, which no device shows;
+for a projector upside down, which is rare; and for an axis that runs backwards from neighbour to
+neighbour."""
+
+OUTSIDE = 0.08
+"""Share of the coordinates beyond the projector, that noise of fine periods does not reach."""
+LEAST_MOTION = 0.015
+"""Displacement from the first to the last step, in periods, that gamma and noise do not imitate."""
+MUCH_MOTION = 0.03
+"""The same, from which a capture must not be measured: a fringe is read to a hundredth."""
+LEAST_GHOST, GHOST_SIGMAS = 0.02, 5.0
+"""Share of the image before, that blur and gamma do not imitate, and in its standard errors."""

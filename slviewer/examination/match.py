@@ -1,0 +1,157 @@
+"""Match of sampled pixels with the patterns of a hypothesis, by zero-mean normalised correlation.
+
+A pixel sees A + B d(u) of the pattern values d at its projector coordinate u. The coordinate of
+largest correlation is the most likely one for equal noise in all frames (Mirdehghan et al.,
+"Optimal structured light a la carte", CVPR 2018). A pixel is predicted from the coordinates of its
+two neighbours: that counts wrong patterns, and patterns that do not join, alike.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slviewer.examination import limits
+from slviewer.examination.atoms import Atoms
+from slviewer.examination.sample import Sample
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Prediction of the p pixels of a sample.
+
+    ``images`` (k,): of the sample, described by the atoms at ``places`` (k,); ``coordinate`` (p,)
+    px: the mean of the two neighbours'; ``rise`` (p,) px: from the first to the second one;
+    ``predicted`` (k, p): pattern values; ``background``, ``contrast`` (p,): A and B; ``misfit``
+    (p,): 1 - correlation^2.
+    """
+
+    images: list[int]
+    places: list[int]
+    coordinate: np.ndarray
+    rise: np.ndarray
+    predicted: np.ndarray
+    background: np.ndarray
+    contrast: np.ndarray
+    misfit: np.ndarray
+
+    @property
+    def jump(self) -> np.ndarray:
+        """(p,) px between the neighbours' coordinates."""
+        return np.abs(self.rise)
+
+    def residual(self, sample: Sample) -> np.ndarray:
+        """(k, p) grey levels that the prediction does not explain."""
+        seen = sample.levels[self.images, 1]
+        return np.asarray(seen - self.background - self.contrast * self.predicted)
+
+    def good(self, sample: Sample) -> np.ndarray:
+        """(p,) bool: pixels that are explained, and lie on one surface with their neighbours."""
+        return (
+            (self.misfit < limits.GOOD)
+            & (self.jump < 4 * np.median(self.jump) + 2)
+            & (self.contrast > limits.LEAST_CONTRAST * sample.swing)
+        )
+
+
+def match(sample: Sample, atoms: Atoms, images: list[int | None]) -> Match:
+    """Match a sample with atoms, whose frames are seen in ``images``; None where one is missing."""
+    places = [place for place, image in enumerate(images) if image is not None]
+    there = [image for image in images if image is not None]
+    levels, values = sample.levels[there], atoms.values[places]
+    centred = values - values.mean(axis=0)
+    length = np.sqrt(np.einsum("ku,ku->u", centred, centred))
+    beside = levels[:, [0, 2]]
+    beside = beside - beside.mean(axis=0)
+    scores = beside.reshape(len(there), -1).T @ (centred / np.maximum(length, 1e-3))
+    # a bit on an edge, half bright, decides nothing
+    undecided = limits.UNDECIDED * 0.25 / float(np.mean(length**2))
+    best = _join(
+        scores.reshape(2, levels.shape[2], -1),
+        np.sqrt(np.einsum("kip,kip->ip", beside, beside)),
+        undecided,
+    )
+    coordinate = _refine(scores, best.ravel()) * atoms.step_px + atoms.start_px
+    first, second = coordinate.reshape(2, -1)
+    middle, rise = (first + second) / 2, second - first
+    seen, predicted = levels[:, 1], atoms.at(middle)[places]
+    misfit, background, contrast = _fit_levels(seen, predicted)
+    predicted = _fit_groups(seen, predicted, background, contrast, misfit, atoms.groups[places])
+    misfit, background, contrast = _fit_levels(seen, predicted)
+    return Match(there, places, middle, rise, predicted, background, contrast, misfit)
+
+
+def _fit_levels(
+    seen: np.ndarray, predicted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit levels (k, p) by the predicted patterns: 1 - correlation^2, background, contrast (p,)."""
+    p0 = predicted - predicted.mean(axis=0)
+    s0 = seen - seen.mean(axis=0)
+    pp, ps, ss = (np.einsum("kp,kp->p", a, b) for a, b in ((p0, p0), (p0, s0), (s0, s0)))
+    contrast = np.maximum(ps, 0) / np.maximum(pp, 1e-3)
+    misfit = 1 - np.maximum(ps, 0) ** 2 / np.maximum(pp * ss, 1e-6)
+    return misfit, seen.mean(axis=0) - contrast * predicted.mean(axis=0), contrast
+
+
+def _fit_groups(
+    seen: np.ndarray,
+    predicted: np.ndarray,
+    background: np.ndarray,
+    contrast: np.ndarray,
+    misfit: np.ndarray,
+    groups: np.ndarray,
+) -> np.ndarray:
+    """Return the prediction with mean and contrast of the steps of each period fitted.
+
+    Blur takes contrast from fine fringes that it leaves to wide stripes, and gamma lowers their
+    mean.
+    """
+    good = misfit < np.quantile(misfit, 0.7)
+    relative = (seen[:, good] - background[good]) / np.maximum(contrast[good], 1e-3)
+    out = predicted.copy()
+    for group in range(groups.max() + 1):
+        own = groups == group
+        if np.count_nonzero(own) < 3 or not good.any():
+            continue
+        x, y = predicted[own][:, good].ravel(), np.clip(relative[own].ravel(), -1, 2)
+        slope = np.mean((x - x.mean()) * (y - y.mean())) / max(float(x.var()), 1e-3)
+        slope = np.float32(np.clip(slope, *limits.CONTRASTS))
+        out[own] = y.mean() + slope * (predicted[own] - x.mean())
+    return out
+
+
+def _join(scores: np.ndarray, length: np.ndarray, undecided: float) -> np.ndarray:
+    """Return the place (2, p) of the best score of two neighbours; where one is undecided, the
+    place that is near the other's.
+
+    ``scores`` (2, p, u); ``length`` (2, p) of the pixels' centred levels.
+    """
+    best = scores.argmax(axis=2)
+    highest = np.take_along_axis(scores, best[:, :, None], axis=2)[:, :, 0]
+    usual = int(np.median(best[1] - best[0]))
+    far = np.flatnonzero(np.abs(best[1] - best[0] - usual) > limits.NEAR)
+    if not far.size:
+        return best
+    window = np.arange(-limits.NEAR, limits.NEAR + 1)
+    rival, loss = np.empty((2, len(far)), int), np.empty((2, len(far)))
+    for i in (0, 1):
+        around = best[1 - i][far][:, None] + (usual if i else -usual) + window
+        around = np.clip(around, 0, scores.shape[2] - 1)
+        near = np.take_along_axis(scores[i][far], around, axis=1)
+        k = near.argmax(axis=1)
+        rows = np.arange(len(far))
+        rival[i] = around[rows, k]
+        loss[i] = (highest[i][far] - near[rows, k]) / np.maximum(length[i][far], 1e-6)
+    least = loss.argmin(axis=0)
+    accepted = np.flatnonzero(loss.min(axis=0) < undecided)
+    best[least[accepted], far[accepted]] = rival[least[accepted], accepted]
+    return best
+
+
+def _refine(scores: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Return the place of the maximum between its neighbours, by a parabola."""
+    inner = np.clip(best, 1, scores.shape[1] - 2)
+    rows = np.arange(len(best))
+    left, middle, right = (scores[rows, inner + d] for d in (-1, 0, 1))
+    curve = 2 * middle - left - right
+    shift = np.where(curve > 1e-9, (right - left) / np.maximum(2 * curve, 1e-9), 0.0)
+    return np.asarray(np.where(best == inner, best + np.clip(shift, -0.5, 0.5), best))
