@@ -34,6 +34,10 @@ class Atoms:
         part = (place - below).astype(np.float32)
         return self.values[:, below] * (1 - part) + self.values[:, below + 1] * part
 
+    def slope_at(self, coordinate: np.ndarray) -> np.ndarray:
+        """Return the change (k, p) of the values per px at coordinates (p,) px."""
+        return self.at(coordinate + 0.5) - self.at(coordinate - 0.5)
+
 
 def tabulate_atoms(sequence: PatternSequence, axis: Axis) -> Atoms:
     """Tabulate the patterns of an axis over all coordinates that they distinguish."""

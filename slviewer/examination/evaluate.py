@@ -1,6 +1,6 @@
 """Evaluation of hypotheses about a capture on its sample."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.examination import limits
 from slviewer.examination.atoms import Atoms, tabulate_atoms
 from slviewer.examination.match import Match, match
-from slviewer.examination.sample import CaptureSample
+from slviewer.examination.sample import CaptureSample, Sample
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.records.verdict import Cause
 
@@ -89,8 +89,17 @@ class Evaluator:
             self._matches[key] = match(self.sample.by_axis[axis], atoms, list(images))
         return self._matches[key]
 
+    def explained(self, hypothesis: Hypothesis) -> Iterator[tuple[Axis, Sample, Match, np.ndarray]]:
+        """Yield each axis of which enough pixels are explained: its sample, its match, and where
+        they are, (p,) bool."""
+        for axis, sample in self.sample.by_axis.items():
+            if (m := self.match(hypothesis, axis)) is not None:
+                good = m.good(sample)
+                if np.count_nonzero(good) >= limits.FEWEST_PIXELS:
+                    yield axis, sample, m, good
+
     def compare(self, base: Hypothesis, other: Hypothesis) -> "Comparison":
-        """Compare a hypothesis with the ``base``; on the images of both, where one is left out."""
+        """Compare a hypothesis with the ``base``, on the images that both use."""
         gains, losses = [], []
         for axis, sample in self.sample.by_axis.items():
             a, b = self.match(base, axis), self.match(other, axis)
@@ -133,8 +142,7 @@ class Evaluator:
         """
         slopes = []
         for axis, sample in self.sample.by_axis.items():
-            own = next((h for h in hypotheses if h.axis == axis), hypotheses[0])
-            m = self.match(own, axis)
+            m = self.match(_select_own(hypotheses, axis), axis)
             if m is None or np.count_nonzero(sure := m.good(sample)) < limits.FEWEST_PIXELS / 2:
                 return None
             design, good = np.c_[np.ones(len(sure)), sample.place], sure
@@ -145,16 +153,15 @@ class Evaluator:
             slopes.append(fit[:0:-1])
         return np.array(slopes) if len(slopes) == 2 else None
 
-    def list_folded(self, hypotheses: Sequence[Hypothesis]) -> list[Axis]:
+    def list_folded(self, hypotheses: Sequence[Hypothesis], jacobian: np.ndarray) -> list[Axis]:
         """Return the axes whose coordinates fall from neighbour to neighbour where they rise over
-        the image, or the other way round, under the hypotheses."""
-        J, out = self.jacobian(hypotheses), list[Axis]()
-        for i, (axis, sample) in enumerate(self.sample.by_axis.items() if J is not None else ()):
-            own = next((h for h in hypotheses if h.axis == axis), hypotheses[0])
-            m = self.match(own, axis)
-            if m is not None and J is not None:
+        the image, or the other way round, under the hypotheses, of which `jacobian` is known."""
+        out = list[Axis]()
+        for i, (axis, sample) in enumerate(self.sample.by_axis.items()):
+            m = self.match(_select_own(hypotheses, axis), axis)
+            if m is not None:
                 local = float(np.median(m.rise[m.good(sample)]))
-                if local * J[i, 1 - sample.direction] < 0:
+                if local * jacobian[i, 1 - sample.direction] < 0:
                     out.append(axis)
         return out
 
@@ -175,6 +182,11 @@ class Comparison:
     def left(self) -> float:
         """Mean share of the variance that the first leaves."""
         return self.loss - self.gain
+
+
+def _select_own(hypotheses: Sequence[Hypothesis], axis: Axis) -> Hypothesis:
+    """Return the one of the hypotheses that is about an axis, else the first."""
+    return next((h for h in hypotheses if h.axis == axis), hypotheses[0])
 
 
 def _list_conventions(sequence: PatternSequence, axis: Axis) -> tuple[object, ...]:

@@ -50,20 +50,17 @@ def examine(
     if not sequence.axes:
         return Examination()
     light = light or estimate_frame_light(sequence, stack)
-    evaluator, base = _prepare(sequence, stack, light), described(sequence)
-    sample = evaluator.sample
-    if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
-        return Examination((describe_missing_pattern(sample),), light.drift)
-    with threadpool_limits(1, "blas"):  # its products are too small for more
-        findings = _judge(evaluator, base, stack, light)
+    with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
+        findings = _judge(sequence, stack, light)
     return Examination(tuple(findings), light.drift)
 
 
-def _judge(
-    evaluator: Evaluator, base: Hypothesis, stack: np.ndarray, light: FrameLight
-) -> Sequence[Finding]:
-    """Return the findings of a sample that shows patterns."""
-    sequence = base.sequence
+def _judge(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> Sequence[Finding]:
+    """Return the findings of a capture whose light has been estimated."""
+    evaluator, base = _prepare(sequence, stack, light), described(sequence)
+    sample = evaluator.sample
+    if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
+        return [describe_missing_pattern(sample)]
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
     found = explain(evaluator, base)
     # the first image has none before it, and stands out from those that have a ghost

@@ -15,7 +15,7 @@ from slviewer.examination.hypotheses import (
     list_orders,
     recover_orders,
 )
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Indices, PatternSequence
 from slviewer.records.verdict import Cause
 
 Explanation = tuple[Hypothesis, ...]
@@ -39,10 +39,7 @@ def explain(evaluator: Evaluator, base: Hypothesis) -> Explanation:
 def list_unresolved(evaluator: Evaluator, base: Hypothesis) -> list[int]:
     """Return the frames of the finest Gray bits whose stripes the camera does not resolve."""
     sequence, out = base.sequence, list[int]()
-    for axis, sample in evaluator.sample.by_axis.items():
-        m = evaluator.match(base, axis)
-        if m is None or np.count_nonzero(good := m.good(sample)) < limits.FEWEST_PIXELS:
-            continue
+    for axis, sample, m, good in evaluator.explained(base):
         bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
         residual = (m.residual(sample) / m.contrast.clip(1e-3))[:, good].clip(-1, 1)
         for i in reversed(bits):
@@ -77,7 +74,7 @@ def _search(evaluator: Evaluator, base: Hypothesis) -> Explanation:
     rated = [
         r
         for r in sorted(_rate_all(evaluator, base), key=_net, reverse=True)
-        if r.comparison.sigmas > _least_sigmas(evaluator, r, gained)
+        if r.comparison.sigmas > _least_sigmas(r, gained)
         and r.net + gained > 0
         and (r.hypotheses[0].axis or not unresolved.issuperset(r.hypotheses[0].changed))
     ]
@@ -113,12 +110,9 @@ def _rate_all(evaluator: Evaluator, base: Hypothesis) -> list["_Rated"]:
         for axis in evaluator.sample.by_axis
     ]
     rated += [_rate(evaluator, base, (h,)) for ranked in by_axis for _, h in ranked]
-    joint = (
-        [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]
-        if (len(by_axis) == 2)
-        else []
-    )
-    rated += [r for r in joint if r.comparison.sigmas > limits.SIGMAS]
+    if len(by_axis) == 2:
+        joint = [_rate(evaluator, base, (a, b)) for (_, a), (_, b) in product(*by_axis)]
+        rated += [r for r in joint if r.comparison.sigmas > limits.SIGMAS]
     best = max(rated, key=_net).hypotheses[0]
     return rated + [_rate(evaluator, base, (h,)) for h in list_neighbours(best)]
 
@@ -148,20 +142,21 @@ def _locate(evaluator: Evaluator, rated: Sequence["_Rated"], found: "_Rated") ->
 
 @dataclass(frozen=True)
 class _Rated:
-    """Some hypotheses, compared with the description; ``net``: their gain less their cost."""
+    """Some hypotheses, compared with the description; ``net``: their gain less their cost, of which
+    ``turned`` is that of the coordinates' directions."""
 
     hypotheses: Explanation
     comparison: Comparison
     net: float
+    turned: float
 
 
-def _least_sigmas(evaluator: Evaluator, rated: "_Rated", gained: float) -> float:
+def _least_sigmas(rated: _Rated, gained: float) -> float:
     """Return the significance that an explanation needs: less where it gives coordinates that rise
     in a possible direction, and the description, whose directions cost ``gained``, does not."""
     is_impossible = gained >= min(limits.MIRRORED_COST, limits.FOLDED_COST)
-    if is_impossible and _turned(evaluator, rated.hypotheses) < gained:
-        return limits.SIGMAS_OF_IMPOSSIBLE
-    return limits.SIGMAS
+    is_possible = rated.turned < gained
+    return limits.SIGMAS_OF_IMPOSSIBLE if is_impossible and is_possible else limits.SIGMAS
 
 
 def _net(rated: _Rated) -> float:
@@ -174,8 +169,9 @@ def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _R
     each = [evaluator.compare(base, h) for h in hypotheses]
     gain = sum(c.gain for c in each)
     comparison = Comparison(each[0].loss, gain, min(c.sigmas for c in each))
-    cost = sum(h.cost for h in hypotheses) + _turned(evaluator, hypotheses)
-    return _Rated(hypotheses, comparison, gain - cost)
+    turned = _turned(evaluator, hypotheses)
+    net = gain - sum(h.cost for h in hypotheses) - turned
+    return _Rated(hypotheses, comparison, net, turned)
 
 
 def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
@@ -185,7 +181,7 @@ def _turned(evaluator: Evaluator, hypotheses: Explanation) -> float:
     J = evaluator.jacobian(hypotheses)
     if J is None:
         return 0.0
-    folded = limits.FOLDED_COST * len(evaluator.list_folded(hypotheses))
+    folded = limits.FOLDED_COST * len(evaluator.list_folded(hypotheses, J))
     if np.linalg.det(J) < 0:
         return folded + limits.MIRRORED_COST
     return folded + (limits.TURNED_COST if J[0, 0] < 0 and J[1, 1] < 0 else 0.0)
@@ -238,43 +234,46 @@ def _choose_strange(evaluator: Evaluator, rated: Sequence[_Rated]) -> Explanatio
     return (Hypothesis(cause, sequence, (), (k,), value=j),)
 
 
+def _read_image(
+    evaluator: Evaluator, hypothesis: Hypothesis, k: int
+) -> tuple[Indices, np.ndarray, np.ndarray] | None:
+    """Return what image k, which the hypothesis leaves out, shows at the pixels that the others
+    explain: (p,) relative to their dark and bright levels; before it the frames of its axis, and
+    behind it their patterns (k, p). None for too few pixels."""
+    for axis, sample, m, good in evaluator.explained(hypothesis):
+        atoms = evaluator.atoms(hypothesis, axis)
+        if k in atoms.frames:
+            shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
+            return tuple(atoms.frames), shown, atoms.at(m.coordinate[good])
+    return None
+
+
 def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> int | None:
     """Return the other frame of its axis whose pattern image k shows, which the hypothesis leaves
     out; None where it shows none."""
-    for axis, sample in evaluator.sample.by_axis.items():
-        atoms, m = evaluator.atoms(hypothesis, axis), evaluator.match(hypothesis, axis)
-        if k in atoms.frames and m is not None:
-            good = m.good(sample)
-            shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
-            values = atoms.at(m.coordinate[good])
-            residual = np.minimum((shown - values) ** 2, 1).mean(axis=1)
-            j = int(residual.argmin())
-            is_like = residual[j] < limits.UNLIKE_ANY_LEAST and values[j].std() > limits.FLAT / 2
-            return atoms.frames[j] if is_like and atoms.frames[j] != k else None
-    return None
+    if (read := _read_image(evaluator, hypothesis, k)) is None:
+        return None
+    frames, shown, patterns = read
+    residual = np.minimum((shown - patterns) ** 2, 1).mean(axis=1)
+    j = int(residual.argmin())
+    is_like = residual[j] < limits.UNLIKE_ANY_LEAST and patterns[j].std() > limits.FLAT / 2
+    return frames[j] if is_like and frames[j] != k else None
 
 
 def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> float:
     """Return the mean squared residual of image k, which the hypothesis leaves out, in squares of
     the contrast; 0 where it shows its pattern, or what blur leaves of stripes."""
-    kind = hypothesis.sequence.frames[k].kind
+    if (read := _read_image(evaluator, hypothesis, k)) is None:
+        return 0.0
+    frames, shown, patterns = read
+    own = patterns[frames.index(k)]
+    is_flat = np.median(np.abs(shown - 0.5)) < limits.FLAT
+    alike = np.corrcoef(shown, own)[0, 1] if own.std() > 0.05 else 0.0
+    if hypothesis.sequence.frames[k].kind != "phase" and (is_flat or alike > limits.ALIKE):
+        return 0.0
+    residual = float(np.minimum((shown - own) ** 2, 1).mean())
     usual = limits.STRANGE * np.nanmedian(evaluator.residuals(hypothesis))
-    for axis, sample in evaluator.sample.by_axis.items():
-        atoms, m = evaluator.atoms(hypothesis, axis), evaluator.match(hypothesis, axis)
-        if k not in atoms.frames or m is None:
-            continue
-        good = m.good(sample)
-        if np.count_nonzero(good) < limits.FEWEST_PIXELS:
-            continue
-        shown = (sample.levels[k, 1][good] - m.background[good]) / m.contrast[good]
-        own = atoms.at(m.coordinate[good])[atoms.frames.index(k)]
-        is_flat = np.median(np.abs(shown - 0.5)) < limits.FLAT
-        alike = np.corrcoef(shown, own)[0, 1] if own.std() > 0.05 else 0.0
-        if kind != "phase" and (is_flat or alike > limits.ALIKE):
-            return 0.0
-        residual = float(np.minimum((shown - own) ** 2, 1).mean())
-        return residual if residual > usual + limits.STRANGE_LEAST else 0.0
-    return 0.0
+    return residual if residual > usual + limits.STRANGE_LEAST else 0.0
 
 
 def _explain_single_images(evaluator: Evaluator, base: Hypothesis) -> Iterator[Hypothesis]:
@@ -336,10 +335,7 @@ def _read_steps(evaluator: Evaluator, base: Hypothesis) -> tuple[dict[int, int],
     """Return the frame that each phase step shows which does not show its own, and the steps that
     show none of their axis."""
     shows, strange = dict[int, int](), list[int]()
-    for axis, sample in evaluator.sample.by_axis.items():
-        m = evaluator.match(base, axis)
-        if m is None or np.count_nonzero(good := m.good(sample)) < limits.FEWEST_PIXELS:
-            continue
+    for axis, sample, m, good in evaluator.explained(base):
         groups = evaluator.atoms(base, axis).groups[m.places]
         levels = sample.levels[m.images, 1][:, good]
         shown = np.clip((levels - m.background[good]) / m.contrast[good], -1, 2)

@@ -182,9 +182,14 @@ def _describe_convention(
     )
 
 
+def wrap(turns: float) -> float:
+    """Wrap a number of periods to the range -0.5 ... 0.5."""
+    return float((turns + 0.5) % 1 - 0.5)
+
+
 def describe_turns(turns: float) -> str:
     """Return a share of a period with its direction as text: "a quarter period later"."""
-    turns = float((turns + 0.5) % 1 - 0.5)
+    turns = wrap(turns)
     share = {0.25: "a quarter period", 0.5: "half a period"}.get(round(abs(turns) * 20) / 20)
     return f"{share or f'{abs(turns):.2f} periods'} {'later' if turns > 0 else 'earlier'}"
 

@@ -16,12 +16,8 @@ def measure_ghost(evaluator: Evaluator, base: Hypothesis) -> tuple[float, float]
     Each image's own light, light of the room, and displacement are fitted beside it.
     """
     normal, moment = 1e-9, 0.0
-    for axis, sample in evaluator.sample.by_axis.items():
-        m = evaluator.match(base, axis)
-        if m is None or np.count_nonzero(good := m.good(sample)) < limits.FEWEST_PIXELS:
-            continue
-        atoms, u = evaluator.atoms(base, axis), m.coordinate[good]
-        slope = (atoms.at(u + 0.5) - atoms.at(u - 0.5))[m.places]
+    for axis, sample, m, good in evaluator.explained(base):
+        slope = evaluator.atoms(base, axis).slope_at(m.coordinate[good])[m.places]
         A, B, d = m.background[good], m.contrast[good], m.predicted[:, good]
         residuals = m.residual(sample)[:, good] / B
         for k, i in enumerate(m.images):

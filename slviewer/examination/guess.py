@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.examination import limits
 from slviewer.examination.evaluate import Evaluator, described
 from slviewer.examination.examine import examine
-from slviewer.examination.findings import LINES
+from slviewer.examination.findings import LINES, wrap
 from slviewer.examination.frame_blocks import (
     BlockReader,
     Doubt,
@@ -436,11 +436,6 @@ def _list_cells(parts: _AxisBlocks) -> list[float]:
     around = turns * (1 + CELL_ERROR * np.arange(-count, count + 1) / count)
     whole = [float(round(turns))] if turns > 0.9 else []
     return [float(f"{ASSUMED_PX * each:.4g}") for each in (*whole, *around)]
-
-
-def wrap(turns: float) -> float:
-    """Wrap a number of periods to the range -0.5 ... 0.5."""
-    return float((turns + 0.5) % 1 - 0.5)
 
 
 def _check_fringes(

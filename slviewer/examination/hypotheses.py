@@ -92,11 +92,8 @@ def exchange(sequence: PatternSequence, a: int, b: int) -> Hypothesis:
     is_reversal = first.kind == second.kind == "phase" and first.axis == second.axis
     hypothesis = _order("frame-order", sequence, images, (a, b))
     # in three or four steps that is the other sign of the phase as well
-    return (
-        replace(hypothesis, cost=4 * CHANGE_COST)
-        if is_reversal and first.steps <= 4
-        else (hypothesis)
-    )
+    is_reversal = is_reversal and first.steps <= 4
+    return replace(hypothesis, cost=4 * CHANGE_COST) if is_reversal else hypothesis
 
 
 def recover_orders(evaluator: Evaluator, sequence: PatternSequence) -> Iterator[Hypothesis]:

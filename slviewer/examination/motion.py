@@ -16,15 +16,12 @@ def measure_motion(evaluator: Evaluator, base: Hypothesis) -> dict[Axis, float]:
     displaces one.
     """
     out = dict[Axis, float]()
-    for axis, sample in evaluator.sample.by_axis.items():
-        m = evaluator.match(base, axis)
-        if m is None or np.count_nonzero(good := m.good(sample)) < limits.FEWEST_PIXELS:
-            continue
-        atoms, u = evaluator.atoms(base, axis), m.coordinate[good]
+    for axis, sample, m, good in evaluator.explained(base):
+        atoms = evaluator.atoms(base, axis)
         steps = np.flatnonzero(atoms.groups[m.places] >= 0)
         if len(steps) < 4:
             continue
-        slope = (atoms.at(u + 0.5) - atoms.at(u - 0.5))[m.places][steps]
+        slope = atoms.slope_at(m.coordinate[good])[m.places][steps]
         residual = (m.residual(sample)[:, good] / m.contrast[good])[steps]
         squares, moment = (np.einsum("kp,kp->k", a, slope) for a in (slope, residual))
         shift = -moment / squares

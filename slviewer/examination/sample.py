@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slviewer.examination import limits
+from slviewer.fringe.cosines import estimate_roughness
 from slviewer.fringe.layout import white_level
 from slviewer.fringe.sequence import Axis, PatternSequence
 
@@ -58,7 +59,7 @@ class CaptureSample:
 
 
 def sample_capture(sequence: PatternSequence, stack: np.ndarray) -> CaptureSample:
-    """Sample the frames (n, h, w) of a capture on a grid; clipped pixels are left out."""
+    """Sample the frames (n, h, w) of a capture on a grid, without pixels that clip often."""
     coded = [i for i, frame in enumerate(sequence.frames) if frame.axis]
     height, width = stack.shape[1:]
     reach = max(1, min(limits.REACH_PX, min(height, width) // 40))
@@ -73,7 +74,8 @@ def sample_capture(sequence: PatternSequence, stack: np.ndarray) -> CaptureSampl
     ).astype(np.float32)  # (n, 5, p)
     high, low = _list_extremes(cross[coded])
     white = white_level(sequence, stack, coded)
-    noise = _measure_roughness(stack, coded, rows)
+    some = stack[coded[:: max(1, len(coded) // 6)]][:, rows[::8]].astype(np.float32)
+    noise = estimate_roughness(some.reshape(len(some), -1), width)
     least = max(limits.DARK_SHARE * white, limits.DARK_SIGMAS * noise)
     # a lamp that is switched on makes all pixels vary, but in one group of frames only
     groups = _group_frames(sequence)
@@ -141,12 +143,3 @@ def _choose_pixels(levels: np.ndarray, swing: np.ndarray) -> tuple[np.ndarray, i
     first = list(dict.fromkeys(np.concatenate(few).tolist()))
     every = np.unique(np.concatenate([pixels[: limits.EVEN], *edges]))
     return np.array([*first, *np.setdiff1d(every, first)], int), len(first)
-
-
-def _measure_roughness(stack: np.ndarray, coded: list[int], rows: np.ndarray) -> float:
-    """Return the grey levels by which neighbours along a row deviate from a smooth curve; at least
-    those of rounding."""
-    some = stack[coded[:: max(1, len(coded) // 6)]][:, rows[::8]].astype(np.float32)
-    third = np.abs(np.diff(some, n=3, axis=-1))
-    # 1 + 9 + 9 + 1 variances
-    return max(float(np.median(third)) / (0.6745 * np.sqrt(20)) if third.size else 0.0, 12**-0.5)

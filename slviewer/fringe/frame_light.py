@@ -196,17 +196,18 @@ def _measure_unequal_means(
         bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
         groups.append([*zip(bits, inverse, strict=False)])
 
-    def spread(values: np.ndarray) -> float:
-        """Return the largest standard deviation inside a group, a share of its mean as captured:
-        without the light of the room the mean is smaller, and the differences are the same."""
+    def spread(values: np.ndarray, whole: np.ndarray) -> float:
+        """Return the largest deviation inside a group, as a share of its mean in ``whole``."""
         sums = [
-            np.array([[v[[*pair]].sum() for pair in group] for v in (values, means)])
+            np.array([[v[[*pair]].sum() for pair in group] for v in (values, whole)])
             for group in groups
             if group
         ]
         return max((float(s[0].std() / max(s[1].mean(), 1e-6)) for s in sums), default=0.0)
 
-    return spread(means), spread((means - room * means.mean()) / gain), spread(gain)
+    # without the light of the room the mean is smaller, and the differences are the same
+    equalized = (means - room * means.mean()) / gain
+    return spread(means, means), spread(equalized, means), spread(gain, gain)
 
 
 def equalize_frames(

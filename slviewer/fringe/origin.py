@@ -31,12 +31,14 @@ class CodeOrigin:
     """Phase at which a code begins.
 
     ``turns``: in periods, -0.5 to 0.5, NaN where the edges do not agree; ``edges``: their number;
-    ``rising``: share of them at which the phase rises with the code.
+    ``rising``: share of them at which the phase rises with the code; ``is_exact``: whether it lies
+    between the pixels of most edges, rather than being the mean of blurred ones.
     """
 
     turns: float
     edges: int
     rising: float
+    is_exact: bool = True
 
 
 def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
@@ -132,6 +134,7 @@ def measure_code_origin(layout: Layout, stack: np.ndarray, white: float) -> Code
         if abs(common) < MIN_CONCENTRATION:
             return none
         near = np.abs(np.angle(middle / common)) < np.pi / 4
-        return CodeOrigin(float(np.angle(middle[near].mean()) / (2 * np.pi)), len(origin), rising)
+        turns = float(np.angle(middle[near].mean()) / (2 * np.pi))
+        return CodeOrigin(turns, len(origin), rising, is_exact=False)
     best = np.exp(1j * places)[count > _BEST_SHARE * count.max()]
     return CodeOrigin(float(np.angle(best.mean()) / (2 * np.pi)), len(origin), rising)

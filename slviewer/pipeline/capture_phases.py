@@ -98,19 +98,15 @@ def decode_or_explain(
 
 
 def decode_examined(
-    name: str,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    files: Sequence[str] = (),
-    examination: Examination | None = None,
+    name: str, sequence: PatternSequence, frames: np.ndarray, files: Sequence[str] = ()
 ) -> dict[Axis, PhaseMap]:
     """Examine the frames (n, h, w), decode them, and check what was decoded.
 
     Raises InputError like `check_capture`, and for frames that cannot be decoded; what the
-    examination rejects comes first, as it explains the others. ``examination``: of these frames,
-    made here if None.
+    examination rejects comes first, as it explains the others. ``files``: names of the frames'
+    files.
     """
-    examination = examination or examine_frames(sequence, frames, files)
+    examination = examine_frames(sequence, frames, files)
     raise_rejected(name, examination)
     phases = decode_frames(name, sequence, frames)
     check_capture(name, sequence, frames, phases, examination)

@@ -233,7 +233,7 @@ def _reverse_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
 
 
 def _permute_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The steps of every period are shown in an order that is no shift and no reversal."""
+    """The steps of every period are shown in an order that neither shifts nor reverses them."""
 
     def permute(n: int) -> list[int]:
         """A random order."""

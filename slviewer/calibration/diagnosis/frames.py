@@ -88,7 +88,8 @@ def measure_period(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> 
     if not (layout.shifts and layout.gray) or abs(layout.gray_origin_px) < MIN_ORIGIN_PX:
         return np.nan
     white = white_level(sequence, stack, sequence.select(axis))
-    origin = measure_code_origin(layout, stack, white).turns
+    found = measure_code_origin(layout, stack, white)
+    origin = found.turns if found.is_exact else np.nan
     turns = layout.gray_origin_px / layout.period_px
     ratio = turns / origin if np.isfinite(origin) and abs(origin) > 1e-3 else np.nan
     return float(layout.period_px * ratio) if 0.1 < ratio < 10 else np.nan
