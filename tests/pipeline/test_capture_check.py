@@ -37,7 +37,7 @@ def frames() -> np.ndarray:
 def test_a_sound_capture_passes(frames: np.ndarray) -> None:
     examination = examine_frames(SEQUENCE, frames)
     assert examination.warnings() == []
-    assert {*decode_examined("pose_01", SEQUENCE, frames, (), examination)} == {"x"}
+    assert {*decode_examined("pose_01", SEQUENCE, frames)} == {"x"}
 
 
 @pytest.mark.computes
