@@ -1,7 +1,6 @@
 """Starts the wizard: the operator, the server, and one thread that draws."""
 
 import contextlib
-import logging
 import os
 import signal
 import tempfile
@@ -9,35 +8,28 @@ import threading
 import time
 import webbrowser
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import viser
 
-from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
+from slviewer.devices.browser import PAGE_ROLES, PageChannels
 from slviewer.devices.page_channel import PageState
 from slviewer.errors import SlviewerError, UsageError
-from slviewer.gui.links import show_links
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.scene import ViewerScene
-from slviewer.gui.shell import Shell, greet_viewer, notify
-from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
+from slviewer.gui.scene import FIELD_OF_VIEW, OVERVIEW
+from slviewer.gui.shell import Shell
+from slviewer.gui.widgets import alert
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.pipeline.rig_presets import load_rig
 from slviewer.server.access import ONE_TIME_SECONDS, ROLES
 from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve
-from slviewer.server.viewers import Viewers
 from slviewer.server.viser_internals import ViserClient
 from slviewer.session.store import Session
-from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.preparation import Preparation
-from slviewer.wizard.snapshot import Level
-
-log = logging.getLogger("slviewer.gui")
 
 DRAWN_PER_S = 10.0
 DEFAULT_SESSION = "slviewer-session"
@@ -62,13 +54,12 @@ class App:
         be served.
         """
         self.operator = operator
-        self.pages = pages
-        self._print_links = print_links
         self.server: SafeServer = serve(serving, label="slviewer")
         try:
             if pages is not None:
                 serve_device_pages(self.server, pages)
-            self._start()
+            self._context = PanelContext(operator, self.server, pages)
+            self._start(print_links)
         except BaseException:
             self.server.stop()
             raise
@@ -78,11 +69,11 @@ class App:
         self._closing = True
         self._changed.set()
         self._unsubscribe()
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        self._context.executor.shutdown(wait=False, cancel_futures=True)
         self._thread.join(5.0)
         self.server.stop()
 
-    def _start(self) -> None:
+    def _start(self, print_links: Callable[[SafeServer], None]) -> None:
         """Build the page and its shell, subscribe to snapshots and previews, and start the drawing
         thread."""
         page, operator = self.server.viser, self.operator
@@ -91,28 +82,12 @@ class App:
         page.initial_camera.fov = FIELD_OF_VIEW
         page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
         self._closing = False
-        self._executor = ThreadPoolExecutor(1, "slviewer requests")
         self._changed = threading.Event()
-        self._offers: dict[Path, str] = {}
         self._folder: Path | None = None
         self._failure = ""
-        context = PanelContext(
-            page.gui,
-            ViewerScene(page.scene),
-            Viewpoints(lambda: page.get_clients().values()),
-            operator,
-            self._offer_download,
-            self._notify,
-            self._show_step,
-            self._report_failure,
-            self._executor,
-            partial(Viewers, page),
-            self._get_page_state,
-            self._show_links,
-        )
         snapshot = operator.snapshot()
         self._notified = snapshot.notices[-1].number if snapshot.notices else 0
-        self.shell = Shell(context, snapshot.steps)
+        self.shell = Shell(self._context, snapshot.steps, print_links)
         page.on_client_connect(self._greet_client)
         self._unsubscribe = operator.subscribe(
             lambda _: self._changed.set(), lambda _: self._changed.set()
@@ -121,8 +96,6 @@ class App:
             target=self._draw_forever, name="slviewer drawing", daemon=True
         )
         self._thread.start()
-
-    # drawing
 
     def _draw_forever(self) -> None:
         """Draw new snapshots and previews until closing; a failure is reported once and retried
@@ -135,7 +108,7 @@ class App:
             self._changed.clear()
             if self._closing:
                 return
-            if pages != (pages := [self._get_page_state(role) for role in PAGE_ROLES]):
+            if pages != (pages := [self._context.page_state(role) for role in PAGE_ROLES]):
                 version = -1
             try:
                 version, number = self._draw(version, number)
@@ -143,7 +116,7 @@ class App:
                 version = -1
                 if repr(error) != self._failure:  # it is tried again, and reported once
                     self._failure = repr(error)
-                    self._report_failure(error)
+                    self._context.report_failure(error)
                 time.sleep(1.0)
             time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
 
@@ -154,81 +127,29 @@ class App:
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
             self._folder = folder
-            self._offers.clear()
-            self.server.downloads.clear()
+            self._context.clear_downloads()
         if snapshot.version != version or self.shell.needs_drawing:
             with self.server.viser.atomic():
                 self.shell.draw(snapshot)
             for notice in snapshot.notices:
                 if notice.number > self._notified:
                     self._notified = notice.number
-                    self._notify(notice.level, notice.text)
+                    self._context.notify(notice.level, notice.text)
         if preview is not None and preview.number != number:
             self.shell.draw_preview(preview)
             number = preview.number
         return snapshot.version, number
 
-    # what panels use
-
-    def _notify(self, level: Level, text: str) -> None:
-        """Show a notification in every browser."""
-        for client in self.server.viser.get_clients().values():
-            notify(client, level, text)
-
-    def _report_failure(self, error: BaseException) -> None:
-        """Show an error as a notification in every browser."""
-        self._notify("error", describe_failure("This", error))
-
-    def _show_step(self, key: str) -> None:
-        """Show another step, drawn at once."""
-        self.shell.go(key)
-        self._changed.set()
-
-    def _offer_download(self, path: Path) -> str:
-        """Return the download address of a file of the session, cached by path."""
-        if path not in self._offers:
-            session = self.operator.snapshot().session
-            folder = session.folder if session is not None else path.parent
-            self._offers[path] = self.server.downloads.offer(path, within=folder)
-        return self._offers[path]
-
-    def _get_page_state(self, role: PageRole) -> PageState | None:
-        """Return the state of a device's page; None where none is served."""
-        if self.pages is None:
-            return None
-        return (self.pages.projector if role == "projector" else self.pages.camera).page_state()
-
     def _greet_client(self, client: viser.ClientHandle) -> None:
-        """Show a browser that may only watch that it may, and an operator's what only operators
-        see."""
+        """Show a browser that may only watch that it cannot change anything, and an operator's what
+        only operators see."""
         if self.server.role(client.client_id) == "operate":
             ViserClient(self.server.viser, client.client_id).send_private_values()
         else:
-            greet_viewer(client)
-
-    def _show_links(self, client: viser.ClientHandle | None) -> None:
-        """Show the links in the browser that requested them; None: it has disconnected."""
-        if client is None:
-            return
-        number = client.client_id
-
-        def replace() -> None:
-            """Replace all links, and print the new ones."""
-            try:
-                self.server.renew_links(number)
-                self.operator.notify(
-                    "info", "The links were replaced: pages opened by the old ones are closed"
+            with client.atomic():
+                client.gui.add_html(
+                    str(alert("View only: this link changes nothing.", "info")), order=-1.0
                 )
-            except OSError as error:
-                file = self.server.serving.token_file
-                self.operator.notify(
-                    "error",
-                    f"The links were replaced, but {file} holds the old tokens, valid again after a"
-                    f" restart ({error.strerror}): write new ones into it",
-                )
-            self._print_links(self.server)
-
-        show_links(client, self.server, replace)
 
 
 def run(

@@ -1,89 +1,63 @@
 """Inspection plans in the step Measure: uploaded or made, run on scans, with the table of what
 passes."""
 
-import viser
-
 from slviewer.errors import InputError
-from slviewer.gui.inputs import Choice, change
-from slviewer.gui.panel import PanelContext
-from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, link, paragraph, table
+from slviewer.gui.panel import NO_SESSION, Choice, Part
+from slviewer.gui.widgets import DECISION_TONES, Html, Text, alert, coloured, note, paragraph, table
 from slviewer.pipeline.inspect_parts import FILES
 from slviewer.pipeline.stored_records import Stored
-from slviewer.records.acceptance import Decision
 from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
 from slviewer.session.inspection_plan import OWN_PLAN
 from slviewer.wizard.snapshot import Snapshot
 
 SHOWN, ALL = "shown", "all"
-TONES: dict[Decision, Tone] = {"pass": "good", "fail": "error", "undecided": "warning"}
 TABLE_PX = 320
 """Greatest height of the table."""
 
 
-class InspectionInputs:
+class InspectionInputs(Part):
     """Inputs that run an inspection plan on the surface that is shown, or on every scan, and what
     came of it."""
 
-    def __init__(self, context: PanelContext) -> None:
-        self._context = context
-        self._surface = ""
-        self._scans: tuple[str, ...] = ()
+    _surface = ""
+    _scans: tuple[str, ...] = ()
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context, operator = self._context.gui, self._context, self._context.operator
-        with gui.add_folder(
-            "Inspection plan", visible=False, expand_by_default=False
-        ) as self._folder:
-            self._plan = Choice(gui, "Plan", "Make one from the results above, or upload one")
-            upload = gui.add_upload_button(
-                "Upload plan", icon=viser.Icon.UPLOAD, color="gray", mime_type=".toml"
-            )
-            upload.on_upload(
-                context.callback(
-                    lambda: operator.upload_plan(upload.value.name, upload.value.content)
-                )
-            )
-            self._parts = Choice(gui, "Parts")
-            self._run = context.button("Run plan", self._request_run, viser.Icon.LIST_CHECK, None)
+        gui, context, operator = self._gui, self._context, self._operator
+        with gui.add_folder("Inspection plan", expand_by_default=False) as self._folder:
+            hint = "Make one from the results above, or upload one"
+            self._plan = Choice(context, "Plan", hint=hint)
+            context.upload_button("Upload plan", operator.upload_plan, ".toml")
+            self._parts = Choice(context, "Parts")
+            self._run = context.button("Run plan", self._request_run, "list-check", None)
             self._result = Text(gui)
             self._files = Text(gui)
 
     def draw(self, snapshot: Snapshot, surface: str) -> None:
         """Offer the session's plans for the shown surface and for all scans, and show the latest
         results."""
-        session = snapshot.session
+        session = snapshot.session or NO_SESSION
         self._surface = surface
-        change(self._folder, visible=bool(session and surface))
-        if session is None:
-            return
-        names = [
+        self._folder.visible = bool(surface)
+        self._plan.offer(
             (plan, "made here" if plan == OWN_PLAN else plan.partition("/")[2])
             for plan in session.plans
-        ]
-        self._plan.offer(names)
+        )
         self._scans = tuple(scan.name for scan in session.scans if scan.cloud == "fresh")
         every = [(ALL, f"all {len(self._scans)} scans")] if len(self._scans) > 1 else []
         self._parts.offer([(SHOWN, "the surface shown"), *every], SHOWN)
-        change(self._run, disabled=snapshot.is_busy or not session.plans)
+        self._run.disabled = snapshot.is_busy or not session.plans
         runs = session.list_records(Inspection)
         self._result.set(inspection_html(runs[-1]) if runs else "")
-        files = [each for each in session.exports if each.name in FILES]
-        self._files.set(
-            "".join(
-                paragraph(link(self._context.offer(each.path), f"Download {each.name}"))
-                for each in files
-            )
-            if runs
-            else ""
-        )
+        self._files.set(self._context.links_html(session.exports, *FILES) if runs else "")
 
     def _request_run(self) -> None:
         """Request that the chosen plan be run."""
         parts = self._scans if self._parts.value == ALL else (self._surface,)
         if not self._plan.value:
             raise InputError("there is no plan yet: press Make plan, or upload one")
-        self._context.operator.run_plan(self._plan.value, *parts)
+        self._operator.run_plan(self._plan.value, *parts)
 
 
 def inspection_html(run: Stored[Inspection]) -> Html:
@@ -91,7 +65,7 @@ def inspection_html(run: Stored[Inspection]) -> Html:
     decisions."""
     seen, counts = run.record, run.record.count_parts()
     said = ", ".join(
-        coloured(f"{n} {decision}", TONES[decision], bold=True)
+        coloured(f"{n} {decision}", DECISION_TONES[decision], bold=True)
         for decision, n in counts.items()
         if n
     )
@@ -103,7 +77,7 @@ def inspection_html(run: Stored[Inspection]) -> Html:
         for i, (wanted, result) in enumerate(zip(seen.characteristic, part.results, strict=True)):
             title = coloured(part.part, "dim") if i == 0 and len(seen.parts) > 1 else Html("")
             name = Html(f"{title}{'<br>' if title else ''}{coloured(result.name, 'plain')}")
-            mark = coloured(result.decision, TONES[result.decision], bold=True)
+            mark = coloured(result.decision, DECISION_TONES[result.decision], bold=True)
             rows.append(
                 (name, format_result(wanted, result), Html(f"{format_limits(wanted)}<br>{mark}"))
             )
@@ -117,14 +91,10 @@ def inspection_html(run: Stored[Inspection]) -> Html:
         for result in part.results
         if result.reason
     }
-    notes = "".join(
-        paragraph(coloured(f"Not measured: {reason}", "warning")) for reason in sorted(reasons)
-    )
+    notes = "".join(note(f"Not measured: {reason}", "warning") for reason in sorted(reasons))
     if not all(result.whole for part in seen.parts for result in part.results):
-        notes += paragraph(
-            coloured("Some U hold no part of the calibration's uncertainty: it is unknown.", "dim")
-        )
-    return Html(html + scrolled + notes + paragraph(coloured(RULE, "dim")))
+        notes += note("Some U hold no part of the calibration's uncertainty: it is unknown.")
+    return html + scrolled + notes + note(RULE)
 
 
 def format_result(wanted: Characteristic, result: CharacteristicResult) -> Html:

@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 import cv2
 import viser
 
+from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Html, alert, paragraph, to_html
 from slviewer.server.secure import SafeServer
 
@@ -16,10 +17,36 @@ _QUIET_ZONE = 4
 """White modules around a QR code (ISO/IEC 18004)."""
 
 
-def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable[[], None]) -> None:
-    """Open a dialog with the links in one browser; `replace()` is called when new ones are
-    requested in it."""
-    origin = server.origin_of(client.client_id)
+def show_links(
+    context: PanelContext,
+    print_links: Callable[[SafeServer], None],
+    client: viser.ClientHandle | None,
+) -> None:
+    """Open a dialog with the links in the browser that requests them; None: it has disconnected.
+
+    New ones that are requested in it are passed to `print_links`.
+    """
+    server, operator = context.server, context.operator
+    if client is None:
+        return
+    number = client.client_id
+
+    def replace(_: object) -> None:
+        """Replace all links, and print the new ones."""
+        try:
+            server.renew_links(number)
+            operator.notify(
+                "info", "The links were replaced: pages opened by the old ones are closed"
+            )
+        except OSError as error:
+            operator.notify(
+                "error",
+                f"The links were replaced, but {server.serving.token_file} holds the old tokens,"
+                f" valid again after a restart ({error.strerror}): write new ones into it",
+            )
+        print_links(server)
+
+    origin = server.origin_of(number)
     is_own = origin is not None and urlsplit(origin).hostname in ("127.0.0.1", "localhost", "::1")
     if is_own and not server.loopback:
         origin = server.shared_origin
@@ -34,25 +61,19 @@ def show_links(client: viser.ClientHandle, server: SafeServer, replace: Callable
         gui = client.gui
         gui.add_html("".join(_link_html(what, link, others_reach) for what, link in rows))
         if not others_reach:
-            advice = (
+            advice = Html(
                 "Only this computer reaches these links. For others, and phones, start slviewer"
-                " with"
+                " with <code style='white-space:nowrap'>--host 0.0.0.0 --tls</code>."
             )
-            code = "<code style='white-space:nowrap'>--host 0.0.0.0 --tls</code>"
-            gui.add_html(str(alert(Html(f"{advice} {code}."), "info")))
-        gui.add_html(
-            str(
-                paragraph(
-                    Html(
-                        "<b>New links</b> closes every page that was opened by the present ones,"
-                        " those of projector and camera too. This page continues."
-                    )
-                )
-            )
+            gui.add_html(str(alert(advice, "info")))
+        about = Html(
+            "<b>New links</b> closes every page that was opened by the present ones, those of"
+            " projector and camera too. This page continues."
         )
+        gui.add_html(str(paragraph(about)))
         renew = gui.add_button("New links", icon=viser.Icon.REFRESH, color="red")
         close = gui.add_button("Close", color="gray")
-    renew.on_click(lambda _: replace())
+    renew.on_click(replace)
     close.on_click(lambda _: dialog.close())
 
 

@@ -10,16 +10,14 @@ import numpy as np
 import viser
 
 from slviewer.gui.panel import PanelContext
-from slviewer.gui.scene import spacing, thin
+from slviewer.gui.scene import add_points, spacing, thin
+from slviewer.server.viewers import Viewers
 from slviewer.wizard.live_scan import LiveCloud
 
 LAYER = "live"
 MOST_POINTS, FEWEST_POINTS = 60_000, 15_000
 # a browser that takes longer, or less, for a cloud is sent fewer points, or more
-_SLOW_S, _QUICK_S = (
-    0.09,
-    0.05,
-)
+_SLOW_S, _QUICK_S = 0.09, 0.05
 
 
 class LiveScreen:
@@ -27,7 +25,7 @@ class LiveScreen:
 
     def __init__(self, context: PanelContext) -> None:
         self._context = context
-        self._viewers = context.viewers(self._wake)
+        self._viewers = Viewers(context.server.viser, self._wake)
         self._condition = threading.Condition()
         self._cloud: LiveCloud | None = None
         self._nodes: dict[int, Any] = {}
@@ -68,7 +66,7 @@ class LiveScreen:
             try:
                 drawn = self._draw_cloud(cloud) if cloud is not None else self._remove_cloud()
             except Exception as error:
-                self._context.failed(error)
+                self._context.report_failure(error)
                 drawn = False
             with self._condition:
                 if not drawn and self._cloud is cloud:
@@ -85,9 +83,8 @@ class LiveScreen:
         self.points = len(points)
         if not len(points):
             return self._remove_cloud()
-        size = spacing(points)
         for client in clients:
-            self._send_cloud(client, points, colours, size)
+            self._send_cloud(client, points, colours)
             self._drawn[client.client_id] = cloud.number
         if not self._is_in_view:
             self._is_in_view = True
@@ -98,24 +95,17 @@ class LiveScreen:
         return True
 
     def _send_cloud(
-        self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray, size: float
+        self, client: viser.ClientHandle, points: np.ndarray, colours: np.ndarray
     ) -> None:
         """Send points (n, 3) mm with colours to one browser, as a new or an updated node."""
         number = client.client_id
         with client.atomic():
             if number not in self._nodes:
-                self._nodes[number] = client.scene.add_point_cloud(
-                    f"/{LAYER}/cloud",
-                    points,
-                    colours,
-                    point_size=size,
-                    point_shape="square",
-                    point_shading="flat",
-                    precision="float32",
-                )
+                path = f"/{LAYER}/cloud"
+                self._nodes[number] = add_points(client.scene, path, points, colours)
             else:
                 node = self._nodes[number]
-                node.points, node.colors, node.point_size = points, colours, size
+                node.points, node.colors, node.point_size = points, colours, spacing(points)
             self._viewers.sent(client)
 
     def _remove_cloud(self) -> bool:

@@ -1,34 +1,58 @@
 """The measurements: drawn in 3D, listed, shown one by one, renamed, deleted, restored, written as a
-table."""
+table; a section with cursors to measure in it."""
 
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import viser
 
-from slviewer.gui.inputs import Choice, change
+from slviewer.errors import InputError
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table
-from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
-from slviewer.gui.panel import PanelContext
-from slviewer.gui.pictures import PLOT_PX, Painter, Plot
-from slviewer.gui.widgets import Text, link, paragraph
+from slviewer.gui.panel import NO_SESSION, Choice, Painter, PanelContext, Part, scan_labels
+from slviewer.gui.scene import Stroke
+from slviewer.gui.widgets import (
+    DECISION_TONES,
+    PLOT_PX,
+    Html,
+    Plot,
+    Text,
+    alert,
+    note,
+    properties_table,
+    records_html,
+    relabel,
+    report_table,
+    to_html,
+)
 from slviewer.inspection.colours import colour_limit
-from slviewer.inspection.section import CutPlane
+from slviewer.inspection.section import (
+    CutPlane,
+    measure_cursors,
+    nearest_on_section,
+    radius_through,
+)
 from slviewer.pipeline.measurements import section_lines
 from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
-from slviewer.records.measurement import Measurement
-from slviewer.report.measurements import section_plot
+from slviewer.records.measurement import Measurement, list_quantities
+from slviewer.report.canvas import finish_figure, new_figure, style_axes
+from slviewer.report.measurements import draw_deviations, section_plot
+from slviewer.report.page import Figure
 from slviewer.wizard.measure_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 
-CHOSEN, OTHER, STALE = (200, 40, 40), (30, 90, 160), (140, 140, 140)
+CHOSEN, OTHER, STALE = Stroke((200, 40, 40)), Stroke((30, 90, 160)), Stroke((140, 140, 140))
+CURSORS = ("A", "B", "C")
+_AT = (0.15, 0.85, 0.5)
+"""Initial positions of the cursors, as shares of the section's length."""
+_STEPS = 400
+_MARKS = tuple(f"cursor {cursor}" for cursor in CURSORS)
+"""Of the cursors in 3D."""
+_HISTOGRAM_PX = 230
 Lines = list[np.ndarray]
 
 
-class MeasurementList:
+class MeasurementList(Part):
     """List of measurements with a chosen one; ``changed(measured)`` is called when another one is
     chosen."""
 
@@ -39,48 +63,44 @@ class MeasurementList:
         layer: str,
         changed: Callable[[Stored[Measurement] | None], None],
     ) -> None:
-        self._context, self._painter, self._layer, self._changed = context, painter, layer, changed
-        self._lock = threading.RLock()
-        self._session: SessionView | None = None
-        self._on = ""
+        super().__init__(context)
+        self._painter, self._layer, self._changed = painter, layer, changed
+        self._session: SessionView = NO_SESSION
+        self._on = self._chosen_id = self._section_id = ""
         self._known: set[str] = set()
-        self._chosen_id = ""
         self._drawn: dict[str, Any] = {}
         self._lines: dict[str, tuple[CutPlane, Lines]] = {}
-
-    def build(self) -> None:
-        """Create the inputs."""
-        gui, context, operator = self._context.gui, self._context, self._context.operator
-        with gui.add_folder("Result", visible=False) as self._chosen_folder:
-            self._choice = Choice(gui, "Result")
-            self._choice.on_change(context.callback(self.refresh))
+        gui, operator = self._gui, self._operator
+        with gui.add_folder("Result") as self._chosen_folder:
+            self._choice = choice = Choice(context, "Result", self.refresh)
             self._histogram = Plot(gui)
-            self._section = SectionPlot(self._context, self.refresh)
+            self._section = Plot(gui)
+            self._cursors: list[Any] = [
+                gui.add_slider(f"{name}, mm", 0.0, 1.0, 0.01, 0.0, hint=f"Cursor {name}")
+                for name in CURSORS
+            ]
+            context.on_change(self.refresh, *self._cursors)
+            self._values = Text(gui)
             self._details = Text(gui)
-            self._rename_to = gui.add_text("New name", "")
-            context.button("Rename", self._request_rename, viser.Icon.PENCIL)
-            delete = lambda: operator.delete_measurement(self._choice.value)  # noqa: E731
+            self._new_name: Any = gui.add_text("New name", "")
+            context.button("Rename", self._request_rename, "pencil")
             context.button(
                 "Delete result",
-                delete,
-                viser.Icon.TRASH,
+                lambda: operator.delete_measurement(choice.value),
+                "trash",
                 "red",
                 hint="Moves it to the session's trash",
             )
         self._restore = context.button(
-            "Restore deleted",
-            operator.undo_delete,
-            viser.Icon.ARROW_BACK_UP,
-            "orange",
-            visible=False,
+            "Restore deleted", operator.undo_delete, "arrow-back-up", "orange"
         )
-        with gui.add_folder("All results", visible=False) as self._table_folder:
+        with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
-            context.button("Write CSV", operator.export_measurements_table, viser.Icon.TABLE_EXPORT)
+            context.button("Write CSV", operator.export_measurements_table, "table-export")
             context.button(
                 "Make plan",
                 operator.make_inspection_plan,
-                viser.Icon.REPEAT,
+                "repeat",
                 hint="To repeat the fits on other scans",
             )
             self._file = Text(gui)
@@ -88,41 +108,30 @@ class MeasurementList:
     @property
     def chosen(self) -> Stored[Measurement] | None:
         """The chosen measurement; None where there is none."""
-        return next((each for each in self._measurements if each.name == self._choice.value), None)
+        measured = self._session.measurements
+        return next((each for each in measured if each.name == self._choice.value), None)
 
-    def draw(self, session: SessionView | None, on: str) -> list[Stored[Measurement]]:
+    def draw(self, session: SessionView, on: str) -> list[Stored[Measurement]]:
         """Show the session's measurements, in 3D those on the surface ``on``; returns the new
         ones."""
         with self._lock:
             before, self._session, self._on = self._session, session, on
-            measured = self._measurements
-            if session is None or before is None or session.folder != before.folder:
-                self._known = {each.name for each in measured}
+            measured = session.measurements
+            names = [each.name for each in measured]
+            if session.folder != before.folder:
+                self._known = set(names)
                 self._clear_drawings()
             new = [each for each in measured if each.name not in self._known]
-            self._known = {each.name for each in measured}
-            self._offer_choice()
+            self._known = set(names)
+            # the latest first, by their names; by their ids too where names occur twice
+            self._choice.offer(list(zip(names, name_records(measured), strict=True))[::-1])
             if new:
                 self._choice.choose(new[-1].name)
-            for folder in (self._chosen_folder, self._table_folder):
-                change(folder, visible=bool(measured))
-            change(self._restore, visible=bool(session and session.deleted_measurements))
-            files = (
-                [each for each in session.exports if each.name in (TABLE, PLAN)] if session else []
-            )
-            links = [
-                link(self._context.offer(each.path), f"Download {each.name}") for each in files
-            ]
-            self._file.set("".join(map(paragraph, links)))
+            self._chosen_folder.visible = self._table_folder.visible = bool(measured)
+            self._restore.visible = session.deleted_measurements > 0
+            self._file.set(self._context.links_html(session.exports, TABLE, PLAN))
             self.refresh()
             return new
-
-    def _offer_choice(self) -> None:
-        """Offer the measurements, the latest first, by their names; by their ids too where names
-        occur twice."""
-        measured = self._measurements
-        names = [each.name for each in measured]
-        self._choice.offer(list(zip(names, name_records(measured), strict=True))[::-1])
 
     def change_surface(self, on: str) -> None:
         """Draw the measurements of another surface."""
@@ -132,42 +141,25 @@ class MeasurementList:
     def refresh(self) -> None:
         """Update tables, plots and 3D drawings for the chosen measurement."""
         with self._lock:
-            chosen, measured = self.chosen, self._measurements
+            chosen, measured = self.chosen, self._session.measurements
             chosen_id = chosen.name if chosen else ""
             if chosen_id != self._chosen_id:
                 self._chosen_id = chosen_id
                 self._changed(chosen)
-            labels = self._labels
+            labels = scan_labels(self._session)
+            if (merge := self._session.merge) is not None:
+                labels[f"merge/{merge.name}"] = f"merge of {len(merge.record.scans)} scans"
             self._table.set(measurements_table(measured, labels) if measured else "")
             self._details.set(measurement_html(chosen, labels) if chosen else "")
             self._draw_deviation(chosen)
             self._draw_section(chosen)
-            self._request_drawings(chosen)
+            self._request_drawings(measured, chosen)
 
     # inside
 
-    @property
-    def _measurements(self) -> tuple[Stored[Measurement], ...]:
-        """The session's measurements."""
-        return self._session.measurements if self._session else ()
-
-    @property
-    def _labels(self) -> dict[str, str]:
-        """{name of a surface: its label}, for scans and the merge."""
-        if self._session is None:
-            return {}
-        merge = self._session.merge
-        merged = (
-            {}
-            if merge is None
-            else {f"merge/{merge.name}": f"merge of {len(merge.record.scans)} scans"}
-        )
-        return {scan.name: scan.label for scan in self._session.scans} | merged
-
     def _clear_drawings(self) -> None:
         """Remove all drawings, as the measurements of another session have the same ids."""
-        for identity in self._drawn:
-            self._context.scene.remove(self._layer, identity)
+        self._scene.remove(self._layer, *self._drawn)
         self._drawn, self._lines, self._chosen_id = {}, {}, ""
         for place in ("drawings", "histogram", "section"):
             self._painter.cancel(place)
@@ -175,104 +167,98 @@ class MeasurementList:
     def _request_rename(self) -> None:
         """Request the entered name for the chosen measurement."""
         if self._choice.value:
-            self._context.operator.relabel_measurement(self._choice.value, self._rename_to.value)
-            change(self._rename_to, value="")
+            self._operator.relabel_measurement(self._choice.value, self._new_name.value)
+            self._new_name.value = ""
 
     def _draw_deviation(self, measured: Stored[Measurement] | None) -> None:
         """Show the histogram of a deviation; hide it for others."""
         if measured is None or measured.record.deviation is None:
             self._painter.cancel("histogram")
-            self._histogram.hide()
+            self._histogram.set(None)
             return
         tolerance = measured.record.deviation.tolerance_mm
 
-        def make() -> Any:
+        def make() -> Figure:
             """Plot the histogram of the deviation."""
             arrays = load_arrays(self._context.session, f"{Measurement.kind}/{measured.name}")
-            limit = colour_limit(arrays["signed"], tolerance)
-            return deviation_figure(
-                measured.label, arrays["edges"], arrays["counts"], limit, tolerance
-            )
+            return deviation_figure(measured.label, arrays, tolerance)
 
-        self._painter.request(
-            "histogram", (measured.name, measured.label), make, self._histogram.set
-        )
+        key = (measured.name, measured.label)
+        self._painter.request("histogram", key, make, self._histogram.set)
 
     def _draw_section(self, measured: Stored[Measurement] | None) -> None:
         """Show the plot of a section with its cursors, once its lines are read; None: hide it."""
-        if measured is None or measured.name not in self._lines:
+        loaded = self._lines.get(measured.name) if measured else None
+        for slider in self._cursors:
+            slider.visible = loaded is not None
+        if measured is None or loaded is None:
+            self._section_id = ""
             self._painter.cancel("section")
-            self._section.hide()
-            for cursor in CURSORS:
-                self._context.scene.remove(self._layer, f"cursor {cursor}")
+            self._section.set(None)
+            self._values.set("")
+            self._scene.remove(self._layer, *_MARKS)
             return
-        plane, lines = self._lines[measured.name]
-        self._section.set(measured.name, lines)
-        at, on, key = (
-            self._section.at,
-            self._on,
-            (measured.name, measured.label, self._section.at, self._on),
-        )
+        plane, lines = loaded
+        if measured.name != self._section_id:  # on the same section they keep their positions
+            self._section_id = measured.name
+            low, high, step = _round_range(np.concatenate(lines)[:, 0])
+            for slider, share in zip(self._cursors, _AT, strict=True):
+                slider.min, slider.max, slider.step = low, high, step
+                slider.value = round(low + round(share * (high - low) / step) * step, 6)
+        at, on = tuple(float(slider.value) for slider in self._cursors), self._on
 
-        def make() -> Any:
+        def make() -> tuple[Figure, np.ndarray]:
             """Plot the section; returns (figure, cursors (3, 2) mm)."""
             cursors = cursor_points(lines, at)
             named = dict(zip(CURSORS, cursors, strict=True))
             return section_plot(measured.label, lines, named, width=PLOT_PX), cursors
 
-        def show(made: Any) -> None:
-            """Show the plot, and mark the cursors in 3D if the section's surface is shown."""
-            self._section.show(*made)
-            for cursor, point in zip(CURSORS, lifted(plane, made[1]), strict=True):
-                if on == measured.record.source:
-                    self._context.scene.mark(self._layer, f"cursor {cursor}", point, cursor)
-                else:
-                    self._context.scene.remove(self._layer, f"cursor {cursor}")
+        def show(made: tuple[Figure, np.ndarray]) -> None:
+            """Show the plot with the values at the cursors, and mark these in 3D if the section's
+            surface is shown."""
+            figure, cursors = made
+            self._section.set(figure)
+            self._values.set(cursor_html(cursors))
+            if on == measured.record.source:
+                points = lifted(plane, cursors)
+                for cursor, mark, point in zip(CURSORS, _MARKS, points, strict=True):
+                    self._scene.mark(self._layer, mark, point, cursor)
+            else:
+                self._scene.remove(self._layer, *_MARKS)
 
-        self._painter.request("section", key, make, show)
+        self._painter.request("section", (measured.name, measured.label, at, on), make, show)
 
-    def _request_drawings(self, chosen: Stored[Measurement] | None) -> None:
+    def _request_drawings(
+        self, measured: Sequence[Stored[Measurement]], chosen: Stored[Measurement] | None
+    ) -> None:
         """Request the 3D drawings of all measurements on this surface; the lines of sections are
         read from disk."""
-        measured = self._measurements
-        others = {each.name: each.record for each in measured}
-        shown = [
-            each
-            for each in measured
-            if self._on
-            in (
-                each.record.source,
-                *(others[o].source for o in each.record.of if o in others),
-            )
-        ]
-        cut = [
-            each.name
-            for each in (*shown, *([chosen] if chosen else ()))
-            if each.record.plane is not None
-        ]
+        records = {each.name: each.record for each in measured}
+        on_surface = {name for name, record in records.items() if record.source == self._on}
+        shown = [each for each in measured if on_surface & {each.name, *each.record.of}]
         looks = {each.name: (each.label, each.stale, each is chosen) for each in shown}
+        sections = [each.name for each in measured if each.record.plane is not None]
 
         def make() -> dict[str, tuple[CutPlane, Lines]]:
             """Load the plane and the lines of each section that is not loaded yet."""
             store = self._context.session
-            return {i: self._lines[i] if i in self._lines else section_lines(store, i) for i in cut}
+            return {name: self._lines.get(name) or section_lines(store, name) for name in sections}
 
         def show(lines: dict[str, tuple[CutPlane, Lines]]) -> None:
             """Draw what has changed, and remove what is no longer there."""
             with self._lock:
                 loaded = lines.keys() - self._lines.keys()
                 self._lines = lines
-                for identity in self._drawn.keys() - looks.keys():
-                    self._context.scene.remove(self._layer, identity)
-                    del self._drawn[identity]
+                self._scene.remove(self._layer, *(self._drawn.keys() - looks.keys()))
                 for each in shown:
                     if self._drawn.get(each.name) != looks[each.name]:
-                        self._drawn[each.name] = looks[each.name]
-                        self._draw_one(each, others, each is chosen)
+                        self._draw_one(each, records, each is chosen)
+                self._drawn = looks
                 if chosen is not None and chosen.name in loaded:
                     self.refresh()
 
-        self._painter.request("drawings", (self._on, tuple(looks.items()), tuple(cut)), make, show)
+        key = (self._on, tuple(looks.items()), tuple(sections))
+        self._painter.request("drawings", key, make, show)
 
     def _draw_one(
         self, measured: Stored[Measurement], others: dict[str, Measurement], chosen: bool
@@ -280,10 +266,86 @@ class MeasurementList:
         """Draw one measurement in 3D with its label, coloured by whether it is stale, chosen or
         neither."""
         cut = self._lines[measured.name][1] if measured.record.plane is not None else ()
-        lines = drawn(measured.record, others, cut)
-        if lines is None:
-            return
-        colour = STALE if measured.stale else CHOSEN if chosen else OTHER
-        self._context.scene.drawing(
-            self._layer, measured.name, lines[0], colour, lines[1], label(measured)
+        if (drawing := drawn(measured.record, others, cut)) is not None:
+            segments, place = drawing
+            stroke = STALE if measured.stale else CHOSEN if chosen else OTHER
+            text = label(measured)
+            self._scene.lines(self._layer, measured.name, segments, stroke, (text, place))
+
+
+def _round_range(along: np.ndarray) -> tuple[float, float, float]:
+    """Return (lowest, highest, step) of positions (n,) mm as round numbers."""
+    low, high = float(along.min()), float(along.max())
+    digits = int(np.clip(-np.floor(np.log10(max(high - low, 1e-6) / _STEPS)), 0, 5))
+    step = 10.0**-digits
+    return (
+        round(np.ceil(low / step) * step, digits),
+        round(np.floor(high / step) * step, digits),
+        step,
+    )
+
+
+def cursor_points(lines: list[np.ndarray], at: tuple[float, ...]) -> np.ndarray:
+    """Return the section's points (3, 2) mm at the cursors."""
+    return np.array([nearest_on_section(lines, x) for x in at])
+
+
+def cursor_html(cursors: np.ndarray) -> Html:
+    """Return a table of distances and radius at the cursors (3, 2) mm."""
+    a, b, c = cursors
+    values = {
+        f"{q.name.capitalize()} A – B": f"{q.value:.3f} {q.unit}".replace("-", "−")
+        for q in measure_cursors(a, b)
+    }
+    try:
+        radius = f"{radius_through(a, c, b).value:.3f} mm"
+    except InputError:
+        radius = "none: straight line"
+    return properties_table("Cursors", {**values, "Radius through A, C, B": radius})
+
+
+def measurements_table(measured: Sequence[Stored[Measurement]], labels: Mapping[str, str]) -> Html:
+    """Return a table of all measurements, the latest first; ``labels``: {scan: the operator's
+    name}."""
+    named = {
+        f"{each.label} ({each.name}{', stale' if each.stale else ''})": each.record
+        for each in reversed(measured)
+    }
+    listed = relabel(list_quantities(named), labels)
+    # a panel is too narrow for a column of scans
+    rows = [[f"{name} on {scan}", what, scan, *rest] for name, what, scan, *rest in listed.rows]
+    shown = [column for column in listed.columns if column.title != "scan"]
+    return report_table(replace(listed, rows=rows).select(shown))
+
+
+def measurement_html(measured: Stored[Measurement], labels: Mapping[str, str]) -> Html:
+    """Return all figures of one measurement, with its source and warnings."""
+    record = measured.record
+    about = f"{record.what} on {labels.get(record.source, record.source)}, by {record.model}"
+    about += f"; {record.where}." if record.where else "."
+    html = records_html([measured], labels, named=False) + note(about)
+    if record.deviation is not None and (verdict := record.deviation.verdict) is not None:
+        html = (
+            alert(Html(f"<b>{to_html(verdict.text())}</b>"), DECISION_TONES[verdict.decision])
+            + html
         )
+    if measured.stale:
+        stale = "Out of date: the measured surface has changed; measure again."
+        html = alert(stale, "warning") + html
+    return html
+
+
+def deviation_figure(
+    name: str, arrays: Mapping[str, np.ndarray], tolerance: float | None
+) -> Figure:
+    """Plot the histogram of a stored deviation: ``edges`` (n + 1,) mm, ``counts`` (n,), and
+    ``signed`` (m,) mm, by whose range it is coloured."""
+    drawing = new_figure(PLOT_PX, _HISTOGRAM_PX)
+    axes = drawing.subplots()
+    style_axes(axes, "", "deviation, mm", "points, %")
+    edges, limit = arrays["edges"], colour_limit(arrays["signed"], tolerance)
+    draw_deviations(axes, edges, arrays["counts"], limit, tolerance)
+    if tolerance is not None:
+        far = max(float(edges[-1]), 1.15 * tolerance)
+        axes.set_xlim(-far, far)
+    return finish_figure(drawing, "Histogram of the deviations.", name)

@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.gui.inputs import Choice, change, scan_options
-from slviewer.gui.measure_html import deviation_bar
-from slviewer.gui.panel import PanelContext
-from slviewer.gui.pictures import Painter
+from slviewer.gui.panel import Choice, Painter, PanelContext, Part, scan_options
+from slviewer.gui.scene import Click
 from slviewer.gui.steps.scan import sort_scans
-from slviewer.gui.widgets import Html, Text, paint
+from slviewer.gui.widgets import Html, Text, colour_bar, paint
 from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.stored_records import Stored, load_arrays
@@ -23,77 +21,66 @@ COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"
 
 
-class SurfaceView:
+class SurfaceView(Part):
     """View of the chosen surface; ``loaded()`` is called once another one is shown, on the
     painter's thread."""
 
     def __init__(
         self, context: PanelContext, painter: Painter, layer: str, loaded: Callable[[], None]
     ) -> None:
-        self._context, self._painter, self._layer, self._loaded = context, painter, layer, loaded
+        super().__init__(context)
+        self._painter, self._layer, self._loaded = painter, layer, loaded
         self._clicks = count()
         self._deviation: Stored[Measurement] | None = None
         self._versions: dict[str, Any] = {}
         self._visible = False
         self.on: MeasuredSurface | None = None
-
-    def build(self) -> None:
-        """Create the inputs."""
-        gui, context = self._context.gui, self._context
-        self._choice = Choice(gui, "Surface")
-        self._choice.on_change(context.callback(self.request))
-        self._colour = gui.add_dropdown("Colour", COLOURS)
-        self._colour.on_update(context.callback(self.request))
-        self._legend = Text(gui)
+        self.choice = Choice(context, "Surface", self.request)
+        self._colour: Any = self._gui.add_dropdown("Colour", COLOURS)
+        context.on_change(self.request, self._colour)
+        self._legend = Text(self._gui)
         context.view_button(lambda: None if self.on is None else self.on.points)
 
     @property
     def name(self) -> str:
         """The chosen scan or merge; empty where there is none."""
-        return self._choice.value
+        return self.choice.value
 
-    def choose(self, name: str) -> None:
-        """Choose a surface by name, if it is offered."""
-        self._choice.choose(name)
-
-    def offer(self, session: SessionView | None) -> None:
+    def offer(self, session: SessionView) -> None:
         """Offer the surfaces that can be measured on, and draw the chosen one."""
-        scans = (
-            [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"] if session else []
-        )
+        scans = [scan for scan in sort_scans(session.scans) if scan.cloud == "fresh"]
         offered = scan_options(scans)
-        folder = session.folder if session else None
-        cut = session.restriction if session else lambda _: (None, ())
-        self._versions = {s.name: (folder, s.figures, *cut(s.name)) for s in scans}
-        merge = session.merge if session else None
+        self._versions = {
+            scan.name: (session.folder, scan.figures, *session.restriction(scan.name))
+            for scan in scans
+        }
+        merge = session.merge
         if merge is not None and not merge.stale:
             name = f"{MERGED}{merge.name}"
             offered.append((name, f"Merge of {len(merge.record.scans)} scans"))
-            self._versions[name] = (folder, merge.record.points)
-        self._choice.offer(offered)
+            self._versions[name] = (session.folder, merge.record.points)
+        self.choice.offer(offered)
         self.request()
 
     def show_deviation(self, measured: Stored[Measurement] | None) -> None:
         """Colour the surface by this deviation; None: by another quantity."""
         self._deviation = measured
+        options = COLOURS if measured is None else (*COLOURS, DEVIATION)
+        if self._colour.options != options:
+            self._colour.options = options  # a colour that is no longer offered becomes the first
         if measured is not None:
-            change(self._colour, options=(*COLOURS, DEVIATION))
-            change(self._colour, value=DEVIATION)
-        elif DEVIATION in self._colour.options:
-            colour = COLOURS[0] if self._colour.value == DEVIATION else self._colour.value
-            self._colour.options = COLOURS
-            change(self._colour, value=colour)
+            self._colour.value = DEVIATION
         self.request()
 
     def show(self, visible: bool) -> None:
         """Show or hide the surface."""
         self._visible = visible
-        self._context.scene.show(self._layer, visible)
+        self._scene.show(self._layer, visible)
         self._show_view()
 
-    def pick(self, origin: np.ndarray, direction: np.ndarray, do: Callable[[Place], None]) -> None:
-        """Call ``do(place)`` later with the point that a ray meets; not called where it misses the
-        surface."""
+    def pick(self, click: Click, do: Callable[[Place], None]) -> None:
+        """Call ``do(place)`` later with the point that a click meets; not called where it misses
+        the surface."""
         on, slot = self.on, f"click {next(self._clicks)}"
         if on is None:
             return
@@ -104,7 +91,9 @@ class SurfaceView:
             if place is not None and on is self.on:
                 do(place)
 
-        self._painter.request(slot, None, lambda: place_at(on, origin, direction), picked)
+        self._painter.request(
+            slot, None, lambda: place_at(on, click.origin, click.direction), picked
+        )
 
     def request(self) -> None:
         """Request the chosen surface in the chosen colours."""
@@ -112,21 +101,20 @@ class SurfaceView:
         if not name:
             self.on = None
             self._painter.cancel("surface")
-            self._context.scene.remove(self._layer, "surface")
+            self._scene.remove(self._layer, "surface")
             self._legend.set("")
             return
         if shown is not None and (shown.record.source != name or colour != DEVIATION):
             shown = None
         key = (name, self._versions.get(name), colour if shown is None else shown.name)
-        context = self._context
 
         def make() -> tuple[MeasuredSurface, np.ndarray, np.ndarray, Html]:
             """Load the surface; returns (surface, points, colours, legend)."""
-            on = context.operator.surface(name)
+            on = self._operator.surface(name)
             if shown is None:
                 return (on, *paint_surface(on, COLOURS[0] if colour == DEVIATION else colour))
             assert shown.record.deviation is not None
-            arrays = load_arrays(context.session, f"{Measurement.kind}/{shown.name}")
+            arrays = load_arrays(self._context.session, f"{Measurement.kind}/{shown.name}")
             return (on, *_colour_by_deviation(arrays, shown.record.deviation.tolerance_mm))
 
         self._painter.request("surface", key, make, self._draw_surface)
@@ -136,8 +124,7 @@ class SurfaceView:
         on, points, painted, bar = made
         is_new = on is not self.on
         self.on = on
-        self._context.scene.cloud(self._layer, "surface", points, painted)
-        self._context.scene.show(self._layer, self._visible)
+        self._scene.cloud(self._layer, "surface", points, painted)
         self._legend.set(bar)
         if is_new:
             self._loaded()
@@ -155,12 +142,8 @@ def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndar
         return on.points, on.texture, Html("")
     if colour == "uncertainty":
         sigma = on.sigma_mm if on.left_mm is None else np.hypot(on.sigma_mm, on.left_mm)
-        title = (
-            "uncertainty of z (1 sigma)"
-            if on.organised
-            else "uncertainty along the normal (1 sigma)"
-        )
-        title += "" if on.left_mm is not None else ", noise only"
+        what = "uncertainty of z" if on.organised else "uncertainty along the normal"
+        title = f"{what} (1 sigma){'' if on.left_mm is not None else ', noise only'}"
         return on.points, *paint(np.where(on.measured, sigma, np.nan), "mm", 3, title)
     return on.points, *paint(on.points[..., 2], "mm", 1, "depth")
 
@@ -174,8 +157,7 @@ def _colour_by_deviation(
     uncovered = arrays["uncovered"].reshape(-1, 3)
     points = np.concatenate([arrays["points"], uncovered]).astype(np.float32)
     grey = np.broadcast_to(np.array(EXCLUDED_COLOUR, np.uint8), uncovered.shape)
-    return (
-        points,
-        np.concatenate([deviation_colours(arrays["signed"], limit), grey]),
-        deviation_bar(limit),
-    )
+    title = "deviation; red: outside, blue: inside, grey: not measured"
+    scale = deviation_colours(np.linspace(-1, 1, 13), 1.0)
+    legend = colour_bar(f"−{limit:.3g} mm", f"+{limit:.3g} mm", scale, title)
+    return points, np.concatenate([deviation_colours(arrays["signed"], limit), grey]), legend

@@ -1,26 +1,22 @@
 """Picking the same points on a scan and on the reference, which are shown side by side."""
 
-import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count
 from typing import Any, Literal
 
 import numpy as np
-import viser
 
 from slviewer.errors import SlviewerError
-from slviewer.gui.inputs import Choice, change
 from slviewer.gui.merge_views import SCAN_COLOURS, patch
-from slviewer.gui.panel import PanelContext
-from slviewer.gui.pictures import Painter
-from slviewer.gui.viewpoints import TO_THE_RIGHT
-from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, table, to_html
+from slviewer.gui.panel import Choice, Painter, PanelContext, Part
+from slviewer.gui.scene import TO_THE_RIGHT, Click
+from slviewer.gui.widgets import Html, Text, alert, note, table, to_html
 from slviewer.registration.multiway import Pair
 from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
 from slviewer.session.store import Session
-from slviewer.wizard.result_views import ScanCloud, load_scan_cloud, nearest
+from slviewer.wizard.result_views import load_scan_cloud
 
 LAYER = "merge picks"
 Side = Literal["scan", "onto"]
@@ -90,46 +86,38 @@ class _SideBySide:
         middle = np.nanmean(points, axis=0)
         return np.asarray(middle + _MARGIN * (points - middle), np.float32)
 
-    def hit(self, origin: np.ndarray, direction: np.ndarray) -> tuple[Side, np.ndarray] | None:
-        """Return the cloud that a ray meets first, and the point (3,) mm on it; None where it
+    def hit(self, click: Click) -> tuple[Side, np.ndarray] | None:
+        """Return the cloud that a click meets first, and the point (3,) mm on it; None where it
         misses both."""
-        met = []
-        for side in _SIDES:
-            index = nearest(self.clouds[side], origin - self.offset(side), direction)
-            if index is not None:
-                point = self.clouds[side][index].astype(np.float64)
-                met.append((float((point + self.offset(side) - origin) @ direction), side, point))
-        return min(met, key=lambda one: one[0])[1:] if met else None
+        met = click.find_first([self.clouds[side] + self.offset(side) for side in _SIDES])
+        if met is None:
+            return None
+        side = _SIDES[met[0]]
+        return side, self.clouds[side][met[1]].astype(np.float64)
 
 
-class PointPicker:
+class PointPicker(Part):
     """Inputs and 3D view to pick points; ``changed()`` is called after every accepted click."""
 
     def __init__(
         self, context: PanelContext, painter: Painter, changed: Callable[[], None]
     ) -> None:
-        self._context, self._painter, self._changed = context, painter, changed
-        self._lock = threading.RLock()
+        super().__init__(context)
+        self._painter, self._changed = painter, changed
         self._clicks = count()
         self._picks: dict[Pair, _Picks] = {}
+        self._current: dict[str, _Picks] = {}
         self._labels: Mapping[str, str] = {}
-        self._names: list[str] = []
         self._reference = ""
         self._shown: _SideBySide | None = None
-        self._marked: dict[str, tuple[float, ...]] = {}
+        self._marked: dict[tuple[Side, int], tuple[float, ...]] = {}
         self._offered = False
         self._on: bool | None = None
-
-    def build(self) -> None:
-        """Create the inputs."""
-        gui, context = self._context.gui, self._context
-        self._scan = Choice(gui, "Scan", "To be picked on together with the reference")
-        self._scan.on_change(context.callback(self._changed))
-        self._note = Text(gui)
-        self._table = Text(gui)
-        self._undo = context.button(
-            "Undo last point", self._undo_point, viser.Icon.ARROW_BACK_UP, visible=False
-        )
+        hint = "To be picked on together with the reference"
+        self._scan = Choice(context, "Scan", changed, hint=hint)
+        self._note = Text(self._gui)
+        self._table = Text(self._gui)
+        self._undo = context.button("Undo last point", self._undo_point, "arrow-back-up")
 
     def offer(
         self, versions: Mapping[str, Any], reference: str, labels: Mapping[str, str], on: bool
@@ -137,54 +125,55 @@ class PointPicker:
         """Offer the scans to merge, {name: version of its cloud}; ``on``: show the inputs. Drops
         outdated points."""
         with self._lock:
-            self._labels, self._reference = labels, reference
-            self._names = [name for name in versions if name != reference]
-            for pair in list(self._picks):
-                # points picked on an earlier cloud are not on the new one
-                if any(
-                    versions.get(name, known) != known
-                    for name, known in zip(pair, self._picks[pair].versions, strict=True)
-                ):
-                    self._picks.pop(pair)
-            for name in self._names if reference else ():
-                self._picks.setdefault(
-                    (name, reference), _Picks((versions[name], versions[reference]))
+            self._labels, self._reference, self._offered = labels, reference, on
+            # points picked on an earlier cloud are not on the new one
+            self._picks = {
+                pair: picks
+                for pair, picks in self._picks.items()
+                if all(
+                    versions.get(name, known) == known
+                    for name, known in zip(pair, picks.versions, strict=True)
                 )
-            self._scan.offer([(name, labels.get(name, name)) for name in self._names])
-            self._scan.set_visible(on and len(self._names) > 1)
-            self._offered = on
+            }
+            self._current = {
+                name: self._picks.setdefault(
+                    (name, reference), _Picks((version, versions[reference]))
+                )
+                for name, version in versions.items()
+                if name != reference
+            }
+            self._scan.offer((name, labels.get(name, name)) for name in self._current)
+            self._scan.handle.visible = on and len(self._current) > 1
 
     @property
     def is_ready(self) -> bool:
         """Whether at least one scan has enough pairs, and none has too few."""
-        counts = [len(picks.pairs) for picks in self._list_current_picks()]
-        return max(counts, default=0) >= LEAST_PICKS and not any(
-            0 < n < LEAST_PICKS for n in counts
-        )
+        counts = [len(picks.pairs) for picks in self._current.values()]
+        return any(counts) and not any(0 < n < LEAST_PICKS for n in counts)
 
     def picked(self) -> dict[Pair, tuple[np.ndarray, np.ndarray]]:
         """Return the points (n, 3) mm on the scan and on the reference, by pair."""
-        with self._lock:
-            pairs = [(name, self._reference) for name in self._names]
-            return {pair: self._picks[pair].points for pair in pairs if self._picks[pair].pairs}
+        return {
+            (name, self._reference): picks.points
+            for name, picks in self._current.items()
+            if picks.pairs
+        }
 
     def show(self, on: bool) -> None:
         """Draw the two clouds and react to clicks, or stop both."""
         with self._lock:
-            scene = self._context.scene
             if on != self._on:
                 if on or self._on:  # otherwise the clicks may be another step's
-                    scene.on_pick(self._handle_click if on else None)
+                    self._scene.on_click(self._handle_click if on else None)
                 self._on = on
-                scene.show(LAYER, on)
-            self._draw_note(self._offered)
+                self._scene.show(LAYER, on)
+            self._draw_note()
             pair = self._pair
             if not on or pair is None:
                 return
-            key = (pair, self._picks[pair].versions)
             self._painter.request(
                 "picks",
-                key,
+                (pair, self._picks[pair].versions),
                 lambda: _load_side_by_side(self._context.session, pair),
                 self._draw_clouds,
             )
@@ -202,15 +191,6 @@ class PointPicker:
         pair = self._scan.value, self._reference
         return pair if pair in self._picks else None
 
-    def _list_current_picks(self) -> Sequence[_Picks]:
-        """List the picks of all offered scans with the current reference."""
-        with self._lock:
-            return [
-                self._picks[name, self._reference]
-                for name in self._names
-                if (name, self._reference) in self._picks
-            ]
-
     # drawing
 
     def _draw_clouds(self, shown: _SideBySide) -> None:
@@ -218,10 +198,8 @@ class PointPicker:
         with self._lock:
             self._shown = shown
             for side in _SIDES:
-                self._context.scene.cloud(
-                    LAYER, side, shown.clouds[side] + shown.offset(side), shown.colours[side]
-                )
-            self._context.scene.show(LAYER, bool(self._on))
+                points = shown.clouds[side] + shown.offset(side)
+                self._scene.cloud(LAYER, side, points, shown.colours[side])
             self._draw_marks()
             self._show_view()
 
@@ -233,28 +211,28 @@ class PointPicker:
 
     def _draw_marks(self) -> None:
         """Draw the numbered points on both clouds."""
-        shown, scene = self._shown, self._context.scene
-        wanted: dict[str, tuple[np.ndarray, str, Side]] = {}
-        ball = 0.0 if shown is None else _BALL * shown.wide_mm
+        shown = self._shown
+        wanted: dict[tuple[Side, int], tuple[float, ...]] = {}
         if shown is not None and shown.pair == self._pair:
             picks = self._picks[shown.pair]
             for k, pair in enumerate([*picks.pairs, picks.begun], 1):
                 for side, point in pair.items():
-                    wanted[f"{side} {k}"] = point + shown.offset(side), str(k), side
-        for name in self._marked.keys() - wanted.keys():
-            scene.remove(LAYER, name)
-        for name, (point, text, side) in wanted.items():
-            if self._marked.get(name) != tuple(point):
-                scene.mark(LAYER, name, point, text, _MARKS[side], ball)
-        self._marked = {name: tuple(point) for name, (point, _, _) in wanted.items()}
+                    place = point + shown.offset(side)
+                    wanted[side, k] = tuple(place)
+                    if wanted[side, k] != self._marked.get((side, k)):
+                        ball = _BALL * shown.wide_mm
+                        self._scene.mark(LAYER, f"{side} {k}", place, str(k), _MARKS[side], ball)
+        gone = self._marked.keys() - wanted.keys()
+        self._scene.remove(LAYER, *(f"{side} {k}" for side, k in gone))
+        self._marked = wanted
 
-    def _draw_note(self, on: bool) -> None:
+    def _draw_note(self) -> None:
         """Show what to click next, and the residuals of the pairs."""
         pair = self._pair
-        if not on or pair is None:
+        if not self._offered or pair is None:
             self._note.set("")
             self._table.set("")
-            change(self._undo, visible=False)
+            self._undo.visible = False
             return
         picks = self._picks[pair]
         if self._on:
@@ -262,46 +240,41 @@ class PointPicker:
         else:
             self._note.write("To pick more, choose the 3D view side by side.", "dim")
         self._table.set(_residuals_html(picks) + self._counts_html())
-        change(self._undo, visible=bool(picks.pairs or picks.begun))
+        self._undo.visible = bool(picks.pairs or picks.begun)
 
     def _format_instruction(self, pair: Pair, picks: _Picks) -> Html:
         """Describe the next click for a pair of scans."""
-        names = {
-            side: (
-                f"{patch(_MARKS[side])} <b>{to_html(self._labels.get(name, name))}</b>"
-                f" {_WHERE[side]}"
-            )
+        scan, onto = [
+            f"{patch(_MARKS[side])} <b>{to_html(self._labels.get(name, name))}</b> {_WHERE[side]}"
             for side, name in zip(_SIDES, pair, strict=True)
-        }
+        ]
         number = f"Pair {len(picks.pairs) + 1}: "
         if picks.begun:
-            missing = next(side for side in _SIDES if side not in picks.begun)
-            return Html(f"{number}click the same point on {names[missing]}.")
+            missing = onto if "scan" in picks.begun else scan
+            return Html(f"{number}click the same point on {missing}.")
         if len(picks.pairs) >= LEAST_PICKS:
             return Html(f"{len(picks.pairs)} pairs: press Merge, or pick another pair.")
         return Html(
-            f"{number}click a point on {names['scan']}, then the same point on {names['onto']}. "
+            f"{number}click a point on {scan}, then the same point on {onto}. "
             f"At least {LEAST_PICKS} pairs, far apart; corners are best."
         )
 
     def _counts_html(self) -> Html:
         """List the number of pairs of each scan; empty for a single one."""
-        if len(self._names) < 2 or not any(picks.pairs for picks in self._list_current_picks()):
+        counts = {name: len(picks.pairs) for name, picks in self._current.items()}
+        if len(counts) < 2 or not any(counts.values()):
             return Html("")
         parts = []
-        for name in self._names:
-            n = len(self._picks[name, self._reference].pairs)
+        for name, n in counts.items():
             counted = f"{n} pair{'s' * (n != 1)}" if n else "none (aligned by features)"
-            parts.append(
-                f"{self._labels.get(name, name)}: {counted}"
-                + (", too few" if 0 < n < LEAST_PICKS else "")
-            )
-        return paragraph(coloured("; ".join(parts), "dim"))
+            few = ", too few" if 0 < n < LEAST_PICKS else ""
+            parts.append(f"{self._labels.get(name, name)}: {counted}{few}")
+        return note("; ".join(parts))
 
     # clicks
 
-    def _handle_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Add the point that a clicked ray meets, computed on the painter's thread."""
+    def _handle_click(self, click: Click) -> None:
+        """Add the point that a click meets, computed on the painter's thread."""
         shown, slot = self._shown, f"click {next(self._clicks)}"
         if shown is None:
             return
@@ -315,9 +288,7 @@ class PointPicker:
                 self._picks[shown.pair].add(*met)
             self._changed()
 
-        self._painter.request(
-            slot, None, lambda: shown.hit(origin, direction / np.linalg.norm(direction)), add
-        )
+        self._painter.request(slot, None, lambda: shown.hit(click), add)
 
     def _undo_point(self) -> None:
         """Remove the last point or pair of the shown scans."""
@@ -331,34 +302,24 @@ def _residuals_html(picks: _Picks) -> Html:
     """Return a table of the residual distance of each pair after the best rigid alignment."""
     n = len(picks.pairs)
     if n < LEAST_PICKS:
-        return paragraph(coloured(f"{n} of {LEAST_PICKS} pairs picked", "dim"))
+        return note(f"{n} of {LEAST_PICKS} pairs picked")
     try:
         _, residuals_mm = fit_picked_start(*picks.points)
     except SlviewerError as error:
         return alert(str(error), "warning")
-    rows = [(f"Pair {k}", f"{mm:.2f}") for k, mm in enumerate(residuals_mm, 1)]
-    return table(("Residual, mm", f"RMS {np.sqrt(np.mean(residuals_mm**2)):.2f}"), rows)
+    rms = f"RMS {np.sqrt(np.mean(residuals_mm**2)):.2f}"
+    pairs = [(f"Pair {k}", f"{mm:.2f}") for k, mm in enumerate(residuals_mm, 1)]
+    return table(("Residual, mm", rms), pairs)
 
 
 def _load_side_by_side(session: Session, pair: Pair) -> _SideBySide:
     """Load two scans, the first moved to the left of the reference, at the same distance from the
     viewpoint."""
-    clouds: dict[Side, ScanCloud] = {
-        side: load_scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)
-    }
-    flat = {
-        side: cloud.points[np.isfinite(cloud.points[..., 2])].astype(np.float64)
-        for side, cloud in clouds.items()
-    }
-    wide = max(
-        float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat.values()
-    )
-    shift = (
-        np.median(flat["onto"], axis=0)
-        - np.median(flat["scan"], axis=0)
-        - (1 + _APART) * wide * TO_THE_RIGHT
-    )
-    painted = {side: cloud.texture for side, cloud in clouds.items()}
-    return _SideBySide(
-        pair, {side: cloud.points for side, cloud in clouds.items()}, painted, shift, wide
-    )
+    loaded = {side: load_scan_cloud(session, name) for side, name in zip(_SIDES, pair, strict=True)}
+    clouds = {side: cloud.points for side, cloud in loaded.items()}
+    flat = [points[np.isfinite(points[..., 2])].astype(np.float64) for points in clouds.values()]
+    wide = max(float(np.ptp(np.percentile(points @ TO_THE_RIGHT, [1, 99]))) for points in flat)
+    scan, onto = (np.median(points, axis=0) for points in flat)
+    shift = onto - scan - (1 + _APART) * wide * TO_THE_RIGHT
+    painted = {side: cloud.texture for side, cloud in loaded.items()}
+    return _SideBySide(pair, clouds, painted, shift, wide)

@@ -1,18 +1,18 @@
-"""Selecting points of a scan in the 3D view, and deleting them so that they can be brought back."""
+"""Selecting points of a scan in the 3D view, and deleting them so that they can be brought back;
+and the region of interest, a box that is moved and turned by a handle."""
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import viser
 
 from slviewer.errors import InputError
 from slviewer.evaluation.render import format_count
-from slviewer.gui.inputs import change
-from slviewer.gui.panel import PanelContext
-from slviewer.gui.widgets import Text, coloured, paragraph
+from slviewer.gui.panel import PanelContext, Part, Setting
+from slviewer.gui.scene import Click, Stroke
+from slviewer.gui.widgets import Text, note
 from slviewer.pipeline.edit import SUPPORT, Selection
+from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import (
     SupportPlane,
     ViewCamera,
@@ -20,8 +20,8 @@ from slviewer.surface.selection import (
     select_in_outline,
     select_support,
 )
-from slviewer.wizard.result_views import ScanCloud, nearest
-from slviewer.wizard.snapshot import ScanView
+from slviewer.wizard.result_views import ScanCloud
+from slviewer.wizard.snapshot import ScanView, SessionView
 
 OFF, RECTANGLE, LASSO, PART = "off", "rectangle", "lasso", "connected part"
 _HINTS = {
@@ -34,35 +34,25 @@ SELECTED = (225, 40, 120)
 SHOWN_EDITS = 6
 """The last ones are listed; the report lists all."""
 _SELECTION, _OUTLINE = "selection", "outline"
+REGION_ON, REGION_OFF = Stroke((20, 150, 140)), Stroke((150, 150, 150))
+_BOX, _HANDLE = "region", "region handle"
+_HANDLE_SHARE = 0.6
+"""Of the longest side of the box: the size of its handle."""
 
 
 @dataclass(eq=False)
 class _EditedScan:
-    """A scan that is shown, at ``T`` (4, 4) mm of the 3D view: its cloud with NaN for what edits
-    and region removed, its points (h, w, 3) mm in the view's frame, and masks (h, w) of those that
-    are hidden and selected.
+    """A scan that is shown: its cloud with NaN for what edits and region removed, its points (h, w,
+    3) mm in the frame of the 3D view, and masks (h, w) of those that are hidden and selected.
 
     ``plane``: what the selection is everything below of, where it is.
     """
 
     cloud: ScanCloud
-    T: np.ndarray
     points: np.ndarray
     hidden: np.ndarray
     selected: np.ndarray
     plane: SupportPlane | None = None
-
-    @classmethod
-    def at(cls, cloud: ScanCloud, T: np.ndarray | None) -> "_EditedScan":
-        """Return the scan of a cloud at T (4, 4); None: in its own frame."""
-        pose = np.eye(4) if T is None else T
-        points = (
-            cloud.points
-            if T is None
-            else (cloud.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-        )
-        none = np.zeros(cloud.points.shape[:2], bool)
-        return cls(cloud, pose, points, none, none.copy())
 
     @property
     def shown(self) -> np.ndarray:
@@ -72,26 +62,10 @@ class _EditedScan:
     @property
     def shown_points(self) -> np.ndarray:
         """The points (h, w, 3) mm in the view's frame, NaN where they are not shown."""
-        return (
-            np.where(self.hidden[..., None], np.float32(np.nan), self.points)
-            if self.hidden.any()
-            else self.points
-        )
-
-    def update(self, other: "_EditedScan") -> bool:
-        """Take over what was hidden and selected of the same scan before; returns whether it is the
-        same."""
-        if other.cloud.name != self.cloud.name or other.points.shape != self.points.shape:
-            return False
-        # no plane: others may lie below it now
-        self.hidden, self.selected = (
-            other.hidden,
-            other.selected & self.shown,
-        )
-        return True
+        return np.where(self.hidden[..., None], np.float32(np.nan), self.points)
 
 
-class PointEditing:
+class PointEditing(Part):
     """Inputs that select, hide and delete points of the scans that are shown, drawn in a layer of
     the scene.
 
@@ -104,49 +78,43 @@ class PointEditing:
         context: PanelContext,
         layer: str,
         redraw: Callable[[], None],
-        pick: Callable[[np.ndarray, np.ndarray], None] | None = None,
+        pick: Callable[[Click], None] | None = None,
     ) -> None:
-        self._context, self._layer, self._redraw, self._pick = context, layer, redraw, pick
-        self._lock = threading.RLock()
+        super().__init__(context)
+        self._layer, self._redraw, self._pick = layer, redraw, pick
         self._scans: list[_EditedScan] = []
         self._what: list[str] = []
-        self._corners: list[tuple[float, float]] = []
+        self._corners: list[np.ndarray] = []
         self._rays: list[np.ndarray] = []
         self._view: ViewCamera | None = None
         self._visible = False
-        gui, operator = context.gui, context.operator
+        gui, operator = self._gui, self._operator
         with gui.add_folder("Edit points", expand_by_default=False) as self._folder:
             self._mode = gui.add_dropdown("Select by", (OFF, RECTANGLE, LASSO, PART))
             self._hint = Text(gui)
-            self._close = context.button(
-                "Close outline", self._close_outline, viser.Icon.POLYGON, None, visible=False
-            )
+            self._close = context.button("Close outline", self._close_outline, "polygon", None)
+            self._close.visible = False
             context.button(
-                "Select support", self._select_support, viser.Icon.TABLE,
+                "Select support", self._select_support, "table",
                 hint="The plane that the object stands on, and all below it",
             )  # fmt: skip
-            context.button("Invert selection", self._invert, viser.Icon.SWITCH_HORIZONTAL)
-            context.button("Select nothing", self._clear_selection, viser.Icon.X)
+            context.button("Invert selection", self._invert, "switch-horizontal")
+            context.button("Select nothing", self._clear_selection, "x")
             self._status = Text(gui)
-            self._hide = context.button("Hide selected", self._hide_selected, viser.Icon.EYE_OFF)
-            self._show = context.button(
-                "Show hidden", self._show_hidden, viser.Icon.EYE, visible=False
-            )
+            self._hide = context.button("Hide selected", self._hide_selected, "eye-off")
+            self._show = context.button("Show hidden", self._show_hidden, "eye")
             self._delete = context.button(
-                "Delete selected", self._delete_selected, viser.Icon.ERASER, "red",
+                "Delete selected", self._delete_selected, "eraser", "red",
                 hint="The scan on disk stays as it is: Undo brings the points back",
             )  # fmt: skip
             self._undo = context.button(
-                "Undo edit",
-                lambda: operator.undo_edit(*self._names),
-                viser.Icon.ARROW_BACK_UP,
-                "orange",
+                "Undo edit", lambda: operator.undo_edit(*self._names), "arrow-back-up", "orange"
             )
             self._redo = context.button(
-                "Redo edit", lambda: operator.redo_edit(*self._names), viser.Icon.ARROW_FORWARD_UP
+                "Redo edit", lambda: operator.redo_edit(*self._names), "arrow-forward-up"
             )
             self._list = Text(gui)
-        self._mode.on_update(context.callback(self._change_mode))
+        context.on_change(self._change_mode, self._mode)
         self._draw_status()
 
     @property
@@ -154,38 +122,46 @@ class PointEditing:
         """The scans that are shown."""
         return [scan.cloud.name for scan in self._scans]
 
-    def set_scans(self, scans: Sequence[tuple[ScanCloud, np.ndarray | None]]) -> list[np.ndarray]:
-        """Set the scans that are shown, with NaN for what edits and region removed, at T (4, 4)
-        each (None: in its own frame); returns the points (h, w, 3) mm to show of each, without
-        hidden ones.
+    def set_scans(self, scans: Sequence[tuple[ScanCloud, np.ndarray]]) -> list[np.ndarray]:
+        """Set the scans that are shown, with NaN for what edits and region removed, and their
+        points (h, w, 3) mm in the frame of the view; returns those to show of each, without hidden
+        ones.
 
         What was selected or hidden stays for the same scans.
         """
         with self._lock:
-            before, self._scans = self._scans, [_EditedScan.at(cloud, T) for cloud, T in scans]
-            same = len(before) == len(self._scans)
-            if not (
-                same and all(now.update(old) for now, old in zip(self._scans, before, strict=True))
-            ):
-                for scan in self._scans:
-                    scan.hidden[:] = scan.selected[:] = False
-                self._forget_selection()
-            self._draw_selection()
+            before = self._scans
+            self._scans = [
+                _EditedScan(cloud, points, *np.zeros((2, *points.shape[:2]), bool))
+                for cloud, points in scans
+            ]
+            old, new = (
+                [(scan.cloud.name, scan.points.shape) for scan in each]
+                for each in (before, self._scans)
+            )
+            if old == new:
+                for scan, earlier in zip(self._scans, before, strict=True):
+                    scan.hidden = earlier.hidden
+                    # no plane: others may lie below it now
+                    scan.selected = earlier.selected & scan.shown
+                self._draw_selection()
+            else:
+                self._clear_selection()
             return [scan.shown_points for scan in self._scans]
 
     def draw(self, scans: Sequence[ScanView]) -> None:
         """List the edits of scans, and offer to undo and redo them; without scans nothing is
         offered."""
-        change(self._folder, visible=bool(scans))
-        change(self._undo, disabled=not any(scan.edits for scan in scans))
-        change(self._redo, disabled=not any(scan.undone_edits for scan in scans))
+        self._folder.visible = bool(scans)
+        self._undo.disabled = not any(scan.edits for scan in scans)
+        self._redo.disabled = not any(scan.undone_edits for scan in scans)
         titles = ["" if len(scans) == 1 else f"{scan.label}, " for scan in scans]
         lines = [
             f"{title}{i}. {words}"
             for title, scan in zip(titles, scans, strict=True)
             for i, words in enumerate(scan.edits, 1)
         ]
-        self._list.set("".join(paragraph(coloured(line, "dim")) for line in lines[-SHOWN_EDITS:]))
+        self._list.set("".join(map(note, lines[-SHOWN_EDITS:])))
 
     def show(self, visible: bool) -> None:
         """Take clicks and drags in the 3D view, or leave them."""
@@ -206,29 +182,30 @@ class PointEditing:
         self._what = [*dict.fromkeys([*self._what, what])]
         self._draw_selection()
 
-    def _forget_selection(self) -> None:
+    def _clear_selection(self) -> None:
         """Select nothing, and forget the outline."""
-        for scan in self._scans:
-            scan.selected = np.zeros_like(scan.selected)
-            scan.plane = None
-        self._what = []
-        self._forget_outline()
+        with self._lock:
+            for scan in self._scans:
+                scan.selected = np.zeros_like(scan.selected)
+                scan.plane = None
+            self._what = []
+            self._forget_outline()
+            self._draw_selection()
 
     def _forget_outline(self) -> None:
         """Forget the corners of the outline."""
         self._corners, self._rays, self._view = [], [], None
-        self._context.scene.remove(self._layer, _OUTLINE)
+        self._scene.remove(self._layer, _OUTLINE)
         self._hint.write(_HINTS[self._mode.value], "dim")
-        change(self._close, visible=False)
+        self._close.visible = False
 
     def _draw_selection(self) -> None:
         """Draw the selected points over the others."""
-        scene = self._context.scene
         chosen = [scan.points[scan.selected] for scan in self._scans]
         if any(map(len, chosen)):
-            scene.cloud(self._layer, _SELECTION, np.concatenate(chosen), SELECTED)
+            self._scene.cloud(self._layer, _SELECTION, np.concatenate(chosen), SELECTED)
         else:
-            scene.remove(self._layer, _SELECTION)
+            self._scene.remove(self._layer, _SELECTION)
         self._draw_status()
 
     def _draw_status(self) -> None:
@@ -238,13 +215,11 @@ class PointEditing:
         hidden = sum(
             int((scan.hidden & np.isfinite(scan.points[..., 2])).sum()) for scan in self._scans
         )
-        text = f"{selected:,} of {total:,} points selected" + (
-            f", {hidden:,} hidden" if hidden else ""
-        )
-        self._status.set(paragraph(coloured(text, "plain" if selected else "dim")) if total else "")
-        change(self._delete, disabled=not selected)
-        change(self._hide, disabled=not selected)
-        change(self._show, visible=bool(hidden))
+        suffix = f", {hidden:,} hidden" if hidden else ""
+        text = f"{selected:,} of {total:,} points selected{suffix}"
+        self._status.set(note(text, "plain" if selected else "dim") if total else "")
+        self._delete.disabled = self._hide.disabled = not selected
+        self._show.visible = bool(hidden)
 
     # the 3D view
 
@@ -256,31 +231,20 @@ class PointEditing:
 
     def _listen(self) -> None:
         """Take the clicks or drags that the way of selecting needs."""
-        scene, mode = self._context.scene, self._mode.value
-        rectangles = self._visible and mode == RECTANGLE
-        scene.on_rectangle(self._take_rectangle if rectangles else None)
-        if mode == LASSO:
-            scene.on_view_click(self._take_corner if self._visible else None)
-        else:
-            wanted = self._visible and (mode == PART or (mode == OFF and self._pick is not None))
-            scene.on_pick(self._take_click if wanted else None)
+        mode = self._mode.value if self._visible else ""
+        self._scene.on_rectangle(self._take_rectangle if mode == RECTANGLE else None)
+        clicks = {OFF: self._pick, LASSO: self._take_corner, PART: self._select_part}
+        self._scene.on_click(clicks.get(mode))
 
-    def _take_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Select the part that a ray meets, or pass the click on."""
-        if self._mode.value != PART:
-            if self._pick is not None:
-                self._pick(origin, direction)
-            return
+    def _select_part(self, click: Click) -> None:
+        """Select the part that a click meets."""
         with self._lock:
-            met = []
-            for i, scan in enumerate(self._scans):
-                pixel = nearest(scan.shown_points, origin, direction)
-                if pixel is not None:
-                    met.append((float((scan.points[pixel] - origin) @ direction), i, pixel))
-            if met:
-                _, i, (v, u) = min(met)
+            clouds = [scan.shown_points for scan in self._scans]
+            met = click.find_first(clouds)
+            if met is not None:
+                i, (v, u) = met
                 masks = [np.zeros_like(scan.selected) for scan in self._scans]
-                masks[i] = select_connected(self._scans[i].shown_points, (u, v))
+                masks[i] = select_connected(clouds[i], (u, v))
                 self._add(masks, PART)
 
     def _select_outline(self, view: ViewCamera, corners: np.ndarray, what: str) -> None:
@@ -294,9 +258,9 @@ class PointEditing:
                 view, np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), RECTANGLE
             )
 
-    def _take_corner(self, view: ViewCamera, at: np.ndarray, ray: np.ndarray) -> None:
-        """Add a corner of the outline, at (2,) in a view along a ray (3,); begin again where the
-        view has moved."""
+    def _take_corner(self, click: Click) -> None:
+        """Add a corner of the outline; begin again where the view has moved."""
+        view, ray = click.view, click.direction
         with self._lock:
             if self._view is not None and not self._view.is_near(view):
                 self._forget_outline()
@@ -304,7 +268,7 @@ class PointEditing:
             if not self._scans:
                 return
             self._view = view
-            self._corners.append((float(at[0]), float(at[1])))
+            self._corners.append(click.place)
             # drawn before the points, so that it stays visible
             away = 0.5 * min(
                 float(np.nanmin(np.linalg.norm(s.points - view.position, axis=-1)))
@@ -313,10 +277,10 @@ class PointEditing:
             self._rays.append(view.position + away * ray / np.linalg.norm(ray))
             ends = np.array(self._rays)
             segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
-            self._context.scene.lines(self._layer, _OUTLINE, segments, SELECTED)
+            self._scene.lines(self._layer, _OUTLINE, segments, Stroke(SELECTED))
             count = format_count(len(self._corners), "corner")
             self._hint.write(f"{_HINTS[LASSO]} {count} set.", "dim")
-            change(self._close, visible=True, disabled=len(self._corners) < 3)
+            self._close.visible, self._close.disabled = True, len(self._corners) < 3
 
     def _close_outline(self) -> None:
         """Select what the outline holds."""
@@ -351,19 +315,12 @@ class PointEditing:
             self._what = [f"all but {' and '.join(self._what)}"] if self._what else ["everything"]
             self._draw_selection()
 
-    def _clear_selection(self) -> None:
-        """Select nothing."""
-        with self._lock:
-            self._forget_selection()
-            self._draw_selection()
-
     def _hide_selected(self) -> None:
         """Hide the selected points in this view; they are still used."""
         with self._lock:
             for scan in self._scans:
                 scan.hidden = scan.hidden | scan.selected
-            self._forget_selection()
-            self._draw_selection()
+            self._clear_selection()
         self._redraw()
 
     def _show_hidden(self) -> None:
@@ -383,6 +340,113 @@ class PointEditing:
             ]
             if not any(each.selected.any() for each in selections):
                 raise InputError("no point is selected: select some first")
-            if self._context.operator.delete_points(selections, " and ".join(self._what)):
-                self._forget_selection()
-                self._draw_selection()
+            if self._operator.delete_points(selections, " and ".join(self._what)):
+                self._clear_selection()
+
+
+class RegionInputs(Part):
+    """Inputs that show and set the session's region of interest, drawn in a layer of the scene."""
+
+    def __init__(self, context: PanelContext, layer: str) -> None:
+        super().__init__(context)
+        self._layer = layer
+        self._region: RegionOfInterest | None = None
+        self._scan = ""
+        self._drawn: object = None
+        gui = self._gui
+        with gui.add_folder("Region of interest", expand_by_default=False):
+            self._text = Text(gui)
+            use = gui.add_checkbox(
+                "Use region", False, hint="Ignores all points outside of a box, in every scan"
+            )
+            self._automatic = context.button(
+                "Automatic region",
+                lambda: self._operator.fit_region(self._scan),
+                "box",
+                hint="Box around this scan",
+            )
+            self._handles = gui.add_checkbox(
+                "Handles", False, hint="Arrows move the box in 3D, rings turn it"
+            )
+            self._centre = gui.add_vector3("Centre (mm)", (0.0, 0.0, 0.0), step=0.1)
+            self._size = gui.add_vector3(
+                "Size (mm)", (1.0, 1.0, 1.0), min=(0.1, 0.1, 0.1), step=0.1
+            )
+            self._turn = gui.add_vector3("Turn (°)", (0.0, 0.0, 0.0), step=0.1)
+        self._on = Setting(context, use, self._switch)
+        self._numbers = [
+            Setting(context, each, self._set_from_numbers)
+            for each in (self._centre, self._size, self._turn)
+        ]
+        context.on_change(self._draw_box, self._handles)
+
+    def draw(self, session: SessionView, scan: str) -> None:
+        """Show the region of a session; ``scan``: the one that the automatic region is put
+        around."""
+        self._scan = scan
+        self._region = region = session.region
+        self._on.update(session.region_is_on)
+        for handle in (self._handles, self._centre, self._size, self._turn):
+            handle.visible = region is not None
+        self._automatic.disabled = not scan
+        if region is None:
+            self._text.write(
+                "All points are used. The automatic region is a box around this scan.", "dim"
+            )
+        else:
+            values = region.centre_mm, region.size_mm, region.rotation_deg
+            for number, value in zip(self._numbers, values, strict=True):
+                number.update(tuple(round(each, 1) for each in value))
+            is_off = "" if session.region_is_on else "The region is off: all points are used."
+            self._text.write(is_off, "dim")
+        self._draw_box(session.region_is_on)
+
+    def _draw_box(self, is_on: bool | None = None) -> None:
+        """Draw the box, and its handle where it is wanted."""
+        region = self._region
+        is_on = bool(self._on.handle.value) if is_on is None else is_on
+        drawn = (region, is_on, self._handles.value)
+        if drawn == self._drawn:
+            return
+        self._drawn = drawn
+        if region is None or not self._handles.value:
+            self._scene.remove(self._layer, _HANDLE)
+        if region is None:
+            self._scene.remove(self._layer, _BOX)
+            return
+        self._scene.lines(self._layer, _BOX, region.edges(), REGION_ON if is_on else REGION_OFF)
+        if self._handles.value:
+            size = _HANDLE_SHARE * max(region.size_mm)
+            self._scene.gizmo(
+                self._layer, _HANDLE, region.T_camera_box, self._preview, self._place, scale_mm=size
+            )
+
+    def _preview(self, T: np.ndarray) -> None:
+        """Draw the box at T (4, 4) while its handle is dragged."""
+        if self._region is not None:
+            moved = RegionOfInterest.placed(T, self._region.size_mm)
+            self._scene.lines(self._layer, _BOX, moved.edges(), REGION_ON)
+
+    def _place(self, T: np.ndarray) -> None:
+        """Request the region at T (4, 4), where its handle was dragged to."""
+        region = self._region
+        if region is not None:
+            self._context.callback(
+                lambda: self._operator.set_region(RegionOfInterest.placed(T, region.size_mm))
+            )(None)
+
+    def _switch(self, on: bool) -> None:
+        """Switch the region on or off; without one, take the automatic one."""
+        if self._region is not None or not on:
+            self._operator.switch_region(on)
+        elif self._scan:
+            self._operator.fit_region(self._scan)
+
+    def _set_from_numbers(self, _: object) -> None:
+        """Request the region of the numbers that were entered; nothing happens while they are no
+        box."""
+        try:
+            region = RegionOfInterest(self._centre.value, self._size.value, self._turn.value)
+        except InputError:
+            return
+        self._operator.set_region(region, bool(self._on.handle.value))

@@ -3,11 +3,27 @@
 import cv2
 import numpy as np
 
-from slviewer.gui.widgets import PICTURE_PX, Html, coloured, fitted, paragraph, to_html
+from slviewer.gui.widgets import PICTURE_PX, Html, Picture, coloured, fitted, paragraph, to_html
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PreviewView
 
 _DETECTED, _GHOST, _CLIPPED = (60, 220, 90), (40, 190, 255), (255, 0, 80)
+
+
+class LiveImage(Picture):
+    """The live image in a panel, with what is to be seen in it."""
+
+    def draw(self, preview: PreviewView) -> None:
+        """Show a frame and its exposure."""
+        self.set(draw_preview(preview), legend(preview, exposure_html(preview)))
+
+    def draw_board(
+        self, preview: PreviewView, board: Board | None, ghost_px: np.ndarray | None = None
+    ) -> None:
+        """Show a frame with the detected board, and where to hold it next."""
+        hint = "" if ghost_px is None else "Dashed blue: hold the board here"
+        lines = board_html(preview, board), exposure_html(preview), coloured(hint, "info")
+        self.set(draw_preview(preview, board, ghost_px), legend(preview, *lines))
 
 
 def draw_preview(

@@ -1,17 +1,15 @@
 """The choice of the rig: by name, or from single devices, which can be saved under a name."""
 
 import inspect
+from collections.abc import Mapping
 from typing import Any
-
-import viser
 
 from slviewer.devices.browser import PAGE_ROLES, PageRole
 from slviewer.devices.drivers import Driver, available
 from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError
-from slviewer.gui.inputs import SessionValue, change
-from slviewer.gui.panel import PanelContext
-from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, to_html
+from slviewer.gui.panel import Part, Setting
+from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, note, paragraph, to_html
 from slviewer.pipeline.rig_choice import Choice
 from slviewer.pipeline.rig_presets import Preset, check_choice, presets
 from slviewer.server.viser_internals import make_private
@@ -29,67 +27,56 @@ _ADDRESSES = ("source", "serial")
 """Names of the drivers' options that choose one device among several."""
 
 
-class RigChoice:
+class RigChoice(Part):
     """Inputs of the step Rig that choose the devices."""
 
-    def __init__(self, context: PanelContext) -> None:
-        self._context = context
-        self._presets: dict[str, Preset] = {}
-        self._session: SessionView | None = None
-        gui = context.gui
+    _presets: Mapping[str, Preset] = {}
+    _session: SessionView | None = None
+    _needed_pages: tuple[PageRole, ...] = ()
+
+    def build(self) -> None:
+        """Create the inputs."""
+        gui, context, operator = self._gui, self._context, self._operator
         self._choice: Any = gui.add_dropdown("Rig", (_CHOOSE, *SIMULATED, _CUSTOM))
-        self._chosen_value = SessionValue(self._choice)
-        self._choice.on_update(context.callback(self._request_choice, by_user=True))
+        self._chosen = Setting(context, self._choice, self._request_choice)
         self._status = Text(gui)
-        self._retry = context.button(
-            "Try again", self._request_again, viser.Icon.REFRESH, None, visible=False
-        )
+        self._retry = context.button("Try again", self._request_again, "refresh", None)
         with gui.add_folder("Devices", visible=False) as self._devices:
             self._cameras = _label_drivers([d for d in available() if d.camera])
             self._projectors = _label_drivers([d for d in available() if d.projector])
             self._camera = gui.add_dropdown("Camera", tuple(self._cameras))
-            self._camera.on_update(context.callback(self._draw_devices))
             self._source = gui.add_text(
                 "Camera ID", "", hint="Number of a webcam, file, address, or serial number"
             )
             make_private(self._source)  # it may hold a password
             self._projector = gui.add_dropdown("Projector", tuple(self._projectors))
-            self._projector.on_update(context.callback(self._draw_devices))
             self._size = gui.add_text(
                 "Resolution", "", hint="For example 1920x1080; empty: that of its screen"
             )
             self._missing = Text(gui)
             self._use = context.button(
                 "Use these devices",
-                lambda: context.operator.choose_rig(self._read_entered()),
-                viser.Icon.PLUG_CONNECTED,
+                lambda: operator.choose_rig(self._read_entered()),
+                "plug-connected",
                 None,
             )
         self._pages = {role: Text(gui) for role in PAGE_ROLES}
         with gui.add_folder("Recording", visible=False) as self._recording:
-            self._folder = gui.add_text(
+            source = gui.add_text(
                 "Source folder", "", hint="A session, or folders of images that can be imported"
             )
             context.button(
                 "Play back",
-                lambda: context.operator.choose_rig(
-                    {"driver": "replay", "source": self._folder.value}
-                ),
-                viser.Icon.PLAYER_PLAY,
+                lambda: operator.choose_rig({"driver": _REPLAY, "source": source.value}),
+                "player-play",
                 None,
             )
-        with gui.add_folder(
-            "Save this rig", visible=False, expand_by_default=False
-        ) as self._saving:
-            self._name = gui.add_text(
+        with gui.add_folder("Save this rig", expand_by_default=False) as self._saving:
+            name = gui.add_text(
                 "Name", "", hint="The rig is then offered by this name, with its exposure"
             )
-            context.button(
-                "Save",
-                lambda: context.operator.save_rig(self._name.value),
-                viser.Icon.DEVICE_FLOPPY,
-            )
-        self._needed_pages: tuple[PageRole, ...] = ()
+            context.button("Save", lambda: operator.save_rig(name.value), "device-floppy")
+        context.on_change(self._draw_devices, self._camera, self._projector)
         self._draw_devices()
         self._offer_rigs()
 
@@ -99,21 +86,21 @@ class RigChoice:
             self._session = snapshot.session
             self._offer_rigs()
         rig = snapshot.rig
-        self._chosen_value.update(self._match_option(rig))
+        self._chosen.update(self._match_option(rig))
         preset = self._presets.get(self._choice.value)
-        about = "" if preset is None else paragraph(coloured(preset.problem or preset.what, "dim"))
+        about = "" if preset is None else note(preset.problem or preset.what)
         self._status.set(about + _rig_html(rig))
-        change(self._retry, visible=rig.state == "lost")
-        self._draw_folders()
-        change(self._saving, visible=rig.state == "open" and not rig.simulated)
+        self._retry.visible = rig.state == "lost"
         self._needed_pages = rig.pages
-        self._draw_pages()
+        self._draw_folders()
+        self._saving.visible = rig.state == "open" and not rig.simulated
 
     def _offer_rigs(self) -> None:
         """Update the options from the rig presets; a choice that is no longer offered is reset."""
-        session = self._context.operator.session
         self._presets = {
-            p.name: p for p in presets(session) if p.choice.get("driver") != "simulated"
+            p.name: p
+            for p in presets(self._operator.session)
+            if p.choice.get("driver") != "simulated"
         }
         options = (_CHOOSE, *SIMULATED, *self._presets, _CUSTOM)
         if tuple(self._choice.options) != options:
@@ -137,11 +124,10 @@ class RigChoice:
             _CUSTOM,
         )
 
-    def _request_choice(self) -> None:
+    def _request_choice(self, chosen: str) -> None:
         """Request the chosen rig; where it is refused, show the one in use again."""
-        chosen = self._choice.value
         self._draw_folders()
-        operator, preset = self._context.operator, self._presets.get(chosen)
+        operator, preset = self._operator, self._presets.get(chosen)
         if chosen in SIMULATED:
             granted = operator.choose_rig(SIMULATED[chosen])
         elif preset is None or chosen == _REPLAY:
@@ -157,73 +143,64 @@ class RigChoice:
 
     def _request_again(self) -> None:
         """Request the current rig again."""
-        choice = self._context.operator.snapshot().rig.choice
+        choice = self._operator.snapshot().rig.choice
         if choice is not None:
-            self._context.operator.choose_rig(choice)
+            self._operator.choose_rig(choice)
 
     def _draw_folders(self) -> None:
         """Show the inputs for custom devices or a recording, as chosen."""
-        change(self._devices, visible=self._choice.value == _CUSTOM)
-        change(self._recording, visible=self._choice.value == _REPLAY)
+        self._devices.visible = self._choice.value == _CUSTOM
+        self._recording.visible = self._choice.value == _REPLAY
         self._draw_pages()
 
     def _draw_pages(self) -> None:
         """Show the states of the pages that the rig needs, or the devices that are being chosen."""
-        own = {
-            "camera": self._cameras[self._camera.value],
-            "projector": self._projectors[self._projector.value],
-        }
         for role, text in self._pages.items():
-            is_chosen = self._choice.value == _CUSTOM and own[role].page
+            is_chosen = self._choice.value == _CUSTOM and self._drivers[role].page
             needed = is_chosen or role in self._needed_pages
             text.set(_page_html(role, self._context.page_state(role)) if needed else "")
 
     def _draw_devices(self) -> None:
         """Show what the chosen drivers lack, and whether the camera needs an identifier."""
-        chosen = (self._cameras[self._camera.value], self._projectors[self._projector.value])
+        self._drivers: dict[PageRole, Driver] = {
+            "camera": self._cameras[self._camera.value],
+            "projector": self._projectors[self._projector.value],
+        }
         missing = "; ".join(
-            f"{d.name} cannot be used here, {d.missing}" for d in chosen if d.missing
+            f"{d.name} cannot be used here, {d.missing}"
+            for d in self._drivers.values()
+            if d.missing
         )
         self._missing.write(missing, "warning")
-        change(self._use, disabled=bool(missing))
-        change(self._source, visible=_address_option(chosen[0]) is not None)
+        self._use.disabled = bool(missing)
+        self._source.visible = _address_option(self._drivers["camera"]) is not None
         self._draw_pages()
 
     def _read_entered(self) -> Choice:
         """Return the rig of the entered devices. Raises InputError for an invalid one."""
-        camera, projector = (
-            self._cameras[self._camera.value],
-            self._projectors[self._projector.value],
-        )
-        camera_choice: dict[str, Any] = {"driver": camera.name}
+        choices: dict[str, dict[str, Any]] = {}
+        for role, driver in self._drivers.items():
+            choices[role] = {"driver": driver.name}
+            page = self._context.page_state(role) if driver.page else None
+            if page is not None and page.size is not None:
+                # saved, since the page may be opened after the session
+                choices[role]["size"] = list(page.size)
+        camera, projector = self._drivers["camera"], self._drivers["projector"]
         option, address = _address_option(camera), self._source.value.strip()
         if option is not None and address:
-            camera_choice[option] = (
-                int(address) if address.isdecimal() and option == "source" else address
-            )
-        video = self._context.page_state("camera") if camera.page else None
-        if video is not None and video.size is not None:  # saved, as the projector's
-            camera_choice["size"] = list(video.size)
-        projector_choice: dict[str, Any] = {"driver": projector.name}
-        page = self._context.page_state("projector") if projector.page else None
+            is_number = address.isdecimal() and option == "source"
+            choices["camera"][option] = int(address) if is_number else address
         if self._size.value.strip():
-            projector_choice["size"] = _size(self._size.value)
-        elif page is not None and page.size is not None:
-            # saved, since the page may be opened after the session
-            projector_choice["size"] = list(page.size)
-        choice = {
-            "name": f"{camera.name} and {projector.name}",
-            "camera": camera_choice,
-            "projector": projector_choice,
-        }
+            choices["projector"]["size"] = _size(self._size.value)
+        choice: Choice = {"name": f"{camera.name} and {projector.name}", **choices}
         check_choice(choice, "this rig")
         return choice
 
 
 def _label_drivers(drivers: list[Driver]) -> dict[str, Driver]:
     """Return {label: driver}, the most common driver first."""
-    shape_of = sorted(drivers, key=lambda driver: driver.name != _FIRST)
-    return {f"{driver.name}: {driver.what}": driver for driver in shape_of}
+    drivers = sorted(drivers, key=lambda driver: driver.name != _FIRST)
+    return {f"{driver.name}: {driver.what}": driver for driver in drivers}
 
 
 def _address_option(driver: Driver) -> str | None:
@@ -252,7 +229,7 @@ def _rig_html(rig: RigView) -> str:
     if rig.state == "lost":
         return alert(rig.fault or "The rig does not answer.", "error")
     if rig.state == "opening":
-        return paragraph(coloured("Opening …", "dim"))
+        return note("Opening …")
     sizes = [
         f"{what} {size[0]} × {size[1]} px"
         for what, size in (("camera", rig.camera), ("projector", rig.projector))

@@ -1,11 +1,11 @@
 """The 3D view: named layers in the camera's frame, in mm, x to the right and y down as in the
-image.
+image; clicks and drags in it, and the browsers' viewpoints.
 
 A layer ("poses", "scan", …) belongs to a panel, which fills it, and shows or hides it as a whole.
 An object replaces that of the same name. Every method may be called from any thread.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ import viser.transforms as tf
 from numpy.typing import NDArray
 
 from slviewer.surface.selection import ViewCamera
+from slviewer.wizard.result_views import nearest
 
 Colour = tuple[int, int, int]
 
@@ -26,6 +27,15 @@ SHOWN_POINTS = 150_000
 """Points of one cloud that are sent to a browser: software rendering still moves them smoothly."""
 _FRUSTUM_MM = 60.0
 _FLOOR_MM = 260.0
+_FROM = np.array([-0.45, -0.35, -0.82])
+"""Viewing direction: from the upper left of the camera, so that depth is visible and nothing is
+upside down."""
+TO_THE_RIGHT = np.cross([0.0, 1.0, 0.0], -_FROM) / np.linalg.norm(_FROM[[0, 2]])
+"""(3,): to the right in that view, at the same distance."""
+OVERVIEW = ((-430.0, -560.0, -820.0), (55.0, 40.0, 330.0))
+"""Camera position and target, mm: the rig and objects at its working distance, in a narrow window
+too."""
+FIELD_OF_VIEW = 0.75  # rad
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,28 @@ class Stroke:
     """How lines are drawn."""
 
     colour: Colour
-    width_px: float = 2.0
+    width_px: float = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Click:
+    """A click into the 3D view: the browser's view, the place in it, (2,) from 0 at its upper left
+    to 1, and the ray through it, origin (3,) mm and direction (3,)."""
+
+    view: ViewCamera
+    place: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+
+    def find_first(self, clouds: Sequence[np.ndarray]) -> tuple[int, tuple[int, ...]] | None:
+        """Return which of several clouds (..., 3) mm the ray meets first, and the index of the
+        point; None where it misses all."""
+        met = []
+        for i, points in enumerate(clouds):
+            index = nearest(points, self.origin, self.direction)
+            if index is not None:
+                met.append((float((points[index] - self.origin) @ self.direction), i, index))
+        return min(met)[1:] if met else None
 
 
 class ViewerScene:
@@ -42,9 +73,7 @@ class ViewerScene:
     def __init__(self, api: viser.SceneApi) -> None:
         self._api = api
         self._layers: dict[str, Any] = {}
-        self._nodes: dict[tuple[str, str], list[Any]] = {}
-        self._pick: Callable[[Any], Any] | None = None
-        self._rectangle: Callable[[Any], Any] | None = None
+        self._nodes: dict[tuple[str, str], Any] = {}
         api.set_up_direction("-y")
         api.add_grid(
             "/floor",
@@ -65,15 +94,15 @@ class ViewerScene:
         """Show or hide a layer and everything in it, now and when it is filled later."""
         self._get_layer(layer).visible = visible
 
-    def remove(self, layer: str, name: str) -> None:
-        """Remove an object from a layer, if it exists."""
-        for node in reversed(self._nodes.pop((layer, name), [])):  # what hangs below a node first
-            node.remove()
+    def remove(self, layer: str, *names: str) -> None:
+        """Remove those of these objects that exist from a layer."""
+        for name in names:
+            if (node := self._nodes.pop((layer, name), None)) is not None:
+                node.remove()
 
     def clear(self, layer: str) -> None:
         """Remove all objects of a layer."""
-        for name in self.names(layer):
-            self.remove(layer, name)
+        self.remove(layer, *self.names(layer))
 
     def names(self, layer: str) -> list[str]:
         """List the names of a layer's objects."""
@@ -94,7 +123,7 @@ class ViewerScene:
         mm."""
         width, height = size
         wxyz, position = _split_pose(T_camera_device)
-        handle = self._api.add_camera_frustum(
+        self._nodes[layer, name] = self._api.add_camera_frustum(
             self._make_path(layer, name),
             fov=float(2 * np.arctan2(height / 2, K[1, 1])),
             # of the viewing angles, not of the pixels: a projector's may be far from square
@@ -106,7 +135,6 @@ class ViewerScene:
             wxyz=wxyz,
             position=position,
         )
-        self._store_nodes(layer, name, [handle])
 
     def board(
         self,
@@ -126,51 +154,29 @@ class ViewerScene:
         as `Board.outline` gives them; the picture's rows run along the board's. Returns the handle
         of the picture, for clicks on it, None without one.
         """
+        sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
+        self.lines(layer, name, sides, stroke, T=T_camera_board)
         path = self._make_path(layer, name)
-        wxyz, position = _split_pose(T_camera_board)
-        nodes: list[Any] = [
-            self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)
-        ]
-        sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1).astype(np.float32)
-        nodes.append(
-            self._api.add_line_segments(
-                f"{path}/outline",
-                sides,
-                stroke.colour,
-                thickness=stroke.width_px,
-                thickness_units="screen",
-            )
-        )
-        image = None
-        if picture is not None:
-            # rows of viser's images go up; the board's y goes down
-            turned = tf.SO3.from_x_radians(np.pi).wxyz
-            width, height = map(float, np.ptp(outline, axis=0)[:2])
-            middle = outline.mean(axis=0)
-            image = self._api.add_image(
-                f"{path}/picture", picture, width, height, wxyz=turned, position=middle
-            )
-            nodes.append(image)
         if label:
-            nodes.append(
-                self._api.add_label(
-                    f"{path}/label",
-                    label,
-                    position=outline[0],
-                    anchor="bottom-left",
-                    depth_test=True,
-                )
+            self._api.add_label(
+                f"{path}/label", label, position=outline[0], anchor="bottom-left", depth_test=True
             )
-        self._store_nodes(layer, name, nodes)
-        return image
+        if picture is None:
+            return None
+        # rows of viser's images go up; the board's y goes down
+        turned = tf.SO3.from_x_radians(np.pi).wxyz
+        width, height = map(float, np.ptp(outline, axis=0)[:2])
+        return self._api.add_image(
+            f"{path}/picture", picture, width, height, wxyz=turned, position=outline.mean(axis=0)
+        )
 
     def gizmo(
         self,
         layer: str,
         name: str,
         T: np.ndarray,
-        on_move: Callable[[np.ndarray], None],
-        on_end: Callable[[np.ndarray], None] | None = None,
+        on_move: Callable[[np.ndarray], None] | None,
+        on_end: Callable[[np.ndarray], None],
         *,
         scale_mm: float = 90.0,
     ) -> None:
@@ -178,7 +184,7 @@ class ViewerScene:
         frame."""
         wxyz, position = _split_pose(T)
         limits = ((-5000.0, 5000.0),) * 3
-        handle = self._api.add_transform_controls(
+        self._nodes[layer, name] = handle = self._api.add_transform_controls(
             self._make_path(layer, name),
             scale=scale_mm,
             wxyz=wxyz,
@@ -190,17 +196,15 @@ class ViewerScene:
         @handle.on_update
         def _(event: Any) -> None:
             """Call the callbacks with the handle's new pose."""
-            on_move(_read_pose(event.target))
-            if on_end is not None and event.phase == "end":
+            if on_move is not None:
+                on_move(_read_pose(event.target))
+            if event.phase == "end":
                 on_end(_read_pose(event.target))
-
-        self._store_nodes(layer, name, [handle])
 
     def move(self, layer: str, name: str, T: np.ndarray) -> None:
         """Move an existing object to T (4, 4), without calling its callbacks."""
-        nodes = self._nodes.get((layer, name))
-        if nodes:
-            nodes[0].wxyz, nodes[0].position = _split_pose(T)
+        if (node := self._nodes.get((layer, name))) is not None:
+            node.wxyz, node.position = _split_pose(T)
 
     def cloud(
         self,
@@ -217,19 +221,11 @@ class ViewerScene:
         that no stripes appear.
         """
         shown, colours = thin(points, colours, limit)
-        if not len(shown):
+        if len(shown):
+            path = self._make_path(layer, name)
+            self._nodes[layer, name] = add_points(self._api, path, shown, colours)
+        else:
             self.remove(layer, name)
-            return 0
-        handle = self._api.add_point_cloud(
-            self._make_path(layer, name),
-            shown,
-            colours,
-            point_size=spacing(shown),
-            point_shape="square",
-            point_shading="flat",
-            precision="float32",
-        )
-        self._store_nodes(layer, name, [handle])
         return len(shown)
 
     def mark(
@@ -243,18 +239,16 @@ class ViewerScene:
     ) -> None:
         """Draw a point (3,) mm as a ball with a label."""
         path = self._make_path(layer, name)
-        ball = self._api.add_icosphere(
+        self._nodes[layer, name] = self._api.add_icosphere(
             path, radius=radius_mm, color=colour, position=np.asarray(point, float)
         )
-        self._store_nodes(
-            layer, name, [ball, self._api.add_label(f"{path}/words", text, anchor="bottom-left")]
-        )
+        self._api.add_label(f"{path}/words", text, anchor="bottom-left")
 
     def ball(
         self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour
     ) -> None:
         """Draw a transparent ball around centre (3,) mm."""
-        handle = self._api.add_icosphere(
+        self._nodes[layer, name] = self._api.add_icosphere(
             self._make_path(layer, name),
             radius=radius_mm,
             color=colour,
@@ -263,95 +257,65 @@ class ViewerScene:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._store_nodes(layer, name, [handle])
 
-    def drawing(
+    def lines(
         self,
         layer: str,
         name: str,
         segments: np.ndarray,
-        colour: Colour,
-        place: np.ndarray,
-        text: str,
+        stroke: Stroke,
+        label: tuple[str, np.ndarray] | None = None,
+        T: np.ndarray | None = None,
     ) -> None:
-        """Draw segments (n, 2, 3) mm (n may be 0), and a label at place (3,) mm."""
+        """Draw segments (n, 2, 3) mm (n may be 0) at T (4, 4), and a label, its text and place (3,)
+        mm."""
         path = self._make_path(layer, name)
-        nodes: list[Any] = [self._api.add_frame(path, show_axes=False)]
+        wxyz, position = _split_pose(np.eye(4) if T is None else T)
+        self._nodes[layer, name] = self._api.add_frame(
+            path, show_axes=False, wxyz=wxyz, position=position
+        )
         if len(segments):
-            nodes.append(
-                self._api.add_line_segments(
-                    f"{path}/lines",
-                    np.asarray(segments, np.float32),
-                    colour,
-                    thickness=3.0,
-                    thickness_units="screen",
-                )
+            self._api.add_line_segments(
+                f"{path}/lines",
+                np.asarray(segments, np.float32),
+                stroke.colour,
+                thickness=stroke.width_px,
+                thickness_units="screen",
             )
-        nodes.append(
+        if label is not None:
+            text, place = label
             self._api.add_label(
                 f"{path}/words", text, position=np.asarray(place, float), anchor="bottom-left"
             )
-        )
-        self._store_nodes(layer, name, nodes)
 
-    def lines(self, layer: str, name: str, segments: np.ndarray, colour: Colour) -> None:
-        """Draw segments (n, 2, 3) mm."""
-        handle = self._api.add_line_segments(
-            self._make_path(layer, name),
-            np.asarray(segments, np.float32),
-            colour,
-            thickness=3.0,
-            thickness_units="screen",
-        )
-        self._store_nodes(layer, name, [handle])
+    # clicks and drags
 
-    def on_view_click(
-        self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None
-    ) -> None:
-        """Call `do(view, at, direction)` for each click in place of `on_pick`: the browser's view,
-        the place in it, (2,) from 0 at its upper left to 1, and the ray (3,) through it; None:
-        stop."""
-        self.on_pick(None)
+    def on_click(self, do: Callable[[Click], None] | None) -> None:
+        """Call `do(click)` for each click into the scene; None: stop."""
+        self._api.remove_click_callback()
         if do is not None:
 
             def click(event: Any) -> None:
-                """Call `do` with the place and view of a click."""
-                do(
-                    read_view(event.client),
-                    np.array(event.screen_pos),
-                    np.array(event.ray_direction),
+                """Call `do` with the place and ray of a click."""
+                place, origin, direction = map(
+                    np.array, (event.screen_pos, event.ray_origin, event.ray_direction)
                 )
+                do(Click(read_view(event.client), place, origin, direction))
 
-            self._pick = self._api.on_click()(click)
+            self._api.on_click()(click)
 
     def on_rectangle(self, do: Callable[[ViewCamera, np.ndarray, np.ndarray], None] | None) -> None:
         """Call `do(view, low, high)` for each rectangle that is dragged: the browser's view, and
         two corners, (2,) from 0 at its upper left to 1; dragging does not turn the view then. None:
         stop."""
-        if self._rectangle is not None:
-            self._api.remove_rect_select_callback(self._rectangle)
-            self._rectangle = None
+        self._api.remove_rect_select_callback()
         if do is not None:
 
             def select(event: Any) -> None:
                 """Call `do` with the corners of a rectangle."""
                 do(read_view(event.client), np.array(event.screen_min), np.array(event.screen_max))
 
-            self._rectangle = self._api.on_rect_select()(select)
-
-    def on_pick(self, do: Callable[[np.ndarray, np.ndarray], None] | None) -> None:
-        """Call `do(origin, direction)`, (3,) each in the camera's frame, for each click into the
-        scene; None: stop."""
-        if self._pick is not None:
-            self._api.remove_click_callback(self._pick)
-            self._pick = None
-        if do is not None:
-
-            def pick(event: Any) -> None:
-                """Call `do` with the ray of a click."""
-                do(np.array(event.ray_origin), np.array(event.ray_direction))
-
-            self._pick = self._api.on_click()(pick)
+            self._api.on_rect_select()(select)
 
     def _get_layer(self, layer: str) -> Any:
         """Return the node of a layer, created where it is missing."""
@@ -365,9 +329,20 @@ class ViewerScene:
         # names are entered by the operator: a slash would make another layer
         return f"/{layer}/{name.replace('/', '_')}"
 
-    def _store_nodes(self, layer: str, name: str, nodes: list[Any]) -> None:
-        """Store the nodes of an object, its root first."""
-        self._nodes[layer, name] = nodes
+
+def add_points(
+    api: viser.SceneApi, path: str, points: np.ndarray, colours: np.ndarray | Colour
+) -> viser.PointCloudHandle:
+    """Add points (n, 3) mm in colours (n, 3) to a scene, as large as their distances."""
+    return api.add_point_cloud(
+        path,
+        points,
+        colours,
+        point_size=spacing(points),
+        point_shape="square",
+        point_shading="flat",
+        precision="float32",
+    )
 
 
 def read_view(client: viser.ClientHandle) -> ViewCamera:
@@ -424,3 +399,47 @@ def spacing(points: np.ndarray) -> float:
     low, high = np.percentile(points, [1, 99], axis=0)
     sides = np.sort(high - low)
     return float(np.clip(1.3 * np.sqrt(max(sides[1] * sides[2], 1e-6) / len(points)), 0.05, 20.0))
+
+
+class Viewpoints:
+    """Moves the views of all browsers of a server; a new cloud is shown in every view."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._shown = ""
+
+    def overview(self) -> None:
+        """Show the whole rig again, if a cloud was shown."""
+        if self._shown:
+            self._shown = ""
+            for client in self._server.get_clients().values():
+                _set_view(client, *(np.array(each) for each in OVERVIEW))
+
+    def show(self, name: str, points: np.ndarray | None) -> None:
+        """Move all views to the points (..., 3) mm, unless those of the same `name` are shown
+        already."""
+        if points is None or name == self._shown:
+            return
+        self._shown = name
+        for client in self._server.get_clients().values():
+            look_at_points(client, points)
+
+
+def look_at_points(client: viser.ClientHandle, points: np.ndarray) -> None:
+    """Move one browser's view to the points (..., 3) mm; nothing happens where none is valid."""
+    flat = points.reshape(-1, 3)
+    flat = flat[np.isfinite(flat[:, 2])][:: max(1, len(flat) // 20_000)]
+    if not len(flat):
+        return
+    low, high = np.percentile(flat, [2, 98], axis=0)
+    middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    # the field of view is that of the height
+    away = max(1.45 * size * max(1.0, 0.85 / client.camera.aspect), 50.0)
+    _set_view(client, middle + _FROM * away, middle)
+
+
+def _set_view(client: viser.ClientHandle, position: np.ndarray, at: np.ndarray) -> None:
+    """Set one browser's camera position and target (3,) mm."""
+    with client.atomic():
+        client.camera.position = tuple(position)  # this also moves the target
+        client.camera.look_at = tuple(at)

@@ -1,4 +1,5 @@
-"""HTML for panels: coloured text, alerts, tables, pictures with a legend, colour scales.
+"""HTML for panels: coloured text, alerts, tables, pictures with a legend, colour scales, links to
+the help.
 
 HTML uses viser's own colours, so that it is readable in the light and in the dark theme. Texts
 given to `to_html`, `table` and `Text.write` are escaped here; a `Html` is used as it is.
@@ -21,11 +22,18 @@ from numpy.typing import NDArray
 from slviewer.errors import hide_passwords
 from slviewer.pipeline.stored_records import Stored, name_records
 from slviewer.records.table import Mark, Table
+from slviewer.report.page import Figure
+from slviewer.server.help_pages import PREFIX
 from slviewer.server.text import escape
+from slviewer.wizard.snapshot import Level
 
 NO_BREAK_HYPHEN = "\u2011"
 PICTURE_PX = 720
 """Width at which pictures are sent: viser shrinks a picture to its panel but never enlarges it."""
+PLOT_PX = 440
+"""CSS px: as wide as the page's panel, so that letters in a figure are as large as the panel's
+own."""
+STEPS_PAGE, FINDINGS_PAGE = "howto/wizard.md", "explanation/findings.md"
 
 _UNIT = re.compile(
     r"(?<=\d) (?=(?:mm|px|ms|µm|rad|ppm|kB|MB|GB|s|x"
@@ -50,6 +58,14 @@ _BOXES = {
     "warning": "var(--mantine-color-orange-light)",
     "error": "var(--mantine-color-red-light)",
 }
+DECISION_TONES: dict[str, Tone] = {"pass": "good", "fail": "error", "undecided": "warning"}
+NOTICES: dict[Level, tuple[str, Any, float, Tone]] = {
+    "info": ("Note", "blue", 5.0, "plain"),
+    "good": ("Done", "green", 5.0, "good"),
+    "warning": ("Warning", "orange", 12.0, "warning"),
+    "error": ("Error", "red", 20.0, "error"),
+}
+"""{level: title, colour and duration s of a notification, tone in the panel}."""
 
 
 class Html(str):
@@ -74,21 +90,33 @@ def to_html(text: object) -> Html:
 
 
 def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
-    """Return text in a tone's colour."""
+    """Return text in a tone's colour; empty where the text is."""
+    if text == "":
+        return Html("")
     weight = ";font-weight:600" if bold else ""
     return Html(f'<span style="color:{_TONES[tone]}{weight}">{to_html(text)}</span>')
 
 
 def paragraph(content: object) -> Html:
-    """Return HTML with the margins of viser's inputs."""
+    """Return HTML with the margins of viser's inputs; empty where the content is."""
+    if not content:
+        return Html("")
     return Html(
         '<div style="padding:0 0.75em'
         f' 0.5em;font-size:0.875em;line-height:1.45">{to_html(content)}</div>'
     )
 
 
+def note(text: object, tone: Tone = "dim") -> Html:
+    """Return a paragraph of text in a tone's colour."""
+    return paragraph(coloured(text, tone))
+
+
 def alert(content: object, tone: Tone) -> Html:
-    """Return a box in a tone's colour, for a message that must not be overlooked."""
+    """Return a box in a tone's colour, for a message that must not be overlooked; empty where the
+    content is."""
+    if not content:
+        return Html("")
     style = (
         f"background:{_BOXES[tone]};border-left:3px solid"
         f" {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
@@ -125,6 +153,12 @@ def table(
     )  # fmt: skip
 
 
+def properties_table(title: object, properties: Mapping[str, object]) -> Html:
+    """Return a table of properties with a title, without those that are None."""
+    rows = [(name, value) for name, value in properties.items() if value is not None]
+    return table((title, ""), rows)
+
+
 def report_table(shown: Table) -> Html:
     """Return a table of figures without its details, with its notes."""
     tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
@@ -141,10 +175,9 @@ def report_table(shown: Table) -> Html:
         ]
         for line in shown.format([*shown.rows, *shown.footer])
     ]
-    caption = paragraph(coloured(shown.caption, "plain", bold=True)) if shown.caption else Html("")
+    caption = paragraph(coloured(shown.caption, "plain", bold=True))
     aligned = [column.align for column in shown.columns]
-    notes = "".join(paragraph(coloured(note, "dim")) for note in shown.notes)
-    return caption + table(titles, rows, aligned) + notes
+    return caption + table(titles, rows, aligned) + "".join(map(note, shown.notes))
 
 
 def records_html(
@@ -165,9 +198,7 @@ def records_html(
         tables = [replace(each.without_constant(), caption="") for each in tables]
     html = "".join(map(report_table, tables))
     if stale := ", ".join(each.label for each in found if each.stale):
-        html += paragraph(
-            coloured(f"Out of date, made from what has changed since: {stale}.", "warning")
-        )
+        html += note(f"Out of date, made from what has changed since: {stale}.", "warning")
     return Html(html)
 
 
@@ -200,6 +231,21 @@ def link(address: str, text: str) -> Html:
     return Html(f'<a href="{to_html(address)}" download style="{style}">{to_html(text)}</a>')
 
 
+def help_link(anchor: str, page: str = FINDINGS_PAGE, style: str = "") -> Html:
+    """Return a link that opens a section of a page of the help in another tab: of a step, or of a
+    finding, which is named after its key: the cause of a diagnosis, the name of a check, the reason
+    of a refusal.
+
+    Its address is relative to the wizard's own, which differs between the operator and those who
+    watch.
+    """
+    address = to_html(f"{PREFIX}{page}#{anchor}")
+    colour = "color:var(--mantine-color-anchor);font-weight:400;white-space:nowrap"
+    return Html(
+        f'<a href="{address}" target="_blank" rel="noopener" style="{colour};{style}">Help</a>'
+    )
+
+
 def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
     """Return a small picture inside HTML; an empty box where there is no JPEG yet."""
     height = round(0.75 * width_px)
@@ -229,25 +275,16 @@ class Text:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._handle = gui.add_html("", visible=False)
-        self._content = ""
 
     def set(self, content: str) -> None:
         """Show HTML, as `paragraph`, `alert`, `table` and the like return it."""
-        if content != self._content:
-            self._content = content
-            self._handle.content = str(content)  # an Html would not be sent
-            if self._handle.visible != bool(content):
-                self._handle.visible = bool(content)
+        self._handle.content = str(content)  # an Html would not be sent
+        self._handle.visible = bool(content)
 
     def write(self, text: str, tone: Tone = "plain") -> None:
         """Show a sentence, in a box where its tone requires attention; hide it where it is
         empty."""
-        if not text:
-            self.set("")
-        elif tone in ("plain", "dim"):
-            self.set(paragraph(coloured(text, tone)))
-        else:
-            self.set(alert(text, tone))
+        self.set((note if tone in ("plain", "dim") else alert)(text, tone))
 
 
 class Picture:
@@ -267,15 +304,30 @@ class Picture:
         """Show an image (h, w) or (h, w, 3) uint8 RGB, scaled to the panel, and the legend (HTML,
         empty: none)."""
         self._image.image = fitted(image, self._width)
-        if not self._image.visible:
-            self._image.visible = True
+        self._image.visible = True
         self._legend.set(legend)
 
     def hide(self) -> None:
         """Hide image and legend."""
-        if self._image.visible:
-            self._image.visible = False
+        self._image.visible = False
         self._legend.set("")
+
+
+class Plot:
+    """A figure in a panel with its caption below; hidden while there is none. The figures are those
+    of the report, drawn narrower."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        blank = np.full((8, 2 * PLOT_PX, 3), 255, np.uint8)
+        self._image = gui.add_image(blank, format="png", visible=False)
+        self._caption = Text(gui)
+
+    def set(self, figure: Figure | None) -> None:
+        """Show a figure with its caption; None: hide both."""
+        if figure is not None:
+            self._image.image = figure.pixels
+        self._image.visible = figure is not None
+        self._caption.set(note(figure.caption) if figure else "")
 
 
 class Sound:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from facts import missing_facts
 
-from slviewer.gui.exposures import draw_suggestion, name_exposures, suggestion_html
+from slviewer.gui.capture_inputs import draw_suggestion, name_exposures, suggestion_html
 from slviewer.pipeline.suggest_exposure import STATES, ExposureSuggestion
 
 

@@ -8,10 +8,11 @@ from typing import get_args
 
 from slviewer import wizard
 from slviewer.fringe.phase import Reason as PixelReason
-from slviewer.gui.calibration_html import verdict_html
-from slviewer.gui.help_links import FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link, step_help_link
-from slviewer.gui.merge_html import merge_failure_html
-from slviewer.gui.rig_check import checks_table
+from slviewer.gui.merge_views import merge_failure_html
+from slviewer.gui.shell import STAGES
+from slviewer.gui.steps.calibrate import verdict_html
+from slviewer.gui.steps.rig import checks_table
+from slviewer.gui.widgets import FINDINGS_PAGE, STEPS_PAGE, help_link
 from slviewer.pipeline.check_results import CHECK_NAMES, Check, Preflight
 from slviewer.records.verdict import CAUSES, Finding, Verdict
 from slviewer.registration.refusal import Reason as Refusal
@@ -53,7 +54,7 @@ def test_every_step_has_a_section() -> None:
     keys = [step.key for step in STEPS]
     assert list(STAGES) == keys
     assert [anchor for anchor in HelpPages().anchors(STEPS_PAGE) if anchor in keys] == keys
-    assert hrefs(step_help_link("rig")) == ["help/howto/wizard.md#rig"]
+    assert hrefs(help_link("rig", STEPS_PAGE)) == ["help/howto/wizard.md#rig"]
 
 
 def test_links_between_pages_lead_to_pages_and_headings() -> None:

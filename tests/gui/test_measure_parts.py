@@ -7,10 +7,15 @@ import pytest
 from facts import missing_facts
 
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.measure_html import deviation_figure, measurement_html, measurements_table
-from slviewer.gui.measure_section import cursor_html, cursor_points
+from slviewer.gui.measure_list import (
+    cursor_html,
+    cursor_points,
+    deviation_figure,
+    measurement_html,
+    measurements_table,
+)
 from slviewer.gui.measure_surface import paint_surface
-from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
+from slviewer.gui.steps.measure import COMPARE, FIT, PICK, Tool
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
@@ -169,7 +174,8 @@ def test_measurements_as_text() -> None:
     )
     assert missing_facts(told, *facts) == []
     edges = np.linspace(-0.2, 0.2, 9)
-    assert deviation_figure("d", edges, np.arange(8), 0.1, 0.1).png.startswith(b"\x89PNG")
+    arrays = {"edges": edges, "counts": np.arange(8), "signed": edges}
+    assert deviation_figure("d", arrays, 0.1).png.startswith(b"\x89PNG")
 
 
 def test_a_merge_is_painted_and_clicked_as_a_scan_is() -> None:

@@ -7,8 +7,16 @@ from typing import Any
 import numpy as np
 from facts import missing_facts
 
-from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html
-from slviewer.gui.merge_views import BY_SCAN, BY_SIGMA, OWN, SCAN_COLOURS, colour_merge
+from slviewer.gui.merge_views import (
+    BY_SCAN,
+    BY_SIGMA,
+    OWN,
+    SCAN_COLOURS,
+    colour_merge,
+    merge_failure_html,
+    merge_html,
+    turntable_html,
+)
 from slviewer.gui.widgets import use_labels
 from slviewer.pipeline.stored_records import Stored, save_record
 from slviewer.records.merge import LoopClosure, Merge, RefusedPair, Registered

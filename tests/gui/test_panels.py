@@ -32,9 +32,8 @@ from wizard_page import (
 
 from slviewer.evaluation.crossvalidation import gather_results
 from slviewer.gui.app import App
-from slviewer.gui.calibration_html import named_poses, verdict_html
-from slviewer.gui.inputs import display_name
-from slviewer.gui.pictures import Painter
+from slviewer.gui.panel import Painter, display_name
+from slviewer.gui.steps.calibrate import named_poses, verdict_html
 from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html

@@ -5,33 +5,31 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
-import viser
 
 from slviewer.fringe.sequence import Axis
-from slviewer.gui.calibration_html import (
-    exclusions_html,
-    model_choice_html,
-    named_poses,
-    verdict_html,
-)
-from slviewer.gui.inputs import Choice, SessionValue, change, scan_options
-from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.pictures import PLOT_PX, Plot
-from slviewer.gui.scene import Stroke
+from slviewer.gui.panel import Choice, Setting, StepPanel, scan_options
+from slviewer.gui.scene import Click, Stroke
 from slviewer.gui.widgets import (
+    PLOT_PX,
     Html,
+    Plot,
     Text,
+    Tone,
+    alert,
     coloured,
+    help_link,
+    note,
     paint,
     paragraph,
+    properties_table,
     records_html,
     report_table,
     table,
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
-from slviewer.pipeline.stored_records import Stored
 from slviewer.records.model_comparison import ModelComparison
+from slviewer.records.verdict import Finding, Verdict
 from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures, PixelCurve
 from slviewer.report.maps import rms_maps
@@ -46,6 +44,16 @@ LAYER, BOARDS = "calibrate", "calibrated boards"
 DEVICES = ("camera", "projector")
 USUAL_WEIGHT = "80 % or more is usual"
 _MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on two lines
+_LEVELS: dict[str, tuple[Tone, str, str]] = {
+    "good": ("good", "Good", "no problems detected."),
+    "doubtful": ("warning", "Doubtful", "use it with care, or correct this first:"),
+    "rejected": ("error", "Rejected", "do not measure with it. Causes and remedies:"),
+}
+_MARKS: dict[Tone, str] = {
+    "good": '<path d="M5 10.5l3.4 3.4L15 7"/>',
+    "warning": '<path d="M10 4.5v7M10 15v.2"/>',
+    "error": '<path d="M6 6l8 8M14 6l-8 8"/>',
+}
 
 
 class CalibratePanel(StepPanel):
@@ -54,191 +62,156 @@ class CalibratePanel(StepPanel):
     key = "calibrate"
     layers = (LAYER, BOARDS)
 
-    def __init__(self, context: PanelContext) -> None:
-        super().__init__(context)
-        self._pixel_chosen = False
-        self._boards: tuple[Any, ...] = ()
-        self._details: tuple[tuple[Any, ...], CalibrationFigures] | None = None
-        self._chosen = ""  # the operator's model in the latest snapshot
+    _cloud: result_views.ScanCloud | None = None
+    _pixel_chosen = False
+    _boards: tuple[Any, ...] = ()
+    _details: tuple[tuple[Any, ...], CalibrationFigures] | None = None
+    _chosen = ""  # the operator's model in the latest snapshot
 
     def build(self) -> None:
         """Create the inputs, plots and tables."""
         gui, context, operator = self._gui, self._context, self._operator
-        self._calibrate = context.button("Calibrate", operator.calibrate, viser.Icon.TARGET, None)
+        self._calibrate = context.button("Calibrate", operator.calibrate, "target", None)
         self._verdict = Text(gui)
         hint = "Uses this calibration although it was rejected"
-        self._anyway = gui.add_checkbox("Accept anyway", False, visible=False, hint=hint)
-        self._anyway_value = SessionValue(self._anyway)
-        self._named = gui.add_button_group("Show pose", ("–",), visible=False)
-        self._exclusions = Text(gui)
+        anyway = gui.add_checkbox("Accept anyway", False, hint=hint)
+        self._anyway = Setting(context, anyway, operator.accept_rejected_calibration)
+        self._named = gui.add_button_group("Show pose", ("–",))
+        self._named.on_click(context.callback(lambda: self._pose.choose(self._named.value)))
         self._summary = Text(gui)
-        with gui.add_folder("Models", visible=False) as self._models_folder:
+        with gui.add_folder("Models") as self._models_folder:
             self._choice_note = Text(gui)
-            self._use = Choice(gui, "Model", "Used for scans and verifications")
+            hint = "Used for scans and verifications"
+            self._use = use = Choice(context, "Model", hint=hint)
+            choose = lambda: operator.choose_model(use.value)  # noqa: E731
+            context.on_change(choose, use.handle, by_user=True)
             self._compare = context.button(
-                "Compare models", operator.compare_models, viser.Icon.SCALE,
+                "Compare models", operator.compare_models, "scale",
                 hint="Cross-validation: measures each pose by calibrations without it; "
                 "takes a minute or more",
             )  # fmt: skip
             self._comparison = Text(gui)
-            self._splined = Text(gui)
-        with gui.add_folder("Reprojection error", visible=False) as self._poses_folder:
+        with gui.add_folder("Reprojection error") as self._poses_folder:
             self._bars = Plot(gui)
-            self._pose = Choice(gui, "Pose")
+            self._pose = Choice(context, "Pose", self._refresh)
             self._pose_note = Text(gui)
             self._exclude = context.button("Exclude this pose", self._toggle_pose, color="orange")
             self._device = gui.add_dropdown("Residuals", DEVICES)
             self._arrows = Plot(gui)
-        with gui.add_folder(
-            "Parameters", visible=False, expand_by_default=False
-        ) as self._parameters_folder:
+        with gui.add_folder("Parameters", expand_by_default=False) as self._parameters_folder:
             self._parameters = Text(gui)
-        with gui.add_folder("Pixel-wise model", visible=False) as self._pixels_folder:
+        with gui.add_folder("Pixel-wise model") as self._pixels_folder:
             self._fits = Text(gui)
-            self._axis = Choice(gui, "Axis", "x: along the projector's columns; y: along its rows")
+            hint = "x: along the projector's columns; y: along its rows"
+            self._axis = Choice(context, "Axis", self._refresh, hint=hint)
             self._maps = Plot(gui)
-            self._column = gui.add_number("Pixel u", 0, min=0, step=1, hint="Column")
-            self._row = gui.add_number("Pixel v", 0, min=0, step=1, hint="Row")
-            self._over = Choice(gui, "Cloud", "Click a point of it to choose its pixel")
-            context.view_button(lambda: self._cloud.points if self._cloud else None)
+            self._column: Any = gui.add_number("Pixel u", 0, min=0, step=1, hint="Column")
+            self._row: Any = gui.add_number("Pixel v", 0, min=0, step=1, hint="Row")
+            hint = "Click a point of it to choose its pixel"
+            self._over = Choice(context, "Cloud", self._request_cloud, hint=hint)
+            context.view_button(self._get_points)
             self._curve_note = Text(gui)
             self._curves = Plot(gui)
-        self._anyway.on_update(context.callback(self._toggle_anyway))
-        self._named.on_click(context.callback(self._show_named))
-        self._use.on_change(context.callback(self._choose_model))
-        for choice in (self._pose, self._axis):
-            choice.on_change(context.callback(self._refresh))
-        for handle in (self._device, self._column, self._row):
-            handle.on_update(context.callback(self._refresh))
-        self._over.on_change(context.callback(self._request_cloud))
+        context.on_change(self._refresh, self._device, self._column, self._row)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the calibration of a snapshot, and request its pictures."""
-        with self._lock:
-            self._snapshot = snapshot
-            session, calibration, busy = snapshot.session, snapshot.calibration, snapshot.is_busy
-            label = "Calibrate again" if calibration else "Calibrate"
-            change(
-                self._calibrate,
-                disabled=busy or snapshot.step(self.key).state == "blocked",
-                label=label,
-            )
-            self._draw_verdict(session, calibration)
-            self._draw_models(
-                session.list_records(ModelComparison) if session else [], calibration, busy
-            )
-            change(self._poses_folder, visible=bool(calibration and calibration.stereo.poses))
-            change(self._parameters_folder, visible=calibration is not None)
-            change(self._pixels_folder, visible=bool(calibration and calibration.pixelwise))
-            self._summary.set(_summary(calibration) if calibration else "")
-            if session is None or calibration is None:
-                return
-            names = [
-                pose.name for pose in session.poses if pose.state in ("used", "excluded", "unused")
-            ]
-            self._pose.offer([(name, name) for name in names], worst(calibration))
-            self._axis.offer(
-                [(axis, axis) for axis in calibration.pixelwise.axes]
-                if calibration.pixelwise
-                else []
-            )
-            clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
-            self._over.offer([("", "none"), *clouds])
-            self._fits.set(
-                report_table(calibration.pixelwise.table()) if calibration.pixelwise else ""
-            )
-            if not self._pixel_chosen:
-                self._pixel_chosen = True
-                u, v = np.round(calibration.stereo.rig.camera.K[:2, 2]).astype(int)
-                change(self._column, value=max(int(u), 0))
-                change(self._row, value=max(int(v), 0))
-            self._refresh()
+        session, calibration = self._session, snapshot.calibration
+        blocked = snapshot.step(self.key).state == "blocked"
+        self._calibrate.disabled = snapshot.is_busy or blocked
+        self._calibrate.label = "Calibrate again" if calibration else "Calibrate"
+        self._draw_verdict(session.verdict)
+        self._poses_folder.visible = bool(calibration and calibration.stereo.poses)
+        self._parameters_folder.visible = calibration is not None
+        self._pixels_folder.visible = bool(calibration and calibration.pixelwise)
+        self._models_folder.visible = bool(
+            calibration and len(calibration.models) > 1 and calibration.stereo.poses
+        )
+        if calibration is None:
+            self._summary.set("")
+            return
+        self._summary.set(exclusions_html(calibration) + _summary(calibration))
+        if self._models_folder.visible:
+            self._draw_models(calibration, snapshot.is_busy)
+        states = ("used", "excluded", "unused")
+        names = [pose.name for pose in session.poses if pose.state in states]
+        rms = {name: max(rms) for name, rms in calibration.stereo.pose_rms_px.items()}
+        self._pose.offer_names(names, max(rms, key=rms.__getitem__, default=""))
+        clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
+        self._over.offer([("", "none"), *clouds])
+        if calibration.pixelwise is not None:
+            self._axis.offer_names(calibration.pixelwise.axes)
+            self._fits.set(report_table(calibration.pixelwise.table()))
+        if not self._pixel_chosen:
+            self._pixel_chosen = True
+            u, v = np.round(calibration.stereo.rig.camera.K[:2, 2]).astype(int)
+            self._column.value, self._row.value = max(int(u), 0), max(int(v), 0)
+        self._refresh()
 
-    def _draw_verdict(
-        self, session: SessionView | None, calibration: CalibrationView | None
-    ) -> None:
-        """Show the verdict, the poses that it names and the exclusions."""
-        verdict = session.verdict if session else None
-        if session is not None and verdict is not None:
+    def _draw_verdict(self, verdict: Verdict | None) -> None:
+        """Show the verdict, and the poses that it names."""
+        session, calibration = self._session, self._session.calibration
+        if verdict is not None:
             self._verdict.set(verdict_html(verdict, session.verdict_of_calibration, calibration))
         elif calibration is not None and calibration.stereo.board:
-            self._verdict.write("No verdict on this calibration: calibrate again for one.", "plain")
+            self._verdict.write("No verdict on this calibration: calibrate again for one.")
         else:
             self._verdict.set("")
-        change(self._anyway, visible=bool(calibration and calibration.rejected))
-        self._anyway_value.update(bool(calibration and calibration.is_pinned))
+        self._anyway.handle.visible = bool(calibration and calibration.rejected)
+        self._anyway.update(bool(calibration and calibration.is_pinned))
         known = calibration.stereo.pose_rms_px if calibration else {}
-        names = tuple(name for name in named_poses(verdict, calibration) if name in known)[
-            :_MOST_NAMED
-        ]
-        if names and names != self._named.options:
-            self._named.options = names
-        change(self._named, visible=bool(names))
-        self._exclusions.set(exclusions_html(calibration) if calibration else "")
+        names = [name for name in named_poses(verdict, calibration) if name in known]
+        if names:
+            self._named.options = tuple(names[:_MOST_NAMED])
+        self._named.visible = bool(names)
 
-    def _draw_models(
-        self,
-        found: Sequence[Stored[ModelComparison]],
-        calibration: CalibrationView | None,
-        busy: bool,
-    ) -> None:
-        """Show the choice and the comparison of the models, where there are several."""
-        several = (
-            calibration is not None
-            and len(calibration.models) > 1
-            and bool(calibration.stereo.poses)
-        )
-        change(self._models_folder, visible=several)
-        if calibration is None or not several:
-            return
+    def _draw_models(self, calibration: CalibrationView, busy: bool) -> None:
+        """Show the choice and the comparison of the models."""
+        found = self._session.list_records(ModelComparison)
         compared = next((each.record for each in found if not each.stale), None)
         self._choice_note.set(model_choice_html(calibration, compared))
         options = [("", f"{calibration.recommended} (recommended)")]
-        self._use.offer(
-            options + [(model, model) for model in calibration.models], calibration.chosen
-        )
+        options += [(model, model) for model in calibration.models]
+        self._use.offer(options, calibration.chosen)
         if calibration.chosen != self._chosen:
             self._chosen = calibration.chosen
             self._use.choose(calibration.chosen)
-        label = "Compare models" if compared is None else "Compare again"
-        change(self._compare, disabled=busy or bool(calibration.stale), label=label)
-        self._comparison.set(records_html(found))
+        self._compare.disabled = busy or bool(calibration.stale)
+        self._compare.label = "Compare models" if compared is None else "Compare again"
+        splined = Html("")
         if calibration.splined is not None:
-            self._splined.set(report_table(calibration.splined.table()))
-        else:
-            self._splined.write(
-                f"No splined model: {calibration.missing}." if calibration.missing else "", "dim"
-            )
+            splined = report_table(calibration.splined.table())
+        elif calibration.missing:
+            splined = note(f"No splined model: {calibration.missing}.")
+        self._comparison.set(records_html(found) + splined)
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers, and react to clicks into the scene while shown."""
         super().show(visible)
-        self._scene.on_pick(self._pick_pixel if visible else None)
+        self._scene.on_click(self._pick_pixel if visible else None)
 
     # pictures
 
     def _refresh(self) -> None:
         """Request the pictures of the chosen pose, axis and pixel."""
         with self._lock:
-            session = self._session
-            if session is None or session.calibration is None:
+            session, calibration = self._session, self._session.calibration
+            if calibration is None:
                 return
-            calibration, context = session.calibration, self._context
+            context, stereo, request = self._context, calibration.stereo, self._painter.request
             made = fingerprint(calibration)
-            if calibration.stereo.poses:
-                self._painter.request(
+            if stereo.poses:
+                request(
                     "bars",
                     made,
                     lambda: pose_bars(
-                        calibration.stereo.pose_rms_px,
-                        calibration.stereo.reprojection_rms_px,
-                        width=PLOT_PX,
+                        stereo.pose_rms_px, stereo.reprojection_rms_px, width=PLOT_PX
                     ),
                     self._bars.set,
                 )
-            self._draw_pose(session, calibration)
+            self._draw_pose(calibration)
             self._draw_boards(session, calibration)
-            self._painter.request(
+            request(
                 "parameters",
                 made,
                 lambda: _parameters(self._load_details(made)),
@@ -247,7 +220,7 @@ class CalibratePanel(StepPanel):
             axis = cast(Axis, self._axis.value)
             if calibration.pixelwise is None or axis not in calibration.pixelwise.axes:
                 return
-            self._painter.request(
+            request(
                 "maps",
                 (made, axis),
                 lambda: rms_maps(
@@ -256,21 +229,21 @@ class CalibratePanel(StepPanel):
                 self._maps.set,
             )
             pixel = (int(self._column.value), int(self._row.value))
-            self._painter.request(
+            request(
                 "curves",
                 (made, axis, pixel),
                 lambda: (pixel, result_views.pixel_curve(context.session, pixel, axis)),
                 self._draw_curve,
             )
 
-    def _draw_pose(self, session: SessionView, calibration: CalibrationView) -> None:
+    def _draw_pose(self, calibration: CalibrationView) -> None:
         """Show the reprojection error of the chosen pose, and request its residuals as arrows."""
         name, device = self._pose.value, self._device.value
-        pose = next((pose for pose in session.poses if pose.name == name), None)
+        pose = self._snapshot.pose(name)
         if pose is None:
             return
         excluded = pose.state == "excluded"
-        change(self._exclude, label=f"Include {name} again" if excluded else f"Exclude {name}")
+        self._exclude.label = f"Include {name} again" if excluded else f"Exclude {name}"
         rms = calibration.stereo.pose_rms_px.get(name)
         if rms is None:
             why = f": {pose.why}" if pose.why else ""
@@ -278,7 +251,7 @@ class CalibratePanel(StepPanel):
                 f"{name} is not in this calibration ({pose.state}{why}).", "warning"
             )
             self._painter.cancel("arrows")
-            self._arrows.hide()
+            self._arrows.set(None)
             return
         text = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
         if calibration.splined is not None and name in calibration.splined.weights:
@@ -286,65 +259,58 @@ class CalibratePanel(StepPanel):
             weights = f"features {100 * camera:.0f} %, phase {100 * projector:.0f} %"
             text += f" Weight in the joint adjustment: {weights}; {USUAL_WEIGHT}."
         if excluded:
-            self._pose_note.write(f"{text} Excluded since: calibrate again.", "warning")
-        else:
-            self._pose_note.write(text)
+            text += " Excluded since: calibrate again."
+        self._pose_note.write(text, "warning" if excluded else "plain")
         made = fingerprint(calibration)
 
         def arrows() -> Figure | None:
             """Plot the residuals of the pose as arrows in the chosen device; None where there are
             none."""
             details = self._load_details(made)
-            residuals, title = details.residuals.get(name), f"{name}, {device}"
+            residuals, rig = details.residuals.get(name), details.stereo.rig
             if residuals is None:
                 return None
             if device == "camera":
-                return residual_arrows(
-                    title, residuals.pixels, residuals.camera, details.stereo.rig.camera.size
-                )
-            return residual_arrows(
-                title,
-                residuals.projector_pixels,
-                residuals.projector,
-                details.stereo.rig.projector.size,
-            )
+                pixels, errors, size = residuals.pixels, residuals.camera, rig.camera.size
+            else:
+                pixels, errors = residuals.projector_pixels, residuals.projector
+                size = rig.projector.size
+            return residual_arrows(f"{name}, {device}", pixels, errors, size)
 
         self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
     def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
         """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one
         thick."""
-        scene, chosen = self._scene, self._pose.value
+        stereo, chosen, covered = calibration.stereo, self._pose.value, bool(self._over.value)
         key = (
             fingerprint(calibration),
             chosen,
-            bool(self._over.value),
+            covered,
             tuple((p.name, p.state) for p in session.poses),
         )
         if key == self._boards:
             return
         self._boards = key
-        scene.clear(BOARDS)
-        if self._over.value or not calibration.stereo.board:
+        self._scene.clear(BOARDS)
+        if covered or not stereo.board:
             return
-        outline = Board.parse(calibration.stereo.board).outline()
-        usual = np.sqrt(
-            np.mean(
-                np.square([max(rms) for rms in calibration.stereo.pose_rms_px.values()] or [1.0])
-            )
-        )
+        outline = Board.parse(stereo.board).outline()
+        worst_px = {name: max(rms) for name, rms in stereo.pose_rms_px.items()}
+        usual = np.sqrt(np.mean(np.square([*worst_px.values()] or [1.0])))
         for pose in session.poses:
-            if pose.T_camera_board is not None and pose.name in calibration.stereo.pose_rms_px:
-                share = float(
-                    np.clip(max(calibration.stereo.pose_rms_px[pose.name]) / usual - 0.5, 0, 1)
-                )
-                colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
+            if pose.T_camera_board is not None and pose.name in worst_px:
+                share = float(np.clip(worst_px[pose.name] / usual - 0.5, 0, 1))
                 here = pose.name == chosen
-                label, stroke = (
-                    (pose.name, Stroke(colour, 5.0)) if here else ("", Stroke(colour, 1.5))
+                colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
+                self._scene.board(
+                    BOARDS,
+                    pose.name,
+                    pose.T_camera_board,
+                    outline,
+                    Stroke(colour, 5.0 if here else 1.5),
+                    label=pose.name if here else "",
                 )
-                scene.board(BOARDS, pose.name, pose.T_camera_board, outline, stroke, label=label)
-        scene.show(BOARDS, self._visible)
 
     def _load_details(self, made: tuple[Any, ...]) -> CalibrationFigures:
         """Return the calibration with its residuals, read once, on the painter's thread."""
@@ -356,83 +322,53 @@ class CalibratePanel(StepPanel):
         """Show data and fit of a pixel, or that it has too few poses."""
         (u, v), curve = made
         if curve is None:
-            self._curve_note.write(
-                f"Pixel ({u}, {v}) saw the board in too few poses: choose another.", "warning"
-            )
-            self._curves.hide()
-            return
-        self._curve_note.write("")
-        self._curves.set(pixel_curves(curve, width=PLOT_PX))
+            text = f"Pixel ({u}, {v}) saw the board in too few poses: choose another."
+            self._curve_note.write(text, "warning")
+            self._curves.set(None)
+        else:
+            self._curve_note.set("")
+            self._curves.set(pixel_curves(curve, width=PLOT_PX))
 
     # requests
 
-    def _toggle_anyway(self) -> None:
-        """Request that the rejected calibration be used, or no longer."""
-        calibration = self._snapshot.calibration if self._snapshot else None
-        if (
-            calibration is not None
-            and calibration.rejected
-            and self._anyway.value != calibration.is_pinned
-        ):
-            self._operator.accept_rejected_calibration(self._anyway.value)
-
-    def _choose_model(self) -> None:
-        """Request the chosen model, if it is another one."""
-        if self._use.value != self._chosen:
-            self._chosen = self._use.value
-            self._operator.choose_model(self._use.value)
-
-    def _show_named(self) -> None:
-        """Choose the pose whose button was pressed."""
-        self._pose.choose(self._named.value)
-        self._refresh()
-
     def _toggle_pose(self) -> None:
         """Request that the chosen pose be excluded, or included again."""
-        name = self._pose.value
-        pose = self._snapshot.pose(name) if self._snapshot else None
-        if pose is None:
-            return
-        if pose.state == "excluded":
-            self._operator.include(name)
-        else:
-            self._operator.exclude(name)
+        pose = self._snapshot.pose(self._pose.value)
+        if pose is not None:
+            is_excluded = pose.state == "excluded"
+            (self._operator.include if is_excluded else self._operator.exclude)(pose.name)
 
     def _request_cloud(self) -> None:
         """Request the chosen cloud; without one, show the calibrated boards."""
         name = self._over.value
         if not name:
             self._painter.cancel("cloud")
-            self._cloud = None
+            self._cloud = self._shown = None
             self._scene.clear(LAYER)
             self._context.viewpoints.overview()
-            self._refresh()
-            return
         self._refresh()
-        context = self._context
-        self._painter.request(
-            "cloud",
-            name,
-            lambda: result_views.load_scan_cloud(context.session, name),
-            self._draw_cloud,
-        )
+        if name:
+            self._painter.request(
+                "cloud",
+                name,
+                lambda: result_views.load_scan_cloud(self._context.session, name),
+                self._draw_cloud,
+            )
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         """Draw a cloud, coloured by depth, to choose pixels on."""
-        self._cloud = cloud
+        self._cloud, self._shown = cloud, (cloud.name, cloud.points)
         self._scene.cloud(LAYER, "cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
-        self._scene.show(LAYER, self._visible)
         self._show_view()
 
-    def _pick_pixel(self, origin: np.ndarray, direction: np.ndarray) -> None:
+    def _pick_pixel(self, click: Click) -> None:
         """Choose the pixel whose point is closest to the clicked ray."""
         cloud = self._cloud
-        pixel = None if cloud is None else cloud.nearest(origin, direction)
+        pixel = None if cloud is None else cloud.nearest(click.origin, click.direction)
         if cloud is None or pixel is None:
             return
         u, v = pixel
-        change(self._column, value=u)
-        change(self._row, value=v)
+        self._column.value, self._row.value = pixel
         self._scene.mark(LAYER, "picked", cloud.points[v, u], f"pixel ({u}, {v})")
 
 
@@ -442,39 +378,24 @@ def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
     return calibration.models, rig.camera.K.tobytes(), rig.projector.K.tobytes(), rig.t.tobytes()
 
 
-def worst(calibration: CalibrationView) -> str:
-    """Return the pose with the largest reprojection error; empty where none is known."""
-    errors = calibration.stereo.pose_rms_px
-    return max(errors, key=lambda name: max(errors[name]), default="")
-
-
 def _summary(calibration: CalibrationView) -> Html:
     """Return a table of the calibration: errors, poses, depths, baseline and models."""
     stereo = calibration.stereo
-    rms = stereo.reprojection_rms_px
-    rows: list[tuple[object, object]] = []
-    if rms:
-        rows.append(
-            ("Reprojection RMS, camera", coloured(f"{rms['camera']:.3f} px", "plain", bold=True))
-        )
-        rows.append(
-            (
-                "Reprojection RMS, projector",
-                coloured(f"{rms['projector']:.3f} px", "plain", bold=True),
-            )
-        )
-    rows.append(
-        ("Poses used", f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}")
-    )
-    if stereo.depth_range_mm:
-        rows.append(
-            ("Calibrated depths (R2)", "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm))
-        )
-    rows.append(("Baseline", f"{stereo.baseline_mm:.2f} mm"))
-    rows.append(("Models", ", ".join(calibration.models)))
-    rows.append(("Model in use", "none: rejected" if calibration.refused else calibration.best))
-    rows += [(model, words) for model, words in calibration.scales.items()]
-    return table(("Calibration", ""), rows)
+    properties: dict[str, object] = {
+        f"Reprojection RMS, {device}": coloured(f"{rms:.3f} px", "plain", bold=True)
+        for device, rms in stereo.reprojection_rms_px.items()
+        if device in DEVICES
+    }
+    depths = stereo.depth_range_mm
+    properties |= {
+        "Poses used": f"{len(stereo.poses)} of {len(stereo.poses) + len(stereo.excluded)}",
+        "Calibrated depths (R2)": "{:.0f} to {:.0f} mm".format(*depths) if depths else None,
+        "Baseline": f"{stereo.baseline_mm:.2f} mm",
+        "Models": ", ".join(calibration.models),
+        "Model in use": "none: rejected" if calibration.refused else calibration.best,
+        **calibration.scales,
+    }
+    return properties_table("Calibration", properties)
 
 
 def _parameters(details: CalibrationFigures) -> Html:
@@ -484,7 +405,107 @@ def _parameters(details: CalibrationFigures) -> Html:
         (f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)
     ]
     rig = [*rig_rows(stereo), ("Target", stereo.board or "imported")]
-    note = paragraph(coloured("±: one standard deviation.", "dim"))
-    return Html(
-        table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig) + to_html(note)
+    tables = table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig)
+    return tables + note("±: one standard deviation.")
+
+
+def verdict_html(
+    verdict: Verdict, of_calibration: bool, calibration: CalibrationView | None
+) -> Html:
+    """Return the verdict as text, colour and icon, then every finding with its remedy.
+
+    `of_calibration`: whether the judged attempt made the current calibration.
+    """
+    tone, level, meaning = _LEVELS[verdict.level]
+    lines = [
+        f'<div style="display:flex;gap:0.5em;align-items:flex-start">{_draw_icon(tone)}'
+        f"<div>{coloured(level, tone, bold=True)}: {to_html(meaning)}</div></div>"
+    ]
+    lines += [_format_finding(finding) for finding in verdict.findings]
+    if not of_calibration:
+        consequence = (
+            "This attempt gave no calibration."
+            if calibration is None
+            else "This attempt gave no calibration: the previous one is shown below."
+        )
+        lines.append(f'<div style="margin-top:0.5em">{to_html(consequence)}</div>')
+    return alert(Html("".join(lines)), tone)
+
+
+def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) -> tuple[str, ...]:
+    """List the poses that the verdict or the joint adjustment names, each once."""
+    names = [name for finding in verdict.findings for name in finding.poses] if verdict else []
+    if calibration is not None and calibration.splined is not None:
+        names += calibration.splined.excluded
+    return tuple(dict.fromkeys(names))
+
+
+def exclusions_html(calibration: CalibrationView) -> Html:
+    """List excluded poses and features, each with its reason; empty where there are none."""
+    n = calibration.stereo.features_excluded
+    outliers = note(
+        f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma): shadow or"
+        " occlusion."
+    )
+    lines = [f"{name}: {why}" for name, why in calibration.stereo.excluded.items()]
+    if calibration.splined is not None:
+        lines += [
+            f"{name}, in the splined model only: it {why}"
+            for name, why in calibration.splined.excluded.items()
+        ]
+    html = Html("")
+    if lines:
+        items = "".join(
+            f'<li style="margin:0.15em 0">{to_html(_capitalise(line))}</li>' for line in lines
+        )
+        listed = f'<ul style="margin:0.2em 0 0;padding-left:1.2em">{items}</ul>'
+        html = alert(Html(f"{coloured('Excluded', 'warning', bold=True)}{listed}"), "warning")
+    return html + outliers if n else html
+
+
+def model_choice_html(calibration: CalibrationView, compared: ModelComparison | None) -> Html:
+    """Describe which model is used, and why, by their comparison if there is one; empty where there
+    is one model."""
+    if calibration.chosen and calibration.chosen != calibration.recommended:
+        return alert(
+            f"{calibration.chosen} is used (your choice); {calibration.recommended} is"
+            " recommended.",
+            "warning",
+        )
+    if len(calibration.models) < 2:
+        return Html("")
+    if compared is None:
+        why = "default; compare the models to confirm it."
+    elif calibration.recommended in compared.models:
+        why = "smallest error on held-out boards."
+    else:
+        why = "default."
+    return paragraph(
+        Html(f"{coloured(calibration.best, 'good', bold=True)} is used: {to_html(why)}")
+    )
+
+
+def _format_finding(finding: Finding) -> str:
+    """Return the HTML of a finding and its remedy."""
+    text, link = to_html(_capitalise(finding.sentence, finding.poses)), help_link(finding.cause)
+    if finding.severity == "note":
+        return f'<div style="margin-top:0.5em">{coloured("Corrected:", "dim")} {text}. {link}</div>'
+    remedy = coloured(f"{finding.remedy[:1].upper()}{finding.remedy[1:]}.", "plain", bold=True)
+    return f'<div style="margin-top:0.5em">{text}.<br>→ {remedy} {link}</div>'
+
+
+def _capitalise(text: str, names: Sequence[str] = ()) -> str:
+    """Return the text with a capital first letter, unless it begins with a name."""
+    named = any(text.startswith(name) for name in names) or text.split(":")[0].count("_")
+    return text if named else text[:1].upper() + text[1:]
+
+
+def _draw_icon(tone: Tone) -> str:
+    """Return the SVG icon of a tone: a disc with a check mark, an exclamation mark or a cross."""
+    colour = {"good": "green-7", "warning": "orange-7", "error": "red-7"}[tone]
+    return (
+        '<svg viewBox="0 0 20 20" width="22" height="22" style="flex:none" fill="none"'
+        ' stroke="#fff" stroke-width="2.2" stroke-linecap="round" stroke-linejoin="round"><circle'
+        ' cx="10" cy="10" r="10" stroke="none"'
+        f' fill="var(--mantine-color-{colour})"/>{_MARKS[tone]}</svg>'
     )

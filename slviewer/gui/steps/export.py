@@ -2,15 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
-import viser
 
 from slviewer.errors import SlviewerError
-from slviewer.gui.inputs import Choice, change, scan_options
-from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.widgets import Html, Text, coloured, link, paragraph, records_html, table, to_html
+from slviewer.gui.panel import Choice, PanelContext, Part, StepPanel, scan_labels, scan_options
+from slviewer.gui.widgets import Html, Text, link, note, paragraph, records_html, table, to_html
 from slviewer.pipeline.export import (
     What,
     default_file_name,
@@ -33,27 +31,17 @@ MERGED = "merged"
 POINTS, MESH = "points", "mesh"
 MESHES = ("mesh", "merged-mesh")
 FORMAT_NAMES = {
-    "ply": "PLY",
-    "stl": "STL",
-    "obj": "OBJ",
-    "glb": "GLB",
-    "3mf": "3MF",
     "xyz": "XYZ text",
-    "e57": "E57",
     "yml": "OpenCV YAML",
     "xml": "OpenCV XML",
-    "json": "JSON",
     "npz": "NumPy",
 }
-NUMBERS: dict[What, tuple[str, str]] = {
-    "calibration": (
-        "calibration",
-        "Lenses and poses of camera and projector, and the reprojection errors",
-    ),
-    "poses": ("poses", "Poses of camera, projector, target and merged scans, as 4x4 matrices"),
-    "coefficients": ("coefficients", "Coefficients of the rational function of every camera pixel"),
+NUMBERS: dict[What, str] = {
+    "calibration": "Lenses and poses of camera and projector, and the reprojection errors",
+    "poses": "Poses of camera, projector, target and merged scans, as 4x4 matrices",
+    "coefficients": "Coefficients of the rational function of every camera pixel",
 }
-"""Other exports than shapes: the choice, and its content."""
+"""Other exports than shapes, and their content."""
 _QUIET = "color:var(--mantine-color-anchor);font-weight:600;text-decoration:none"
 TEXTURED_FORMATS = ("glb", "obj")
 METHODS: dict[Method, str] = {
@@ -69,38 +57,33 @@ SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 """Number of iterations."""
 
 
-class MeshInputs:
+class MeshInputs(Part):
     """Inputs of a `MeshingPlan`, visible if there is something to mesh."""
 
     def __init__(self, context: PanelContext, changed: Callable[[], None]) -> None:
-        gui = context.gui
-        self._method = Choice(
-            gui, "Method", "Pixel grid keeps every point; the others smooth out noise"
-        )
+        super().__init__(context)
+        gui = self._gui
+        hint = "Pixel grid keeps every point; the others smooth out noise"
+        self._method = Choice(context, "Method", changed, hint=hint)
         self._holes = gui.add_dropdown("Holes", (SMALL, OPEN, SIZED, CLOSED))
-        self._size = gui.add_number(
-            "Hole size, mm", 2.0, min=0.1, max=500.0, step=0.1, visible=False
-        )
+        self._size = gui.add_number("Hole size, mm", 2.0, min=0.1, max=500.0, step=0.1)
         self._thin = gui.add_number(
             "Triangles", 0, min=0, max=50_000_000, step=1000, hint="Maximum number; 0: no limit"
         )
         self._smooth = gui.add_dropdown(
             "Smoothing", tuple(SMOOTHING), hint="The result states how far the surface was moved"
         )
-        self._method.on_change(context.callback(changed))
-        for handle in (self._holes, self._size, self._thin, self._smooth):
-            handle.on_update(context.callback(changed))
+        context.on_change(changed, self._holes, self._size, self._thin, self._smooth)
 
     def draw(self, visible: bool, merged: bool) -> None:
         """Show or hide the inputs; merged points have no pixel grid."""
         self._method.offer(
-            [(name, text) for name, text in METHODS.items() if not (merged and name == "grid")]
+            (name, text) for name, text in METHODS.items() if not (merged and name == "grid")
         )
-        self._method.set_visible(visible)
-        inputs: list[Any] = [self._holes, self._thin, self._smooth]
+        inputs: list[Any] = [self._method.handle, self._holes, self._thin, self._smooth]
         for handle in inputs:
-            change(handle, visible=visible)
-        change(self._size, visible=visible and self._holes.value == SIZED)
+            handle.visible = visible
+        self._size.visible = visible and self._holes.value == SIZED
 
     @property
     def triangles(self) -> int | None:
@@ -124,7 +107,6 @@ class ExportPanel(StepPanel):
 
     key = "export"
     layers = (LAYER,)
-    _points: np.ndarray | None = None
     _drawn: SessionView | None = None
 
     def build(self) -> None:
@@ -133,14 +115,14 @@ class ExportPanel(StepPanel):
         with gui.add_folder("Files"):
             self._files = Text(gui)
         with gui.add_folder("Cloud or mesh"):
-            self._source = Choice(gui, "Source")
+            self._source = Choice(context, "Source", self._describe)
             self._finish = context.button(
-                "Write textured mesh", self._request_textured, viser.Icon.BRUSH, None,
+                "Write textured mesh", self._request_textured, "brush", None,
                 hint="GLB with an image of the surface, 2048 px: for viewers and presentations",
             )  # fmt: skip
             self._as: Any = gui.add_dropdown("Type", (POINTS, MESH))
             self._mesh = MeshInputs(context, self._describe)
-            self._shape_format = Choice(gui, "File type")
+            self._shape_format = Choice(context, "File type", self._describe)
             self._texture: Any = gui.add_dropdown(
                 "Texture",
                 tuple(TEXTURES),
@@ -152,76 +134,53 @@ class ExportPanel(StepPanel):
                 hint="Takes the board's white for neutral; for colour cameras",
             )
             self._shape_note = Text(gui)
-            self._shape_link = Text(gui)
-            self._shape_result = Text(gui)
-            self._write = context.button(
-                "Write file", self._request_shape, viser.Icon.FILE_EXPORT, None
-            )
-            context.view_button(lambda: self._points)
+            self._write = context.button("Write file", self._request_shape, "file-export", None)
+            context.view_button(self._get_points)
         with gui.add_folder("Calibration and poses"):
-            self._numbers = Choice(gui, "Content")
-            self._number_format = Choice(gui, "Format")
+            self._numbers = Choice(context, "Content", self._describe)
+            self._number_format = Choice(context, "Format", self._describe)
             self._number_note = Text(gui)
-            self._number_link = Text(gui)
             self._write_numbers = context.button(
-                "Write calibration", self._request_numbers, viser.Icon.FILE_EXPORT, None
+                "Write calibration", self._request_numbers, "file-export", None
             )
-        with gui.add_folder(
-            "Figures", visible=False, expand_by_default=False
-        ) as self._figures_folder:
+        with gui.add_folder("Figures", expand_by_default=False) as self._figures_folder:
             self._figures = Text(gui)
         with gui.add_folder("Report and tables"):
-            self._report = context.button("Write report", operator.report, viser.Icon.REPORT, None)
+            self._report = context.button("Write report", operator.report, "report", None)
             self._table = context.button(
                 "Write figures",
                 lambda: operator.export("table"),
-                viser.Icon.TABLE_EXPORT,
+                "table-export",
                 hint="All verifications, clouds and merges as a CSV table",
             )
             context.button(
-                "Collect diagnostics", operator.diagnostic_bundle, viser.Icon.STETHOSCOPE,
+                "Collect diagnostics", operator.diagnostic_bundle, "stethoscope",
                 hint="Versions, settings, logs and thumbnails for a bug report; no frames",
             )  # fmt: skip
-        self._as.on_update(context.callback(self._describe))
-        self._texture.on_update(context.callback(self._describe))
-        for choice in (self._source, self._shape_format, self._numbers, self._number_format):
-            choice.on_change(context.callback(self._describe))
+        context.on_change(self._describe, self._as, self._texture)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show what a snapshot's session can export, and its files."""
-        self._snapshot = snapshot
-        session, calibration = snapshot.session, snapshot.calibration
+        session, calibration, busy = self._session, snapshot.calibration, snapshot.is_busy
         self._files.set(self._files_html(session))
-        if session is None:
-            return
         things = [(MERGED, "merged scans")] if session.merge else []
         things += scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._source.offer(things)
         models = calibration.models if calibration else ()
         coefficients = bool({"pixelwise", "splined"} & set(models))
-        self._numbers.offer(
-            [(k, text) for k, (text, _) in NUMBERS.items() if k != "coefficients" or coefficients]
-        )
-        unusable = snapshot.is_busy or (calibration is not None and bool(calibration.refused))
+        self._numbers.offer_names(k for k in NUMBERS if k != "coefficients" or coefficients)
+        unusable = busy or bool(calibration and calibration.refused)
         blocked = snapshot.step(self.key).state == "blocked"
-        change(self._report, disabled=snapshot.is_busy or blocked)
-        change(self._write_numbers, disabled=unusable or blocked)
-        for button in (self._write, self._finish):
-            change(button, disabled=unusable or not things)
-        change(self._table, disabled=snapshot.is_busy or not session.records)
-        change(self._figures_folder, visible=bool(session.records))
-        self._draw_figures(session)
-        self._describe()
-
-    def _draw_figures(self, session: SessionView) -> None:
-        """Show the tables of all records, drawn again only where the session has changed."""
+        self._report.disabled = busy or blocked
+        self._write_numbers.disabled = unusable or blocked
+        self._write.disabled = self._finish.disabled = unusable or not things
+        self._table.disabled = busy or not session.records
+        self._figures_folder.visible = bool(session.records)
         if session is not self._drawn:
-            self._drawn, labels = session, {scan.name: scan.label for scan in session.scans}
-            self._figures.set(
-                "".join(
-                    records_html(session.list_records(kind), labels) for kind in RECORDS.values()
-                )
-            )
+            self._drawn, labels = session, scan_labels(session)
+            tables = (records_html(session.list_records(kind), labels) for kind in RECORDS.values())
+            self._figures.set("".join(tables))
+        self._describe()
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers, and move the views to the cloud."""
@@ -230,82 +189,61 @@ class ExportPanel(StepPanel):
 
     def _get_shape(self) -> tuple[What, str]:
         """Return what is to be exported, and its name; empty where nothing is offered."""
-        name, mesh, session = self._source.value, self._as.value == MESH, self._session
+        name, mesh, merge = self._source.value, self._as.value == MESH, self._session.merge
         if name == MERGED:
-            return "merged-mesh" if mesh else "merge", (
-                session.merge.name if session and session.merge else ""
-            )
+            return "merged-mesh" if mesh else "merge", merge.name if merge else ""
         return "mesh" if mesh else "cloud", name
 
     def _describe(self) -> None:
         """Describe the chosen files, link those that exist, and request the cloud."""
-        if self._session is not None:
-            self._request_cloud(self._session)
-            self._describe_shape(self._session)
-            self._describe_numbers(self._session)
+        self._request_cloud(self._session)
+        self._describe_shape(self._session)
+        self._describe_numbers(self._session)
 
     def _describe_shape(self, session: SessionView) -> None:
         """Describe the file of the chosen cloud or mesh, and link it where it exists."""
         what, name = self._get_shape()
         mesh = what in MESHES
         self._mesh.draw(mesh and bool(name), what == "merged-mesh")
-        self._shape_format.offer(
-            [(each, FORMAT_NAMES.get(each, each.upper())) for each in formats(what)]
-        )
-        change(
-            self._texture,
-            visible=bool(name) and mesh and self._shape_format.value in TEXTURED_FORMATS,
-        )
-        change(
-            self._white, visible=self._texture.visible and TEXTURES[self._texture.value] is not None
-        )
+        self._shape_format.offer(_name_formats(what))
+        chosen = self._shape_format.value
+        self._texture.visible = bool(name) and mesh and chosen in TEXTURED_FORMATS
+        self._white.visible = self._texture.visible and TEXTURES[self._texture.value] is not None
         if not name:
             self._shape_note.write("Nothing reconstructed yet: scan an object first.", "warning")
-            self._shape_link.set("")
-            self._shape_result.set("")
             return
-        chosen = self._shape_format.value
         file = _get_export(session, default_file_name(what, name, chosen))
         predicted = estimate_file_bytes(
             what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
         )
         shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
-        self._shape_note.write(
-            describe_shape_file(session, shown_type, name, chosen, None if file else predicted),
-            "dim",
-        )
-        self._shape_link.set(self._link_html(file))
-        self._shape_result.write(self._result_text(file) if file and mesh else "", "dim")
-        is_own = file is not None and what == "merge" and chosen == "ply"  # the merge's own file
-        label = "Write again" if file else "Write file"
-        change(self._write, visible=not is_own, label=label, color=_button_colour(file))
+        text = describe_shape_file(session, shown_type, name, chosen, None if file else predicted)
+        result = self._result_text(file) if file and mesh else ""
+        self._shape_note.set(note(text) + self._link_html(file) + note(result))
+        # a merge's PLY is its own file
+        self._write.visible = file is None or what != "merge" or chosen != "ply"
+        self._write.label = "Write again" if file else "Write file"
+        self._write.color = "gray" if file else None  # it is rather downloaded
 
     def _describe_numbers(self, session: SessionView) -> None:
         """Describe the file of the chosen numbers, and link it where it exists."""
         numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
-        self._number_format.offer([(each, FORMAT_NAMES[each]) for each in formats(numbers)])
+        self._number_format.offer(_name_formats(numbers))
         chosen = self._number_format.value
-        self._number_note.write(f"{NUMBERS[numbers][1]}. {describe_format(chosen)}.", "dim")
         file = _get_export(session, default_file_name(numbers, "", chosen))
-        self._number_link.set(self._link_html(file))
-        label = f"Write {numbers} again" if file else f"Write {numbers}"
-        change(self._write_numbers, label=label, color=_button_colour(file))
+        text = f"{NUMBERS[numbers]}. {describe_format(chosen)}."
+        self._number_note.set(note(text) + self._link_html(file))
+        self._write_numbers.label = f"Write {numbers} again" if file else f"Write {numbers}"
+        self._write_numbers.color = "gray" if file else None
 
     def _request_cloud(self, session: SessionView) -> None:
         """Request the cloud of the chosen source."""
-        name, merge, context = (
-            self._source.value,
-            session.merge.name if session.merge else "",
-            self._context,
-        )
+        name, context = self._source.value, self._context
+        merge = session.merge.name if session.merge else ""
         if not name:
             self._painter.cancel("cloud")
             self._scene.clear(LAYER)
             return
-        clouds = {
-            scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
-            for scan in session.scans
-        }
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
             """Load points (..., 3) mm and colours of the source; None: it has no colours."""
@@ -315,21 +253,16 @@ class ExportPanel(StepPanel):
             cloud = result_views.load_scan_cloud(context.session, name)
             return cloud.points, cloud.texture
 
-        key: Any = merge if name == MERGED else clouds.get(name)
-        self._painter.request("cloud", (name, key), load, self._draw_cloud)
+        version = (*_points(session, name), session.restriction(name))
+        key = (name, merge if name == MERGED else version)
+        self._painter.request("cloud", key, load, self._draw_cloud)
 
     def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
         """Draw a loaded cloud, grey where it has no colours."""
         points, colours = made
-        self._points = points
+        self._shown = self._source.value, points
         self._scene.cloud(LAYER, "cloud", points, (150, 150, 150) if colours is None else colours)
-        self._scene.show(LAYER, self._visible)
         self._show_view()
-
-    def _show_view(self) -> None:
-        """Move the browsers' views to the cloud, if it is visible."""
-        if self._visible:
-            self._context.viewpoints.show(f"{LAYER} {self._source.value}", self._points)
 
     # requests
 
@@ -339,11 +272,8 @@ class ExportPanel(StepPanel):
         if name:
             plan = self._mesh.plan() if what in MESHES else None
             chosen = self._shape_format.value
-            texture = (
-                TEXTURES[self._texture.value]
-                if plan is not None and chosen in TEXTURED_FORMATS
-                else None
-            )
+            has_texture = plan is not None and chosen in TEXTURED_FORMATS
+            texture = TEXTURES[self._texture.value] if has_texture else None
             white = BOARD if texture is not None and self._white.value else ""
             self._operator.export(what, name, chosen, plan, texture, white)
 
@@ -360,18 +290,17 @@ class ExportPanel(StepPanel):
 
     # files
 
-    def _files_html(self, session: SessionView | None) -> Html:
+    def _files_html(self, session: SessionView) -> Html:
         """Return a table of the exported files with sizes and download links."""
-        exports = session.exports if session else ()
-        if not exports:
-            return paragraph(coloured("No files yet.", "dim"))
+        if not session.exports:
+            return note("No files yet.")
         rows = [
             (
                 Html(f'<span style="overflow-wrap:anywhere">{to_html(export.name)}</span>'),
                 Html(f'<span style="white-space:nowrap">{format_bytes(export.bytes)}</span>'),
                 self._format_link(export, "Download", quiet=True),
             )
-            for export in sorted(exports, key=_rank_export)
+            for export in sorted(session.exports, key=_rank_export)
         ]
         return Html(
             f'<div style="max-height:{LIST_PX}px;overflow-y:auto">'
@@ -381,34 +310,33 @@ class ExportPanel(StepPanel):
     def _result_text(self, export: ExportView) -> str:
         """Return the notice about this file, without its name; empty where it is no longer among
         the notices."""
-        notices = reversed(self._snapshot.notices if self._snapshot else ())
-        text = next(
-            (each.text for each in notices if each.text.startswith(f"{export.name} is ready")), ""
-        )
-        return text.partition(": ")[2]
+        for notice in reversed(self._snapshot.notices):
+            if notice.text.startswith(f"{export.name} is ready"):
+                return notice.text.partition(": ")[2]
+        return ""
 
     def _link_html(self, export: ExportView | None) -> str:
         """Return a link to an existing file; empty where there is none."""
-        return (
-            ""
-            if export is None
-            else paragraph(
-                self._format_link(export, f"Download {export.name}, {format_bytes(export.bytes)}")
-            )
-        )
+        if export is None:
+            return ""
+        words = f"Download {export.name}, {format_bytes(export.bytes)}"
+        return paragraph(self._format_link(export, words))
 
     def _format_link(self, export: ExportView, words: str, quiet: bool = False) -> Html:
         """Return a download link, plain text if `quiet`, else a button; empty where the file is
         gone."""
         try:
-            address = self._context.offer(export.path)
-            return (
-                Html(f'<a href="{to_html(address)}" download style="{_QUIET}">{words}</a>')
-                if quiet
-                else link(address, words)
-            )
+            address = self._context.offer_download(export.path)
         except SlviewerError:  # removed since the snapshot was made: the next one will not list it
-            return to_html("")
+            return Html("")
+        if quiet:
+            return Html(f'<a href="{to_html(address)}" download style="{_QUIET}">{words}</a>')
+        return link(address, words)
+
+
+def _name_formats(what: What) -> list[tuple[str, str]]:
+    """Return (format, its name) of the files that an export can be written to."""
+    return [(each, FORMAT_NAMES.get(each, each.upper())) for each in formats(what)]
 
 
 def describe_shape_file(
@@ -439,16 +367,8 @@ def _get_export(session: SessionView, name: str) -> ExportView | None:
     return next((export for export in session.exports if export.name == name), None)
 
 
-def _button_colour(file: ExportView | None) -> Literal["gray"] | None:
-    """Return grey for a file that exists already, which is rather downloaded; else the main
-    colour."""
-    return None if file is None else "gray"
-
-
 def _rank_export(export: ExportView) -> tuple[int, str]:
     """Return a sort key: merged clouds, then other shapes, then documents."""
-    shaped = Path(export.name).suffix.removeprefix(".").lower() in {
-        *point_formats(),
-        *mesh_formats(),
-    }
+    suffix = Path(export.name).suffix.removeprefix(".").lower()
+    shaped = suffix in {*point_formats(), *mesh_formats()}
     return (0 if export.name.startswith("merged") else 1 if shaped else 2, export.name)

@@ -3,15 +3,12 @@
 from typing import Any, cast
 
 import numpy as np
-import viser
 
-from slviewer.gui.inputs import Choice, change
 from slviewer.gui.inspection_inputs import InspectionInputs
 from slviewer.gui.measure_list import MeasurementList
 from slviewer.gui.measure_surface import SurfaceView
-from slviewer.gui.measure_tools import COMPARE, FIT, PICK, Tool
-from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.scene import GHOST
+from slviewer.gui.panel import NO_SESSION, Choice, StepPanel
+from slviewer.gui.scene import GHOST, Click, Stroke
 from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, to_html
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
@@ -27,10 +24,89 @@ from slviewer.wizard.surfaces import box_in_view, point_at
 
 LAYER = "measure"
 UNKNOWN = "unknown"
-BALL, RECTANGLE = "ball", "rectangle"
-BOX_COLOUR = (20, 150, 140)
-_BALL, _BOX = "ball", "box"
+BALL, RECTANGLE, BOX = "ball", "rectangle", "box"
+BOX_STROKE = Stroke((20, 150, 140))
 _PICKED = ("picked 1", "picked 2")
+PICK = ("Point", "Distance", "Section")
+FIT = ("Plane", "Sphere", "Cylinder")
+COMPARE = ("Relation", "Deviation")
+_CLICKS = {
+    "Point": ("Click the point.",),
+    "Distance": ("Click the first point.", "Click the second point."),
+    "Section": ("Click the start of the section.", "Click the end of the section."),
+}
+_WITHOUT_CLICKS = {
+    "Relation": "Choose two points or fits, and measure their distances and angles.",
+    "Deviation": "Choose or upload a nominal model (STL, PLY, OBJ, STEP, 3MF), and compare.",
+}
+
+
+class Tool:
+    """The chosen tool, its name empty for none, the points picked with it, and the box drawn for a
+    fit: by a rectangle where ``by_rectangle``, else fits use a ball about the picked point."""
+
+    def __init__(self) -> None:
+        self.name = ""
+        self.picked: list[Place] = []
+        self.by_rectangle = False
+        self.box: Region | None = None
+
+    def select(self, name: str) -> None:
+        """Select another tool, or none; picked points and the box are dropped."""
+        self.name, self.picked, self.box = name, [], None
+
+    @property
+    def has_region(self) -> bool:
+        """Whether there is a region to fit to."""
+        return self.fits and (self.box is not None if self.by_rectangle else bool(self.picked))
+
+    @property
+    def fits(self) -> bool:
+        """Whether the tool fits a shape to a region around the picked point."""
+        return self.name in FIT
+
+    @property
+    def clicks(self) -> bool:
+        """Whether the tool needs clicks on the surface."""
+        return self.fits or self.name in _CLICKS
+
+    def pick(self, place: Place) -> tuple[Place, ...] | None:
+        """Add a click on the surface; returns all points once the tool has enough, and starts
+        again.
+
+        A tool that fits replaces its point instead, until the operator accepts the region. The same
+        point again, as by a double click, is not a second point.
+        """
+        if self.fits:
+            self.picked = [place]
+            return None
+        if place in self.picked:
+            return None
+        self.picked.append(place)
+        if len(self.picked) < len(_CLICKS.get(self.name, ())):
+            return None
+        done, self.picked = tuple(self.picked), []
+        return done
+
+    @property
+    def instruction(self) -> str:
+        """What to do now, in one sentence."""
+        if not self.name:
+            return "Choose a tool."
+        if self.fits:
+            shape = self.name.lower()
+            if self.by_rectangle:
+                end = f", then press Fit {shape}." if self.box is not None else "."
+                return f"Drag a rectangle over the {shape} alone{end}"
+            if not self.picked:
+                return f"Click the centre of the {shape}."
+            return (
+                f"Set the radius so that the ball contains only the {shape}, then press Fit"
+                f" {shape}."
+            )
+        if self.name in _WITHOUT_CLICKS:
+            return _WITHOUT_CLICKS[self.name]
+        return _CLICKS[self.name][len(self.picked)]
 
 
 class MeasurePanel(StepPanel):
@@ -38,106 +114,80 @@ class MeasurePanel(StepPanel):
 
     key = "measure"
 
-    def __init__(self, context: PanelContext) -> None:
-        super().__init__(context)
-        self._tool = Tool()
-        self._sized_for = ""
-        self._related: list[tuple[str, str]] = []
-        self._surface = SurfaceView(context, self._painter, LAYER, self._handle_loaded)
-        self._results = MeasurementList(context, self._painter, LAYER, self._show_measurement)
-        self._inspection = InspectionInputs(context)
+    _sized_for = ""
 
     def build(self) -> None:
         """Create the inputs of surface, tools and results."""
         gui, context = self._gui, self._context
-        with gui.add_folder("Surface", visible=False) as self._surface_folder:
-            self._surface.build()
-        with gui.add_folder("Tools", visible=False) as self._tools_folder:
+        self._tool = Tool()
+        self._related: list[tuple[str, str]] = []
+        with gui.add_folder("Surface") as self._surface_folder:
+            self._surface = SurfaceView(context, self._painter, LAYER, self._handle_loaded)
+        with gui.add_folder("Tools") as self._tools_folder:
             for title, tools in (("Pick", PICK), ("Fit", FIT), ("Compare", COMPARE)):
                 group = gui.add_button_group(title, tools)
                 group.on_click(context.callback(lambda group=group: self._select_tool(group.value)))  # type: ignore[misc]
             self._instruction = Text(gui)
             self._build_fit()
-            self._build_relation()
-            self._build_deviation()
+            self._from, self._to = Choice(context, "From"), Choice(context, "To")
+            self._relate = context.button(
+                "Measure relation",
+                lambda: self._operator.measure_between(self._from.value, self._to.value),
+                "ruler-2",
+                None,
+            )
+            # viser cannot hide upload buttons alone
+            with gui.add_folder(None) as self._nominal_folder:
+                self._build_deviation()
             self._end = context.button(
-                "End tool", lambda: self._select_tool(""), viser.Icon.X, hint="Key: Esc"
+                "End tool", lambda: self._select_tool(""), "x", hint="Key: Esc"
             )
         self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
         self._escape.on_trigger(context.callback(lambda: self._select_tool("")))
-        self._results.build()
-        self._inspection.build()
+        self._results = MeasurementList(context, self._painter, LAYER, self._show_measurement)
+        self._inspection = InspectionInputs(context)
         self._draw_tool()
 
     def _build_fit(self) -> None:
         """Create the inputs to fit a shape: radius of the region, and a button."""
-        self._by: Any = self._gui.add_dropdown("Region", (BALL, RECTANGLE), visible=False)
-        self._by.on_update(self._context.callback(self._change_region))
-        hint = "Of the ball in 3D"
-        self._radius: Any = self._gui.add_slider(
-            "Radius, mm", 0.5, 100.0, 0.5, 15.0, visible=False, hint=hint
+        gui, context = self._gui, self._context
+        self._by: Any = gui.add_dropdown("Region", (BALL, RECTANGLE))
+        context.on_change(self._change_region, self._by)
+        self._radius: Any = gui.add_slider(
+            "Radius, mm", 0.5, 100.0, 0.5, 15.0, hint="Of the ball in 3D"
         )
-        self._radius.on_update(self._context.callback(self._draw_ball))
-        self._inside = Text(self._gui)
-        self._fit = self._context.button(
-            "Fit", self._request_fit, viser.Icon.CHECK, None, visible=False
-        )
-
-    def _build_relation(self) -> None:
-        """Create the inputs to measure between two results."""
-        self._from, self._to = Choice(self._gui, "From"), Choice(self._gui, "To")
-        self._relate = self._context.button(
-            "Measure relation",
-            lambda: self._operator.measure_between(self._from.value, self._to.value),
-            viser.Icon.RULER_2,
-            None,
-            visible=False,
-        )
+        context.on_change(self._draw_region, self._radius)
+        self._inside = Text(gui)
+        self._fit = context.button("Fit", self._request_fit, "check", None)
 
     def _build_deviation(self) -> None:
         """Create the inputs to upload a nominal model and compare with it."""
-        gui, context, operator = self._gui, self._context, self._operator
-        with gui.add_folder(
-            None, visible=False
-        ) as self._nominal_folder:  # viser cannot hide upload buttons alone
-            upload = gui.add_upload_button(
-                "Upload model",
-                icon=viser.Icon.UPLOAD,
-                color="gray",
-                mime_type=".stl,.ply,.obj,.step,.stp,.3mf",
-            )
-            upload.on_upload(
-                context.callback(
-                    lambda: operator.upload_nominal(upload.value.name, upload.value.content)
-                )
-            )
-            self._nominal = Choice(gui, "Nominal")
-            hint = "Of the nominal model; unknown: mm, if the sizes agree"
-            self._units: Any = gui.add_dropdown("Units", (UNKNOWN, *MM), hint=hint)
-            hint = "0: without a verdict"
-            self._tolerance = gui.add_number(
-                "Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint
-            )
-            self._compare = context.button(
-                "Compare", self._request_comparison, viser.Icon.ARROWS_DIFF, None
-            )
+        gui, context = self._gui, self._context
+        context.upload_button(
+            "Upload model", self._operator.upload_nominal, ".stl,.ply,.obj,.step,.stp,.3mf"
+        )
+        self._nominal = Choice(context, "Nominal")
+        hint = "Of the nominal model; unknown: mm, if the sizes agree"
+        self._units: Any = gui.add_dropdown("Units", (UNKNOWN, *MM), hint=hint)
+        hint = "0: without a verdict"
+        self._tolerance = gui.add_number(
+            "Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint
+        )
+        self._compare = context.button("Compare", self._request_comparison, "arrows-diff", None)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the surfaces and measurements of a snapshot."""
-        with self._lock:
-            session = snapshot.session
-            usable = session is not None and snapshot.step(self.key).state != "blocked"
-            self._surface.offer(session if usable else None)
-            has_surface = bool(self._surface.name)
-            change(self._surface_folder, visible=has_surface)
-            change(self._tools_folder, visible=has_surface)
-            self._offer_inputs(session)
-            new = self._results.draw(session, self._surface.name)
-            self._inspection.draw(snapshot, self._surface.name)
-            if self._tool.fits and any(each.record.what == self._tool.name.lower() for each in new):
-                self._select_tool(self._tool.name)
-            change(self._compare, disabled=snapshot.is_busy or not self._nominal.value)
-            change(self._fit, disabled=snapshot.is_busy)
+        session = self._session
+        usable = snapshot.step(self.key).state != "blocked"
+        self._surface.offer(session if usable else NO_SESSION)
+        self._surface_folder.visible = self._tools_folder.visible = bool(self._surface.name)
+        self._offer_inputs(session)
+        new = self._results.draw(session, self._surface.name)
+        self._inspection.draw(snapshot, self._surface.name)
+        if self._tool.fits and any(each.record.what == self._tool.name.lower() for each in new):
+            self._select_tool(self._tool.name)
+        self._compare.disabled = snapshot.is_busy or not self._nominal.value
+        self._fit.disabled = snapshot.is_busy
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is
@@ -147,9 +197,9 @@ class MeasurePanel(StepPanel):
             self._draw_tool()
             self._visible = visible
             self._surface.show(visible)
-            self._scene.on_pick(None)
+            self._scene.on_click(None)
             self._scene.on_rectangle(None)
-            change(self._escape, disabled=True)
+            self._escape.disabled = True
 
     # tools
 
@@ -164,10 +214,11 @@ class MeasurePanel(StepPanel):
         """React to clicks into the scene while the tool needs them; another step handles its own
         clicks."""
         if self._visible:
-            change(self._escape, disabled=not self._tool.name)
+            self._escape.disabled = not self._tool.name
             rectangle = self._tool.fits and self._tool.by_rectangle
             self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
-            self._scene.on_pick(self._handle_click if self._tool.clicks and not rectangle else None)
+            clicks = self._tool.clicks and not rectangle
+            self._scene.on_click(self._handle_click if clicks else None)
 
     def _change_region(self) -> None:
         """Take clicks or rectangles, as the operator chose."""
@@ -187,9 +238,9 @@ class MeasurePanel(StepPanel):
 
         self._context.callback(take)(None)
 
-    def _handle_click(self, origin: np.ndarray, direction: np.ndarray) -> None:
-        """Pick the point of the surface that a clicked ray meets."""
-        self._context.callback(lambda: self._surface.pick(origin, direction, self._add_pick))(None)
+    def _handle_click(self, click: Click) -> None:
+        """Pick the point of the surface that a click meets."""
+        self._context.callback(lambda: self._surface.pick(click, self._add_pick))(None)
 
     def _add_pick(self, place: Place) -> None:
         """Add a picked point to the tool, and request the measurement once it has enough."""
@@ -198,9 +249,8 @@ class MeasurePanel(StepPanel):
                 return
             places, on = self._tool.pick(place), self._surface.name
             self._draw_tool()
-        if places is None:
-            return
-        self._operator.measure(on, cast(What, self._tool.name.lower()), places)
+        if places is not None:
+            self._operator.measure(on, cast(What, self._tool.name.lower()), places)
 
     def _draw_tool(self) -> None:
         """Show the instruction and the inputs of the tool, and the points picked with it."""
@@ -210,40 +260,38 @@ class MeasurePanel(StepPanel):
         self._instruction.set(
             alert(text, "info") if tool.name else paragraph(coloured(text, "dim"))
         )
-        change(self._end, visible=bool(tool.name))
-        change(self._by, visible=tool.fits)
-        change(self._radius, visible=tool.fits and not tool.by_rectangle)
-        label = f"Fit {tool.name.lower()}" if tool.fits else "Fit"
-        change(self._fit, visible=tool.has_region, label=label)
+        self._end.visible = bool(tool.name)
+        self._by.visible = tool.fits
+        self._radius.visible = tool.fits and not tool.by_rectangle
+        self._fit.visible = tool.has_region
+        self._fit.label = f"Fit {tool.name.lower()}"
         relation, deviation = (tool.name == name for name in COMPARE)
-        for choice in (self._from, self._to):
-            choice.set_visible(relation)
-        change(self._relate, visible=relation)
-        change(self._nominal_folder, visible=deviation)
+        for handle in (self._from.handle, self._to.handle, self._relate):
+            handle.visible = relation
+        self._nominal_folder.visible = deviation
         on = self._surface.on
         marked = [] if on is None or tool.fits else tool.picked
-        for i, name in enumerate(_PICKED):
-            if on is not None and i < len(marked):
-                self._scene.mark(LAYER, name, point_at(on, marked[i]), str(i + 1))
-            else:
-                self._scene.remove(LAYER, name)
-        self._draw_ball()
+        self._scene.remove(LAYER, *_PICKED[len(marked) :])
+        for name, place in zip(_PICKED, marked, strict=False):
+            if on is not None:
+                self._scene.mark(LAYER, name, point_at(on, place), name[-1])
+        self._draw_region()
 
-    def _draw_ball(self) -> None:
+    def _draw_region(self) -> None:
         """Draw the region that a shape would be fitted to, and request its number of points."""
         with self._lock:
             on, region = self._surface.on, self._make_region()
-            for name in (_BALL, _BOX):
-                if region is None or name != (_BALL if region.kind == "ball" else _BOX):
-                    self._scene.remove(LAYER, name)
             if on is None or region is None:
+                self._scene.remove(LAYER, BALL, BOX)
                 self._painter.cancel("inside")
                 self._inside.set("")
                 return
             if region.kind == "ball":
-                self._scene.ball(LAYER, _BALL, region.centre, float(region.size[0]), GHOST)
+                self._scene.remove(LAYER, BOX)
+                self._scene.ball(LAYER, BALL, region.centre, float(region.size[0]), GHOST)
             else:
-                self._scene.lines(LAYER, _BOX, region.edges(), BOX_COLOUR)
+                self._scene.remove(LAYER, BALL)
+                self._scene.lines(LAYER, BOX, region.edges(), BOX_STROKE)
             key = (self._surface.name, region.text())
             self._painter.request(
                 "inside",
@@ -283,19 +331,18 @@ class MeasurePanel(StepPanel):
         """Show the surface on which a measurement was made."""
         record = None if measured is None else measured.record
         if record is not None and record.source != self._surface.name:
-            self._surface.choose(record.source)
+            self._surface.choice.choose(record.source)
         self._surface.show_deviation(
             measured if record is not None and record.deviation is not None else None
         )
 
     # requests
 
-    def _offer_inputs(self, session: SessionView | None) -> None:
+    def _offer_inputs(self, session: SessionView) -> None:
         """Offer the results to relate, by default the latest two, and the nominal models."""
-        measured = session.measurements if session else ()
         related = [
             (each.name, each.label)
-            for each in measured
+            for each in session.measurements
             if each.record.what in KINDS and not each.stale
         ]
         for choice in (self._from, self._to):
@@ -305,8 +352,8 @@ class MeasurePanel(StepPanel):
             self._from.choose(related[-2][0])
             self._to.choose(related[-1][0])
         self._related = related
-        change(self._relate, disabled=len(related) < 2)
-        self._nominal.offer([(name, name) for name in (session.nominals if session else ())])
+        self._relate.disabled = len(related) < 2
+        self._nominal.offer_names(session.nominals)
 
     def _request_fit(self) -> None:
         """Request the fit of the tool's shape to the region."""

@@ -1,14 +1,11 @@
 """Step 7: choose scans, the reference and the initial alignment; merge, and compare before with
 after."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import viser
 
-from slviewer.gui.inputs import Choice, change, display_name, scan_options
-from slviewer.gui.merge_html import merge_failure_html, merge_html, turntable_html
 from slviewer.gui.merge_picking import PointPicker
 from slviewer.gui.merge_views import (
     AFTER,
@@ -18,8 +15,11 @@ from slviewer.gui.merge_views import (
     ColouredClouds,
     colour_merge,
     colour_scans,
+    merge_failure_html,
+    merge_html,
+    turntable_html,
 )
-from slviewer.gui.panel import PanelContext, StepPanel
+from slviewer.gui.panel import Choice, StepPanel, display_name, scan_labels, scan_options
 from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
@@ -55,80 +55,62 @@ class MergePanel(StepPanel):
 
     key = "merge"
 
-    def __init__(self, context: PanelContext) -> None:
-        super().__init__(context)
-        self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
-        self._picker = PointPicker(context, self._painter, self._refresh)
-        self._merged: int | None = None
-        self._clouds: ColouredClouds | None = None
-        self._layer_shown: bool | None = None
-        self._is_start_chosen = False
+    _merged: int | None = None
+    _clouds: ColouredClouds | None = None
+    _layer_shown: bool | None = None
+    _is_start_chosen = False
 
     def build(self) -> None:
         """Create the inputs of scans, alignment and view."""
         gui, context, operator = self._gui, self._context, self._operator
+        self._boxes: dict[str, viser.GuiCheckboxHandle] = {}
         with gui.add_folder("Scans") as self._scans_folder:
             self._none = Text(gui)
-        with gui.add_folder("Alignment", visible=False) as self._alignment_folder:
-            self._reference = Choice(gui, "Reference", "The other scans are moved to it")
-            self._reference.on_change(context.callback(self._refresh))
+        with gui.add_folder("Alignment") as self._alignment_folder:
+            hint = "The other scans are moved to it"
+            self._reference = Choice(context, "Reference", self._refresh, hint=hint)
             self._start: Any = gui.add_dropdown(
                 "Start from", tuple(STARTS), hint="Initial alignment, which is then refined"
             )
-            self._start.on_update(context.callback(self._change_start))
-            self._start.on_update(context.callback(self._keep_start, by_user=True))
+            context.on_change(self._change_start, self._start)
+            context.on_change(self._keep_start, self._start, by_user=True)
             self._angle: Any = gui.add_number(
-                "Angle, °",
-                30.0,
-                min=1.0,
-                max=180.0,
-                step=0.5,
+                "Angle, °", 30.0, min=1.0, max=180.0, step=0.5,
                 hint="Of the turntable, from each scan to the next",
-            )
-            self._angle.on_update(context.callback(self._refresh))
+            )  # fmt: skip
+            context.on_change(self._refresh, self._angle)
             self._start_note = Text(gui)
-            self._picker.build()
-            self._merge = context.button(
-                "Merge", self._request_merge, viser.Icon.LAYERS_INTERSECT, None
-            )
+            self._picker = PointPicker(context, self._painter, self._refresh)
+            self._merge = context.button("Merge", self._request_merge, "layers-intersect", None)
             self._failure = Text(gui)
         self._result = Text(gui)
-        self._undo = context.button(
-            "Undo merge", operator.undo_merge, viser.Icon.ARROW_BACK_UP, "orange", visible=False
-        )
-        self._view = Choice(gui, "3D view")
-        self._view.on_change(context.callback(self._refresh))
+        self._undo = context.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
+        self._view = Choice(context, "3D view", self._refresh)
         self._legend = Text(gui)
-        context.view_button(self._get_shown_points)
+        context.view_button(self._get_points)
         self._editing = PointEditing(context, EDITS, self._redraw)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the scans and the merge of a snapshot."""
-        with self._lock:
-            self._snapshot = snapshot
-            session = snapshot.session
-            scans = _list_mergeable(session)
-            self._draw_boxes(scans)
-            merge = session.merge if session else None
-            preferred = merge.record.reference if merge else scans[-1].name if scans else ""
-            self._reference.offer(scan_options(scans), preferred)
-            change(self._alignment_folder, visible=len(scans) > 1)
-            change(self._undo, visible=merge is not None)
-            labels = {scan.name: scan.label for scan in scans}
-            self._result.set(merge_html(merge, labels) if merge else "")
-            failure = snapshot.merge_failure
-            self._failure.set(
-                merge_failure_html(failure, labels, merge, snapshot.merge_refusal)
-                if failure
-                else ""
-            )
-            self._offer_views(merge)
-            self._propose_start(scans)
-            number = int(merge.name) if merge is not None else 0
-            if self._merged is not None and number > self._merged:
-                self._view.choose(AFTER)  # show what was just merged
-            self._merged = number
-            self._refresh()
+        session, merge, failure = self._session, self._session.merge, snapshot.merge_failure
+        scans = _list_mergeable(session)
+        self._draw_boxes(scans)
+        preferred = merge.record.reference if merge else scans[-1].name if scans else ""
+        self._reference.offer(scan_options(scans), preferred)
+        self._alignment_folder.visible = len(scans) > 1
+        self._undo.visible = merge is not None
+        labels = {scan.name: scan.label for scan in scans}
+        self._result.set(merge_html(merge, labels) if merge else "")
+        self._failure.set(
+            merge_failure_html(failure, labels, merge, snapshot.merge_refusal) if failure else ""
+        )
+        self._offer_views(merge)
+        self._propose_start(scans)
+        number = int(merge.name) if merge is not None else 0
+        if self._merged is not None and number > self._merged:
+            self._view.choose(AFTER)  # show what was just merged
+        self._merged = number
+        self._refresh()
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layers."""
@@ -140,12 +122,12 @@ class MergePanel(StepPanel):
 
     def _draw_boxes(self, scans: list[ScanView]) -> None:
         """Update the check boxes, one per scan."""
-        names, labels = [scan.name for scan in scans], [scan.label for scan in scans]
+        labels = [scan.label for scan in scans]
         self._none.write(
             "" if scans else "No reconstructed scan yet: capture two or more in the step Scan.",
             "warning",
         )
-        for name in [name for name in self._boxes if name not in names]:
+        for name in self._boxes.keys() - {scan.name for scan in scans}:
             self._boxes.pop(name).remove()
         for scan in scans:
             label = (
@@ -154,9 +136,9 @@ class MergePanel(StepPanel):
             if scan.name not in self._boxes:
                 with self._scans_folder:
                     box = self._gui.add_checkbox(label, True)
-                box.on_update(self._context.callback(self._refresh))
+                self._context.on_change(self._refresh, box)
                 self._boxes[scan.name] = box
-            change(self._boxes[scan.name], label=label)
+            self._boxes[scan.name].label = label
 
     def _offer_views(self, merge: Stored[Merge] | None) -> None:
         """Offer the 3D views: before and after the merge, merged, or side by side to pick
@@ -164,8 +146,8 @@ class MergePanel(StepPanel):
         views = [BEFORE] if merge is None else [AFTER, BEFORE, *MERGED]
         if self._start.value == PICKED:
             views.append(SIDE_BY_SIDE)
-        self._view.offer([(view, view) for view in views])
-        self._view.set_visible(len(views) > 1)
+        self._view.offer_names(views)
+        self._view.handle.visible = len(views) > 1
 
     def _keep_start(self) -> None:
         """Keep the operator's choice of the initial alignment."""
@@ -176,43 +158,41 @@ class MergePanel(StepPanel):
         one."""
         if self._is_start_chosen:
             return
-        names = set(self._list_chosen())
+        names = self._list_chosen()
         chosen = [scan for scan in scans if scan.name in names]
         if not chosen:
             return
-        turned = self._get_stored_angles([scan.name for scan in chosen]) is not None
+        turned = self._get_stored_angles(names) is not None
         placed = all(scan.is_placed for scan in chosen)
-        start = TURNTABLE if turned else PLACED if placed else FEATURES
-        if self._start.value != start:
-            self._start.value = start
+        self._start.value = TURNTABLE if turned else PLACED if placed else FEATURES
 
     def _change_start(self) -> None:
         """Update the views for another initial alignment; picked points are shown side by side."""
         with self._lock:
-            self._offer_views(self._session.merge if self._session else None)
+            self._offer_views(self._session.merge)
             if self._start.value == PICKED:
                 self._view.choose(SIDE_BY_SIDE)
             self._refresh()
 
     def _list_chosen(self) -> list[str]:
         """List the scans to merge, with the reference, in the order of their capture."""
-        scans = _list_mergeable(self._session)
         boxes, reference = self._boxes, self._reference.value
         return [
-            s.name
-            for s in scans
-            if s.name == reference or (s.name in boxes and boxes[s.name].value)
+            scan.name
+            for scan in _list_mergeable(self._session)
+            if scan.name == reference or (scan.name in boxes and boxes[scan.name].value)
         ]
 
     def _get_stored_angles(self, names: list[str]) -> list[float] | None:
         """Return the angles, deg, that are stored with scans of one turn; None where they are of
         several or of none."""
-        scans = {scan.name: scan for scan in self._session.scans} if self._session else {}
-        steps = [step for name in names if (step := scans[name].turn_step) is not None]
-        same = len(steps) == len(names) and len({step.turn for step in steps}) == 1
-        return [step.deg for step in steps] if same else None
+        steps = [scan.turn_step for scan in self._session.scans if scan.name in names]
+        turns = {step.turn if step else "" for step in steps}
+        if len(turns) != 1 or "" in turns:
+            return None
+        return [step.deg for step in steps if step]
 
-    def _get_shown_points(self) -> np.ndarray | None:
+    def _get_points(self) -> np.ndarray | None:
         """Return the shown points (n, 3) mm; None where none are."""
         if self._is_picking:
             return self._picker.points
@@ -227,53 +207,45 @@ class MergePanel(StepPanel):
         """Update inputs and notes for the current choice, and request the clouds."""
         with self._lock:
             snapshot, session = self._snapshot, self._session
-            if snapshot is None or session is None:
-                return
             names, start = self._list_chosen(), self._start.value
-            versions = {
+            self._versions = {
                 scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
                 for scan in session.scans
                 if scan.cloud != "absent"
             }
-            labels = {scan.name: scan.label for scan in session.scans}
+            labels = scan_labels(session)
             self._draw_start(names, labels)
-            chosen = {name: versions[name] for name in names}
+            chosen = {name: self._versions[name] for name in names}
             self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
             ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
-            change(
-                self._merge,
-                label=f"Merge {len(names)} scans",
-                disabled=snapshot.is_busy or not ready,
-            )
-            shown = self._list_shown(session, names, versions)
+            self._merge.label = f"Merge {len(names)} scans"
+            self._merge.disabled = snapshot.is_busy or not ready
+            # those of the merge, else those to merge
+            listed = session.merge.record.scans if session.merge else names
+            shown = [
+                scan
+                for scan in session.scans
+                if scan.name in self._versions and scan.name in listed
+            ]
             editable = self._view.value not in MERGED and not self._is_picking
-            self._editing.draw(
-                [scan for scan in session.scans if scan.name in shown] if editable else []
-            )
+            self._editing.draw(shown if editable else [])
             self._show_layers()
             if not self._is_picking:
-                self._request_clouds(session, names, versions, labels)
+                self._request_clouds([name for name in listed if name in self._versions], labels)
 
     def _draw_start(self, names: list[str], labels: dict[str, str]) -> None:
         """Show the angles or the note of the chosen initial alignment."""
         start, stored = self._start.value, self._get_stored_angles(names)
-        change(self._angle, visible=start == TURNTABLE and stored is None)
+        self._angle.visible = start == TURNTABLE and stored is None
         if start == TURNTABLE:
             given = [k * float(self._angle.value) for k in range(len(names))]
             self._start_note.set(turntable_html(names, given if stored is None else stored, labels))
         else:
             self._start_note.write(_START_NOTES.get(start, ""), "dim")
 
-    def _request_clouds(
-        self,
-        session: SessionView,
-        names: list[str],
-        versions: Mapping[str, Any],
-        labels: dict[str, str],
-    ) -> None:
-        """Request the clouds of the chosen view."""
-        merge, view, context = session.merge, self._view.value, self._context
-        shown = self._list_shown(session, names, versions)
+    def _request_clouds(self, shown: list[str], labels: dict[str, str]) -> None:
+        """Request the clouds of the chosen view: the merged surface, or these scans."""
+        merge, view, context = self._session.merge, self._view.value, self._context
         poses = (
             {n: np.array(p.T_reference_scan) for n, p in merge.record.pairs.items()}
             if merge is not None and view == AFTER
@@ -282,32 +254,18 @@ class MergePanel(StepPanel):
         key = (
             view,
             merge.name if merge else "",
-            tuple((name, versions[name], labels[name]) for name in shown),
+            tuple((name, self._versions[name], labels[name]) for name in shown),
             tuple((name, T.tobytes()) for name, T in poses.items()),
         )
 
         def make() -> ColouredClouds:
             """Load and colour the merged surface or the scans."""
             if merge is not None and view in MERGED:
-                return colour_merge(
-                    context.session,
-                    merge.name,
-                    view,
-                    [labels.get(name, name) for name in merge.record.scans],
-                )
+                titles = [labels.get(name, name) for name in merge.record.scans]
+                return colour_merge(context.session, merge.name, view, titles)
             return colour_scans(context.session, shown, poses, labels)
 
         self._painter.request("clouds", key, make, self._draw_clouds)
-
-    def _list_shown(
-        self, session: SessionView, names: list[str], versions: Mapping[str, Any]
-    ) -> list[str]:
-        """List the scans in the 3D view: those of the merge, else those to merge."""
-        return [
-            name
-            for name in (session.merge.record.scans if session.merge is not None else names)
-            if name in versions
-        ]
 
     def _redraw(self) -> None:
         """Draw the clouds again, as other points of them are hidden."""
@@ -316,11 +274,9 @@ class MergePanel(StepPanel):
 
     def _draw_clouds(self, clouds: ColouredClouds) -> None:
         """Draw the loaded clouds, and remove others."""
-        for name in set(self._scene.names(LAYER)) - set(clouds.clouds):
-            self._scene.remove(LAYER, name)
-        shown = self._editing.set_scans(clouds.scans) or [
-            points for points, _ in clouds.clouds.values()
-        ]
+        self._scene.remove(LAYER, *(set(self._scene.names(LAYER)) - set(clouds.clouds)))
+        scans = [(scan, clouds.clouds[scan.name][0]) for scan in clouds.scans]
+        shown = self._editing.set_scans(scans) or [points for points, _ in clouds.clouds.values()]
         for points, (name, (_, painted)) in zip(shown, clouds.clouds.items(), strict=True):
             self._scene.cloud(LAYER, name, points, painted, SHOWN)
         with self._lock:
@@ -356,7 +312,6 @@ class MergePanel(StepPanel):
         )
 
 
-def _list_mergeable(session: SessionView | None) -> list[ScanView]:
+def _list_mergeable(session: SessionView) -> list[ScanView]:
     """List the reconstructed scans of objects, without captured planes and spheres."""
-    scans = session.scans if session else ()
-    return [scan for scan in scans if scan.cloud != "absent" and shape_of(scan) == "scan"]
+    return [scan for scan in session.scans if scan.cloud != "absent" and shape_of(scan) == "scan"]

@@ -1,25 +1,26 @@
 """Step 3: hold the board where it is suggested, and capture; each pose is judged at once."""
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import GOAL_POSES, Coverage
-from slviewer.gui.import_inputs import ImportInputs
-from slviewer.gui.inputs import Choice, RestoreButton, SessionValue, change
-from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.pose_list import TONES, PoseBoards, pose_table
-from slviewer.gui.preview import board_html, draw_preview, exposure_html, legend
-from slviewer.gui.scene import GHOST, Stroke
+from slviewer.gui.capture_inputs import ImportInputs
+from slviewer.gui.panel import NO_SESSION, Choice, RestoreButton, Setting, StepPanel
+from slviewer.gui.preview import LiveImage
+from slviewer.gui.scene import GHOST, Colour, Stroke
 from slviewer.gui.widgets import (
     Html,
-    Picture,
     Sound,
     Text,
+    Tone,
     alert,
     coloured,
+    note,
     paragraph,
     thumbnail,
     to_html,
@@ -38,6 +39,17 @@ _COLOURS = (
 _TILTS = {(1, 1): "●", (0, 1): "▲", (1, 2): "▶", (2, 1): "▼", (1, 0): "◀"}
 """Place (row, column) and arrow of each of the coverage's tilts: facing, then the side that is
 farther away."""
+_GOOD: tuple[Tone, Colour] = ("good", (47, 158, 68))
+_STATES: dict[str, tuple[Tone, Colour]] = {
+    "judging": ("info", (34, 139, 230)),
+    "good": _GOOD,
+    "used": _GOOD,
+    "refused": ("error", (224, 49, 49)),
+    "excluded": ("dim", (140, 140, 140)),
+    "unused": ("warning", (232, 119, 0)),
+}
+"""{state of a pose: tone of its name, colour of its board in 3D}."""
+_PICTURE_PX = 160
 
 
 def coverage_chart(coverage: Coverage) -> Html:
@@ -97,64 +109,59 @@ class PosesPanel(StepPanel):
     key = "poses"
     layers = (LAYER, WORLD)
 
-    def __init__(self, context: PanelContext) -> None:
-        super().__init__(context)
-        self._board: Board | None = None
-        self._states: dict[str, str] = {}
-        self._drawn_session: Any = None
-        self._is_counting = False
-        self._dragged = self._sent = 0.0
-        self._ghost_px: np.ndarray | None = None
-        self._world: np.ndarray | None = None
-        self._target = self._latest = ""
+    _board: Board | None = None
+    _drawn_session: SessionView | None = None
+    _is_counting = False
+    _dragged = _sent = 0.0
+    _ghost_px: np.ndarray | None = None
+    _world: np.ndarray | None = None
+    _target = _latest = ""
 
     def build(self) -> None:
         """Create the live image, the buttons, the coverage and the list of poses."""
         gui, context, operator = self._gui, self._context, self._operator
-        self._boards = PoseBoards(context.scene, LAYER, self._select_pose)
-        self._picture = Picture(gui)
+        self._T_board_centre = np.eye(4)  # mm; the board's handle is at its centre
+        self._states: dict[str, str] = {}
+        self._drawn_poses: dict[str, Any] = {}
+        self._picture = LiveImage(gui)
         self._countdown = Text(gui)
         self._other_object = Text(gui)
         self._place = context.button(
-            "Place board", operator.place_at_suggestion, viser.Icon.TARGET_ARROW, "cyan",
-            visible=False,
+            "Place board", operator.place_at_suggestion, "target-arrow", "cyan",
             hint="Moves the simulated board to the suggested pose",
         )  # fmt: skip
         self._capture = context.button(
-            "Capture pose", operator.capture_pose, viser.Icon.CAMERA, None, hint="Key: C"
+            "Capture pose", operator.capture_pose, "camera", None, hint="Key: C"
         )
         self._hotkey = gui.add_command(
             "Capture pose", hotkey="C", icon=viser.Icon.CAMERA, disabled=True
         )
         self._hotkey.on_trigger(context.callback(operator.capture_pose))
-        self._hands_free = gui.add_checkbox(
+        hands_free = gui.add_checkbox(
             "Hands-free", False, hint="Captures whenever the board is held still"
         )
-        self._hands_free_value = SessionValue(self._hands_free)
-        self._hands_free.on_update(
-            context.callback(
-                lambda: operator.set_hands_free(bool(self._hands_free.value)), by_user=True
-            )
-        )
+        self._hands_free = Setting(context, hands_free, operator.set_hands_free)
         self._accuracy = Text(gui)
-        self._wanted = gui.add_number(
+        wanted = gui.add_number(
             "Sigma, mm", 0.0, min=0.0, max=10.0, step=0.001,
             hint="Goal: predicted 3D standard deviation at which no further pose is suggested; "
             "0: the default",
         )  # fmt: skip
-        self._wanted_value = SessionValue(self._wanted)
-        self._wanted.on_update(
-            context.callback(
-                lambda: operator.set_wanted_sigma(float(self._wanted.value) or None), by_user=True
-            )
+        self._wanted = Setting(
+            context, wanted, lambda sigma: operator.set_wanted_sigma(float(sigma) or None)
         )
         self._coverage = Text(gui)
         with gui.add_folder("Captured poses"):
             self._table = Text(gui)
-            self._chosen = Choice(gui, "Pose")
-            self._chosen.on_change(context.callback(self._draw_choice))
+            self._chosen = Choice(context, "Pose", self._draw_choice)
             self._detail = Text(gui)
-            actions = gui.add_button_group("Action", ("Exclude", "Include", "Retake", "Delete"))
+            self._actions = {
+                "Exclude": operator.exclude,
+                "Include": operator.include,
+                "Retake": operator.retake_pose,
+                "Delete": operator.delete,
+            }
+            actions = gui.add_button_group("Action", tuple(self._actions))
             actions.on_click(context.callback(lambda: self._request_action(actions.value)))
             self._restore = RestoreButton(context)
         self._import = ImportInputs(context, "calibration")
@@ -162,57 +169,47 @@ class PosesPanel(StepPanel):
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the poses, coverage and suggestion of a snapshot."""
-        session = snapshot.session
-        target = session.target if session else ""
-        if target != self._target:
-            self._target, self._board = target, Board.parse(target) if target else None
+        session = snapshot.session or NO_SESSION
+        if session.target != self._target:
+            self._target = session.target
+            self._board = Board.parse(self._target) if self._target else None
+            if self._board is not None:
+                self._T_board_centre[:3, 3] = self._board.outline().mean(axis=0)
             self._world = None
-        change(self._capture, disabled=snapshot.rig.state != "open" or self._board is None)
-        can_place = (
-            session is not None and session.suggestion is not None and session.pending_plan is None
-        )
-        change(self._place, visible=snapshot.world is not None, disabled=not can_place)
-        self._hands_free_value.update(snapshot.hands_free)
+        self._capture.disabled = snapshot.rig.state != "open" or self._board is None
+        self._place.visible = snapshot.world is not None
+        self._place.disabled = session.suggestion is None or session.pending_plan is not None
+        self._hands_free.update(snapshot.hands_free)
         self._draw_world(snapshot)
         self._import.draw(snapshot)
         if session is self._drawn_session:
             return
         self._drawn_session = session
-        poses = session.poses if session else ()
-        self._coverage.set(coverage_chart(session.coverage) if session and session.coverage else "")
+        poses = session.poses
+        self._coverage.set(coverage_chart(session.coverage) if session.coverage else "")
         self._draw_accuracy(session)
         self._draw_ghost(session)
         self._play_sound(poses, snapshot.hands_free)
         latest = poses[-1].name if poses else ""
-        self._chosen.offer([(pose.name, pose.name) for pose in reversed(poses)])
+        self._chosen.offer_names(pose.name for pose in reversed(poses))
         if latest and latest != self._latest:
             self._chosen.choose(latest)
         self._latest = latest
         self._table.set(pose_table(poses))
-        self._restore.offer(session.deleted_poses if session else ())
-        self._draw_choice(snapshot)
+        self._restore.offer(session.deleted_poses)
+        self._draw_choice()
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image with the detected board, and the countdown of a hands-free
         capture."""
-        hint = (
-            coloured("Dashed blue: hold the board here", "info")
-            if self._ghost_px is not None
-            else Html("")
-        )
-        self._picture.set(
-            draw_preview(preview, self._board, self._ghost_px),
-            legend(preview, board_html(preview, self._board), exposure_html(preview), hint),
-        )
+        self._picture.draw_board(preview, self._board, self._ghost_px)
         count = preview.countdown_s
-        if count is None:
-            self._countdown.set("")
-        else:
-            if not self._is_counting:
-                self._sound.play("tick")
-            text = to_html(f"Hold still: {max(count, 0):.1f} s")
-            self._countdown.set(alert(Html(f'<b style="font-size:1.3rem">{text}</b>'), "info"))
+        if count is not None and not self._is_counting:
+            self._sound.play("tick")
         self._is_counting = count is not None
+        text = "" if count is None else to_html(f"Hold still: {max(count, 0):.1f} s")
+        bold = Html(f'<b style="font-size:1.3rem">{text}</b>' if text else "")
+        self._countdown.set(alert(bold, "info"))
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers; the hotkey works only while shown."""
@@ -222,55 +219,43 @@ class PosesPanel(StepPanel):
 
     # drawing
 
-    def _draw_accuracy(self, session: SessionView | None) -> None:
+    def _draw_accuracy(self, session: SessionView) -> None:
         """Show the predicted standard deviation and the goal."""
-        if session is None or session.plan is None or session.plan.sigma_mm is None:
-            self._accuracy.set("")
-        else:
-            plan = session.plan
+        plan, text = session.plan, ""
+        if plan is not None:
+            self._wanted.update(round(session.wanted_mm, 3))
+        if plan is not None and plan.sigma_mm is not None:
             text = f"Predicted sigma {plan.sigma_mm:.3f} mm, goal {session.wanted_mm:.3f} mm"
             if session.enough:
-                self._accuracy.write(f"{text}: reached.", "good")
-            else:
-                following = (
-                    f"; {plan.sigma_next_mm:.3f} mm with the next pose"
-                    if plan.sigma_next_mm
-                    else ""
-                )
-                self._accuracy.write(text + following, "info")
-        if session is not None and session.plan is not None:
-            self._wanted_value.update(round(session.wanted_mm, 3))
+                text += ": reached."
+            elif plan.sigma_next_mm:
+                text += f"; {plan.sigma_next_mm:.3f} mm with the next pose"
+        self._accuracy.write(text, "good" if session.enough else "info")
 
-    def _draw_ghost(self, session: SessionView | None) -> None:
+    def _draw_ghost(self, session: SessionView) -> None:
         """Draw the suggested pose in 3D, and store its outline for the live image."""
-        suggestion = session.suggestion if session and not session.enough else None
+        suggestion = None if session.enough else session.suggestion
         self._ghost_px = suggestion.outline_px if suggestion else None
         if suggestion is None or self._board is None:
             self._scene.remove(LAYER, "suggestion")
         else:
-            outline = self._board.outline()
+            T, outline = suggestion.T_camera_board, self._board.outline()
             self._scene.board(
-                LAYER,
-                "suggestion",
-                suggestion.T_camera_board,
-                outline,
-                Stroke(GHOST, 4.0),
-                label="next pose",
+                LAYER, "suggestion", T, outline, Stroke(GHOST, 4.0), label="next pose"
             )
 
     def _draw_world(self, snapshot: Snapshot) -> None:
         """Draw the simulated board and its handle, or which other object is in view."""
         world, scene = snapshot.world, self._scene
-        other = "" if world is None or world.standing == "board" else world.standing
-        self._other_object.write(
-            other and f"In view: the {other}. Place the board first.", "warning"
-        )
-        if world is None or world.standing != "board" or self._board is None:
+        standing = world.standing if world else "board"
+        text = "" if standing == "board" else f"In view: the {standing}. Place the board first."
+        self._other_object.write(text, "warning")
+        if world is None or text or self._board is None:
             if self._world is not None:
                 scene.clear(WORLD)
                 self._world = None
             return
-        T, centre = world.T_camera_object, self._get_board_centre(self._board)
+        T, centre = world.T_camera_object, self._T_board_centre
         if self._world is None:
             scene.board(WORLD, "board", T, self._board.outline(), Stroke((70, 70, 70), 3.0))
             scene.gizmo(WORLD, "handle", T @ centre, self._drag_board, self._place_board)
@@ -280,28 +265,23 @@ class PosesPanel(StepPanel):
                 scene.move(WORLD, "handle", T @ centre)
         self._world = T
 
-    def _draw_choice(self, snapshot: Snapshot | None = None) -> None:
+    def _draw_choice(self) -> None:
         """Show the details of the chosen pose, and all poses in 3D."""
-        snapshot = snapshot or self._operator.snapshot()
-        poses = snapshot.session.poses if snapshot.session else ()
-        self._boards.draw(poses, self._board, snapshot.rig.camera, self._chosen.value)
-        pose = snapshot.pose(self._chosen.value)
+        self._draw_boards(self._session.poses, self._snapshot.rig.camera)
+        pose = self._snapshot.pose(self._chosen.value)
         if pose is None:
             self._detail.set("")
             return
         lines = [
             Html(f"<b>{to_html(pose.name)}</b>"),
-            coloured(pose.state, TONES[pose.state], bold=True),
+            coloured(pose.state, _STATES[pose.state][0], bold=True),
         ]
         if pose.why:
             lines.append(to_html(pose.why))
         if pose.rms_px is not None:
-            lines.append(
-                to_html(
-                    f"Reprojection RMS: camera {pose.rms_px[0]:.3f} px, projector"
-                    f" {pose.rms_px[1]:.3f} px"
-                )
-            )
+            camera, projector = pose.rms_px
+            rms = f"Reprojection RMS: camera {camera:.3f} px, projector {projector:.3f} px"
+            lines.append(to_html(rms))
         if pose.T_camera_board is not None:
             about = "" if pose.calibrated else "about "
             lines.append(coloured(f"Distance {about}{pose.T_camera_board[2, 3]:.0f} mm", "dim"))
@@ -310,6 +290,28 @@ class PosesPanel(StepPanel):
         self._detail.set(
             paragraph(Html(f'<div style="display:flex;gap:0.8em">{picture}<div>{text}</div></div>'))
         )
+
+    def _draw_boards(self, poses: Sequence[PoseView], camera: tuple[int, int] | None) -> None:
+        """Draw the boards of the poses whose position is known; the chosen one has a thicker
+        outline."""
+        board, chosen = self._board, self._chosen.value
+        known = {pose.name: pose for pose in poses if board and pose.T_camera_board is not None}
+        for name in set(self._drawn_poses) - set(known):
+            self._scene.remove(LAYER, name)
+            del self._drawn_poses[name]
+        for name, pose in known.items():
+            T, is_chosen = pose.T_camera_board, name == chosen
+            assert T is not None and board is not None
+            key = (pose.state, T.tobytes(), bool(pose.thumbnail), is_chosen, str(board))
+            if self._drawn_poses.get(name) != key:
+                self._drawn_poses[name] = key
+                stroke = Stroke(_STATES[pose.state][1], 4.0 if is_chosen else 2.0)
+                image, label = rectified(pose, board, camera), name.removeprefix("pose_")
+                picture = self._scene.board(
+                    LAYER, name, T, board.outline(), stroke, picture=image, label=label
+                )
+                if picture is not None:
+                    picture.on_click(lambda _event, name=name: self._chosen.choose(name))
 
     def _play_sound(self, poses: tuple[PoseView, ...], hands_free: bool) -> None:
         """Play a sound for the result of the last pose, as the operator is looking at the board."""
@@ -326,25 +328,13 @@ class PosesPanel(StepPanel):
 
     # requests
 
-    def _select_pose(self, name: str) -> None:
-        """Choose a pose by its name."""
-        self._chosen.choose(name)
-        self._draw_choice()
-
     def _request_action(self, action: str) -> None:
         """Request the action of a button for the chosen pose: exclude, include, retake or
         delete."""
-        name, operator = self._chosen.value, self._operator
-        if not name:
-            self._context.notify("info", "Capture a pose first.")
-        elif action == "Exclude":
-            operator.exclude(name)
-        elif action == "Include":
-            operator.include(name)
-        elif action == "Retake":
-            operator.retake_pose(name)
+        if name := self._chosen.value:
+            self._actions[action](name)
         else:
-            operator.delete(name)
+            self._context.notify("info", "Capture a pose first.")
 
     def _drag_board(self, T_camera_centre: np.ndarray) -> None:
         """Move the simulated board while its handle is dragged, at most every `_DRAG_S`."""
@@ -355,14 +345,38 @@ class PosesPanel(StepPanel):
 
     def _place_board(self, T_camera_centre: np.ndarray) -> None:
         """Place the simulated board where its handle is, T (4, 4) mm of the board's centre."""
-        if self._board is not None:
-            self._operator.place(
-                "board", T_camera_centre @ np.linalg.inv(self._get_board_centre(self._board))
-            )
+        self._operator.place("board", T_camera_centre @ np.linalg.inv(self._T_board_centre))
 
-    @staticmethod
-    def _get_board_centre(board: Board) -> np.ndarray:
-        """Return T_board_centre (4, 4) mm, as the handle is at the board's centre."""
-        T = np.eye(4)
-        T[:3, 3] = board.outline().mean(axis=0)
-        return T
+
+def pose_table(poses: Sequence[PoseView]) -> Html:
+    """List all poses, the latest first, with their state and its reason."""
+    if not poses:
+        return note("None yet.")
+    rows = []
+    for pose in reversed(poses):
+        rms = f"{pose.rms_px[0]:.2f} / {pose.rms_px[1]:.2f} px" if pose.rms_px is not None else ""
+        state = coloured(pose.state, _STATES[pose.state][0], bold=True)
+        why = f'<div style="color:var(--mantine-color-dimmed)">{to_html(pose.why or rms)}</div>'
+        rows.append(
+            '<div style="display:flex;gap:0.6em;align-items:center;padding:0.25em 0;'
+            'border-top:1px solid var(--mantine-color-default-border)">'
+            f"{thumbnail(pose.thumbnail, 52, pose.name)}"
+            f'<div style="min-width:0"><b>{to_html(pose.name)}</b>&ensp;{state}{why}</div></div>'
+        )
+    return paragraph(Html(f'<div style="max-height:15em;overflow-y:auto">{"".join(rows)}</div>'))
+
+
+def rectified(pose: PoseView, board: Board, camera: tuple[int, int] | None) -> np.ndarray | None:
+    """Cut the board's front (h, w, 3) uint8 out of a pose's thumbnail; None where either is
+    unknown."""
+    if not pose.thumbnail or pose.board_px is None or camera is None:
+        return None
+    image = cv2.imdecode(np.frombuffer(pose.thumbnail, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return None
+    size = np.ptp(board.outline(), axis=0)
+    width, height = _PICTURE_PX, max(1, round(_PICTURE_PX * float(size[1] / size[0])))
+    corners = (pose.board_px + 0.5) * image.shape[1] / camera[0] - 0.5
+    face = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float32)
+    H = cv2.getPerspectiveTransform(corners.astype(np.float32), face)
+    return cv2.cvtColor(cv2.warpPerspective(image, H, (width, height)), cv2.COLOR_BGR2RGB)

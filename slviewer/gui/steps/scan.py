@@ -8,37 +8,33 @@ import viser
 
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
-from slviewer.gui.exposures import ExposureInputs
-from slviewer.gui.import_inputs import ImportInputs
-from slviewer.gui.inputs import (
+from slviewer.gui.capture_inputs import ExposureInputs, ImportInputs, SimulatedObject, TurnInputs
+from slviewer.gui.live import LAYER as LIVE
+from slviewer.gui.live import LiveScreen
+from slviewer.gui.panel import (
     Choice,
     RestoreButton,
-    SessionValue,
-    change,
+    Setting,
+    StepPanel,
     display_name,
     scan_options,
 )
-from slviewer.gui.live import LAYER as LIVE
-from slviewer.gui.live import LiveScreen
-from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.point_editing import PointEditing
-from slviewer.gui.preview import draw_preview, exposure_html, legend
-from slviewer.gui.region_inputs import RegionInputs
-from slviewer.gui.simulated_object import SimulatedObject
+from slviewer.gui.point_editing import PointEditing, RegionInputs
+from slviewer.gui.preview import LiveImage
+from slviewer.gui.scene import Click
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
-from slviewer.gui.turning import TurnInputs
 from slviewer.gui.widgets import (
     Html,
-    Picture,
     Text,
     Tone,
     alert,
     colour_bar,
     coloured,
     colours,
+    note,
     paint,
     paragraph,
-    table,
+    properties_table,
     thumbnail,
     to_html,
 )
@@ -70,140 +66,110 @@ class ScanPanel(StepPanel):
     key = "scan"
     layers = (LAYER,)
 
-    def __init__(self, context: PanelContext) -> None:
-        super().__init__(context)
-        self._known: tuple[str, ...] = ()
-        self._placed: tuple[str, ...] | None = None
-        self._loaded: tuple[Any, ScanCloud] | None = None
-        self._whole: ScanCloud | None = None
-        self._redraws = 0
-        self._is_live = False
-        self._screen = LiveScreen(context)
-        context.operator.subscribe_live(self._screen.offer)
+    _known: tuple[str, ...] = ()
+    _placed: tuple[str, ...] | None = None
+    _loaded: tuple[Any, ScanCloud] | None = None
+    _cloud: ScanCloud | None = None
+    _whole: ScanCloud | None = None
+    _redraws = 0
+    _is_live = False
 
     def build(self) -> None:
         """Create the inputs of capture, live scan, gallery and cloud."""
         gui, context, operator = self._gui, self._context, self._operator
-        with gui.add_folder("Capture", visible=False) as self._capture_folder:
-            self._picture = Picture(gui, "Live image", width_px=SMALL_PX)
+        self._screen = LiveScreen(context)
+        operator.subscribe_live(self._screen.offer)
+        with gui.add_folder("Capture") as self._capture_folder:
+            self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
             self._capture = context.button(
-                "Capture scan",
-                lambda: operator.capture_scan(self._label.value),
-                viser.Icon.CAMERA,
-                None,
+                "Capture scan", lambda: operator.capture_scan(label.value), "camera", None
             )
-            self._patterns = gui.add_dropdown(
+            patterns = gui.add_dropdown(
                 "Patterns",
                 tuple(PRESETS),
                 hint="micro for concave metal, wax and other surfaces that light themselves",
             )
-            self._patterns_value = SessionValue(self._patterns)
-            self._patterns.on_update(
-                context.callback(
-                    lambda: operator.choose_patterns(self._patterns.value), by_user=True
-                )
-            )
+            self._patterns = Setting(context, patterns, operator.choose_patterns)
             self._exposures = ExposureInputs(context, for_scan=True)
-            self._align = gui.add_checkbox(
+            align = gui.add_checkbox(
                 "Align as you scan",
                 False,
                 hint="Shows each new scan in its place beside those before it",
             )
-            self._align_value = SessionValue(self._align)
-            self._align.on_update(
-                context.callback(lambda: operator.set_align_scans(self._align.value), by_user=True)
-            )
-            self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
+            self._align = Setting(context, align, operator.set_align_scans)
+            label = gui.add_text("Name", "", hint="Optional; numbered by default")
             self._live = context.button(
-                "Live", self._toggle_live, viser.Icon.PLAYER_PLAY, "teal", hint=LIVE_HINT
+                "Live", self._toggle_live, "player-play", "teal", hint=LIVE_HINT
             )
             self._save = context.button(
-                "Save cloud",
-                lambda: operator.save_live(self._label.value),
-                viser.Icon.DOWNLOAD,
-                "green",
-                visible=False,
+                "Save cloud", lambda: operator.save_live(label.value), "download", "green"
             )
             self._live_status = Text(gui)
             self._turn = TurnInputs(context)
-            self._simulated = SimulatedObject(
-                context,
-                LAYER,
-                ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE),
-            )
+            things = ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
+            self._simulated = SimulatedObject(context, LAYER, things)
         self._gallery = Text(gui)
-        with gui.add_folder("Cloud", visible=False) as self._cloud_folder:
-            self._scan = Choice(gui, "Scan")
+        with gui.add_folder("Cloud") as self._cloud_folder:
+            self._scan = scan = Choice(context, "Scan", self._refresh)
             self._figures = Text(gui)
-            self._model = Choice(gui, "Model")
+            self._model = Choice(context, "Model")
             self._reconstruct = context.button(
                 "Reconstruct",
-                lambda: operator.reconstruct(self._scan.value, self._model.value or None),
-                viser.Icon.CUBE,
+                lambda: operator.reconstruct(scan.value, self._model.value or None),
+                "cube",
                 None,
             )
             self._placement = Text(gui)
-            self._place = context.button(
-                "Align scan", lambda: operator.align(self._scan.value), viser.Icon.PUZZLE
-            )
+            self._place = context.button("Align scan", lambda: operator.align(scan.value), "puzzle")
             self._take_out = context.button(
-                "Undo alignment",
-                lambda: operator.undo_alignment(self._scan.value),
-                viser.Icon.ARROW_BACK_UP,
+                "Undo alignment", lambda: operator.undo_alignment(scan.value), "arrow-back-up"
             )
             self._support = context.button(
                 "Remove support", lambda: operator.remove_support(*self._shown_scans()),
-                viser.Icon.TABLE_MINUS,
+                "table-minus",
                 hint="Deletes the plane that the object stands on, and all below it; "
                 "Undo edit brings it back",
             )  # fmt: skip
-            self._view = Choice(gui, "3D view")
+            self._view = Choice(context, "3D view", self._refresh)
             self._colour = gui.add_dropdown("Colour", COLOURS)
+            context.on_change(self._refresh, self._colour)
             self._legend = Text(gui)
-            context.view_button(lambda: self._cloud.points if self._cloud else None)
+            context.view_button(self._get_points)
             self._point = Text(gui)
             self._region = RegionInputs(context, LAYER)
             self._editing = PointEditing(context, LAYER, self._redraw, self._show_point)
-            self._new_name = gui.add_text("New name", "")
+            name = gui.add_text("New name", "")
+            context.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
             context.button(
-                "Rename scan",
-                lambda: operator.rename(self._scan.value, self._new_name.value),
-                viser.Icon.PENCIL,
-            )
-            context.button(
-                "Delete scan", lambda: operator.delete(self._scan.value), viser.Icon.TRASH, "red",
+                "Delete scan", lambda: operator.delete(scan.value), "trash", "red",
                 hint="Moves it to the session's trash",
             )  # fmt: skip
         self._restore = RestoreButton(context)
         self._import = ImportInputs(context, "scan")
-        self._scan.on_change(context.callback(self._refresh))
-        self._view.on_change(context.callback(self._refresh))
-        self._colour.on_update(context.callback(self._refresh))
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the scans and the live scan of a snapshot."""
-        with self._lock:
-            self._snapshot = snapshot
-            session = snapshot.session
-            self._draw_capture(snapshot)
-            self._restore.offer(session.deleted_scans if session else ())
-            self._align_value.update(bool(session and session.aligns_scans))
-            scans = sort_scans(session.scans) if session else []
-            self._offer_views(scans)
-            change(self._cloud_folder, visible=bool(scans))
-            self._gallery.set(gallery(scans, self._scan.value))
-            if not scans:
-                self._clear_cloud()
-                return
-            self._offer_scans(scans)
-            calibration = snapshot.calibration
-            models = [(model, model) for model in calibration.models] if calibration else []
-            self._model.offer(models, calibration.best if calibration else "")
-            self._refresh()
+        session, calibration = self._session, snapshot.calibration
+        self._draw_capture(snapshot)
+        self._restore.offer(session.deleted_scans)
+        self._align.update(session.aligns_scans)
+        scans = sort_scans(session.scans)
+        self._offer_views(scans)
+        self._cloud_folder.visible = bool(scans)
+        if not scans:
+            self._gallery.set("")
+            self._clear_cloud()
+            return
+        self._offer_scans(scans)
+        if calibration is not None:
+            self._model.offer_names(calibration.models, calibration.best)
+        else:
+            self._model.offer_names(())
+        self._refresh()
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image."""
-        self._picture.set(draw_preview(preview), legend(preview, exposure_html(preview)))
+        self._picture.draw(preview)
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers; hiding stops a live scan."""
@@ -219,12 +185,12 @@ class ScanPanel(StepPanel):
         """Update the inputs of capture, live scan and import."""
         rig = snapshot.rig
         ready = rig.is_idle and snapshot.step(self.key).state != "blocked"
-        change(self._capture_folder, visible=rig.state != "none")
-        change(self._capture, disabled=not ready)
+        self._capture_folder.visible = rig.state != "none"
+        self._capture.disabled = not ready
         self._draw_live(snapshot.live, ready)
-        change(self._patterns, disabled=not rig.is_idle)
+        self._patterns.handle.disabled = not rig.is_idle
         if snapshot.session is not None:
-            self._patterns_value.update(snapshot.session.patterns)
+            self._patterns.update(snapshot.session.patterns)
         self._exposures.draw(snapshot)
         self._turn.draw(snapshot, ready)
         self._simulated.draw(snapshot)
@@ -241,17 +207,16 @@ class ScanPanel(StepPanel):
 
     def _draw_live(self, live: LiveView | None, ready: bool) -> None:
         """Update buttons and figures of the live scan, during which a captured cloud is hidden."""
-        icon = viser.Icon.PLAYER_PLAY if live is None else viser.Icon.PLAYER_STOP
-        label, colour = ("Live", "teal") if live is None else ("Stop live", "red")
-        change(
-            self._live, label=label, color=colour, icon=icon, disabled=live is None and not ready
-        )
-        change(self._save, visible=live is not None, disabled=live is None or not live.clouds_per_s)
+        button, save = self._live, self._save
+        button.label, button.color = ("Live", "teal") if live is None else ("Stop live", "red")
+        button.icon = viser.IconName("player-play" if live is None else "player-stop")
+        button.disabled = live is None and not ready
+        save.visible, save.disabled = live is not None, live is None or not live.clouds_per_s
         self._live_status.set("" if live is None else live_html(live, self._screen.points))
         if live is None and self._is_live:
             self._screen.clear()
         self._is_live = live is not None
-        if live is not None:
+        if self._is_live:
             self._scene.show(LIVE, True)
             self._clear_cloud()
 
@@ -265,35 +230,39 @@ class ScanPanel(StepPanel):
     def _clear_cloud(self) -> None:
         """Remove the captured cloud with its legend and picked point."""
         self._painter.cancel("cloud")
-        self._cloud = self._whole = None
-        self._editing.set_scans([])
-        for name in ("cloud", "picked"):
-            self._scene.remove(LAYER, name)
+        self._forget_cloud()
+        self._scene.remove(LAYER, "cloud")
         self._legend.set("")
+
+    def _forget_cloud(self) -> None:
+        """Forget the captured cloud and its picked point, as others are shown."""
+        self._cloud = self._whole = self._shown = None
+        self._editing.set_scans([])
+        self._forget_point()
+
+    def _forget_point(self) -> None:
+        """Remove the picked point with its values."""
+        self._scene.remove(LAYER, "picked")
         self._point.set("")
 
     def _refresh(self) -> None:
         """Request the chosen cloud in the chosen colours."""
         with self._lock:
             snapshot, session = self._snapshot, self._session
-            scan = snapshot.scan(self._scan.value) if snapshot else None
-            if snapshot is None or session is None or scan is None:
+            scan = snapshot.scan(self._scan.value)
+            if scan is None:
                 return
             is_absent, busy = scan.cloud == "absent", snapshot.is_busy
-            change(
-                self._reconstruct,
-                disabled=busy,
-                label="Reconstruct" if is_absent else "Reconstruct again",
-            )
+            self._reconstruct.disabled = busy
+            self._reconstruct.label = "Reconstruct" if is_absent else "Reconstruct again"
             self._figures.set(scan_html(scan))
             self._region.draw(session, "" if is_absent else scan.name)
             self._editing.draw([scan])
             self._draw_placement(scan, busy)
             shown = len(self._shown_scans())
-            label = "Remove support" if shown == 1 else f"Remove support, {shown} scans"
-            change(
-                self._support, label=label, disabled=busy or is_absent or shape_of(scan) != "scan"
-            )
+            suffix = "" if shown == 1 else f", {shown} scans"
+            self._support.label = f"Remove support{suffix}"
+            self._support.disabled = busy or is_absent or shape_of(scan) != "scan"
             self._gallery.set(gallery(sort_scans(session.scans), scan.name))
             if self._is_live:
                 return
@@ -335,7 +304,7 @@ class ScanPanel(StepPanel):
 
     def _shown_scans(self) -> tuple[str, ...]:
         """Return the names of the scans in the 3D view: those in place, or the chosen one."""
-        if self._session is not None and self._view.value == ALIGNED:
+        if self._view.value == ALIGNED:
             return tuple(scan.name for scan in self._session.scans if scan.is_placed)
         return (self._scan.value,)
 
@@ -352,33 +321,26 @@ class ScanPanel(StepPanel):
     def _draw_placement(self, scan: ScanView, is_busy: bool) -> None:
         """State where the chosen scan is among the others, or why it is kept apart."""
         placement = scan.placement
-        change(self._place, visible=scan.cloud == "fresh" and not scan.is_placed, disabled=is_busy)
-        change(self._take_out, visible=scan.is_placed, disabled=is_busy)
+        self._place.visible = scan.cloud == "fresh" and not scan.is_placed
+        self._take_out.visible = scan.is_placed
+        self._place.disabled = self._take_out.disabled = is_busy
         tone: Tone = "good" if scan.is_placed else "warning"
-        self._placement.set(
-            ""
-            if placement is None
-            else paragraph(coloured(f"{scan.label}: {placement.summary()}", tone))
-        )
+        self._placement.set(note(f"{scan.label}: {placement.summary()}", tone) if placement else "")
 
     def _draw_aligned(self, aligned: AlignedScans) -> None:
         """Draw the scans in place, in the colours of how many see each point."""
         if self._is_live:
             return
-        self._cloud = self._whole = None
-        self._editing.set_scans([])
-        self._scene.remove(LAYER, "picked")
-        self._point.set("")
+        self._forget_cloud()
         painted = np.where(aligned.seen_by[:, None] > 1, SEEN_AGAIN, SEEN_ONCE)
         # shows the relief
         painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
             np.uint8
         )
         self._scene.cloud(LAYER, "cloud", aligned.points, painted)
-        self._scene.show(LAYER, self._visible)
         self._legend.set(aligned_html(aligned))
-        if self._visible:
-            self._context.viewpoints.show(f"{LAYER} {ALIGNED}", aligned.points)
+        self._shown = ALIGNED, aligned.points
+        self._show_view()
 
     def _redraw(self) -> None:
         """Draw the cloud again, as other points of it are hidden."""
@@ -391,26 +353,22 @@ class ScanPanel(StepPanel):
         if self._is_live:
             return
         is_new = whole is not self._whole
-        self._whole, self._cloud = whole, cloud
+        self._whole, self._cloud, self._shown = whole, cloud, (cloud.name, cloud.points)
         painted, bar = paint_cloud(cloud, colour)
-        (points,) = self._editing.set_scans([(cloud, None)])
+        (points,) = self._editing.set_scans([(cloud, cloud.points)])
         shown = self._scene.cloud(LAYER, "cloud", points, painted)
-        self._scene.show(LAYER, self._visible)
         removed = int(whole.measured_count - cloud.measured_count)
         kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
-        note = f"{shown:,} points shown{kept}. Click a point for its values."
-        self._legend.set(
-            bar + paragraph(coloured(note, "dim")) + (alert(why, "warning") if why else "")
-        )
+        text = f"{shown:,} points shown{kept}. Click a point for its values."
+        self._legend.set(bar + note(text) + alert(why, "warning"))
         if is_new:
-            self._scene.remove(LAYER, "picked")
-            self._point.set("")
+            self._forget_point()
         self._show_view()
 
-    def _show_point(self, origin: np.ndarray, direction: np.ndarray) -> None:
+    def _show_point(self, click: Click) -> None:
         """Show the values of the point closest to the clicked ray."""
         cloud = self._cloud
-        pixel = None if cloud is None else cloud.nearest(origin, direction)
+        pixel = None if cloud is None else cloud.nearest(click.origin, click.direction)
         if cloud is None or pixel is None:
             return
         u, v = pixel
@@ -426,33 +384,25 @@ def aligned_html(aligned: AlignedScans) -> Html:
         f"<span style='color:rgb{colour}'>■</span> {text}"
         for colour, text in ((SEEN_ONCE, "seen by one scan"), (SEEN_AGAIN, "by more than one"))
     )
-    share = (
-        f"{100 * aligned.share_seen_again:.0f} % is seen by more than one; gaps were not seen yet."
-    )
-    return paragraph(Html(f"<div>{marks}</div>{coloured(share, 'dim')}"))
+    share = f"{100 * aligned.share_seen_again:.0f} % is seen by more than one"
+    text = coloured(f"{share}; gaps were not seen yet.", "dim")
+    return paragraph(Html(f"<div>{marks}</div>{text}"))
 
 
 def live_html(live: LiveView, shown: int) -> Html:
     """Describe rate and latency of the live clouds."""
     if not live.clouds_per_s:
-        return paragraph(coloured("Waiting for the first cloud …", "dim"))
+        return note("Waiting for the first cloud …")
     latency = "" if live.latency_ms is None else f", latency {live.latency_ms:.0f} ms"
     rate = to_html(f"{live.shown_per_s or live.clouds_per_s:.1f} clouds/s{latency}")
     html = f"<b>{rate}</b>"
     if live.shown_per_s and live.shown_per_s < 0.8 * live.clouds_per_s:
         html += f" ({live.clouds_per_s:.1f} computed; the browsers take no more)"
     if not live.points:
-        return Html(
-            paragraph(Html(html))
-            + alert(
-                "No points: check that the object is illuminated and within the calibrated depths.",
-                "warning",
-            )
-        )
-    note = (
-        f"{live.points:,} points, {shown:,} shown; moving parts are masked. Nothing is saved yet."
-    )
-    return Html(paragraph(Html(html)) + paragraph(coloured(note, "dim")))
+        text = "No points: check that the object is illuminated and within the calibrated depths."
+        return paragraph(Html(html)) + alert(text, "warning")
+    text = f"{live.points:,} points, {shown:,} shown; moving parts are masked."
+    return paragraph(Html(html)) + note(f"{text} Nothing is saved yet.")
 
 
 def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
@@ -461,9 +411,7 @@ def paint_cloud(cloud: ScanCloud, colour: str) -> tuple[np.ndarray, Html]:
     if colour == "error":
         if not cloud.errors:
             grey = np.full(cloud.points.shape, 150, np.uint8)
-            return grey, paragraph(
-                coloured("No errors yet: measure this capture in the step Verify.", "warning")
-            )
+            return grey, note("No errors yet: measure this capture in the step Verify.", "warning")
         model = cloud.model if cloud.model in cloud.errors else next(iter(cloud.errors))
         limit = error_limit(list(cloud.errors.values()))
         bar = colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", f"error of {model}")
@@ -496,48 +444,42 @@ def uncertainty(cloud: ScanCloud) -> np.ndarray:
 def point_html(cloud: ScanCloud, u: int, v: int) -> Html:
     """Return a table of all values at pixel (u, v)."""
     x, y, z = cloud.points[v, u]
-    rows: list[tuple[object, object]] = [
-        ("Pixel (u, v)", f"({u}, {v})"),
-        ("x, y, z", f"{x:.3f}, {y:.3f}, {z:.3f} mm"),
-        (f"Phase, axis {cloud.axis}", f"{cloud.phase[v, u]:.3f} rad"),
-        ("Modulation", f"{cloud.modulation[v, u]:.1f} grey levels"),
-        ("Noise of z", f"{cloud.sigma_z[v, u]:.3f} mm"),
-    ]
+    values = {
+        "Pixel (u, v)": f"({u}, {v})",
+        "x, y, z": f"{x:.3f}, {y:.3f}, {z:.3f} mm",
+        f"Phase, axis {cloud.axis}": f"{cloud.phase[v, u]:.3f} rad",
+        "Modulation": f"{cloud.modulation[v, u]:.1f} grey levels",
+        "Noise of z": f"{cloud.sigma_z[v, u]:.3f} mm",
+    }
     if cloud.sigma_calibration is not None:
-        rows.append(("Uncertainty of the calibration", f"{cloud.sigma_calibration[v, u]:.3f} mm"))
-        rows.append(("Uncertainty of z (1 sigma)", f"{uncertainty(cloud)[v, u]:.3f} mm"))
-    rows += [
-        (f"Error of {model}", f"{errors[v, u]:.3f} mm") for model, errors in cloud.errors.items()
-    ]
-    return table(("Clicked point", ""), rows)
+        values["Uncertainty of the calibration"] = f"{cloud.sigma_calibration[v, u]:.3f} mm"
+        values["Uncertainty of z (1 sigma)"] = f"{uncertainty(cloud)[v, u]:.3f} mm"
+    for model, errors in cloud.errors.items():
+        values[f"Error of {model}"] = f"{errors[v, u]:.3f} mm"
+    return properties_table("Clicked point", values)
 
 
 def scan_html(scan: ScanView) -> Html:
     """Return a table of a scan's figures, with warnings."""
     if scan.cloud == "absent":
-        return paragraph(coloured("Not reconstructed yet.", "warning"))
-    rows: list[tuple[object, object]] = [
-        ("Points", f"{scan.figures.points:,}"),
-        ("Model", scan.figures.model),
-    ]
-    if scan.figures.depth_mm is not None:
-        rows.append(
-            ("Depth range", f"{scan.figures.depth_mm[0]:.0f} to {scan.figures.depth_mm[1]:.0f} mm")
-        )
-    if scan.figures.noise_mm is not None:
-        rows.append(("Median noise of z", f"{scan.figures.noise_mm:.3f} mm"))
-    if scan.figures.masked is not None:
-        rows.append(("Masked (not calibrated)", f"{100 * scan.figures.masked:.1f} % of pixels"))
-    html = table((display_name(scan.name, scan.label), ""), rows)
-    if scan.figures.masked is not None and scan.figures.masked > MUCH_MASKED:
+        return note("Not reconstructed yet.", "warning")
+    figures, depth, noise = scan.figures, scan.figures.depth_mm, scan.figures.noise_mm
+    masked = figures.masked
+    properties = {
+        "Points": f"{figures.points:,}",
+        "Model": figures.model,
+        "Depth range": None if depth is None else f"{depth[0]:.0f} to {depth[1]:.0f} mm",
+        "Median noise of z": None if noise is None else f"{noise:.3f} mm",
+        "Masked (not calibrated)": None if masked is None else f"{100 * masked:.1f} % of pixels",
+    }
+    html = properties_table(display_name(scan.name, scan.label), properties)
+    if masked is not None and masked > MUCH_MASKED:
         html += alert("Much is masked: capture target poses at the object's place.", "warning")
-    if scan.figures.scale:
-        html += paragraph(f"{scan.figures.scale[:1].upper()}{scan.figures.scale[1:]}.")
+    if figures.scale:
+        html += paragraph(f"{figures.scale[:1].upper()}{figures.scale[1:]}.")
     if scan.cloud == "stale":
-        html += paragraph(
-            coloured("Made with an older calibration: reconstruct it again.", "warning")
-        )
-    return Html(html)
+        html += note("Made with an older calibration: reconstruct it again.", "warning")
+    return html
 
 
 def sort_scans(scans: Sequence[ScanView]) -> list[ScanView]:
@@ -548,8 +490,6 @@ def sort_scans(scans: Sequence[ScanView]) -> list[ScanView]:
 
 def gallery(scans: Sequence[ScanView], chosen: str) -> Html:
     """Return thumbnails of the scans with their names; the chosen one is framed."""
-    if not scans:
-        return Html("")
     cards = []
     for scan in scans:
         frame = "var(--mantine-primary-color-filled)" if scan.name == chosen else "transparent"

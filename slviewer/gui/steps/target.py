@@ -1,14 +1,12 @@
 """Step 2: choose the board, print it, and check that it is detected."""
 
 from pathlib import Path
-
-import viser
+from typing import Any
 
 from slviewer.errors import InputError
-from slviewer.gui.inputs import change
-from slviewer.gui.panel import StepPanel
-from slviewer.gui.preview import board_html, draw_preview, exposure_html, legend
-from slviewer.gui.widgets import Html, Picture, Text, alert, coloured, link, paragraph, to_html
+from slviewer.gui.panel import NO_SESSION, StepPanel
+from slviewer.gui.preview import LiveImage
+from slviewer.gui.widgets import Html, Text, alert, coloured, link, paragraph, to_html
 from slviewer.pipeline.printouts import target as write_target
 from slviewer.target.board import EXAMPLES, Board, board_examples, plugin_boards
 from slviewer.wizard.snapshot import PreviewView, Snapshot
@@ -43,50 +41,48 @@ class TargetPanel(StepPanel):
         gui, context = self._gui, self._context
         board = Board.parse(EXAMPLES["circles"])
         self._kinds = KINDS | {added.what: name for name, added in plugin_boards().items()}
-        self._kind = gui.add_dropdown("Board", tuple(self._kinds))
-        self._columns = gui.add_number("Columns", board.columns, min=2, max=200, step=1)
-        self._rows = gui.add_number("Rows", board.rows, min=3, max=200, step=1)
-        self._pitch = gui.add_number(
+        self._kind: Any = gui.add_dropdown("Board", tuple(self._kinds))
+        self._columns: Any = gui.add_number("Columns", board.columns, min=2, max=200, step=1)
+        self._rows: Any = gui.add_number("Rows", board.rows, min=3, max=200, step=1)
+        self._pitch: Any = gui.add_number(
             "Pitch, mm", float(board.pitch_mm), min=0.1, max=1000.0, step=0.01
         )
-        self._marker = gui.add_number(
+        self._marker: Any = gui.add_number(
             "Marker, mm", 1.0, min=0.1, max=1000.0, step=0.01, visible=False
         )
-        self._dictionary = gui.add_dropdown("Dictionary", DICTIONARIES, visible=False)
+        self._dictionary: Any = gui.add_dropdown("Dictionary", DICTIONARIES, visible=False)
         self._note = Text(gui)
         self._use = context.button(
             "Use this board",
             lambda: self._operator.choose_target(str(self._parse_entered())),
-            viser.Icon.CHECK,
+            "check",
             None,
         )
         context.button(
-            "Create PDF", self._write_sheet, viser.Icon.PRINTER, hint="To print the board to scale"
+            "Create PDF", self._write_sheet, "printer", hint="To print the board to scale"
         )
         self._sheet = Text(gui)
-        self._picture = Picture(gui, "Live image")
-        for field in (self._columns, self._rows, self._pitch, self._marker, self._dictionary):
-            field.on_update(context.callback(self._describe, by_user=True))
-        self._kind.on_update(context.callback(self._change_kind, by_user=True))
+        self._picture = LiveImage(gui, "Live image")
+        numbers = self._columns, self._rows, self._pitch, self._marker
+        context.on_change(self._describe, *numbers, self._dictionary, by_user=True)
+        context.on_change(self._change_kind, self._kind, by_user=True)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the board of a snapshot's session."""
-        session = snapshot.session
-        target, folder = (session.target, session.folder) if session else ("", None)
-        if folder != self._folder:
-            self._folder = folder
+        session = snapshot.session or NO_SESSION
+        if session.folder != self._folder:
+            self._folder = session.folder
             self._sheet.set("")
-        if target != self._target:
-            self._target = target
-            self._board = Board.parse(target) if target else None
+        if session.target != self._target:
+            self._target = session.target
+            self._board = Board.parse(self._target) if self._target else None
             if self._board is not None:
                 self._fill_fields(self._board)
         self._describe()
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image with the detected board."""
-        text = legend(preview, board_html(preview, self._board), exposure_html(preview))
-        self._picture.set(draw_preview(preview, self._board), text)
+        self._picture.draw_board(preview, self._board)
 
     def _parse_entered(self) -> Board:
         """Return the board that the fields describe. Raises InputError for an invalid one."""
@@ -99,19 +95,13 @@ class TargetPanel(StepPanel):
 
     def _fill_fields(self, board: Board) -> None:
         """Fill the fields from a board."""
-        change(
-            self._kind,
-            value=next(label for label, kind in self._kinds.items() if kind == board.kind),
-        )
-        change(self._columns, value=board.columns)
-        change(self._rows, value=board.rows)
-        change(self._pitch, value=float(board.pitch_mm))
+        self._kind.value = next(k for k, kind in self._kinds.items() if kind == board.kind)
+        self._columns.value, self._rows.value = board.columns, board.rows
+        self._pitch.value = float(board.pitch_mm)
         has_markers = board.kind == "charuco"
-        for field in (self._marker, self._dictionary):
-            change(field, visible=has_markers)
+        self._marker.visible = self._dictionary.visible = has_markers
         if has_markers:
-            change(self._marker, value=board.marker_mm)
-            change(self._dictionary, value=board.dictionary)
+            self._marker.value, self._dictionary.value = board.marker_mm, board.dictionary
 
     def _change_kind(self) -> None:
         """Fill the fields with an example of the chosen kind of board."""
@@ -131,7 +121,7 @@ class TargetPanel(StepPanel):
         counts = added.counts if added else _EXPLANATIONS[board.kind]
         explanation = coloured(f"{counts}. Size: {width:.0f} × {height:.0f} mm", "dim")
         in_use = str(board) == self._target
-        change(self._use, disabled=in_use)
+        self._use.disabled = in_use
         state = coloured(
             f"● In use: {board}" if in_use else f"Not in use: {board}",
             "good" if in_use else "warning",
@@ -145,5 +135,5 @@ class TargetPanel(StepPanel):
         path = self._context.session.exports / f"{str(board).replace(':', '_')}.pdf"
         write_target(str(board), path)
         note = to_html("Print at 100 %, glue it to a flat plate, and measure the scale bar.")
-        button = link(self._context.offer(path), f"Download {path.name}")
+        button = link(self._context.offer_download(path), f"Download {path.name}")
         self._sheet.set(paragraph(Html(f"{button}<div style='margin-top:0.4em'>{note}</div>")))

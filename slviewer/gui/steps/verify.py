@@ -3,30 +3,21 @@ capture."""
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
-import viser
-
-from slviewer.gui.inputs import Choice, change, display_name, scan_options
-from slviewer.gui.panel import PanelContext, StepPanel
-from slviewer.gui.pictures import PLOT_PX, Plot
-from slviewer.gui.preview import draw_preview, exposure_html, legend
-from slviewer.gui.simulated_object import SimulatedObject
-from slviewer.gui.widgets import Picture, Text, colour_bar, colours, link, paragraph, records_html
+from slviewer.gui.capture_inputs import SimulatedObject
+from slviewer.gui.panel import Choice, StepPanel, display_name, scan_options
+from slviewer.gui.preview import LiveImage
+from slviewer.gui.widgets import PLOT_PX, Plot, Text, colour_bar, colours, records_html
 from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
 from slviewer.session.store import Session
 from slviewer.wizard import result_views
-from slviewer.wizard.snapshot import (
-    PreviewView,
-    ScanView,
-    SessionView,
-    Snapshot,
-)
+from slviewer.wizard.snapshot import PreviewView, ScanView, SessionView, Snapshot
 
 LAYER = "verify"
+_ICONS: dict[Shape, str] = {"plane": "square", "sphere": "sphere"}
 SMALL_PX = 300
 """Width of the live image: it only shows whether the plane or the sphere is in view."""
 TABLE = "figures.csv"
@@ -40,96 +31,73 @@ class VerifyPanel(StepPanel):
     key = "verify"
     layers = (LAYER,)
 
-    def __init__(self, context: PanelContext) -> None:
-        super().__init__(context)
-        self._measured: tuple[str, ...] = ()
+    _measured: tuple[str, ...] = ()
 
     def build(self) -> None:
         """Create the inputs of capture, results and recorded captures."""
         gui, context, operator = self._gui, self._context, self._operator
-        with gui.add_folder("Capture", visible=False) as self._capture_folder:
-            self._picture = Picture(gui, "Live image", width_px=SMALL_PX)
-            self._plane = context.button(
-                "Capture plane",
-                lambda: operator.capture_plane(self._label.value),
-                viser.Icon.SQUARE,
-                None,
-            )
-            self._sphere = context.button(
-                "Capture sphere",
-                lambda: operator.capture_sphere(self._label.value),
-                viser.Icon.SPHERE,
-                None,
-            )
+        with gui.add_folder("Capture") as self._capture_folder:
+            self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
+            self._captures = [
+                context.button(
+                    f"Capture {shape}", partial(self._request_capture, shape), icon, None
+                )
+                for shape, icon in _ICONS.items()
+            ]
             self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
-            self._simulated = SimulatedObject(context, LAYER, ("plane", "sphere"))
-        with gui.add_folder("Result", visible=False) as self._result_folder:
-            self._result = Choice(gui, "Result")
+            self._simulated = SimulatedObject(context, LAYER, tuple(_ICONS))
+        with gui.add_folder("Result") as self._result_folder:
+            self._result = Choice(context, "Result", self._refresh)
             self._figures = Text(gui)
             self._maps = Plot(gui)
-            self._model = Choice(gui, "3D colours", "The model whose errors colour the cloud")
+            hint = "The model whose errors colour the cloud"
+            self._model = Choice(context, "3D colours", self._refresh, hint=hint)
             self._legend = Text(gui)
-            context.view_button(lambda: self._cloud.points if self._cloud else None)
-        with gui.add_folder("All results", visible=False) as self._table_folder:
+            context.view_button(self._get_points)
+        with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
-            context.button("Write CSV", lambda: operator.export("table"), viser.Icon.TABLE_EXPORT)
+            context.button("Write CSV", lambda: operator.export("table"), "table-export")
             self._file = Text(gui)
-        with gui.add_folder("Recorded captures", visible=False) as self._recorded_folder:
-            self._recorded = Choice(gui, "Capture")
+        with gui.add_folder("Recorded captures") as self._recorded_folder:
+            self._recorded = Choice(context, "Capture")
             hint = "Approximate radius of a sphere, to detect it; 0: unknown"
             self._radius = gui.add_number("Radius, mm", 0.0, min=0.0, max=2000.0, hint=hint)
-            shapes: tuple[tuple[Shape, Any], ...] = (
-                ("plane", viser.Icon.SQUARE),
-                ("sphere", viser.Icon.SPHERE),
-            )
-            self._all: dict[Shape, viser.GuiButtonHandle] = {}
-            for shape, icon in shapes:
+            for shape, icon in _ICONS.items():
                 context.button(f"Measure {shape}", partial(self._request_recorded, shape), icon)
-            for shape, icon in shapes:
-                self._all[shape] = context.button(
-                    f"Measure all {shape}s", partial(self._request_all, shape), icon, visible=False
+            self._all = {
+                shape: context.button(
+                    f"Measure all {shape}s", partial(self._request_all, shape), icon
                 )
-        for choice in (self._result, self._model):
-            choice.on_change(context.callback(self._refresh))
+                for shape, icon in _ICONS.items()
+            }
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the verifications of a snapshot."""
-        with self._lock:
-            self._snapshot = snapshot
-            session, ready = snapshot.session, snapshot.step(self.key).state != "blocked"
-            rig = snapshot.rig
-            change(self._capture_folder, visible=rig.state != "none")
-            for button in (self._plane, self._sphere):
-                change(button, disabled=not (ready and rig.is_idle))
-            self._simulated.draw(snapshot)
-            if session is None or not ready:
-                for folder in (self._recorded_folder, self._result_folder, self._table_folder):
-                    change(folder, visible=False)
-                return
-            self._draw_recorded(session)
-            rows = session.list_records(Verification)
-            for folder in (self._result_folder, self._table_folder):
-                change(folder, visible=bool(rows))
-            labels = {row.name: row.label for row in rows}
-            self._result.offer(
-                [(name, display_name(name, label)) for name, label in labels.items()]
-            )
-            if new := [name for name in labels if name not in self._measured]:
-                if self._measured:  # show what was just measured
-                    self._result.choose(new[-1])
-                self._measured = tuple(labels)
-            self._table.set(records_html(rows))
-            file = next((each for each in session.exports if each.name == TABLE), None)
-            self._file.set(
-                ""
-                if file is None
-                else paragraph(link(self._context.offer(file.path), f"Download {TABLE}"))
-            )
-            self._refresh()
+        session, rig = self._session, snapshot.rig
+        ready = snapshot.step(self.key).state != "blocked"
+        self._capture_folder.visible = rig.state != "none"
+        for button in self._captures:
+            button.disabled = not (ready and rig.is_idle)
+        self._simulated.draw(snapshot)
+        rows = session.list_records(Verification)
+        self._recorded_folder.visible = ready and bool(session.scans)
+        self._result_folder.visible = self._table_folder.visible = ready and bool(rows)
+        if not ready:
+            return
+        self._draw_recorded(session)
+        labels = {row.name: row.label for row in rows}
+        self._result.offer((name, display_name(name, label)) for name, label in labels.items())
+        if new := [name for name in labels if name not in self._measured]:
+            if self._measured:  # show what was just measured
+                self._result.choose(new[-1])
+            self._measured = tuple(labels)
+        self._table.set(records_html(rows))
+        self._file.set(self._context.links_html(session.exports, TABLE))
+        self._refresh()
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the live image."""
-        self._picture.set(draw_preview(preview), legend(preview, exposure_html(preview)))
+        self._picture.draw(preview)
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers, and move the views to the cloud."""
@@ -142,7 +110,6 @@ class VerifyPanel(StepPanel):
         """Offer the recorded captures, those without verification first."""
         waiting = _list_unverified(session)
         names = {scan.name for scan in waiting}
-        change(self._recorded_folder, visible=bool(session.scans))
         self._recorded.offer(
             scan_options(waiting)
             + [
@@ -153,19 +120,18 @@ class VerifyPanel(StepPanel):
         )
         for shape, button in self._all.items():
             n = sum(shape_of(scan) == shape for scan in waiting)
-            change(button, visible=n > 0, label=f"Measure all {n} {shape}s")
+            button.visible, button.label = n > 0, f"Measure all {n} {shape}s"
 
     def _refresh(self) -> None:
         """Request the error maps and the cloud of the chosen result."""
         with self._lock:
-            session = self._session
             name = self._result.value
-            found = session.list_records(Verification) if session else []
+            found = self._session.list_records(Verification)
             view = next((each for each in found if each.name == name), None)
             if view is None:
                 return
             models, shape = list(view.record.models), view.record.shape
-            self._model.offer([(model, model) for model in models], models[-1])
+            self._model.offer_names(models, models[-1])
             self._figures.set(records_html([view], named=False))
             context, key = self._context, (name, view.record.summary())
             self._painter.request(
@@ -181,25 +147,28 @@ class VerifyPanel(StepPanel):
 
     def _draw_cloud(self, made: tuple[result_views.ScanCloud, str, Shape]) -> None:
         """Draw a cloud coloured by the error of a model, with its legend."""
-        self._cloud, model, shape = cloud, *_ = made
+        cloud, model, shape = made
+        self._shown = cloud.name, cloud.points
         limit = error_limit(list(cloud.errors.values()))
         self._scene.cloud(
             LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error")
         )
-        self._scene.show(LAYER, self._visible)
         title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
         self._show_view()
 
     # requests
 
+    def _request_capture(self, shape: Shape) -> None:
+        """Request the capture of a plane or sphere."""
+        capture = {"plane": self._operator.capture_plane, "sphere": self._operator.capture_sphere}
+        capture[shape](self._label.value)
+
     def _request_verification(self, names: Sequence[str], shape: Shape) -> None:
         """Request the verification of captures as a plane or sphere."""
-        radius = float(self._radius.value)
-        if names and names[0]:
-            self._operator.verify(
-                list(names), shape, radius if shape == "sphere" and radius > 0 else None
-            )
+        radius = float(self._radius.value) if shape == "sphere" else 0.0
+        if any(names):
+            self._operator.verify(names, shape, radius or None)
 
     def _request_recorded(self, shape: Shape) -> None:
         """Request a verification of the chosen capture."""
@@ -207,11 +176,10 @@ class VerifyPanel(StepPanel):
 
     def _request_all(self, shape: Shape) -> None:
         """Request the verification of all captures of a shape that have none yet."""
-        session = self._session
-        if session is not None:
-            self._request_verification(
-                [scan.name for scan in _list_unverified(session) if shape_of(scan) == shape], shape
-            )
+        waiting = _list_unverified(self._session)
+        self._request_verification(
+            [scan.name for scan in waiting if shape_of(scan) == shape], shape
+        )
 
 
 def _list_unverified(session: SessionView) -> list[ScanView]:
@@ -225,9 +193,7 @@ def shape_of(scan: ScanView) -> str:
     suggests."""
     if scan.purpose != "scan":
         return scan.purpose
-    return next(
-        (shape for shape in ("plane", "sphere") if scan.name.lower().startswith(shape)), "scan"
-    )
+    return next((shape for shape in _ICONS if scan.name.lower().startswith(shape)), "scan")
 
 
 def _draw_maps(session: Session, view: Stored[Verification]) -> Figure:
