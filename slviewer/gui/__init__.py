@@ -2,5 +2,6 @@
 is computed here.
 
 `app` starts it, `shell` is the frame of the page, `steps/` holds one panel file for each step of
-the wizard, `scene` the 3D view, `widgets` what several panels draw.
+the wizard, `panel` what every panel is made of, `scene` the 3D view, `widgets` what several panels
+draw.
 """

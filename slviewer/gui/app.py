@@ -58,8 +58,28 @@ class App:
         try:
             if pages is not None:
                 serve_device_pages(self.server, pages)
-            self._context = PanelContext(operator, self.server, pages)
-            self._start(print_links)
+            self._context = PanelContext(operator, self.server, pages, print_links)
+            page = self.server.viser
+            page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
+            page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
+            page.initial_camera.fov = FIELD_OF_VIEW
+            page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
+            self._closing = False
+            self._changed = threading.Event()
+            self._folder: Path | None = None
+            self._failure = ""
+            self._version = self._number = -1
+            snapshot = operator.snapshot()
+            self._notified = snapshot.notices[-1].number if snapshot.notices else 0
+            self.shell = Shell(self._context, snapshot.steps)
+            page.on_client_connect(self._greet_client)
+            self._unsubscribe = operator.subscribe(
+                lambda _: self._changed.set(), lambda _: self._changed.set()
+            )
+            self._thread = threading.Thread(
+                target=self._draw_forever, name="slviewer drawing", daemon=True
+            )
+            self._thread.start()
         except BaseException:
             self.server.stop()
             raise
@@ -73,34 +93,9 @@ class App:
         self._thread.join(5.0)
         self.server.stop()
 
-    def _start(self, print_links: Callable[[SafeServer], None]) -> None:
-        """Build the page and its shell, subscribe to snapshots and previews, and start the drawing
-        thread."""
-        page, operator = self.server.viser, self.operator
-        page.gui.configure_theme(brand_color=_BRAND, control_width="large", dark_mode=False)
-        page.initial_camera.position, page.initial_camera.look_at = OVERVIEW
-        page.initial_camera.fov = FIELD_OF_VIEW
-        page.initial_camera.near, page.initial_camera.far = 5.0, 20000.0
-        self._closing = False
-        self._changed = threading.Event()
-        self._folder: Path | None = None
-        self._failure = ""
-        snapshot = operator.snapshot()
-        self._notified = snapshot.notices[-1].number if snapshot.notices else 0
-        self.shell = Shell(self._context, snapshot.steps, print_links)
-        page.on_client_connect(self._greet_client)
-        self._unsubscribe = operator.subscribe(
-            lambda _: self._changed.set(), lambda _: self._changed.set()
-        )
-        self._thread = threading.Thread(
-            target=self._draw_forever, name="slviewer drawing", daemon=True
-        )
-        self._thread.start()
-
     def _draw_forever(self) -> None:
         """Draw new snapshots and previews until closing; a failure is reported once and retried
         every second."""
-        version, number = -1, -1
         pages: list[PageState | None] = []
         while not self._closing:
             begun = time.monotonic()
@@ -109,36 +104,35 @@ class App:
             if self._closing:
                 return
             if pages != (pages := [self._context.page_state(role) for role in PAGE_ROLES]):
-                version = -1
+                self._version = -1
             try:
-                version, number = self._draw(version, number)
+                self._draw()
             except Exception as error:
-                version = -1
+                self._version = -1
                 if repr(error) != self._failure:  # it is tried again, and reported once
                     self._failure = repr(error)
                     self._context.report_failure(error)
                 time.sleep(1.0)
             time.sleep(max(0.0, 1 / DRAWN_PER_S - (time.monotonic() - begun)))
 
-    def _draw(self, version: int, number: int) -> tuple[int, int]:
-        """Draw the snapshot and the preview if they are newer than these; returns the version and
-        number drawn."""
+    def _draw(self) -> None:
+        """Draw the snapshot and the preview if they are newer than those that were drawn."""
         snapshot, preview = self.operator.snapshot(), self.operator.preview()
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
             self._folder = folder
             self._context.clear_downloads()
-        if snapshot.version != version or self.shell.needs_drawing:
+        if snapshot.version != self._version or self.shell.needs_drawing:
             with self.server.viser.atomic():
                 self.shell.draw(snapshot)
             for notice in snapshot.notices:
                 if notice.number > self._notified:
                     self._notified = notice.number
                     self._context.notify(notice.level, notice.text)
-        if preview is not None and preview.number != number:
+        self._version = snapshot.version
+        if preview is not None and preview.number != self._number:
             self.shell.draw_preview(preview)
-            number = preview.number
-        return snapshot.version, number
+            self._number = preview.number
 
     def _greet_client(self, client: viser.ClientHandle) -> None:
         """Show a browser that may only watch that it cannot change anything, and an operator's what
@@ -183,7 +177,10 @@ def run(
                 print_links(app.server)
                 if open_browser:
                     ended.enter_context(browser_opened(app.server))
-                _wait_for_stop()
+                stopped = threading.Event()
+                signal.signal(signal.SIGTERM, lambda *_: stopped.set())  # of a service manager
+                while not stopped.wait(1.0):  # some systems deliver Ctrl-C only between waits
+                    pass
             except KeyboardInterrupt:
                 print("\nslviewer has stopped; the session is saved.")
 
@@ -230,14 +227,6 @@ def rig_choice(text: str, session: Session | None = None) -> dict[str, Any]:
         ) from None
 
 
-def _wait_for_stop() -> None:
-    """Wait for Ctrl-C, or for the signal of a service manager."""
-    stopped = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stopped.set())
-    while not stopped.wait(1.0):  # some systems deliver Ctrl-C only between waits
-        pass
-
-
 def _check_granted(operator: Operator, granted: bool) -> None:
     """Raise SlviewerError with the notice of the error unless a request was granted."""
     if not granted:
@@ -268,13 +257,12 @@ def browser_opened(server: SafeServer) -> Iterator[None]:
     with folder as place:
         page = Path(place, "open.html")
         link = server.one_time_link()
-        with os.fdopen(
-            os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8"
-        ) as file:
-            file.write(
-                '<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
-                f"<title>slviewer</title><script>location.replace({link!r})</script>"
-            )
+        page.touch(0o600, exist_ok=False)
+        page.write_text(
+            '<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer">'
+            f"<title>slviewer</title><script>location.replace({link!r})</script>",
+            encoding="utf-8",
+        )
 
         def open_page() -> None:
             """Open the page, and remove it when its link has been opened or is no longer valid."""

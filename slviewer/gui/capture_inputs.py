@@ -1,12 +1,11 @@
 """Inputs of captures that several steps share: exposures, the turntable, the object before the
 simulated rig, and the import of captures of other tools."""
 
-from collections.abc import Sequence
 from typing import Any, get_args
 
 import numpy as np
 
-from slviewer.gui.panel import NO_SESSION, PanelContext, Part, Setting
+from slviewer.gui.panel import NO_SESSION, PanelPart, Setting, StepPanel
 from slviewer.gui.widgets import Html, Picture, Text, coloured, paragraph
 from slviewer.pipeline.suggest_exposure import BUDGET_S, STATES, ExposureSuggestion
 from slviewer.pipeline.turn import FULL_TURN_DEG, STEPS
@@ -34,15 +33,19 @@ _AUTOMATIC = "by number"
 _RESULTS: dict[Role, str] = {"calibration": "target poses", "scan": "scans"}
 
 
-class ExposureInputs(Part):
+class ExposureInputs(PanelPart):
     """Inputs for the exposures of each capture, chosen by the operator or suggested from what the
     camera sees, in the steps Rig and Scan."""
 
-    def __init__(self, context: PanelContext, *, for_scan: bool = False) -> None:
-        super().__init__(context)
+    _drawn: ExposureChange | None = None
+
+    def __init__(self, panel: StepPanel, *, for_scan: bool = False) -> None:
         self._for_scan = for_scan
-        self._drawn: ExposureChange | None = None
-        gui = self._gui
+        super().__init__(panel)
+
+    def build(self) -> None:
+        """Create the inputs."""
+        gui, context = self._gui, self._context
         self._budget = gui.add_number(
             "Time limit, s", BUDGET_S, min=0.5, max=600.0, step=0.5, hint="Of one capture",
             visible=False,
@@ -53,7 +56,7 @@ class ExposureInputs(Part):
         )  # fmt: skip
         self._undo = context.button("Undo exposure", self._operator.undo_exposure, "arrow-back-up")
         self._picture = Picture(gui, "Measured before and now")
-        if for_scan:
+        if self._for_scan:
             return
         several = gui.add_dropdown(
             "Exposures",
@@ -143,7 +146,7 @@ def name_exposures(exposures_ms: tuple[float, ...], exposure_ms: float | None) -
     return _SUGGESTED
 
 
-class TurnInputs(Part):
+class TurnInputs(PanelPart):
     """Inputs to scan all round on the rig's turntable: number of steps, range, and the buttons to
     begin and to resume a turn; hidden without a turntable."""
 
@@ -179,9 +182,10 @@ class TurnInputs(Part):
             )
             self._note = Text(gui)
 
-    def draw(self, snapshot: Snapshot, ready: bool) -> None:
+    def draw(self, snapshot: Snapshot) -> None:
         """Show the inputs where the rig has a turntable, and what the last turn lacks."""
         self._folder.visible = bool(snapshot.rig.turntable)
+        ready = snapshot.rig.is_idle and snapshot.step("scan").state != "blocked"
         self._scan.disabled = self._resume.disabled = not ready
         scans = (snapshot.session or NO_SESSION).scans
         turned = [(scan.created, scan.turn_step) for scan in scans if scan.turn_step is not None]
@@ -194,16 +198,20 @@ class TurnInputs(Part):
         self._note.write(text if self._resume.visible else "", "warning")
 
 
-class SimulatedObject(Part):
+class SimulatedObject(PanelPart):
     """Inputs that place and move an object in front of the simulated rig; hidden with real
     devices."""
 
-    def __init__(self, context: PanelContext, layer: str, things: Sequence[str]) -> None:
-        super().__init__(context)
-        self._layer, self._things = layer, tuple(things)
-        self._T = np.eye(4)
-        self._standing = self._handled = ""
-        gui = self._gui
+    _standing = _handled = ""
+    _T = np.eye(4)
+
+    def __init__(self, panel: StepPanel, *things: str) -> None:
+        self._things = things
+        super().__init__(panel)
+
+    def build(self) -> None:
+        """Create the inputs."""
+        gui, context = self._gui, self._context
         with gui.add_folder("Simulated rig") as self._folder:
             self._note = Text(gui)
             thing: Any = gui.add_dropdown("Object", (_OTHER, *self._things))
@@ -250,11 +258,11 @@ class SimulatedObject(Part):
         """Add, move or remove the 3D handles of the object in view."""
         wanted = self._standing if self._handles.value else ""
         if not wanted:
-            self._scene.remove(self._layer, _GIZMO)
+            self._layer.remove(_GIZMO)
         elif wanted != self._handled:
-            self._scene.gizmo(self._layer, _GIZMO, self._T, None, self._request_place)
+            self._layer.gizmo(_GIZMO, self._T, None, self._request_place)
         else:
-            self._scene.move(self._layer, _GIZMO, self._T)
+            self._layer.move(_GIZMO, self._T)
         self._handled = wanted
 
     def _request_place(self, T: np.ndarray) -> None:
@@ -272,19 +280,27 @@ class SimulatedObject(Part):
             self._operator.move_object(**to)
 
 
-class ImportInputs(Part):
+class ImportInputs(PanelPart):
     """Inputs of a panel to import captures of other tools, from a folder of the computer that runs
     slviewer or from a zip: location, layout and role."""
 
-    def __init__(self, context: PanelContext, role: Role) -> None:
-        super().__init__(context)
-        self._role, gui = role, self._gui
+    def __init__(self, panel: StepPanel, role: Role) -> None:
+        self._role = role
+        super().__init__(panel)
+
+    def build(self) -> None:
+        """Create the inputs."""
+        gui, context = self._gui, self._context
         with gui.add_folder("Import captures", expand_by_default=False):
             Text(gui).write(
-                f"Imports images of another program as {_RESULTS[role]}, one folder each.", "dim"
+                f"Imports images of another program as {_RESULTS[self._role]}, one folder each.",
+                "dim",
             )
-            hint = "How the files are named; detect uses the names, or a TOML"
-            self._layout: Any = gui.add_dropdown("Layout", (_DETECT, *layouts()), hint=hint)
+            self._layout: Any = gui.add_dropdown(
+                "Layout",
+                (_DETECT, *layouts()),
+                hint="How the files are named; detect uses the names, or a TOML",
+            )
             self._description = Text(gui)
             self._projector = gui.add_text(
                 "Projector", "", hint="Columns x rows, for example 1280x800"

@@ -2,7 +2,7 @@
 passes."""
 
 from slviewer.errors import InputError
-from slviewer.gui.panel import NO_SESSION, Choice, Part
+from slviewer.gui.panel import NO_SESSION, Choice, PanelPart
 from slviewer.gui.widgets import DECISION_TONES, Html, Text, alert, coloured, note, paragraph, table
 from slviewer.pipeline.inspect_parts import FILES
 from slviewer.pipeline.stored_records import Stored
@@ -15,7 +15,7 @@ TABLE_PX = 320
 """Greatest height of the table."""
 
 
-class InspectionInputs(Part):
+class InspectionInputs(PanelPart):
     """Inputs that run an inspection plan on the surface that is shown, or on every scan, and what
     came of it."""
 
@@ -26,15 +26,16 @@ class InspectionInputs(Part):
         """Create the inputs."""
         gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Inspection plan", expand_by_default=False) as self._folder:
-            hint = "Make one from the results above, or upload one"
-            self._plan = Choice(context, "Plan", hint=hint)
+            self._plan = Choice(
+                context, "Plan", hint="Make one from the results above, or upload one"
+            )
             context.upload_button("Upload plan", operator.upload_plan, ".toml")
             self._parts = Choice(context, "Parts")
             self._run = context.button("Run plan", self._request_run, "list-check", None)
             self._result = Text(gui)
             self._files = Text(gui)
 
-    def draw(self, snapshot: Snapshot, surface: str) -> None:
+    def offer(self, snapshot: Snapshot, surface: str) -> None:
         """Offer the session's plans for the shown surface and for all scans, and show the latest
         results."""
         session = snapshot.session or NO_SESSION

@@ -25,6 +25,7 @@ class LiveScreen:
 
     def __init__(self, context: PanelContext) -> None:
         self._context = context
+        context.scene.layer(LAYER)
         self._viewers = Viewers(context.server.viser, self._wake)
         self._condition = threading.Condition()
         self._cloud: LiveCloud | None = None

@@ -44,9 +44,10 @@ def drawn(
     if measured.what == "relation":
         return _draw_relation([feature_of(others[each]) for each in measured.of if each in others])
     feature = feature_of(measured)
-    return (
-        None if feature is None else (_draw_outline(feature, _get_extent(measured)), feature.place)
-    )
+    if feature is None:
+        return None
+    extent = _EXTENT_MM if measured.region is None else max(measured.region.size)
+    return _draw_outline(feature, extent), feature.place
 
 
 def feature_of(measured: Measurement) -> Feature | None:
@@ -142,8 +143,3 @@ def _draw_cross(centre: np.ndarray, half: float) -> np.ndarray:
 def _join_segments(points: np.ndarray) -> np.ndarray:
     """Join consecutive points (n, 3) to segments (n - 1, 2, 3)."""
     return np.stack([points[:-1], points[1:]], axis=1)
-
-
-def _get_extent(measured: Measurement) -> float:
-    """Return half the size, mm, at which to draw a fit: that of its region, or a default."""
-    return _EXTENT_MM if measured.region is None else max(measured.region.size)

@@ -9,8 +9,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.panel import NO_SESSION, Choice, Painter, PanelContext, Part, scan_labels
-from slviewer.gui.scene import Stroke
+from slviewer.gui.panel import NO_SESSION, Choice, PanelPart, StepPanel, scan_labels
 from slviewer.gui.widgets import (
     DECISION_TONES,
     PLOT_PX,
@@ -41,7 +40,7 @@ from slviewer.report.page import Figure
 from slviewer.wizard.measure_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 
-CHOSEN, OTHER, STALE = Stroke((200, 40, 40)), Stroke((30, 90, 160)), Stroke((140, 140, 140))
+CHOSEN, OTHER, STALE = (200, 40, 40), (30, 90, 160), (140, 140, 140)
 CURSORS = ("A", "B", "C")
 _AT = (0.15, 0.85, 0.5)
 """Initial positions of the cursors, as shares of the section's length."""
@@ -52,25 +51,21 @@ _HISTOGRAM_PX = 230
 Lines = list[np.ndarray]
 
 
-class MeasurementList(Part):
+class MeasurementList(PanelPart):
     """List of measurements with a chosen one; ``changed(measured)`` is called when another one is
     chosen."""
 
     def __init__(
-        self,
-        context: PanelContext,
-        painter: Painter,
-        layer: str,
-        changed: Callable[[Stored[Measurement] | None], None],
+        self, panel: StepPanel, changed: Callable[[Stored[Measurement] | None], None]
     ) -> None:
-        super().__init__(context)
-        self._painter, self._layer, self._changed = painter, layer, changed
+        super().__init__(panel)
+        self._changed = changed
         self._session: SessionView = NO_SESSION
         self._on = self._chosen_id = self._section_id = ""
         self._known: set[str] = set()
         self._drawn: dict[str, Any] = {}
         self._lines: dict[str, tuple[CutPlane, Lines]] = {}
-        gui, operator = self._gui, self._operator
+        gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Result") as self._chosen_folder:
             self._choice = choice = Choice(context, "Result", self.refresh)
             self._histogram = Plot(gui)
@@ -105,13 +100,7 @@ class MeasurementList(Part):
             )
             self._file = Text(gui)
 
-    @property
-    def chosen(self) -> Stored[Measurement] | None:
-        """The chosen measurement; None where there is none."""
-        measured = self._session.measurements
-        return next((each for each in measured if each.name == self._choice.value), None)
-
-    def draw(self, session: SessionView, on: str) -> list[Stored[Measurement]]:
+    def update(self, session: SessionView, on: str) -> list[Stored[Measurement]]:
         """Show the session's measurements, in 3D those on the surface ``on``; returns the new
         ones."""
         with self._lock:
@@ -120,7 +109,11 @@ class MeasurementList(Part):
             names = [each.name for each in measured]
             if session.folder != before.folder:
                 self._known = set(names)
-                self._clear_drawings()
+                # the measurements of another session have the same ids
+                self._layer.remove(*self._drawn)
+                self._drawn, self._lines, self._chosen_id = {}, {}, ""
+                for slot in ("drawings", "histogram", "section"):
+                    self._painter.cancel(slot)
             new = [each for each in measured if each.name not in self._known]
             self._known = set(names)
             # the latest first, by their names; by their ids too where names occur twice
@@ -141,7 +134,8 @@ class MeasurementList(Part):
     def refresh(self) -> None:
         """Update tables, plots and 3D drawings for the chosen measurement."""
         with self._lock:
-            chosen, measured = self.chosen, self._session.measurements
+            measured = self._session.measurements
+            chosen = next((each for each in measured if each.name == self._choice.value), None)
             chosen_id = chosen.name if chosen else ""
             if chosen_id != self._chosen_id:
                 self._chosen_id = chosen_id
@@ -156,13 +150,6 @@ class MeasurementList(Part):
             self._request_drawings(measured, chosen)
 
     # inside
-
-    def _clear_drawings(self) -> None:
-        """Remove all drawings, as the measurements of another session have the same ids."""
-        self._scene.remove(self._layer, *self._drawn)
-        self._drawn, self._lines, self._chosen_id = {}, {}, ""
-        for place in ("drawings", "histogram", "section"):
-            self._painter.cancel(place)
 
     def _request_rename(self) -> None:
         """Request the entered name for the chosen measurement."""
@@ -196,7 +183,7 @@ class MeasurementList(Part):
             self._painter.cancel("section")
             self._section.set(None)
             self._values.set("")
-            self._scene.remove(self._layer, *_MARKS)
+            self._layer.remove(*_MARKS)
             return
         plane, lines = loaded
         if measured.name != self._section_id:  # on the same section they keep their positions
@@ -222,9 +209,9 @@ class MeasurementList(Part):
             if on == measured.record.source:
                 points = lifted(plane, cursors)
                 for cursor, mark, point in zip(CURSORS, _MARKS, points, strict=True):
-                    self._scene.mark(self._layer, mark, point, cursor)
+                    self._layer.mark(mark, point, cursor)
             else:
-                self._scene.remove(self._layer, *_MARKS)
+                self._layer.remove(*_MARKS)
 
         self._painter.request("section", (measured.name, measured.label, at, on), make, show)
 
@@ -249,7 +236,7 @@ class MeasurementList(Part):
             with self._lock:
                 loaded = lines.keys() - self._lines.keys()
                 self._lines = lines
-                self._scene.remove(self._layer, *(self._drawn.keys() - looks.keys()))
+                self._layer.remove(*(self._drawn.keys() - looks.keys()))
                 for each in shown:
                     if self._drawn.get(each.name) != looks[each.name]:
                         self._draw_one(each, records, each is chosen)
@@ -268,9 +255,9 @@ class MeasurementList(Part):
         cut = self._lines[measured.name][1] if measured.record.plane is not None else ()
         if (drawing := drawn(measured.record, others, cut)) is not None:
             segments, place = drawing
-            stroke = STALE if measured.stale else CHOSEN if chosen else OTHER
+            colour = STALE if measured.stale else CHOSEN if chosen else OTHER
             text = label(measured)
-            self._scene.lines(self._layer, measured.name, segments, stroke, (text, place))
+            self._layer.lines(measured.name, segments, colour, label=(text, place))
 
 
 def _round_range(along: np.ndarray) -> tuple[float, float, float]:

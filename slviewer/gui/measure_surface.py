@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.gui.panel import Choice, Painter, PanelContext, Part, scan_options
+from slviewer.gui.panel import Choice, PanelPart, StepPanel, scan_options
 from slviewer.gui.scene import Click
 from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, colour_bar, paint
@@ -21,25 +21,22 @@ COLOURS = ("texture", "depth", "uncertainty")
 DEVIATION = "deviation"
 
 
-class SurfaceView(Part):
+class SurfaceView(PanelPart):
     """View of the chosen surface; ``loaded()`` is called once another one is shown, on the
     painter's thread."""
 
-    def __init__(
-        self, context: PanelContext, painter: Painter, layer: str, loaded: Callable[[], None]
-    ) -> None:
-        super().__init__(context)
-        self._painter, self._layer, self._loaded = painter, layer, loaded
+    def __init__(self, panel: StepPanel, loaded: Callable[[], None]) -> None:
+        super().__init__(panel)
+        self._panel, self._loaded = panel, loaded
         self._clicks = count()
         self._deviation: Stored[Measurement] | None = None
         self._versions: dict[str, Any] = {}
-        self._visible = False
         self.on: MeasuredSurface | None = None
-        self.choice = Choice(context, "Surface", self.request)
+        self.choice = Choice(self._context, "Surface", self.request)
         self._colour: Any = self._gui.add_dropdown("Colour", COLOURS)
-        context.on_change(self.request, self._colour)
+        self._context.on_change(self.request, self._colour)
         self._legend = Text(self._gui)
-        context.view_button(lambda: None if self.on is None else self.on.points)
+        self._context.view_button(panel.get_points)
 
     @property
     def name(self) -> str:
@@ -72,12 +69,6 @@ class SurfaceView(Part):
             self._colour.value = DEVIATION
         self.request()
 
-    def show(self, visible: bool) -> None:
-        """Show or hide the surface."""
-        self._visible = visible
-        self._scene.show(self._layer, visible)
-        self._show_view()
-
     def pick(self, click: Click, do: Callable[[Place], None]) -> None:
         """Call ``do(place)`` later with the point that a click meets; not called where it misses
         the surface."""
@@ -101,7 +92,7 @@ class SurfaceView(Part):
         if not name:
             self.on = None
             self._painter.cancel("surface")
-            self._scene.remove(self._layer, "surface")
+            self._layer.remove("surface")
             self._legend.set("")
             return
         if shown is not None and (shown.record.source != name or colour != DEVIATION):
@@ -124,16 +115,11 @@ class SurfaceView(Part):
         on, points, painted, bar = made
         is_new = on is not self.on
         self.on = on
-        self._scene.cloud(self._layer, "surface", points, painted)
+        self._layer.cloud("surface", points, painted)
         self._legend.set(bar)
         if is_new:
             self._loaded()
-        self._show_view()
-
-    def _show_view(self) -> None:
-        """Move the browsers' views to the surface, if it is visible."""
-        if self._visible and self.on is not None:
-            self._context.viewpoints.show(f"{self._layer} {self.on.source}", self.on.points)
+        self._panel.show_points(on.source, on.points)
 
 
 def paint_surface(on: MeasuredSurface, colour: str) -> tuple[np.ndarray, np.ndarray, Html]:

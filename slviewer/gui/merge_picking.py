@@ -10,7 +10,7 @@ import numpy as np
 
 from slviewer.errors import SlviewerError
 from slviewer.gui.merge_views import SCAN_COLOURS, patch
-from slviewer.gui.panel import Choice, Painter, PanelContext, Part
+from slviewer.gui.panel import Choice, PanelPart, StepPanel
 from slviewer.gui.scene import TO_THE_RIGHT, Click
 from slviewer.gui.widgets import Html, Text, alert, note, table, to_html
 from slviewer.registration.multiway import Pair
@@ -18,7 +18,6 @@ from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import load_scan_cloud
 
-LAYER = "merge picks"
 Side = Literal["scan", "onto"]
 _SIDES: tuple[Side, Side] = ("scan", "onto")
 _MARKS = dict(zip(_SIDES, SCAN_COLOURS, strict=False))
@@ -96,14 +95,13 @@ class _SideBySide:
         return side, self.clouds[side][met[1]].astype(np.float64)
 
 
-class PointPicker(Part):
+class PointPicker(PanelPart):
     """Inputs and 3D view to pick points; ``changed()`` is called after every accepted click."""
 
-    def __init__(
-        self, context: PanelContext, painter: Painter, changed: Callable[[], None]
-    ) -> None:
-        super().__init__(context)
-        self._painter, self._changed = painter, changed
+    def __init__(self, panel: StepPanel, changed: Callable[[], None]) -> None:
+        super().__init__(panel)
+        self._panel, self._changed = panel, changed
+        self._layer = self._scene.layer("merge picks")
         self._clicks = count()
         self._picks: dict[Pair, _Picks] = {}
         self._current: dict[str, _Picks] = {}
@@ -113,11 +111,12 @@ class PointPicker(Part):
         self._marked: dict[tuple[Side, int], tuple[float, ...]] = {}
         self._offered = False
         self._on: bool | None = None
-        hint = "To be picked on together with the reference"
-        self._scan = Choice(context, "Scan", changed, hint=hint)
+        self._scan = Choice(
+            self._context, "Scan", changed, hint="To be picked on together with the reference"
+        )
         self._note = Text(self._gui)
         self._table = Text(self._gui)
-        self._undo = context.button("Undo last point", self._undo_point, "arrow-back-up")
+        self._undo = self._context.button("Undo last point", self._undo_point, "arrow-back-up")
 
     def offer(
         self, versions: Mapping[str, Any], reference: str, labels: Mapping[str, str], on: bool
@@ -166,7 +165,7 @@ class PointPicker(Part):
                 if on or self._on:  # otherwise the clicks may be another step's
                     self._scene.on_click(self._handle_click if on else None)
                 self._on = on
-                self._scene.show(LAYER, on)
+                self._layer.show(on)
             self._draw_note()
             pair = self._pair
             if not on or pair is None:
@@ -179,11 +178,6 @@ class PointPicker(Part):
             )
             self._draw_marks()
             self._show_view()
-
-    @property
-    def points(self) -> np.ndarray | None:
-        """The shown points (n, 3) mm; None where none are."""
-        return None if self._shown is None else self._shown.points
 
     @property
     def _pair(self) -> Pair | None:
@@ -199,7 +193,7 @@ class PointPicker(Part):
             self._shown = shown
             for side in _SIDES:
                 points = shown.clouds[side] + shown.offset(side)
-                self._scene.cloud(LAYER, side, points, shown.colours[side])
+                self._layer.cloud(side, points, shown.colours[side])
             self._draw_marks()
             self._show_view()
 
@@ -207,7 +201,7 @@ class PointPicker(Part):
         """Move the browsers' views to the two clouds, if they are shown."""
         shown = self._shown
         if self._on and shown is not None and shown.pair == self._pair:
-            self._context.viewpoints.show(f"{LAYER} {shown.pair}", shown.points)
+            self._panel.show_points(str(shown.pair), shown.points)
 
     def _draw_marks(self) -> None:
         """Draw the numbered points on both clouds."""
@@ -221,9 +215,9 @@ class PointPicker(Part):
                     wanted[side, k] = tuple(place)
                     if wanted[side, k] != self._marked.get((side, k)):
                         ball = _BALL * shown.wide_mm
-                        self._scene.mark(LAYER, f"{side} {k}", place, str(k), _MARKS[side], ball)
+                        self._layer.mark(f"{side} {k}", place, str(k), _MARKS[side], ball)
         gone = self._marked.keys() - wanted.keys()
-        self._scene.remove(LAYER, *(f"{side} {k}" for side, k in gone))
+        self._layer.remove(*(f"{side} {k}" for side, k in gone))
         self._marked = wanted
 
     def _draw_note(self) -> None:
@@ -236,7 +230,7 @@ class PointPicker(Part):
             return
         picks = self._picks[pair]
         if self._on:
-            self._note.set(alert(self._format_instruction(pair, picks), "info"))
+            self._note.write(self._format_instruction(pair, picks), "info")
         else:
             self._note.write("To pick more, choose the 3D view side by side.", "dim")
         self._table.set(_residuals_html(picks) + self._counts_html())

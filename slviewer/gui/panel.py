@@ -23,14 +23,7 @@ from slviewer.server.secure import SafeServer
 from slviewer.session.store import Session
 from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.snapshot import (
-    ExportView,
-    Level,
-    PreviewView,
-    ScanView,
-    SessionView,
-    Snapshot,
-)
+from slviewer.wizard.snapshot import ExportView, Level, PreviewView, ScanView, SessionView, Snapshot
 
 NOTHING = "–"
 TYPING_S = 1.0
@@ -46,13 +39,18 @@ class PanelContext:
 
     `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator`
     takes requests. `executor` runs one callback after the other. `pages` are the pages of devices;
-    None where none is served.
+    None where none is served. `print_links` is called when the links were replaced.
     """
 
     def __init__(
-        self, operator: Operator, server: SafeServer, pages: PageChannels | None = None
+        self,
+        operator: Operator,
+        server: SafeServer,
+        pages: PageChannels | None,
+        print_links: Callable[[SafeServer], None],
     ) -> None:
         self.operator, self.server, self.pages = operator, server, pages
+        self.print_links = print_links
         self.gui, self.scene = server.viser.gui, ViewerScene(server.viser.scene)
         self.viewpoints = Viewpoints(server.viser)
         self.executor = ThreadPoolExecutor(1, "slviewer requests")
@@ -281,10 +279,7 @@ class RestoreButton:
     def __init__(self, context: PanelContext) -> None:
         self._name = ""
         self._button = context.button(
-            "Restore",
-            lambda: context.operator.undelete(self._name),
-            "arrow-back-up",
-            "orange",
+            "Restore", lambda: context.operator.undelete(self._name), "arrow-back-up", "orange"
         )
 
     def offer(self, deleted: Sequence[str]) -> None:
@@ -335,7 +330,7 @@ class Painter:
         came meanwhile.
         """
         with self._condition:
-            if slot in self._requested and self._requested[slot] == key:
+            if self._requested.get(slot, self) == key:
                 return
             self._requested[slot] = key
             self._waiting[slot] = (key, make, show)
@@ -362,15 +357,15 @@ class Painter:
             try:
                 made = make()
                 with self._condition:
-                    wanted = slot in self._requested and self._requested[slot] == key
+                    wanted = self._requested.get(slot, self) == key
                 if wanted:
                     show(made)
             except Exception as error:  # one picture that fails must not end the thread
                 self._failed(error)
 
 
-class Part:
-    """A part of a panel: its inputs show snapshots and send requests."""
+class PanelBase:
+    """Base of panels and of their parts: inputs that show snapshots and send requests."""
 
     def __init__(self, context: PanelContext) -> None:
         self._context, self._gui, self._scene = context, context.gui, context.scene
@@ -379,38 +374,50 @@ class Part:
         self.build()
 
     def build(self) -> None:
-        """Create the handles; called once, inside the part's own container."""
+        """Create the handles; called once, inside the container of panel or part."""
+
+    def draw(self, snapshot: Snapshot) -> None:
+        """Draw a snapshot."""
 
 
-class StepPanel(Part):
-    """Base of the steps' panels. Every method is called by the drawing thread."""
+class StepPanel(PanelBase):
+    """Base of the steps' panels, each with a layer of the scene that is shown with it. Every method
+    is called by the drawing thread."""
 
     key: ClassVar[str]
-    layers: ClassVar[tuple[str, ...]] = ()
-    """Of the scene, shown with the panel."""
     _snapshot: Snapshot
     """The latest one; set before anything can be chosen in the panel."""
     _visible = False
-    _shown: tuple[str, np.ndarray] | None = None
-    """Name and points (..., 3) mm of the cloud that is shown."""
+    _shown: tuple[str, np.ndarray | None] | None = None
+    """Name and points (..., 3) mm of what is shown."""
 
     def __init__(self, context: PanelContext) -> None:
-        self._painter = Painter(context.report_failure)
-        super().__init__(context)
+        self.context, self.painter = context, Painter(context.report_failure)
+        self.parts: list[PanelPart] = []
+        self.layer = context.scene.layer(self.key)
+        self.layers = [self.layer]
+        with context.gui.add_folder(None, visible=False) as self._container:
+            super().__init__(context)
 
     @property
     def _session(self) -> SessionView:
         """The session of the latest snapshot, an empty one where none is open."""
         return self._snapshot.session or NO_SESSION
 
-    def _show_view(self) -> None:
-        """Move the browsers' views to the panel's cloud, if it is visible."""
+    def show_points(self, name: str, points: np.ndarray | None) -> None:
+        """Move the browsers' views to what is shown now, points (..., 3) mm, or once the panel is
+        visible."""
+        self._shown = name, points
+        self.show_view()
+
+    def show_view(self) -> None:
+        """Move the browsers' views to what is shown, if the panel is visible."""
         if self._visible and self._shown is not None:
             name, points = self._shown
             self._context.viewpoints.show(f"{self.key} {name}", points)
 
-    def _get_points(self) -> np.ndarray | None:
-        """Return the points of the panel's cloud; None where there is none."""
+    def get_points(self) -> np.ndarray | None:
+        """Return the points that are shown; None where there are none."""
         return self._shown and self._shown[1]
 
     def update(self, snapshot: Snapshot) -> None:
@@ -418,17 +425,25 @@ class StepPanel(Part):
         `show(True)`."""
         with self._lock:
             self._snapshot = snapshot
+            for part in self.parts:
+                part.draw(snapshot)
             self.draw(snapshot)
-
-    def draw(self, snapshot: Snapshot) -> None:
-        """Draw a snapshot."""
-        raise NotImplementedError
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the latest frame; called while the panel is shown, at most ten times a second."""
 
     def show(self, visible: bool) -> None:
-        """Show or hide the panel's layers of the scene."""
-        self._visible = visible
+        """Show or hide the panel and its layers of the scene."""
+        self._visible = self._container.visible = visible
         for layer in self.layers:
-            self._scene.show(layer, visible)
+            layer.show(visible)
+
+
+class PanelPart(PanelBase):
+    """Base of what several panels share, and of parts that have a state of their own; drawn with
+    its panel, by whose painter and in whose layer."""
+
+    def __init__(self, panel: StepPanel) -> None:
+        self._painter, self._layer = panel.painter, panel.layer
+        panel.parts.append(self)
+        super().__init__(panel.context)

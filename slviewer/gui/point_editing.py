@@ -8,8 +8,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.render import format_count
-from slviewer.gui.panel import PanelContext, Part, Setting
-from slviewer.gui.scene import Click, Stroke
+from slviewer.gui.panel import PanelPart, Setting, StepPanel
+from slviewer.gui.scene import Click
 from slviewer.gui.widgets import Text, note
 from slviewer.pipeline.edit import SUPPORT, Selection
 from slviewer.surface.region_of_interest import RegionOfInterest
@@ -34,7 +34,7 @@ SELECTED = (225, 40, 120)
 SHOWN_EDITS = 6
 """The last ones are listed; the report lists all."""
 _SELECTION, _OUTLINE = "selection", "outline"
-REGION_ON, REGION_OFF = Stroke((20, 150, 140)), Stroke((150, 150, 150))
+REGION_ON, REGION_OFF = (20, 150, 140), (150, 150, 150)
 _BOX, _HANDLE = "region", "region handle"
 _HANDLE_SHARE = 0.6
 """Of the longest side of the box: the size of its handle."""
@@ -65,7 +65,7 @@ class _EditedScan:
         return np.where(self.hidden[..., None], np.float32(np.nan), self.points)
 
 
-class PointEditing(Part):
+class PointEditing(PanelPart):
     """Inputs that select, hide and delete points of the scans that are shown, drawn in a layer of
     the scene.
 
@@ -75,20 +75,19 @@ class PointEditing(Part):
 
     def __init__(
         self,
-        context: PanelContext,
-        layer: str,
+        panel: StepPanel,
         redraw: Callable[[], None],
         pick: Callable[[Click], None] | None = None,
     ) -> None:
-        super().__init__(context)
-        self._layer, self._redraw, self._pick = layer, redraw, pick
+        super().__init__(panel)
+        self._redraw, self._pick = redraw, pick
         self._scans: list[_EditedScan] = []
         self._what: list[str] = []
         self._corners: list[np.ndarray] = []
         self._rays: list[np.ndarray] = []
         self._view: ViewCamera | None = None
         self._visible = False
-        gui, operator = self._gui, self._operator
+        gui, context, operator = self._gui, self._context, self._operator
         with gui.add_folder("Edit points", expand_by_default=False) as self._folder:
             self._mode = gui.add_dropdown("Select by", (OFF, RECTANGLE, LASSO, PART))
             self._hint = Text(gui)
@@ -149,7 +148,7 @@ class PointEditing(Part):
                 self._clear_selection()
             return [scan.shown_points for scan in self._scans]
 
-    def draw(self, scans: Sequence[ScanView]) -> None:
+    def offer(self, scans: Sequence[ScanView]) -> None:
         """List the edits of scans, and offer to undo and redo them; without scans nothing is
         offered."""
         self._folder.visible = bool(scans)
@@ -195,7 +194,7 @@ class PointEditing(Part):
     def _forget_outline(self) -> None:
         """Forget the corners of the outline."""
         self._corners, self._rays, self._view = [], [], None
-        self._scene.remove(self._layer, _OUTLINE)
+        self._layer.remove(_OUTLINE)
         self._hint.write(_HINTS[self._mode.value], "dim")
         self._close.visible = False
 
@@ -203,9 +202,9 @@ class PointEditing(Part):
         """Draw the selected points over the others."""
         chosen = [scan.points[scan.selected] for scan in self._scans]
         if any(map(len, chosen)):
-            self._scene.cloud(self._layer, _SELECTION, np.concatenate(chosen), SELECTED)
+            self._layer.cloud(_SELECTION, np.concatenate(chosen), SELECTED)
         else:
-            self._scene.remove(self._layer, _SELECTION)
+            self._layer.remove(_SELECTION)
         self._draw_status()
 
     def _draw_status(self) -> None:
@@ -277,7 +276,7 @@ class PointEditing(Part):
             self._rays.append(view.position + away * ray / np.linalg.norm(ray))
             ends = np.array(self._rays)
             segments = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
-            self._scene.lines(self._layer, _OUTLINE, segments, Stroke(SELECTED))
+            self._layer.lines(_OUTLINE, segments, SELECTED)
             count = format_count(len(self._corners), "corner")
             self._hint.write(f"{_HINTS[LASSO]} {count} set.", "dim")
             self._close.visible, self._close.disabled = True, len(self._corners) < 3
@@ -344,16 +343,17 @@ class PointEditing(Part):
                 self._clear_selection()
 
 
-class RegionInputs(Part):
+class RegionInputs(PanelPart):
     """Inputs that show and set the session's region of interest, drawn in a layer of the scene."""
 
-    def __init__(self, context: PanelContext, layer: str) -> None:
-        super().__init__(context)
-        self._layer = layer
-        self._region: RegionOfInterest | None = None
-        self._scan = ""
-        self._drawn: object = None
-        gui = self._gui
+    _region: RegionOfInterest | None = None
+    _is_on = False
+    _scan = ""
+    _drawn: object = None
+
+    def build(self) -> None:
+        """Create the inputs."""
+        gui, context = self._gui, self._context
         with gui.add_folder("Region of interest", expand_by_default=False):
             self._text = Text(gui)
             use = gui.add_checkbox(
@@ -380,7 +380,7 @@ class RegionInputs(Part):
         ]
         context.on_change(self._draw_box, self._handles)
 
-    def draw(self, session: SessionView, scan: str) -> None:
+    def offer(self, session: SessionView, scan: str) -> None:
         """Show the region of a session; ``scan``: the one that the automatic region is put
         around."""
         self._scan = scan
@@ -399,33 +399,33 @@ class RegionInputs(Part):
                 number.update(tuple(round(each, 1) for each in value))
             is_off = "" if session.region_is_on else "The region is off: all points are used."
             self._text.write(is_off, "dim")
-        self._draw_box(session.region_is_on)
+        self._is_on = session.region_is_on
+        self._draw_box()
 
-    def _draw_box(self, is_on: bool | None = None) -> None:
+    def _draw_box(self) -> None:
         """Draw the box, and its handle where it is wanted."""
-        region = self._region
-        is_on = bool(self._on.handle.value) if is_on is None else is_on
+        region, is_on = self._region, self._is_on
         drawn = (region, is_on, self._handles.value)
         if drawn == self._drawn:
             return
         self._drawn = drawn
         if region is None or not self._handles.value:
-            self._scene.remove(self._layer, _HANDLE)
+            self._layer.remove(_HANDLE)
         if region is None:
-            self._scene.remove(self._layer, _BOX)
+            self._layer.remove(_BOX)
             return
-        self._scene.lines(self._layer, _BOX, region.edges(), REGION_ON if is_on else REGION_OFF)
+        self._layer.lines(_BOX, region.edges(), REGION_ON if is_on else REGION_OFF)
         if self._handles.value:
             size = _HANDLE_SHARE * max(region.size_mm)
-            self._scene.gizmo(
-                self._layer, _HANDLE, region.T_camera_box, self._preview, self._place, scale_mm=size
+            self._layer.gizmo(
+                _HANDLE, region.T_camera_box, self._preview, self._place, scale_mm=size
             )
 
     def _preview(self, T: np.ndarray) -> None:
         """Draw the box at T (4, 4) while its handle is dragged."""
         if self._region is not None:
             moved = RegionOfInterest.placed(T, self._region.size_mm)
-            self._scene.lines(self._layer, _BOX, moved.edges(), REGION_ON)
+            self._layer.lines(_BOX, moved.edges(), REGION_ON)
 
     def _place(self, T: np.ndarray) -> None:
         """Request the region at T (4, 4), where its handle was dragged to."""

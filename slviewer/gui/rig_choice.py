@@ -8,7 +8,7 @@ from slviewer.devices.browser import PAGE_ROLES, PageRole
 from slviewer.devices.drivers import Driver, available
 from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError
-from slviewer.gui.panel import Part, Setting
+from slviewer.gui.panel import PanelPart, Setting
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, note, paragraph, to_html
 from slviewer.pipeline.rig_choice import Choice
 from slviewer.pipeline.rig_presets import Preset, check_choice, presets
@@ -27,7 +27,7 @@ _ADDRESSES = ("source", "serial")
 """Names of the drivers' options that choose one device among several."""
 
 
-class RigChoice(Part):
+class RigChoice(PanelPart):
     """Inputs of the step Rig that choose the devices."""
 
     _presets: Mapping[str, Preset] = {}
@@ -114,26 +114,25 @@ class RigChoice(Part):
             return _CHOOSE
         if rig.choice.get("driver") == "simulated":
             scale = rig.choice.get("scale", 1.0)
-            return next(
-                (label for label, rig in SIMULATED.items() if rig["scale"] == scale), _CHOOSE
-            )
+            return next((name for name, r in SIMULATED.items() if r["scale"] == scale), _CHOOSE)
         if rig.choice.get("driver") == _REPLAY:
             return _REPLAY
-        return next(
-            (name for name, p in self._presets.items() if _is_same_rig(p.choice, rig.choice)),
-            _CUSTOM,
-        )
+        for name, preset in self._presets.items():
+            # apart from the delay, which is measured later
+            if {**preset.choice, "settle_ms": None} == {**rig.choice, "settle_ms": None}:
+                return name
+        return _CUSTOM
 
     def _request_choice(self, chosen: str) -> None:
         """Request the chosen rig; where it is refused, show the one in use again."""
         self._draw_folders()
         operator, preset = self._operator, self._presets.get(chosen)
+        granted = False
         if chosen in SIMULATED:
             granted = operator.choose_rig(SIMULATED[chosen])
         elif preset is None or chosen == _REPLAY:
             return
         elif preset.problem:
-            granted = False
             operator.notify("error", f"{chosen} cannot be used here: {preset.problem}")
         else:
             granted = operator.choose_rig(preset.choice)
@@ -148,13 +147,10 @@ class RigChoice(Part):
             self._operator.choose_rig(choice)
 
     def _draw_folders(self) -> None:
-        """Show the inputs for custom devices or a recording, as chosen."""
+        """Show the inputs for custom devices or a recording, as chosen, and the states of the pages
+        that the rig needs, or the devices that are being chosen."""
         self._devices.visible = self._choice.value == _CUSTOM
         self._recording.visible = self._choice.value == _REPLAY
-        self._draw_pages()
-
-    def _draw_pages(self) -> None:
-        """Show the states of the pages that the rig needs, or the devices that are being chosen."""
         for role, text in self._pages.items():
             is_chosen = self._choice.value == _CUSTOM and self._drivers[role].page
             needed = is_chosen or role in self._needed_pages
@@ -174,7 +170,7 @@ class RigChoice(Part):
         self._missing.write(missing, "warning")
         self._use.disabled = bool(missing)
         self._source.visible = _address_option(self._drivers["camera"]) is not None
-        self._draw_pages()
+        self._draw_folders()
 
     def _read_entered(self) -> Choice:
         """Return the rig of the entered devices. Raises InputError for an invalid one."""
@@ -215,11 +211,6 @@ def _size(text: str) -> list[int]:
     if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
         raise InputError(f"{text!r} is not a size: write width x height in px, such as 1920x1080")
     return [int(side) for side in sides]
-
-
-def _is_same_rig(preset: Choice, choice: Choice) -> bool:
-    """Whether a rig was chosen by this preset, apart from the delay, which is measured later."""
-    return {**preset, "settle_ms": None} == {**choice, "settle_ms": None}
 
 
 def _rig_html(rig: RigView) -> str:

@@ -2,7 +2,7 @@
 image; clicks and drags in it, and the browsers' viewpoints.
 
 A layer ("poses", "scan", …) belongs to a panel, which fills it, and shows or hides it as a whole.
-An object replaces that of the same name. Every method may be called from any thread.
+Every method may be called from any thread.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,14 +38,6 @@ too."""
 FIELD_OF_VIEW = 0.75  # rad
 
 
-@dataclass(frozen=True)
-class Stroke:
-    """How lines are drawn."""
-
-    colour: Colour
-    width_px: float = 3.0
-
-
 @dataclass(frozen=True, eq=False)
 class Click:
     """A click into the 3D view: the browser's view, the place in it, (2,) from 0 at its upper left
@@ -67,52 +59,30 @@ class Click:
         return min(met)[1:] if met else None
 
 
-class ViewerScene:
-    """Draws named layers of objects into viser's scene."""
+class SceneLayer:
+    """Draws objects into one layer of viser's scene; an object replaces that of the same name."""
 
-    def __init__(self, api: viser.SceneApi) -> None:
-        self._api = api
-        self._layers: dict[str, Any] = {}
-        self._nodes: dict[tuple[str, str], Any] = {}
-        api.set_up_direction("-y")
-        api.add_grid(
-            "/floor",
-            plane="xz",
-            position=(0.0, _FLOOR_MM, 500.0),
-            infinite_grid=True,
-            cell_size=50.0,
-            section_size=250.0,
-            cell_color=(225, 229, 233),
-            section_color=(190, 196, 202),
-            fade_distance=2500.0,
-            shadow_opacity=0.0,
-        )
+    def __init__(self, api: viser.SceneApi, name: str) -> None:
+        self.name, self._api = name, api
+        self._root: Any = api.add_frame(f"/{name}", show_axes=False)
+        self._nodes: dict[str, Any] = {}
 
-    # layers
+    def show(self, visible: bool) -> None:
+        """Show or hide everything in the layer, now and when it is filled later."""
+        self._root.visible = visible
 
-    def show(self, layer: str, visible: bool) -> None:
-        """Show or hide a layer and everything in it, now and when it is filled later."""
-        self._get_layer(layer).visible = visible
-
-    def remove(self, layer: str, *names: str) -> None:
-        """Remove those of these objects that exist from a layer."""
+    def remove(self, *names: str) -> None:
+        """Remove those of these objects that exist."""
         for name in names:
-            if (node := self._nodes.pop((layer, name), None)) is not None:
+            if (node := self._nodes.pop(name, None)) is not None:
                 node.remove()
 
-    def clear(self, layer: str) -> None:
-        """Remove all objects of a layer."""
-        self.remove(layer, *self.names(layer))
-
-    def names(self, layer: str) -> list[str]:
-        """List the names of a layer's objects."""
-        return [name for where, name in list(self._nodes) if where == layer]
-
-    # objects
+    def clear(self) -> None:
+        """Remove all objects."""
+        self.remove(*self._nodes)
 
     def device(
         self,
-        layer: str,
         name: str,
         K: np.ndarray,
         size: tuple[int, int],
@@ -123,8 +93,8 @@ class ViewerScene:
         mm."""
         width, height = size
         wxyz, position = _split_pose(T_camera_device)
-        self._nodes[layer, name] = self._api.add_camera_frustum(
-            self._make_path(layer, name),
+        self._nodes[name] = self._api.add_camera_frustum(
+            self._make_path(name),
             fov=float(2 * np.arctan2(height / 2, K[1, 1])),
             # of the viewing angles, not of the pixels: a projector's may be far from square
             aspect=float((width / K[0, 0]) / (height / K[1, 1])),
@@ -138,11 +108,11 @@ class ViewerScene:
 
     def board(
         self,
-        layer: str,
         name: str,
         T_camera_board: np.ndarray,
         outline: np.ndarray,
-        stroke: Stroke,
+        colour: Colour,
+        width_px: float,
         *,
         picture: np.ndarray | None = None,
         label: str = "",
@@ -155,8 +125,8 @@ class ViewerScene:
         of the picture, for clicks on it, None without one.
         """
         sides = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
-        self.lines(layer, name, sides, stroke, T=T_camera_board)
-        path = self._make_path(layer, name)
+        self.lines(name, sides, colour, width_px, T=T_camera_board)
+        path = self._make_path(name)
         if label:
             self._api.add_label(
                 f"{path}/label", label, position=outline[0], anchor="bottom-left", depth_test=True
@@ -172,7 +142,6 @@ class ViewerScene:
 
     def gizmo(
         self,
-        layer: str,
         name: str,
         T: np.ndarray,
         on_move: Callable[[np.ndarray], None] | None,
@@ -184,8 +153,8 @@ class ViewerScene:
         frame."""
         wxyz, position = _split_pose(T)
         limits = ((-5000.0, 5000.0),) * 3
-        self._nodes[layer, name] = handle = self._api.add_transform_controls(
-            self._make_path(layer, name),
+        self._nodes[name] = handle = self._api.add_transform_controls(
+            self._make_path(name),
             scale=scale_mm,
             wxyz=wxyz,
             position=position,
@@ -196,23 +165,20 @@ class ViewerScene:
         @handle.on_update
         def _(event: Any) -> None:
             """Call the callbacks with the handle's new pose."""
+            rotation = tf.SO3(np.asarray(event.target.wxyz, float))
+            T = tf.SE3.from_rotation_and_translation(rotation, event.target.position).as_matrix()
             if on_move is not None:
-                on_move(_read_pose(event.target))
+                on_move(T)
             if event.phase == "end":
-                on_end(_read_pose(event.target))
+                on_end(T)
 
-    def move(self, layer: str, name: str, T: np.ndarray) -> None:
+    def move(self, name: str, T: np.ndarray) -> None:
         """Move an existing object to T (4, 4), without calling its callbacks."""
-        if (node := self._nodes.get((layer, name))) is not None:
+        if (node := self._nodes.get(name)) is not None:
             node.wxyz, node.position = _split_pose(T)
 
     def cloud(
-        self,
-        layer: str,
-        name: str,
-        points: np.ndarray,
-        colours: np.ndarray | Colour,
-        limit: int = SHOWN_POINTS,
+        self, name: str, points: np.ndarray, colours: np.ndarray | Colour, limit: int = SHOWN_POINTS
     ) -> int:
         """Draw a cloud (h, w, 3) or (n, 3) float32 mm; returns the number of points shown.
 
@@ -222,15 +188,13 @@ class ViewerScene:
         """
         shown, colours = thin(points, colours, limit)
         if len(shown):
-            path = self._make_path(layer, name)
-            self._nodes[layer, name] = add_points(self._api, path, shown, colours)
+            self._nodes[name] = add_points(self._api, self._make_path(name), shown, colours)
         else:
-            self.remove(layer, name)
+            self.remove(name)
         return len(shown)
 
     def mark(
         self,
-        layer: str,
         name: str,
         point: np.ndarray,
         text: str,
@@ -238,20 +202,18 @@ class ViewerScene:
         radius_mm: float = 1.5,
     ) -> None:
         """Draw a point (3,) mm as a ball with a label."""
-        path = self._make_path(layer, name)
-        self._nodes[layer, name] = self._api.add_icosphere(
+        path = self._make_path(name)
+        self._nodes[name] = self._api.add_icosphere(
             path, radius=radius_mm, color=colour, position=np.asarray(point, float)
         )
         self._api.add_label(f"{path}/words", text, anchor="bottom-left")
 
-    def ball(
-        self, layer: str, name: str, centre: np.ndarray, radius_mm: float, colour: Colour
-    ) -> None:
+    def ball(self, name: str, centre: np.ndarray, radius_mm: float) -> None:
         """Draw a transparent ball around centre (3,) mm."""
-        self._nodes[layer, name] = self._api.add_icosphere(
-            self._make_path(layer, name),
+        self._nodes[name] = self._api.add_icosphere(
+            self._make_path(name),
             radius=radius_mm,
-            color=colour,
+            color=GHOST,
             opacity=0.3,
             position=np.asarray(centre, float),
             cast_shadow=False,
@@ -260,26 +222,24 @@ class ViewerScene:
 
     def lines(
         self,
-        layer: str,
         name: str,
         segments: np.ndarray,
-        stroke: Stroke,
+        colour: Colour,
+        width_px: float = 3.0,
         label: tuple[str, np.ndarray] | None = None,
         T: np.ndarray | None = None,
     ) -> None:
         """Draw segments (n, 2, 3) mm (n may be 0) at T (4, 4), and a label, its text and place (3,)
         mm."""
-        path = self._make_path(layer, name)
+        path = self._make_path(name)
         wxyz, position = _split_pose(np.eye(4) if T is None else T)
-        self._nodes[layer, name] = self._api.add_frame(
-            path, show_axes=False, wxyz=wxyz, position=position
-        )
+        self._nodes[name] = self._api.add_frame(path, show_axes=False, wxyz=wxyz, position=position)
         if len(segments):
             self._api.add_line_segments(
                 f"{path}/lines",
                 np.asarray(segments, np.float32),
-                stroke.colour,
-                thickness=stroke.width_px,
+                colour,
+                thickness=width_px,
                 thickness_units="screen",
             )
         if label is not None:
@@ -288,7 +248,34 @@ class ViewerScene:
                 f"{path}/words", text, position=np.asarray(place, float), anchor="bottom-left"
             )
 
-    # clicks and drags
+    def _make_path(self, name: str) -> str:
+        """Return the path of an object's node, with slashes in its name replaced."""
+        # names are entered by the operator: a slash would make another layer
+        return f"/{self.name}/{name.replace('/', '_')}"
+
+
+class ViewerScene:
+    """Viser's scene: its floor, its layers, and the clicks and drags into it."""
+
+    def __init__(self, api: viser.SceneApi) -> None:
+        self._api = api
+        api.set_up_direction("-y")
+        api.add_grid(
+            "/floor",
+            plane="xz",
+            position=(0.0, _FLOOR_MM, 500.0),
+            infinite_grid=True,
+            cell_size=50.0,
+            section_size=250.0,
+            cell_color=(225, 229, 233),
+            section_color=(190, 196, 202),
+            fade_distance=2500.0,
+            shadow_opacity=0.0,
+        )
+
+    def layer(self, name: str) -> SceneLayer:
+        """Return a new layer."""
+        return SceneLayer(self._api, name)
 
     def on_click(self, do: Callable[[Click], None] | None) -> None:
         """Call `do(click)` for each click into the scene; None: stop."""
@@ -316,18 +303,6 @@ class ViewerScene:
                 do(read_view(event.client), np.array(event.screen_min), np.array(event.screen_max))
 
             self._api.on_rect_select()(select)
-
-    def _get_layer(self, layer: str) -> Any:
-        """Return the node of a layer, created where it is missing."""
-        if layer not in self._layers:
-            self._layers[layer] = self._api.add_frame(f"/{layer}", show_axes=False)
-        return self._layers[layer]
-
-    def _make_path(self, layer: str, name: str) -> str:
-        """Return the path of an object's node in its layer, with slashes in its name replaced."""
-        self._get_layer(layer)
-        # names are entered by the operator: a slash would make another layer
-        return f"/{layer}/{name.replace('/', '_')}"
 
 
 def add_points(
@@ -357,14 +332,6 @@ def read_view(client: viser.ClientHandle) -> ViewCamera:
 def _split_pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (wxyz, position) of T (4, 4)."""
     return tf.SO3.from_matrix(T[:3, :3]).wxyz, T[:3, 3]
-
-
-def _read_pose(handle: Any) -> np.ndarray:
-    """Return T (4, 4) of a handle's position and orientation."""
-    T = np.eye(4)
-    T[:3, :3] = tf.SO3(np.asarray(handle.wxyz, float)).as_matrix()
-    T[:3, 3] = handle.position
-    return T
 
 
 def thin(

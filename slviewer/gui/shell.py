@@ -1,19 +1,22 @@
 """The frame of the page: the steps on the left, the current step on the right, and what is visible
-in every step.
+in every step; and the links for other people and devices.
 
 All browsers show the same step: an assistant sees the operator's step.
 """
 
+import base64
+import html
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
+from urllib.parse import urlsplit
 
+import cv2
 import numpy as np
 import viser
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.evaluation.render import format_count
-from slviewer.gui.links import show_links
 from slviewer.gui.panel import NO_SESSION, PanelContext, StepPanel
 from slviewer.gui.scene import CAMERA, PROJECTOR
 from slviewer.gui.widgets import (
@@ -30,7 +33,6 @@ from slviewer.gui.widgets import (
     paragraph,
     to_html,
 )
-from slviewer.server.secure import SafeServer
 from slviewer.session.atomic import format_bytes
 from slviewer.wizard.autopilot import Autopilot
 from slviewer.wizard.snapshot import (
@@ -45,11 +47,7 @@ from slviewer.wizard.snapshot import (
 STEPS_PX, STEP_PX = 236, 452
 """Widths of the two panels: at 1280 px of page, the scene is as wide as the step."""
 
-_ICONS = {
-    "done": "circle-check",
-    "ready": "circle-dotted",
-    "blocked": "lock",
-}
+_ICONS = {"done": "circle-check", "ready": "circle-dotted", "blocked": "lock"}
 _STEP_COLOURS = {"done": (211, 249, 216), "ready": (208, 235, 255), "blocked": (233, 236, 239)}
 _STEPS_WITH_RIG = ("rig", "target", "poses", "calibrate")  # in which the devices matter in 3D
 STAGES = {
@@ -66,29 +64,25 @@ STAGES = {
 """{step: anchor of the findings of its stage in the help}."""
 _HELP_STYLE = "float:right;font-size:0.875rem;line-height:1.9rem"
 _SCROLL_BAR_MARGIN = "<style>.mantine-ScrollArea-content{padding-right:10px}</style>"
+_QUIET_ZONE = 4
+"""White modules around a QR code (ISO/IEC 18004)."""
 _MOST_NOTICES = 12  # of the latest, in the panel
 _MOST_FAULTS = 3  # of the session's files, in the panel
-DEVICES = "devices"
 
 
 class Shell:
     """The page: builds it once; `draw` and `draw_preview` update it, from one thread."""
 
-    def __init__(
-        self,
-        context: PanelContext,
-        steps: Sequence[StepView],
-        print_links: Callable[[SafeServer], None],
-    ) -> None:
+    def __init__(self, context: PanelContext, steps: Sequence[StepView]) -> None:
         self._gui, self._context = context.gui, context
+        self._devices = context.scene.layer("devices")
         self._drawn_devices: tuple[CalibrationView | None, tuple[int, int] | None] = (None, None)
         self._panels: dict[str, StepPanel] = {}
-        self._folders: dict[str, viser.GuiFolderHandle] = {}
         self._shown_key = self._autopilot_key = self._following_key = ""
         self.current = next((s.key for s in steps if s.state != "done"), steps[0].key)
         """The step that is shown, or will be with the next drawing."""
         self._gui.set_panel_label("slviewer")
-        self._build_left(steps, print_links)
+        self._build_left(steps)
         self._build_right(steps)
 
     def go(self, key: str) -> None:
@@ -98,9 +92,7 @@ class Shell:
 
     # building
 
-    def _build_left(
-        self, steps: Sequence[StepView], print_links: Callable[[SafeServer], None]
-    ) -> None:
+    def _build_left(self, steps: Sequence[StepView]) -> None:
         """Build the left panel: buttons of the steps, autopilot, session and messages."""
         gui, context = self._gui, self._context
         gui.main_panel.dock_left()
@@ -132,7 +124,7 @@ class Shell:
         )
         links.on_click(
             lambda event: context.callback(
-                partial(show_links, context, print_links, event.client), at_once=True
+                partial(show_links, context, event.client), at_once=True
             )(event)
         )
         with gui.add_folder("Messages", expand_by_default=True):
@@ -158,9 +150,7 @@ class Shell:
             self._cancel.visible = self._next.visible = False
             for key in (step.key for step in steps):
                 module = importlib.import_module(f"slviewer.gui.steps.{key}")
-                self._folders[key] = folder = gui.add_folder(None, visible=False)
-                with folder:
-                    self._panels[key] = getattr(module, f"{key.title()}Panel")(context)
+                self._panels[key] = getattr(module, f"{key.title()}Panel")(context)
 
     # drawing
 
@@ -202,13 +192,13 @@ class Shell:
     def _switch_panel(self, key: str) -> None:
         """Hide the shown step and show another one."""
         if self._shown_key:
-            self._folders[self._shown_key].visible = False
             self._panels[self._shown_key].show(False)
         self._shown_key = key
+        self._panels[key].show(True)
         if key in _STEPS_WITH_RIG:
             self._context.viewpoints.overview()
-        self._panels[key].show(True)
-        self._folders[key].visible = True
+        else:
+            self._panels[key].show_view()
 
     def _draw_heading(self, snapshot: Snapshot) -> None:
         """Show the step's title, state, instruction and problems, and the button to continue."""
@@ -245,7 +235,7 @@ class Shell:
         """Show the progress of capture and job, and whether it can be cancelled."""
         work = _running_work(snapshot)
         bars = "".join(
-            f'<div style="margin-bottom:0.3em">{to_html(text)}{meter(share, "info")}</div>'
+            f'<div style="margin-bottom:0.3em">{to_html(text)}{meter(share)}</div>'
             for text, share in work
         )
         progress = paragraph(Html(bars))
@@ -279,7 +269,12 @@ class Shell:
                     text += f"; a capture needs {format_bytes(space.capture_bytes)}"
                 lines.append(coloured(text, "dim" if space.enough else "error"))
             about = paragraph(Html("<br>".join(lines)))
-        self._session.set(about + _fault_alerts(snapshot))
+        faults = (session or NO_SESSION).faults
+        more = len(faults) - _MOST_FAULTS
+        rest = f"{more} more files are damaged: `slviewer inspect` lists them." if more > 0 else ""
+        for text in (snapshot.read_failure, *faults[:_MOST_FAULTS], rest):
+            about += alert(text, "error")
+        self._session.set(about)
         self._autopilot.visible = snapshot.rig.simulated
         self._autopilot.label = "Stop autopilot" if snapshot.autopilot else "Autopilot"
         self._autopilot.color = "red" if snapshot.autopilot else "teal"
@@ -296,20 +291,20 @@ class Shell:
 
     def _draw_devices(self, calibration: CalibrationView | None, devices: RigView) -> None:
         """Draw camera and projector as frusta, if they have changed."""
-        camera, projector, scene = devices.camera, devices.projector, self._context.scene
+        camera, projector = devices.camera, devices.projector
         if (calibration, camera) == self._drawn_devices:
             return
         self._drawn_devices = (calibration, camera)
-        scene.clear(DEVICES)
+        self._devices.clear()
         rig = calibration.stereo.rig if calibration else None
         if camera is not None:
             K = (rig.camera if rig else nominal_lens(camera)).K
-            scene.device(DEVICES, "camera", K, camera, np.eye(4), CAMERA)
+            self._devices.device("camera", K, camera, np.eye(4), CAMERA)
         if projector is not None and rig is not None:
             T_camera_projector = np.eye(4)  # the inverse of X_p = R X_c + t
             T_camera_projector[:3, :3], T_camera_projector[:3, 3] = rig.R.T, -rig.R.T @ rig.t
-            scene.device(
-                DEVICES, "projector", rig.projector.K, projector, T_camera_projector, PROJECTOR
+            self._devices.device(
+                "projector", rig.projector.K, projector, T_camera_projector, PROJECTOR
             )
 
     # requests
@@ -329,7 +324,7 @@ def autopilot_step(snapshot: Snapshot) -> str:
     session, world = snapshot.session, snapshot.world
     if not snapshot.autopilot or session is None or world is None:
         return ""
-    job = snapshot.job.name if snapshot.job is not None else ""
+    job = snapshot.job.name if snapshot.job else ""
     if not session.target:
         return "target"
     if job == "Calibrating":
@@ -370,10 +365,81 @@ def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
     return work
 
 
-def _fault_alerts(snapshot: Snapshot) -> str:
-    """Return the HTML of what could not be read of the session, as alerts."""
-    faults = (snapshot.session or NO_SESSION).faults
-    more = len(faults) - _MOST_FAULTS
-    rest = f"{more} more files are damaged: `slviewer inspect` lists them." if more > 0 else ""
-    stated = [snapshot.read_failure, *faults[:_MOST_FAULTS], rest]
-    return "".join(alert(text, "error") for text in stated)
+def show_links(context: PanelContext, client: viser.ClientHandle | None) -> None:
+    """Open a dialog with the links in the browser of the operator that requests them, and in no
+    other; None: it has disconnected."""
+    server, operator = context.server, context.operator
+    if client is None:
+        return
+    number = client.client_id
+
+    def replace(_: object) -> None:
+        """Replace all links, and print the new ones."""
+        try:
+            server.renew_links(number)
+            operator.notify(
+                "info", "The links were replaced: pages opened by the old ones are closed"
+            )
+        except OSError as error:
+            operator.notify(
+                "error",
+                f"The links were replaced, but {server.serving.token_file} holds the old tokens,"
+                f" valid again after a restart ({error.strerror}): write new ones into it",
+            )
+        context.print_links(server)
+
+    origin = server.origin_of(number)
+    is_own = origin is not None and urlsplit(origin).hostname in ("127.0.0.1", "localhost", "::1")
+    if is_own and not server.loopback:
+        origin = server.shared_origin
+    others_reach = not (is_own and server.loopback)
+    rows = [("To watch, from any computer that reaches this address", server.link("watch", origin))]
+    if server.device_pages:
+        rows.append(("Projector page, on another computer", server.link("project", origin)))
+        link = server.link("camera", origin)
+        needs = "" if link.startswith("https:") else ", whose browsers demand --tls"
+        rows.append((f"Camera page, on a phone or another computer{needs}", link))
+    with client.gui.add_modal("Links") as dialog:
+        gui = client.gui
+        gui.add_html("".join(_link_html(what, link, others_reach) for what, link in rows))
+        if not others_reach:
+            advice = Html(
+                "Only this computer reaches these links. For others, and phones, start slviewer"
+                " with <code style='white-space:nowrap'>--host 0.0.0.0 --tls</code>."
+            )
+            gui.add_html(str(alert(advice, "info")))
+        about = Html(
+            "<b>New links</b> closes every page that was opened by the present ones, those of"
+            " projector and camera too. This page continues."
+        )
+        gui.add_html(str(paragraph(about)))
+        renew = gui.add_button("New links", icon=viser.Icon.REFRESH, color="red")
+        close = gui.add_button("Close", color="gray")
+    renew.on_click(replace)
+    close.on_click(lambda _: dialog.close())
+
+
+def _link_html(what: str, link: str, qr_code: bool) -> Html:
+    """Return the HTML of one link, selected by a click to be copied, and its QR code for a
+    phone."""
+    style = (
+        "display:block;user-select:all;overflow-wrap:anywhere;padding:0.4em"
+        " 0.6em;border-radius:4px;"
+        "background:var(--mantine-color-gray-1);font-family:monospace;font-size:0.9em;flex:1"
+    )
+    code = f"<code style='{style}'>{html.escape(link)}</code>"
+    if qr_code:
+        look = "width:7.5em;height:7.5em;image-rendering:pixelated;background:#fff"
+        code += f"<img alt='QR code of this link' style='{look}' src='{encode_qr_code(link)}'>"
+    row = "display:flex;gap:0.6em;align-items:center;margin-top:0.2em"
+    return paragraph(Html(f"{to_html(what)}:<span style='{row}'>{code}</span>"))
+
+
+def encode_qr_code(text: str) -> str:
+    """Return the QR code of a text as the address of a PNG picture, a pixel a module."""
+    modules = cv2.QRCodeEncoder.create().encode(text)
+    # OpenCV adds some of it
+    border = max(0, _QUIET_ZONE - int((modules == 0).any(axis=0).argmax()))
+    modules = cv2.copyMakeBorder(modules, *(border,) * 4, cv2.BORDER_CONSTANT, value=255)
+    png = cv2.imencode(".png", modules)[1].tobytes()
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"

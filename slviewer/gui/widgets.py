@@ -8,7 +8,6 @@ given to `to_html`, `table` and `Text.write` are escaped here; a `Html` is used 
 import base64
 import io
 import re
-import wave
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 import viser
 from numpy.typing import NDArray
+from scipy.io import wavfile
 
 from slviewer.errors import hide_passwords
 from slviewer.pipeline.stored_records import Stored, name_records
@@ -42,7 +42,7 @@ _UNIT = re.compile(
 """The space between a figure and its unit, in escaped text."""
 
 Tone = Literal["plain", "dim", "info", "good", "warning", "error"]
-_TONES = {
+TONES = {
     "plain": "var(--mantine-color-text)",
     "dim": "var(--mantine-color-dimmed)",
     "info": "var(--mantine-color-blue-6)",
@@ -94,7 +94,7 @@ def coloured(text: object, tone: Tone, *, bold: bool = False) -> Html:
     if text == "":
         return Html("")
     weight = ";font-weight:600" if bold else ""
-    return Html(f'<span style="color:{_TONES[tone]}{weight}">{to_html(text)}</span>')
+    return Html(f'<span style="color:{TONES[tone]}{weight}">{to_html(text)}</span>')
 
 
 def paragraph(content: object) -> Html:
@@ -119,7 +119,7 @@ def alert(content: object, tone: Tone) -> Html:
         return Html("")
     style = (
         f"background:{_BOXES[tone]};border-left:3px solid"
-        f" {_TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
+        f" {TONES[tone]};border-radius:4px;padding:0.5em 0.7em"
     )
     return paragraph(Html(f'<div style="{style}">{to_html(content)}</div>'))
 
@@ -142,7 +142,7 @@ def table(
             for side, c in zip(sides, cells, strict=True)
         )
 
-    head = line("th", titles, f"color:{_TONES['dim']};font-weight:600;vertical-align:bottom")
+    head = line("th", titles, f"color:{TONES['dim']};font-weight:600;vertical-align:bottom")
     rule = (
         "border-top:1px solid var(--mantine-color-default-border);font-variant-numeric:tabular-nums"
     )
@@ -246,7 +246,7 @@ def help_link(anchor: str, page: str = FINDINGS_PAGE, style: str = "") -> Html:
     )
 
 
-def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
+def thumbnail(jpeg: bytes, width_px: int, alt: str) -> Html:
     """Return a small picture inside HTML; an empty box where there is no JPEG yet."""
     height = round(0.75 * width_px)
     if not jpeg:
@@ -260,12 +260,12 @@ def thumbnail(jpeg: bytes, width_px: int = 72, alt: str = "") -> Html:
     return Html(f'<img alt="{to_html(alt)}" src="data:image/jpeg;base64,{data}" style="{style}">')
 
 
-def meter(share: float, tone: Tone = "good") -> Html:
+def meter(share: float) -> Html:
     """Return a bar that is filled to `share`, 0 ... 1."""
     width = 100 * min(max(share, 0.0), 1.0)
     return Html(
         '<div style="height:6px;border-radius:3px;background:var(--mantine-color-gray-light)">'
-        f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:{_TONES[tone]}">'
+        f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:{TONES["info"]}">'
         "</div></div>"
     )
 
@@ -361,11 +361,7 @@ def _encode_wav(tones_hz: Sequence[float]) -> bytes:
     envelope = np.minimum(1, np.minimum(t, seconds - t) / 0.01)  # without it, tones click
     samples = np.concatenate([envelope * np.sin(2 * np.pi * f * t) for f in tones_hz])
     file = io.BytesIO()
-    with wave.open(file, "wb") as out:
-        out.setnchannels(1)
-        out.setsampwidth(1)
-        out.setframerate(rate)
-        out.writeframes((128 + 90 * samples).astype(np.uint8).tobytes())
+    wavfile.write(file, rate, (128 + 90 * samples).astype(np.uint8))
     return file.getvalue()
 
 
@@ -398,10 +394,7 @@ def colours(
 
 
 def colour_bar(
-    low: str,
-    high: str,
-    scale: Literal["value", "error"] | NDArray[np.uint8] = "value",
-    title: str = "",
+    low: str, high: str, scale: Literal["value", "error"] | NDArray[np.uint8], title: str
 ) -> Html:
     """Return the legend of a colour scale, that of `colours` or colours (n, 3), from `low` to
     `high` with units."""
@@ -413,7 +406,7 @@ def colour_bar(
             '<div style="flex:1;height:10px;border-radius:3px;'
             f'background:linear-gradient(90deg,{stops})"></div>'
             f"<span>{to_html(high)}</span></div>"
-            + (f'<div style="text-align:center">{to_html(title)}</div>' if title else "")
+            f'<div style="text-align:center">{to_html(title)}</div>'
         )
     )
 

@@ -15,7 +15,7 @@ from slviewer.devices.browser_camera import Video
 from slviewer.devices.browser_projector import ProjectorChannel, browser_projector
 from slviewer.fringe.presets import gray
 from slviewer.gui.app import App
-from slviewer.gui.links import encode_qr_code
+from slviewer.gui.shell import encode_qr_code
 from slviewer.pipeline.rig_choice import set_up
 from slviewer.server.secure import Serving
 from slviewer.wizard.operator import Operator

@@ -8,9 +8,10 @@ import numpy as np
 
 from slviewer.fringe.sequence import Axis
 from slviewer.gui.panel import Choice, Setting, StepPanel, scan_options
-from slviewer.gui.scene import Click, Stroke
+from slviewer.gui.scene import Click
 from slviewer.gui.widgets import (
     PLOT_PX,
+    TONES,
     Html,
     Plot,
     Text,
@@ -40,7 +41,6 @@ from slviewer.target.board import Board
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import CalibrationView, SessionView, Snapshot
 
-LAYER, BOARDS = "calibrate", "calibrated boards"
 DEVICES = ("camera", "projector")
 USUAL_WEIGHT = "80 % or more is usual"
 _MOST_NAMED = 6  # poses of a verdict that are offered as buttons: they fit on two lines
@@ -60,29 +60,30 @@ class CalibratePanel(StepPanel):
     """Panel of the step Calibrate."""
 
     key = "calibrate"
-    layers = (LAYER, BOARDS)
 
     _cloud: result_views.ScanCloud | None = None
     _pixel_chosen = False
-    _boards: tuple[Any, ...] = ()
+    _drawn_boards: tuple[Any, ...] = ()
     _details: tuple[tuple[Any, ...], CalibrationFigures] | None = None
     _chosen = ""  # the operator's model in the latest snapshot
 
     def build(self) -> None:
         """Create the inputs, plots and tables."""
         gui, context, operator = self._gui, self._context, self._operator
+        self._boards = self._scene.layer("calibrated boards")
+        self.layers.append(self._boards)
         self._calibrate = context.button("Calibrate", operator.calibrate, "target", None)
         self._verdict = Text(gui)
-        hint = "Uses this calibration although it was rejected"
-        anyway = gui.add_checkbox("Accept anyway", False, hint=hint)
+        anyway = gui.add_checkbox(
+            "Accept anyway", False, hint="Uses this calibration although it was rejected"
+        )
         self._anyway = Setting(context, anyway, operator.accept_rejected_calibration)
         self._named = gui.add_button_group("Show pose", ("–",))
         self._named.on_click(context.callback(lambda: self._pose.choose(self._named.value)))
         self._summary = Text(gui)
         with gui.add_folder("Models") as self._models_folder:
             self._choice_note = Text(gui)
-            hint = "Used for scans and verifications"
-            self._use = use = Choice(context, "Model", hint=hint)
+            self._use = use = Choice(context, "Model", hint="Used for scans and verifications")
             choose = lambda: operator.choose_model(use.value)  # noqa: E731
             context.on_change(choose, use.handle, by_user=True)
             self._compare = context.button(
@@ -102,14 +103,22 @@ class CalibratePanel(StepPanel):
             self._parameters = Text(gui)
         with gui.add_folder("Pixel-wise model") as self._pixels_folder:
             self._fits = Text(gui)
-            hint = "x: along the projector's columns; y: along its rows"
-            self._axis = Choice(context, "Axis", self._refresh, hint=hint)
+            self._axis = Choice(
+                context,
+                "Axis",
+                self._refresh,
+                hint="x: along the projector's columns; y: along its rows",
+            )
             self._maps = Plot(gui)
             self._column: Any = gui.add_number("Pixel u", 0, min=0, step=1, hint="Column")
             self._row: Any = gui.add_number("Pixel v", 0, min=0, step=1, hint="Row")
-            hint = "Click a point of it to choose its pixel"
-            self._over = Choice(context, "Cloud", self._request_cloud, hint=hint)
-            context.view_button(self._get_points)
+            self._over = Choice(
+                context,
+                "Cloud",
+                self._request_cloud,
+                hint="Click a point of it to choose its pixel",
+            )
+            context.view_button(self.get_points)
             self._curve_note = Text(gui)
             self._curves = Plot(gui)
         context.on_change(self._refresh, self._device, self._column, self._row)
@@ -139,7 +148,7 @@ class CalibratePanel(StepPanel):
         self._pose.offer_names(names, max(rms, key=rms.__getitem__, default=""))
         clouds = scan_options(scan for scan in session.scans if scan.cloud != "absent")
         self._over.offer([("", "none"), *clouds])
-        if calibration.pixelwise is not None:
+        if calibration.pixelwise:
             self._axis.offer_names(calibration.pixelwise.axes)
             self._fits.set(report_table(calibration.pixelwise.table()))
         if not self._pixel_chosen:
@@ -151,9 +160,9 @@ class CalibratePanel(StepPanel):
     def _draw_verdict(self, verdict: Verdict | None) -> None:
         """Show the verdict, and the poses that it names."""
         session, calibration = self._session, self._session.calibration
-        if verdict is not None:
+        if verdict:
             self._verdict.set(verdict_html(verdict, session.verdict_of_calibration, calibration))
-        elif calibration is not None and calibration.stereo.board:
+        elif calibration and calibration.stereo.board:
             self._verdict.write("No verdict on this calibration: calibrate again for one.")
         else:
             self._verdict.set("")
@@ -179,7 +188,7 @@ class CalibratePanel(StepPanel):
         self._compare.disabled = busy or bool(calibration.stale)
         self._compare.label = "Compare models" if compared is None else "Compare again"
         splined = Html("")
-        if calibration.splined is not None:
+        if calibration.splined:
             splined = report_table(calibration.splined.table())
         elif calibration.missing:
             splined = note(f"No splined model: {calibration.missing}.")
@@ -198,7 +207,7 @@ class CalibratePanel(StepPanel):
             session, calibration = self._session, self._session.calibration
             if calibration is None:
                 return
-            context, stereo, request = self._context, calibration.stereo, self._painter.request
+            context, stereo, request = self._context, calibration.stereo, self.painter.request
             made = fingerprint(calibration)
             if stereo.poses:
                 request(
@@ -250,11 +259,11 @@ class CalibratePanel(StepPanel):
             self._pose_note.write(
                 f"{name} is not in this calibration ({pose.state}{why}).", "warning"
             )
-            self._painter.cancel("arrows")
+            self.painter.cancel("arrows")
             self._arrows.set(None)
             return
         text = f"{name}: camera {rms[0]:.3f} px, projector {rms[1]:.3f} px."
-        if calibration.splined is not None and name in calibration.splined.weights:
+        if calibration.splined and name in calibration.splined.weights:
             camera, projector = calibration.splined.weights[name]
             weights = f"features {100 * camera:.0f} %, phase {100 * projector:.0f} %"
             text += f" Weight in the joint adjustment: {weights}; {USUAL_WEIGHT}."
@@ -277,7 +286,7 @@ class CalibratePanel(StepPanel):
                 size = rig.projector.size
             return residual_arrows(f"{name}, {device}", pixels, errors, size)
 
-        self._painter.request("arrows", (made, name, device), arrows, self._arrows.set)
+        self.painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
     def _draw_boards(self, session: SessionView, calibration: CalibrationView) -> None:
         """Draw the poses in 3D, coloured from green to red by reprojection error, the chosen one
@@ -289,10 +298,10 @@ class CalibratePanel(StepPanel):
             covered,
             tuple((p.name, p.state) for p in session.poses),
         )
-        if key == self._boards:
+        if key == self._drawn_boards:
             return
-        self._boards = key
-        self._scene.clear(BOARDS)
+        self._drawn_boards = key
+        self._boards.clear()
         if covered or not stereo.board:
             return
         outline = Board.parse(stereo.board).outline()
@@ -303,12 +312,12 @@ class CalibratePanel(StepPanel):
                 share = float(np.clip(worst_px[pose.name] / usual - 0.5, 0, 1))
                 here = pose.name == chosen
                 colour = (round(60 + 170 * share), round(170 - 110 * share), 70)
-                self._scene.board(
-                    BOARDS,
+                self._boards.board(
                     pose.name,
                     pose.T_camera_board,
                     outline,
-                    Stroke(colour, 5.0 if here else 1.5),
+                    colour,
+                    5.0 if here else 1.5,
                     label=pose.name if here else "",
                 )
 
@@ -342,13 +351,13 @@ class CalibratePanel(StepPanel):
         """Request the chosen cloud; without one, show the calibrated boards."""
         name = self._over.value
         if not name:
-            self._painter.cancel("cloud")
+            self.painter.cancel("cloud")
             self._cloud = self._shown = None
-            self._scene.clear(LAYER)
+            self.layer.clear()
             self._context.viewpoints.overview()
         self._refresh()
         if name:
-            self._painter.request(
+            self.painter.request(
                 "cloud",
                 name,
                 lambda: result_views.load_scan_cloud(self._context.session, name),
@@ -357,9 +366,9 @@ class CalibratePanel(StepPanel):
 
     def _draw_cloud(self, cloud: result_views.ScanCloud) -> None:
         """Draw a cloud, coloured by depth, to choose pixels on."""
-        self._cloud, self._shown = cloud, (cloud.name, cloud.points)
-        self._scene.cloud(LAYER, "cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
-        self._show_view()
+        self._cloud = cloud
+        self.layer.cloud("cloud", cloud.points, paint(cloud.points[..., 2], "mm", 1, "")[0])
+        self.show_points(cloud.name, cloud.points)
 
     def _pick_pixel(self, click: Click) -> None:
         """Choose the pixel whose point is closest to the clicked ray."""
@@ -369,7 +378,7 @@ class CalibratePanel(StepPanel):
             return
         u, v = pixel
         self._column.value, self._row.value = pixel
-        self._scene.mark(LAYER, "picked", cloud.points[v, u], f"pixel ({u}, {v})")
+        self.layer.mark("picked", cloud.points[v, u], f"pixel ({u}, {v})")
 
 
 def fingerprint(calibration: CalibrationView) -> tuple[Any, ...]:
@@ -423,19 +432,16 @@ def verdict_html(
     ]
     lines += [_format_finding(finding) for finding in verdict.findings]
     if not of_calibration:
-        consequence = (
-            "This attempt gave no calibration."
-            if calibration is None
-            else "This attempt gave no calibration: the previous one is shown below."
-        )
-        lines.append(f'<div style="margin-top:0.5em">{to_html(consequence)}</div>')
+        end = "." if calibration is None else ": the previous one is shown below."
+        text = to_html(f"This attempt gave no calibration{end}")
+        lines.append(f'<div style="margin-top:0.5em">{text}</div>')
     return alert(Html("".join(lines)), tone)
 
 
 def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) -> tuple[str, ...]:
     """List the poses that the verdict or the joint adjustment names, each once."""
     names = [name for finding in verdict.findings for name in finding.poses] if verdict else []
-    if calibration is not None and calibration.splined is not None:
+    if calibration and calibration.splined:
         names += calibration.splined.excluded
     return tuple(dict.fromkeys(names))
 
@@ -443,12 +449,10 @@ def named_poses(verdict: Verdict | None, calibration: CalibrationView | None) ->
 def exclusions_html(calibration: CalibrationView) -> Html:
     """List excluded poses and features, each with its reason; empty where there are none."""
     n = calibration.stereo.features_excluded
-    outliers = note(
-        f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma): shadow or"
-        " occlusion."
-    )
+    text = f"{n} outlying feature{'s' * (n != 1)} excluded (beyond 6 robust sigma)"
+    outliers = note(f"{text}: shadow or occlusion.")
     lines = [f"{name}: {why}" for name, why in calibration.stereo.excluded.items()]
-    if calibration.splined is not None:
+    if calibration.splined:
         lines += [
             f"{name}, in the splined model only: it {why}"
             for name, why in calibration.splined.excluded.items()
@@ -464,16 +468,13 @@ def exclusions_html(calibration: CalibrationView) -> Html:
 
 
 def model_choice_html(calibration: CalibrationView, compared: ModelComparison | None) -> Html:
-    """Describe which model is used, and why, by their comparison if there is one; empty where there
-    is one model."""
+    """Describe which model is used, and why, by their comparison if there is one."""
     if calibration.chosen and calibration.chosen != calibration.recommended:
         return alert(
             f"{calibration.chosen} is used (your choice); {calibration.recommended} is"
             " recommended.",
             "warning",
         )
-    if len(calibration.models) < 2:
-        return Html("")
     if compared is None:
         why = "default; compare the models to confirm it."
     elif calibration.recommended in compared.models:
@@ -502,10 +503,9 @@ def _capitalise(text: str, names: Sequence[str] = ()) -> str:
 
 def _draw_icon(tone: Tone) -> str:
     """Return the SVG icon of a tone: a disc with a check mark, an exclamation mark or a cross."""
-    colour = {"good": "green-7", "warning": "orange-7", "error": "red-7"}[tone]
     return (
         '<svg viewBox="0 0 20 20" width="22" height="22" style="flex:none" fill="none"'
         ' stroke="#fff" stroke-width="2.2" stroke-linecap="round" stroke-linejoin="round"><circle'
         ' cx="10" cy="10" r="10" stroke="none"'
-        f' fill="var(--mantine-color-{colour})"/>{_MARKS[tone]}</svg>'
+        f' fill="{TONES[tone]}"/>{_MARKS[tone]}</svg>'
     )

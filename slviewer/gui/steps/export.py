@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from slviewer.errors import SlviewerError
-from slviewer.gui.panel import Choice, PanelContext, Part, StepPanel, scan_labels, scan_options
+from slviewer.gui.panel import Choice, PanelPart, StepPanel, scan_labels, scan_options
 from slviewer.gui.widgets import Html, Text, link, note, paragraph, records_html, table, to_html
 from slviewer.pipeline.export import (
     What,
@@ -24,18 +24,12 @@ from slviewer.surface.meshing import MeshingPlan, Method
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import ExportView, SessionView, Snapshot
 
-LAYER = "export"
 LIST_PX = 250
 """Height of the list of files, so that the inputs below stay in view."""
 MERGED = "merged"
 POINTS, MESH = "points", "mesh"
 MESHES = ("mesh", "merged-mesh")
-FORMAT_NAMES = {
-    "xyz": "XYZ text",
-    "yml": "OpenCV YAML",
-    "xml": "OpenCV XML",
-    "npz": "NumPy",
-}
+FORMAT_NAMES = {"xyz": "XYZ text", "yml": "OpenCV YAML", "xml": "OpenCV XML", "npz": "NumPy"}
 NUMBERS: dict[What, str] = {
     "calibration": "Lenses and poses of camera and projector, and the reprojection errors",
     "poses": "Poses of camera, projector, target and merged scans, as 4x4 matrices",
@@ -57,14 +51,18 @@ SMOOTHING = {"none": 0, "light": 5, "strong": 20}
 """Number of iterations."""
 
 
-class MeshInputs(Part):
+class MeshInputs(PanelPart):
     """Inputs of a `MeshingPlan`, visible if there is something to mesh."""
 
-    def __init__(self, context: PanelContext, changed: Callable[[], None]) -> None:
-        super().__init__(context)
-        gui = self._gui
-        hint = "Pixel grid keeps every point; the others smooth out noise"
-        self._method = Choice(context, "Method", changed, hint=hint)
+    def __init__(self, panel: StepPanel, changed: Callable[[], None]) -> None:
+        super().__init__(panel)
+        gui, context = self._gui, self._context
+        self._method = Choice(
+            context,
+            "Method",
+            changed,
+            hint="Pixel grid keeps every point; the others smooth out noise",
+        )
         self._holes = gui.add_dropdown("Holes", (SMALL, OPEN, SIZED, CLOSED))
         self._size = gui.add_number("Hole size, mm", 2.0, min=0.1, max=500.0, step=0.1)
         self._thin = gui.add_number(
@@ -75,7 +73,7 @@ class MeshInputs(Part):
         )
         context.on_change(changed, self._holes, self._size, self._thin, self._smooth)
 
-    def draw(self, visible: bool, merged: bool) -> None:
+    def show(self, visible: bool, merged: bool) -> None:
         """Show or hide the inputs; merged points have no pixel grid."""
         self._method.offer(
             (name, text) for name, text in METHODS.items() if not (merged and name == "grid")
@@ -106,7 +104,6 @@ class ExportPanel(StepPanel):
     """Panel of the step Export."""
 
     key = "export"
-    layers = (LAYER,)
     _drawn: SessionView | None = None
 
     def build(self) -> None:
@@ -121,7 +118,7 @@ class ExportPanel(StepPanel):
                 hint="GLB with an image of the surface, 2048 px: for viewers and presentations",
             )  # fmt: skip
             self._as: Any = gui.add_dropdown("Type", (POINTS, MESH))
-            self._mesh = MeshInputs(context, self._describe)
+            self._mesh = MeshInputs(self, self._describe)
             self._shape_format = Choice(context, "File type", self._describe)
             self._texture: Any = gui.add_dropdown(
                 "Texture",
@@ -135,13 +132,16 @@ class ExportPanel(StepPanel):
             )
             self._shape_note = Text(gui)
             self._write = context.button("Write file", self._request_shape, "file-export", None)
-            context.view_button(self._get_points)
+            context.view_button(self.get_points)
         with gui.add_folder("Calibration and poses"):
-            self._numbers = Choice(context, "Content", self._describe)
+            self._numbers = numbers = Choice(context, "Content", self._describe)
             self._number_format = Choice(context, "Format", self._describe)
             self._number_note = Text(gui)
             self._write_numbers = context.button(
-                "Write calibration", self._request_numbers, "file-export", None
+                "Write calibration",
+                lambda: operator.export(numbers.value, "", self._number_format.value),  # type: ignore[arg-type]
+                "file-export",
+                None,
             )
         with gui.add_folder("Figures", expand_by_default=False) as self._figures_folder:
             self._figures = Text(gui)
@@ -182,11 +182,6 @@ class ExportPanel(StepPanel):
             self._figures.set("".join(tables))
         self._describe()
 
-    def show(self, visible: bool) -> None:
-        """Show or hide the layers, and move the views to the cloud."""
-        super().show(visible)
-        self._show_view()
-
     def _get_shape(self) -> tuple[What, str]:
         """Return what is to be exported, and its name; empty where nothing is offered."""
         name, mesh, merge = self._source.value, self._as.value == MESH, self._session.merge
@@ -196,15 +191,15 @@ class ExportPanel(StepPanel):
 
     def _describe(self) -> None:
         """Describe the chosen files, link those that exist, and request the cloud."""
-        self._request_cloud(self._session)
-        self._describe_shape(self._session)
-        self._describe_numbers(self._session)
+        self._request_cloud()
+        self._describe_shape()
+        self._describe_numbers()
 
-    def _describe_shape(self, session: SessionView) -> None:
+    def _describe_shape(self) -> None:
         """Describe the file of the chosen cloud or mesh, and link it where it exists."""
-        what, name = self._get_shape()
+        session, (what, name) = self._session, self._get_shape()
         mesh = what in MESHES
-        self._mesh.draw(mesh and bool(name), what == "merged-mesh")
+        self._mesh.show(mesh and bool(name), what == "merged-mesh")
         self._shape_format.offer(_name_formats(what))
         chosen = self._shape_format.value
         self._texture.visible = bool(name) and mesh and chosen in TEXTURED_FORMATS
@@ -225,44 +220,44 @@ class ExportPanel(StepPanel):
         self._write.label = "Write again" if file else "Write file"
         self._write.color = "gray" if file else None  # it is rather downloaded
 
-    def _describe_numbers(self, session: SessionView) -> None:
+    def _describe_numbers(self) -> None:
         """Describe the file of the chosen numbers, and link it where it exists."""
-        numbers: What = self._numbers.value or "calibration"  # type: ignore[assignment]
+        numbers: What = self._numbers.value  # type: ignore[assignment]
         self._number_format.offer(_name_formats(numbers))
         chosen = self._number_format.value
-        file = _get_export(session, default_file_name(numbers, "", chosen))
+        file = _get_export(self._session, default_file_name(numbers, "", chosen))
         text = f"{NUMBERS[numbers]}. {describe_format(chosen)}."
         self._number_note.set(note(text) + self._link_html(file))
         self._write_numbers.label = f"Write {numbers} again" if file else f"Write {numbers}"
         self._write_numbers.color = "gray" if file else None
 
-    def _request_cloud(self, session: SessionView) -> None:
+    def _request_cloud(self) -> None:
         """Request the cloud of the chosen source."""
-        name, context = self._source.value, self._context
+        name, session = self._source.value, self._session
         merge = session.merge.name if session.merge else ""
         if not name:
-            self._painter.cancel("cloud")
-            self._scene.clear(LAYER)
+            self.painter.cancel("cloud")
+            self.layer.clear()
             return
 
         def load() -> tuple[np.ndarray, np.ndarray | None]:
             """Load points (..., 3) mm and colours of the source; None: it has no colours."""
+            store = self._context.session
             if name == MERGED:
-                whole = result_views.merged_cloud(context.session, merge)
+                whole = result_views.merged_cloud(store, merge)
                 return whole.points, whole.colours
-            cloud = result_views.load_scan_cloud(context.session, name)
+            cloud = result_views.load_scan_cloud(store, name)
             return cloud.points, cloud.texture
 
         version = (*_points(session, name), session.restriction(name))
         key = (name, merge if name == MERGED else version)
-        self._painter.request("cloud", key, load, self._draw_cloud)
+        self.painter.request("cloud", key, load, self._draw_cloud)
 
     def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
         """Draw a loaded cloud, grey where it has no colours."""
         points, colours = made
-        self._shown = self._source.value, points
-        self._scene.cloud(LAYER, "cloud", points, (150, 150, 150) if colours is None else colours)
-        self._show_view()
+        self.layer.cloud("cloud", points, (150, 150, 150) if colours is None else colours)
+        self.show_points(self._source.value, points)
 
     # requests
 
@@ -283,10 +278,6 @@ class ExportPanel(StepPanel):
         self._describe()  # offers the formats of a mesh
         self._shape_format.choose("glb")
         self._request_shape()
-
-    def _request_numbers(self) -> None:
-        """Request the file of the chosen numbers: calibration, poses or coefficients."""
-        self._operator.export(cast(What, self._numbers.value), "", self._number_format.value)
 
     # files
 
@@ -356,9 +347,9 @@ def describe_shape_file(
 
 def _points(session: SessionView, name: str) -> tuple[int, str]:
     """Return the number of points of a scan or the merge, and a scan's model."""
-    scan = next((each for each in session.scans if each.name == name), None)
-    if scan is not None:
-        return scan.figures.points, scan.figures.model
+    for scan in session.scans:
+        if scan.name == name:
+            return scan.figures.points, scan.figures.model
     return session.merge.record.points if session.merge else 0, ""
 
 

@@ -8,8 +8,8 @@ from slviewer.gui.inspection_inputs import InspectionInputs
 from slviewer.gui.measure_list import MeasurementList
 from slviewer.gui.measure_surface import SurfaceView
 from slviewer.gui.panel import NO_SESSION, Choice, StepPanel
-from slviewer.gui.scene import GHOST, Click, Stroke
-from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, to_html
+from slviewer.gui.scene import Click
+from slviewer.gui.widgets import Html, Text, to_html
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.measure import What
@@ -22,10 +22,9 @@ from slviewer.surface.selection import ViewCamera
 from slviewer.wizard.snapshot import SessionView, Snapshot
 from slviewer.wizard.surfaces import box_in_view, point_at
 
-LAYER = "measure"
 UNKNOWN = "unknown"
 BALL, RECTANGLE, BOX = "ball", "rectangle", "box"
-BOX_STROKE = Stroke((20, 150, 140))
+BOX_COLOUR = (20, 150, 140)
 _PICKED = ("picked 1", "picked 2")
 PICK = ("Point", "Distance", "Section")
 FIT = ("Plane", "Sphere", "Cylinder")
@@ -118,62 +117,61 @@ class MeasurePanel(StepPanel):
 
     def build(self) -> None:
         """Create the inputs of surface, tools and results."""
-        gui, context = self._gui, self._context
+        gui, context, operator = self._gui, self._context, self._operator
         self._tool = Tool()
         self._related: list[tuple[str, str]] = []
         with gui.add_folder("Surface") as self._surface_folder:
-            self._surface = SurfaceView(context, self._painter, LAYER, self._handle_loaded)
+            self._surface = SurfaceView(self, self._handle_loaded)
         with gui.add_folder("Tools") as self._tools_folder:
             for title, tools in (("Pick", PICK), ("Fit", FIT), ("Compare", COMPARE)):
                 group = gui.add_button_group(title, tools)
                 group.on_click(context.callback(lambda group=group: self._select_tool(group.value)))  # type: ignore[misc]
             self._instruction = Text(gui)
-            self._build_fit()
+            self._by: Any = gui.add_dropdown("Region", (BALL, RECTANGLE))
+            context.on_change(self._change_region, self._by)
+            self._radius: Any = gui.add_slider(
+                "Radius, mm", 0.5, 100.0, 0.5, 15.0, hint="Of the ball in 3D"
+            )
+            context.on_change(self._draw_region, self._radius)
+            self._inside = Text(gui)
+            self._fit = context.button("Fit", self._request_fit, "check", None)
             self._from, self._to = Choice(context, "From"), Choice(context, "To")
             self._relate = context.button(
                 "Measure relation",
-                lambda: self._operator.measure_between(self._from.value, self._to.value),
+                lambda: operator.measure_between(self._from.value, self._to.value),
                 "ruler-2",
                 None,
             )
             # viser cannot hide upload buttons alone
             with gui.add_folder(None) as self._nominal_folder:
-                self._build_deviation()
+                context.upload_button(
+                    "Upload model", operator.upload_nominal, ".stl,.ply,.obj,.step,.stp,.3mf"
+                )
+                self._nominal = Choice(context, "Nominal")
+                self._units: Any = gui.add_dropdown(
+                    "Units",
+                    (UNKNOWN, *MM),
+                    hint="Of the nominal model; unknown: mm, if the sizes agree",
+                )
+                self._tolerance = gui.add_number(
+                    "Tolerance ±, mm",
+                    0.0,
+                    min=0.0,
+                    max=1000.0,
+                    step=0.01,
+                    hint="0: without a verdict",
+                )
+                self._compare = context.button(
+                    "Compare", self._request_comparison, "arrows-diff", None
+                )
             self._end = context.button(
                 "End tool", lambda: self._select_tool(""), "x", hint="Key: Esc"
             )
         self._escape = gui.add_command("End the measuring tool", hotkey="escape", disabled=True)
         self._escape.on_trigger(context.callback(lambda: self._select_tool("")))
-        self._results = MeasurementList(context, self._painter, LAYER, self._show_measurement)
-        self._inspection = InspectionInputs(context)
+        self._results = MeasurementList(self, self._show_measurement)
+        self._inspection = InspectionInputs(self)
         self._draw_tool()
-
-    def _build_fit(self) -> None:
-        """Create the inputs to fit a shape: radius of the region, and a button."""
-        gui, context = self._gui, self._context
-        self._by: Any = gui.add_dropdown("Region", (BALL, RECTANGLE))
-        context.on_change(self._change_region, self._by)
-        self._radius: Any = gui.add_slider(
-            "Radius, mm", 0.5, 100.0, 0.5, 15.0, hint="Of the ball in 3D"
-        )
-        context.on_change(self._draw_region, self._radius)
-        self._inside = Text(gui)
-        self._fit = context.button("Fit", self._request_fit, "check", None)
-
-    def _build_deviation(self) -> None:
-        """Create the inputs to upload a nominal model and compare with it."""
-        gui, context = self._gui, self._context
-        context.upload_button(
-            "Upload model", self._operator.upload_nominal, ".stl,.ply,.obj,.step,.stp,.3mf"
-        )
-        self._nominal = Choice(context, "Nominal")
-        hint = "Of the nominal model; unknown: mm, if the sizes agree"
-        self._units: Any = gui.add_dropdown("Units", (UNKNOWN, *MM), hint=hint)
-        hint = "0: without a verdict"
-        self._tolerance = gui.add_number(
-            "Tolerance ±, mm", 0.0, min=0.0, max=1000.0, step=0.01, hint=hint
-        )
-        self._compare = context.button("Compare", self._request_comparison, "arrows-diff", None)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the surfaces and measurements of a snapshot."""
@@ -182,8 +180,8 @@ class MeasurePanel(StepPanel):
         self._surface.offer(session if usable else NO_SESSION)
         self._surface_folder.visible = self._tools_folder.visible = bool(self._surface.name)
         self._offer_inputs(session)
-        new = self._results.draw(session, self._surface.name)
-        self._inspection.draw(snapshot, self._surface.name)
+        new = self._results.update(session, self._surface.name)
+        self._inspection.offer(snapshot, self._surface.name)
         if self._tool.fits and any(each.record.what == self._tool.name.lower() for each in new):
             self._select_tool(self._tool.name)
         self._compare.disabled = snapshot.is_busy or not self._nominal.value
@@ -193,13 +191,9 @@ class MeasurePanel(StepPanel):
         """Show or hide the panel's layer; the tool is reset, and clicks are ignored until one is
         selected."""
         with self._lock:
-            self._tool.select("")
-            self._draw_tool()
-            self._visible = visible
-            self._surface.show(visible)
-            self._scene.on_click(None)
-            self._scene.on_rectangle(None)
-            self._escape.disabled = True
+            self._visible = True  # until the clicks are left to another step
+            self._select_tool("")
+            super().show(visible)
 
     # tools
 
@@ -207,18 +201,13 @@ class MeasurePanel(StepPanel):
         """Select a tool by name; empty: none."""
         with self._lock:
             self._tool.select(name)
-            self._listen_for_clicks()  # before the instruction appears, so that no click is lost
+            if self._visible:  # before the instruction appears, so that no click is lost
+                self._escape.disabled = not name
+                rectangle = self._tool.fits and self._tool.by_rectangle
+                self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
+                clicks = self._tool.clicks and not rectangle
+                self._scene.on_click(self._handle_click if clicks else None)
             self._draw_tool()
-
-    def _listen_for_clicks(self) -> None:
-        """React to clicks into the scene while the tool needs them; another step handles its own
-        clicks."""
-        if self._visible:
-            self._escape.disabled = not self._tool.name
-            rectangle = self._tool.fits and self._tool.by_rectangle
-            self._scene.on_rectangle(self._handle_rectangle if rectangle else None)
-            clicks = self._tool.clicks and not rectangle
-            self._scene.on_click(self._handle_click if clicks else None)
 
     def _change_region(self) -> None:
         """Take clicks or rectangles, as the operator chose."""
@@ -257,9 +246,7 @@ class MeasurePanel(StepPanel):
         tool = self._tool
         title = f"<b>{to_html(tool.name)}</b>: " if tool.name else ""
         text = Html(title + to_html(tool.instruction))
-        self._instruction.set(
-            alert(text, "info") if tool.name else paragraph(coloured(text, "dim"))
-        )
+        self._instruction.write(text, "info" if tool.name else "dim")
         self._end.visible = bool(tool.name)
         self._by.visible = tool.fits
         self._radius.visible = tool.fits and not tool.by_rectangle
@@ -271,10 +258,10 @@ class MeasurePanel(StepPanel):
         self._nominal_folder.visible = deviation
         on = self._surface.on
         marked = [] if on is None or tool.fits else tool.picked
-        self._scene.remove(LAYER, *_PICKED[len(marked) :])
+        self.layer.remove(*_PICKED[len(marked) :])
         for name, place in zip(_PICKED, marked, strict=False):
             if on is not None:
-                self._scene.mark(LAYER, name, point_at(on, place), name[-1])
+                self.layer.mark(name, point_at(on, place), name[-1])
         self._draw_region()
 
     def _draw_region(self) -> None:
@@ -282,18 +269,18 @@ class MeasurePanel(StepPanel):
         with self._lock:
             on, region = self._surface.on, self._make_region()
             if on is None or region is None:
-                self._scene.remove(LAYER, BALL, BOX)
-                self._painter.cancel("inside")
+                self.layer.remove(BALL, BOX)
+                self.painter.cancel("inside")
                 self._inside.set("")
                 return
             if region.kind == "ball":
-                self._scene.remove(LAYER, BOX)
-                self._scene.ball(LAYER, BALL, region.centre, float(region.size[0]), GHOST)
+                self.layer.remove(BOX)
+                self.layer.ball(BALL, region.centre, float(region.size[0]))
             else:
-                self._scene.remove(LAYER, BALL)
-                self._scene.lines(LAYER, BOX, region.edges(), BOX_STROKE)
+                self.layer.remove(BALL)
+                self.layer.lines(BOX, region.edges(), BOX_COLOUR)
             key = (self._surface.name, region.text())
-            self._painter.request(
+            self.painter.request(
                 "inside",
                 key,
                 lambda: len(on.within(region)),

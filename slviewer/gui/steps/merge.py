@@ -24,11 +24,8 @@ from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
 from slviewer.pipeline.merge import StartKind
-from slviewer.pipeline.stored_records import Stored
-from slviewer.records.merge import Merge
 from slviewer.wizard.snapshot import ScanView, SessionView, Snapshot
 
-LAYER, EDITS = "merge", "merge edits"
 FEATURES, MARKERS, PLACED, TURNTABLE = "features", "markers", "places while scanning", "turntable"
 CURRENT, PICKED = "current position", "picked points"
 STARTS: dict[str, StartKind] = {
@@ -57,7 +54,6 @@ class MergePanel(StepPanel):
 
     _merged: int | None = None
     _clouds: ColouredClouds | None = None
-    _layer_shown: bool | None = None
     _is_start_chosen = False
 
     def build(self) -> None:
@@ -67,8 +63,9 @@ class MergePanel(StepPanel):
         with gui.add_folder("Scans") as self._scans_folder:
             self._none = Text(gui)
         with gui.add_folder("Alignment") as self._alignment_folder:
-            hint = "The other scans are moved to it"
-            self._reference = Choice(context, "Reference", self._refresh, hint=hint)
+            self._reference = Choice(
+                context, "Reference", self._refresh, hint="The other scans are moved to it"
+            )
             self._start: Any = gui.add_dropdown(
                 "Start from", tuple(STARTS), hint="Initial alignment, which is then refined"
             )
@@ -80,15 +77,15 @@ class MergePanel(StepPanel):
             )  # fmt: skip
             context.on_change(self._refresh, self._angle)
             self._start_note = Text(gui)
-            self._picker = PointPicker(context, self._painter, self._refresh)
+            self._picker = PointPicker(self, self._refresh)
             self._merge = context.button("Merge", self._request_merge, "layers-intersect", None)
             self._failure = Text(gui)
         self._result = Text(gui)
         self._undo = context.button("Undo merge", operator.undo_merge, "arrow-back-up", "orange")
         self._view = Choice(context, "3D view", self._refresh)
         self._legend = Text(gui)
-        context.view_button(self._get_points)
-        self._editing = PointEditing(context, EDITS, self._redraw)
+        context.view_button(self.get_points)
+        self._editing = PointEditing(self, self._redraw)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the scans and the merge of a snapshot."""
@@ -104,8 +101,8 @@ class MergePanel(StepPanel):
         self._failure.set(
             merge_failure_html(failure, labels, merge, snapshot.merge_refusal) if failure else ""
         )
-        self._offer_views(merge)
-        self._propose_start(scans)
+        self._offer_views()
+        self._propose_start()
         number = int(merge.name) if merge is not None else 0
         if self._merged is not None and number > self._merged:
             self._view.choose(AFTER)  # show what was just merged
@@ -115,7 +112,7 @@ class MergePanel(StepPanel):
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layers."""
         with self._lock:
-            self._visible = visible
+            super().show(visible)
             self._show_layers()
 
     # drawing
@@ -123,16 +120,14 @@ class MergePanel(StepPanel):
     def _draw_boxes(self, scans: list[ScanView]) -> None:
         """Update the check boxes, one per scan."""
         labels = [scan.label for scan in scans]
-        self._none.write(
-            "" if scans else "No reconstructed scan yet: capture two or more in the step Scan.",
-            "warning",
-        )
+        text = "No reconstructed scan yet: capture two or more in the step Scan."
+        self._none.write("" if scans else text, "warning")
         for name in self._boxes.keys() - {scan.name for scan in scans}:
             self._boxes.pop(name).remove()
         for scan in scans:
-            label = (
-                scan.label if labels.count(scan.label) == 1 else display_name(scan.name, scan.label)
-            )
+            label = scan.label
+            if labels.count(label) > 1:
+                label = display_name(scan.name, label)
             if scan.name not in self._boxes:
                 with self._scans_folder:
                     box = self._gui.add_checkbox(label, True)
@@ -140,10 +135,10 @@ class MergePanel(StepPanel):
                 self._boxes[scan.name] = box
             self._boxes[scan.name].label = label
 
-    def _offer_views(self, merge: Stored[Merge] | None) -> None:
+    def _offer_views(self) -> None:
         """Offer the 3D views: before and after the merge, merged, or side by side to pick
         points."""
-        views = [BEFORE] if merge is None else [AFTER, BEFORE, *MERGED]
+        views = [AFTER, BEFORE, *MERGED] if self._session.merge else [BEFORE]
         if self._start.value == PICKED:
             views.append(SIDE_BY_SIDE)
         self._view.offer_names(views)
@@ -153,50 +148,42 @@ class MergePanel(StepPanel):
         """Keep the operator's choice of the initial alignment."""
         self._is_start_chosen = True
 
-    def _propose_start(self, scans: list[ScanView]) -> None:
+    def _propose_start(self) -> None:
         """Choose the initial alignment that the chosen scans bring along, unless the operator chose
         one."""
-        if self._is_start_chosen:
+        chosen = self._list_chosen()
+        if self._is_start_chosen or not chosen:
             return
-        names = self._list_chosen()
-        chosen = [scan for scan in scans if scan.name in names]
-        if not chosen:
-            return
-        turned = self._get_stored_angles(names) is not None
+        turned = self._get_stored_angles(chosen) is not None
         placed = all(scan.is_placed for scan in chosen)
         self._start.value = TURNTABLE if turned else PLACED if placed else FEATURES
 
     def _change_start(self) -> None:
         """Update the views for another initial alignment; picked points are shown side by side."""
         with self._lock:
-            self._offer_views(self._session.merge)
+            self._offer_views()
             if self._start.value == PICKED:
                 self._view.choose(SIDE_BY_SIDE)
             self._refresh()
 
-    def _list_chosen(self) -> list[str]:
+    def _list_chosen(self) -> list[ScanView]:
         """List the scans to merge, with the reference, in the order of their capture."""
         boxes, reference = self._boxes, self._reference.value
         return [
-            scan.name
+            scan
             for scan in _list_mergeable(self._session)
             if scan.name == reference or (scan.name in boxes and boxes[scan.name].value)
         ]
 
-    def _get_stored_angles(self, names: list[str]) -> list[float] | None:
+    @staticmethod
+    def _get_stored_angles(scans: list[ScanView]) -> list[float] | None:
         """Return the angles, deg, that are stored with scans of one turn; None where they are of
         several or of none."""
-        steps = [scan.turn_step for scan in self._session.scans if scan.name in names]
+        steps = [scan.turn_step for scan in scans]
         turns = {step.turn if step else "" for step in steps}
         if len(turns) != 1 or "" in turns:
             return None
         return [step.deg for step in steps if step]
-
-    def _get_points(self) -> np.ndarray | None:
-        """Return the shown points (n, 3) mm; None where none are."""
-        if self._is_picking:
-            return self._picker.points
-        return None if self._clouds is None else self._clouds.points
 
     @property
     def _is_picking(self) -> bool:
@@ -207,14 +194,15 @@ class MergePanel(StepPanel):
         """Update inputs and notes for the current choice, and request the clouds."""
         with self._lock:
             snapshot, session = self._snapshot, self._session
-            names, start = self._list_chosen(), self._start.value
+            scans, start = self._list_chosen(), self._start.value
+            names = [scan.name for scan in scans]
             self._versions = {
                 scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
                 for scan in session.scans
                 if scan.cloud != "absent"
             }
             labels = scan_labels(session)
-            self._draw_start(names, labels)
+            self._draw_start(scans, labels)
             chosen = {name: self._versions[name] for name in names}
             self._picker.offer(chosen, self._reference.value, labels, start == PICKED)
             ready = len(names) > 1 and (start != PICKED or self._picker.is_ready)
@@ -228,18 +216,18 @@ class MergePanel(StepPanel):
                 if scan.name in self._versions and scan.name in listed
             ]
             editable = self._view.value not in MERGED and not self._is_picking
-            self._editing.draw(shown if editable else [])
+            self._editing.offer(shown if editable else [])
             self._show_layers()
             if not self._is_picking:
                 self._request_clouds([name for name in listed if name in self._versions], labels)
 
-    def _draw_start(self, names: list[str], labels: dict[str, str]) -> None:
+    def _draw_start(self, scans: list[ScanView], labels: dict[str, str]) -> None:
         """Show the angles or the note of the chosen initial alignment."""
-        start, stored = self._start.value, self._get_stored_angles(names)
+        start, stored = self._start.value, self._get_stored_angles(scans)
         self._angle.visible = start == TURNTABLE and stored is None
         if start == TURNTABLE:
-            given = [k * float(self._angle.value) for k in range(len(names))]
-            self._start_note.set(turntable_html(names, given if stored is None else stored, labels))
+            angles = stored or [k * float(self._angle.value) for k in range(len(scans))]
+            self._start_note.set(turntable_html([scan.name for scan in scans], angles, labels))
         else:
             self._start_note.write(_START_NOTES.get(start, ""), "dim")
 
@@ -265,7 +253,7 @@ class MergePanel(StepPanel):
                 return colour_merge(context.session, merge.name, view, titles)
             return colour_scans(context.session, shown, poses, labels)
 
-        self._painter.request("clouds", key, make, self._draw_clouds)
+        self.painter.request("clouds", key, make, self._draw_clouds)
 
     def _redraw(self) -> None:
         """Draw the clouds again, as other points of them are hidden."""
@@ -274,11 +262,12 @@ class MergePanel(StepPanel):
 
     def _draw_clouds(self, clouds: ColouredClouds) -> None:
         """Draw the loaded clouds, and remove others."""
-        self._scene.remove(LAYER, *(set(self._scene.names(LAYER)) - set(clouds.clouds)))
+        before = self._clouds.clouds if self._clouds else {}
+        self.layer.remove(*(f"cloud {name}" for name in before.keys() - clouds.clouds.keys()))
         scans = [(scan, clouds.clouds[scan.name][0]) for scan in clouds.scans]
         shown = self._editing.set_scans(scans) or [points for points, _ in clouds.clouds.values()]
         for points, (name, (_, painted)) in zip(shown, clouds.clouds.items(), strict=True):
-            self._scene.cloud(LAYER, name, points, painted, SHOWN)
+            self.layer.cloud(f"cloud {name}", points, painted, SHOWN)
         with self._lock:
             self._clouds = clouds
             self._show_layers()
@@ -287,24 +276,21 @@ class MergePanel(StepPanel):
         """Show the clouds, or the two scans to pick on, with their legend."""
         picking = self._is_picking
         shown = self._visible and not picking
-        if self._layer_shown != shown:
-            self._layer_shown = shown
-            for layer in (LAYER, EDITS):
-                self._scene.show(layer, shown)
+        self.layer.show(shown)
         if picking:  # the one that stops taking clicks comes first
             self._editing.show(False)
         self._picker.show(self._visible and picking)
         self._editing.show(shown)
         self._legend.set("" if picking or self._clouds is None else self._clouds.legend)
         if shown and self._clouds is not None:
-            self._context.viewpoints.show(f"{LAYER} {self._clouds.view}", self._clouds.points)
+            self.show_points(self._clouds.view, self._clouds.points)
 
     def _request_merge(self) -> None:
         """Request the merge of the chosen scans by the chosen initial alignment."""
-        start, names = self._start.value, self._list_chosen()
-        needs_angle = start == TURNTABLE and self._get_stored_angles(names) is None
+        start, scans = self._start.value, self._list_chosen()
+        needs_angle = start == TURNTABLE and self._get_stored_angles(scans) is None
         self._operator.merge(
-            names,
+            [scan.name for scan in scans],
             self._reference.value,
             start=STARTS[start],
             angle=float(self._angle.value) if needs_angle else None,

@@ -12,13 +12,12 @@ from slviewer.calibration.next_pose import GOAL_POSES, Coverage
 from slviewer.gui.capture_inputs import ImportInputs
 from slviewer.gui.panel import NO_SESSION, Choice, RestoreButton, Setting, StepPanel
 from slviewer.gui.preview import LiveImage
-from slviewer.gui.scene import GHOST, Colour, Stroke
+from slviewer.gui.scene import GHOST, Colour
 from slviewer.gui.widgets import (
     Html,
     Sound,
     Text,
     Tone,
-    alert,
     coloured,
     note,
     paragraph,
@@ -28,7 +27,6 @@ from slviewer.gui.widgets import (
 from slviewer.target.board import Board
 from slviewer.wizard.snapshot import PoseView, PreviewView, SessionView, Snapshot
 
-LAYER, WORLD = "poses", "board"
 _DRAG_S = 0.15  # between two requests while a board is dragged
 _QUIET_S = 1.0  # after which the gizmo follows the board again
 _COLOURS = (
@@ -107,7 +105,6 @@ class PosesPanel(StepPanel):
     """Panel of the step Poses."""
 
     key = "poses"
-    layers = (LAYER, WORLD)
 
     _board: Board | None = None
     _drawn_session: SessionView | None = None
@@ -120,6 +117,8 @@ class PosesPanel(StepPanel):
     def build(self) -> None:
         """Create the live image, the buttons, the coverage and the list of poses."""
         gui, context, operator = self._gui, self._context, self._operator
+        self._world_layer = self._scene.layer("board")
+        self.layers.append(self._world_layer)
         self._T_board_centre = np.eye(4)  # mm; the board's handle is at its centre
         self._states: dict[str, str] = {}
         self._drawn_poses: dict[str, Any] = {}
@@ -164,7 +163,7 @@ class PosesPanel(StepPanel):
             actions = gui.add_button_group("Action", tuple(self._actions))
             actions.on_click(context.callback(lambda: self._request_action(actions.value)))
             self._restore = RestoreButton(context)
-        self._import = ImportInputs(context, "calibration")
+        ImportInputs(self, "calibration")
         self._sound = Sound(gui)
 
     def draw(self, snapshot: Snapshot) -> None:
@@ -181,7 +180,6 @@ class PosesPanel(StepPanel):
         self._place.disabled = session.suggestion is None or session.pending_plan is not None
         self._hands_free.update(snapshot.hands_free)
         self._draw_world(snapshot)
-        self._import.draw(snapshot)
         if session is self._drawn_session:
             return
         self._drawn_session = session
@@ -209,7 +207,7 @@ class PosesPanel(StepPanel):
         self._is_counting = count is not None
         text = "" if count is None else to_html(f"Hold still: {max(count, 0):.1f} s")
         bold = Html(f'<b style="font-size:1.3rem">{text}</b>' if text else "")
-        self._countdown.set(alert(bold, "info"))
+        self._countdown.write(bold, "info")
 
     def show(self, visible: bool) -> None:
         """Show or hide the layers; the hotkey works only while shown."""
@@ -237,32 +235,30 @@ class PosesPanel(StepPanel):
         suggestion = None if session.enough else session.suggestion
         self._ghost_px = suggestion.outline_px if suggestion else None
         if suggestion is None or self._board is None:
-            self._scene.remove(LAYER, "suggestion")
+            self.layer.remove("suggestion")
         else:
             T, outline = suggestion.T_camera_board, self._board.outline()
-            self._scene.board(
-                LAYER, "suggestion", T, outline, Stroke(GHOST, 4.0), label="next pose"
-            )
+            self.layer.board("suggestion", T, outline, GHOST, 4.0, label="next pose")
 
     def _draw_world(self, snapshot: Snapshot) -> None:
         """Draw the simulated board and its handle, or which other object is in view."""
-        world, scene = snapshot.world, self._scene
+        world, layer = snapshot.world, self._world_layer
         standing = world.standing if world else "board"
         text = "" if standing == "board" else f"In view: the {standing}. Place the board first."
         self._other_object.write(text, "warning")
         if world is None or text or self._board is None:
             if self._world is not None:
-                scene.clear(WORLD)
+                layer.clear()
                 self._world = None
             return
         T, centre = world.T_camera_object, self._T_board_centre
         if self._world is None:
-            scene.board(WORLD, "board", T, self._board.outline(), Stroke((70, 70, 70), 3.0))
-            scene.gizmo(WORLD, "handle", T @ centre, self._drag_board, self._place_board)
+            layer.board("board", T, self._board.outline(), (70, 70, 70), 3.0)
+            layer.gizmo("handle", T @ centre, self._drag_board, self._place_board)
         elif not np.array_equal(T, self._world):
-            scene.move(WORLD, "board", T)
+            layer.move("board", T)
             if time.monotonic() - self._dragged > _QUIET_S:
-                scene.move(WORLD, "handle", T @ centre)
+                layer.move("handle", T @ centre)
         self._world = T
 
     def _draw_choice(self) -> None:
@@ -297,7 +293,7 @@ class PosesPanel(StepPanel):
         board, chosen = self._board, self._chosen.value
         known = {pose.name: pose for pose in poses if board and pose.T_camera_board is not None}
         for name in set(self._drawn_poses) - set(known):
-            self._scene.remove(LAYER, name)
+            self.layer.remove(name)
             del self._drawn_poses[name]
         for name, pose in known.items():
             T, is_chosen = pose.T_camera_board, name == chosen
@@ -305,10 +301,10 @@ class PosesPanel(StepPanel):
             key = (pose.state, T.tobytes(), bool(pose.thumbnail), is_chosen, str(board))
             if self._drawn_poses.get(name) != key:
                 self._drawn_poses[name] = key
-                stroke = Stroke(_STATES[pose.state][1], 4.0 if is_chosen else 2.0)
+                colour, width = _STATES[pose.state][1], 4.0 if is_chosen else 2.0
                 image, label = rectified(pose, board, camera), name.removeprefix("pose_")
-                picture = self._scene.board(
-                    LAYER, name, T, board.outline(), stroke, picture=image, label=label
+                picture = self.layer.board(
+                    name, T, board.outline(), colour, width, picture=image, label=label
                 )
                 if picture is not None:
                     picture.on_click(lambda _event, name=name: self._chosen.choose(name))

@@ -4,7 +4,7 @@ import time
 from typing import Any
 
 from slviewer.gui.capture_inputs import ExposureInputs
-from slviewer.gui.panel import NO_SESSION, Part, Setting, StepPanel
+from slviewer.gui.panel import NO_SESSION, PanelPart, Setting, StepPanel
 from slviewer.gui.preview import LiveImage, histogram_chart
 from slviewer.gui.rig_choice import RigChoice
 from slviewer.gui.widgets import Html, Text, Tone, coloured, help_link, paragraph, to_html
@@ -32,13 +32,12 @@ class RigPanel(StepPanel):
     """Panel of the step Rig."""
 
     key = "rig"
-    _drawn: RigView | None = None
     _entered = 0.0
 
     def build(self) -> None:
         """Create the inputs of devices, exposure, light and check."""
         gui, context = self._gui, self._context
-        self._rig = RigChoice(context)
+        RigChoice(self)
         self._picture = LiveImage(gui, "Live image")
         self._histogram = Text(gui)
         self._exposure: Any = gui.add_slider("Exposure, ms", 0.01, 4.0, 0.01, 1.0)
@@ -47,25 +46,19 @@ class RigPanel(StepPanel):
         step.on_click(context.callback(lambda: self._step_exposure(step.value)))
         light = gui.add_dropdown("Projector", tuple(LIGHTS), hint="Shown between captures")
         self._light = Setting(context, light, self._set_light)
-        self._exposures = ExposureInputs(context)
-        self._check = RigCheck(context)
+        ExposureInputs(self)
+        RigCheck(self)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the rig of a snapshot."""
-        self._rig.draw(snapshot)
-        self._exposures.draw(snapshot)
-        self._check.draw(snapshot)
         rig = snapshot.rig
         self._draw_exposure(rig)
-        if rig == self._drawn:
-            return
         self._exposure.disabled = self._light.handle.disabled = rig.state != "open"
         if rig.light in _NAMES:
             self._light.update(_NAMES[rig.light])
         if rig.state != "open":
             self._picture.hide()
             self._histogram.set("")
-        self._drawn = rig
 
     def _draw_exposure(self, rig: RigView) -> None:
         """Set the slider to the rig's exposure, unless it was moved a moment ago."""
@@ -101,7 +94,7 @@ class RigPanel(StepPanel):
             self._light.handle.value = _NAMES[self._operator.snapshot().rig.light]
 
 
-class RigCheck(Part):
+class RigCheck(PanelPart):
     """The check of the rig: its results, their remedies, and the settings that it recommends."""
 
     def build(self) -> None:

@@ -9,16 +9,8 @@ import viser
 from slviewer.errors import InputError
 from slviewer.fringe.presets import PRESETS
 from slviewer.gui.capture_inputs import ExposureInputs, ImportInputs, SimulatedObject, TurnInputs
-from slviewer.gui.live import LAYER as LIVE
 from slviewer.gui.live import LiveScreen
-from slviewer.gui.panel import (
-    Choice,
-    RestoreButton,
-    Setting,
-    StepPanel,
-    display_name,
-    scan_options,
-)
+from slviewer.gui.panel import Choice, RestoreButton, Setting, StepPanel, display_name, scan_options
 from slviewer.gui.point_editing import PointEditing, RegionInputs
 from slviewer.gui.preview import LiveImage
 from slviewer.gui.scene import Click
@@ -50,7 +42,6 @@ from slviewer.wizard.result_views import (
 )
 from slviewer.wizard.snapshot import LiveView, PreviewView, ScanView, SessionView, Snapshot
 
-LAYER = "scan"
 SMALL_PX = 380
 """Width of the live image: the cloud matters more here."""
 COLOURS = ("texture", "depth", "modulation", "noise", "uncertainty", "error")
@@ -64,7 +55,6 @@ class ScanPanel(StepPanel):
     """Panel of the step Scan."""
 
     key = "scan"
-    layers = (LAYER,)
 
     _known: tuple[str, ...] = ()
     _placed: tuple[str, ...] | None = None
@@ -90,7 +80,7 @@ class ScanPanel(StepPanel):
                 hint="micro for concave metal, wax and other surfaces that light themselves",
             )
             self._patterns = Setting(context, patterns, operator.choose_patterns)
-            self._exposures = ExposureInputs(context, for_scan=True)
+            ExposureInputs(self, for_scan=True)
             align = gui.add_checkbox(
                 "Align as you scan",
                 False,
@@ -105,9 +95,9 @@ class ScanPanel(StepPanel):
                 "Save cloud", lambda: operator.save_live(label.value), "download", "green"
             )
             self._live_status = Text(gui)
-            self._turn = TurnInputs(context)
+            TurnInputs(self)
             things = ("object", "stone", "stone on a table", "marked", "sphere", "plane", *CONCAVE)
-            self._simulated = SimulatedObject(context, LAYER, things)
+            SimulatedObject(self, *things)
         self._gallery = Text(gui)
         with gui.add_folder("Cloud") as self._cloud_folder:
             self._scan = scan = Choice(context, "Scan", self._refresh)
@@ -134,10 +124,10 @@ class ScanPanel(StepPanel):
             self._colour = gui.add_dropdown("Colour", COLOURS)
             context.on_change(self._refresh, self._colour)
             self._legend = Text(gui)
-            context.view_button(self._get_points)
+            context.view_button(self.get_points)
             self._point = Text(gui)
-            self._region = RegionInputs(context, LAYER)
-            self._editing = PointEditing(context, LAYER, self._redraw, self._show_point)
+            self._region = RegionInputs(self)
+            self._editing = PointEditing(self, self._redraw, self._show_point)
             name = gui.add_text("New name", "")
             context.button("Rename scan", lambda: operator.rename(scan.value, name.value), "pencil")
             context.button(
@@ -145,12 +135,19 @@ class ScanPanel(StepPanel):
                 hint="Moves it to the session's trash",
             )  # fmt: skip
         self._restore = RestoreButton(context)
-        self._import = ImportInputs(context, "scan")
+        ImportInputs(self, "scan")
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show the scans and the live scan of a snapshot."""
         session, calibration = self._session, snapshot.calibration
-        self._draw_capture(snapshot)
+        rig = snapshot.rig
+        ready = rig.is_idle and snapshot.step(self.key).state != "blocked"
+        self._capture_folder.visible = rig.state != "none"
+        self._capture.disabled = not ready
+        self._draw_live(snapshot.live, ready)
+        self._patterns.handle.disabled = not rig.is_idle
+        if snapshot.session is not None:
+            self._patterns.update(session.patterns)
         self._restore.offer(session.deleted_scans)
         self._align.update(session.aligns_scans)
         scans = sort_scans(session.scans)
@@ -160,7 +157,12 @@ class ScanPanel(StepPanel):
             self._gallery.set("")
             self._clear_cloud()
             return
-        self._offer_scans(scans)
+        reconstructed = [scan.name for scan in scans if scan.cloud != "absent"]
+        self._scan.offer(scan_options(scans), (reconstructed or [""])[0])
+        if new := [name for name in reconstructed if name not in self._known]:
+            if self._known:  # show what was just reconstructed
+                self._scan.choose(new[0])
+            self._known = tuple(reconstructed)
         if calibration is not None:
             self._model.offer_names(calibration.models, calibration.best)
         else:
@@ -177,33 +179,8 @@ class ScanPanel(StepPanel):
         if not visible:
             self._operator.stop_live()
         self._editing.show(visible)
-        self._show_view()
 
     # drawing
-
-    def _draw_capture(self, snapshot: Snapshot) -> None:
-        """Update the inputs of capture, live scan and import."""
-        rig = snapshot.rig
-        ready = rig.is_idle and snapshot.step(self.key).state != "blocked"
-        self._capture_folder.visible = rig.state != "none"
-        self._capture.disabled = not ready
-        self._draw_live(snapshot.live, ready)
-        self._patterns.handle.disabled = not rig.is_idle
-        if snapshot.session is not None:
-            self._patterns.update(snapshot.session.patterns)
-        self._exposures.draw(snapshot)
-        self._turn.draw(snapshot, ready)
-        self._simulated.draw(snapshot)
-        self._import.draw(snapshot)
-
-    def _offer_scans(self, scans: Sequence[ScanView]) -> None:
-        """Offer the scans, and choose one that was just reconstructed."""
-        reconstructed = [scan.name for scan in scans if scan.cloud != "absent"]
-        self._scan.offer(scan_options(scans), (reconstructed or [""])[0])
-        if new := [name for name in reconstructed if name not in self._known]:
-            if self._known:
-                self._scan.choose(new[0])
-            self._known = tuple(reconstructed)
 
     def _draw_live(self, live: LiveView | None, ready: bool) -> None:
         """Update buttons and figures of the live scan, during which a captured cloud is hidden."""
@@ -217,7 +194,6 @@ class ScanPanel(StepPanel):
             self._screen.clear()
         self._is_live = live is not None
         if self._is_live:
-            self._scene.show(LIVE, True)
             self._clear_cloud()
 
     def _toggle_live(self) -> None:
@@ -229,9 +205,9 @@ class ScanPanel(StepPanel):
 
     def _clear_cloud(self) -> None:
         """Remove the captured cloud with its legend and picked point."""
-        self._painter.cancel("cloud")
+        self.painter.cancel("cloud")
         self._forget_cloud()
-        self._scene.remove(LAYER, "cloud")
+        self.layer.remove("cloud")
         self._legend.set("")
 
     def _forget_cloud(self) -> None:
@@ -242,7 +218,7 @@ class ScanPanel(StepPanel):
 
     def _forget_point(self) -> None:
         """Remove the picked point with its values."""
-        self._scene.remove(LAYER, "picked")
+        self.layer.remove("picked")
         self._point.set("")
 
     def _refresh(self) -> None:
@@ -256,9 +232,14 @@ class ScanPanel(StepPanel):
             self._reconstruct.disabled = busy
             self._reconstruct.label = "Reconstruct" if is_absent else "Reconstruct again"
             self._figures.set(scan_html(scan))
-            self._region.draw(session, "" if is_absent else scan.name)
-            self._editing.draw([scan])
-            self._draw_placement(scan, busy)
+            self._region.offer(session, "" if is_absent else scan.name)
+            self._editing.offer([scan])
+            self._place.visible = scan.cloud == "fresh" and not scan.is_placed
+            self._take_out.visible = scan.is_placed
+            self._place.disabled = self._take_out.disabled = busy
+            # where it is among the others, or why it is kept apart
+            text = f"{scan.label}: {scan.placement.summary()}" if scan.placement else ""
+            self._placement.set(note(text, "good" if scan.is_placed else "warning"))
             shown = len(self._shown_scans())
             suffix = "" if shown == 1 else f", {shown} scans"
             self._support.label = f"Remove support{suffix}"
@@ -270,7 +251,7 @@ class ScanPanel(StepPanel):
                 placed = tuple(
                     (each.name, each.figures.model) for each in session.scans if each.is_placed
                 )
-                self._painter.request(
+                self.painter.request(
                     "cloud",
                     (ALIGNED, placed),
                     lambda: aligned_scans(self._context.session),
@@ -300,7 +281,7 @@ class ScanPanel(StepPanel):
                 return whole, whole, colour, str(error)
 
         used = session.restriction(scan.name)
-        self._painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
+        self.painter.request("cloud", (key, used, self._redraws, colour), make, self._draw_cloud)
 
     def _shown_scans(self) -> tuple[str, ...]:
         """Return the names of the scans in the 3D view: those in place, or the chosen one."""
@@ -318,15 +299,6 @@ class ScanPanel(StepPanel):
             self._view.choose(ALIGNED)
         self._placed = placed
 
-    def _draw_placement(self, scan: ScanView, is_busy: bool) -> None:
-        """State where the chosen scan is among the others, or why it is kept apart."""
-        placement = scan.placement
-        self._place.visible = scan.cloud == "fresh" and not scan.is_placed
-        self._take_out.visible = scan.is_placed
-        self._place.disabled = self._take_out.disabled = is_busy
-        tone: Tone = "good" if scan.is_placed else "warning"
-        self._placement.set(note(f"{scan.label}: {placement.summary()}", tone) if placement else "")
-
     def _draw_aligned(self, aligned: AlignedScans) -> None:
         """Draw the scans in place, in the colours of how many see each point."""
         if self._is_live:
@@ -337,10 +309,9 @@ class ScanPanel(StepPanel):
         painted = (painted * (0.35 + 0.65 * np.clip(aligned.facing, 0, 1))[:, None]).astype(
             np.uint8
         )
-        self._scene.cloud(LAYER, "cloud", aligned.points, painted)
+        self.layer.cloud("cloud", aligned.points, painted)
         self._legend.set(aligned_html(aligned))
-        self._shown = ALIGNED, aligned.points
-        self._show_view()
+        self.show_points(ALIGNED, aligned.points)
 
     def _redraw(self) -> None:
         """Draw the cloud again, as other points of it are hidden."""
@@ -353,17 +324,17 @@ class ScanPanel(StepPanel):
         if self._is_live:
             return
         is_new = whole is not self._whole
-        self._whole, self._cloud, self._shown = whole, cloud, (cloud.name, cloud.points)
+        self._whole, self._cloud = whole, cloud
         painted, bar = paint_cloud(cloud, colour)
         (points,) = self._editing.set_scans([(cloud, cloud.points)])
-        shown = self._scene.cloud(LAYER, "cloud", points, painted)
+        shown = self.layer.cloud("cloud", points, painted)
         removed = int(whole.measured_count - cloud.measured_count)
         kept = f", {removed:,} removed by edits and region" if removed else "; the file has all"
         text = f"{shown:,} points shown{kept}. Click a point for its values."
         self._legend.set(bar + note(text) + alert(why, "warning"))
         if is_new:
             self._forget_point()
-        self._show_view()
+        self.show_points(cloud.name, cloud.points)
 
     def _show_point(self, click: Click) -> None:
         """Show the values of the point closest to the clicked ray."""
@@ -373,8 +344,8 @@ class ScanPanel(StepPanel):
             return
         u, v = pixel
         self._point.set(point_html(cloud, u, v))
-        self._scene.mark(
-            LAYER, "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"
+        self.layer.mark(
+            "picked", cloud.points[v, u], f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"
         )
 
 

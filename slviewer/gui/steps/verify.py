@@ -1,22 +1,19 @@
 """Step 5: measure a plane or a sphere by each model, and compare with the noise floor of the
 capture."""
 
-from collections.abc import Sequence
 from functools import partial
 
 from slviewer.gui.capture_inputs import SimulatedObject
 from slviewer.gui.panel import Choice, StepPanel, display_name, scan_options
 from slviewer.gui.preview import LiveImage
 from slviewer.gui.widgets import PLOT_PX, Plot, Text, colour_bar, colours, records_html
-from slviewer.pipeline.stored_records import Stored, load_arrays
+from slviewer.pipeline.stored_records import load_arrays
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
 from slviewer.report.page import Figure
-from slviewer.session.store import Session
 from slviewer.wizard import result_views
-from slviewer.wizard.snapshot import PreviewView, ScanView, SessionView, Snapshot
+from slviewer.wizard.snapshot import PreviewView, ScanView, Snapshot
 
-LAYER = "verify"
 _ICONS: dict[Shape, str] = {"plane": "square", "sphere": "sphere"}
 SMALL_PX = 300
 """Width of the live image: it only shows whether the plane or the sphere is in view."""
@@ -29,44 +26,52 @@ class VerifyPanel(StepPanel):
     """Panel of the step Verify."""
 
     key = "verify"
-    layers = (LAYER,)
 
     _measured: tuple[str, ...] = ()
 
     def build(self) -> None:
         """Create the inputs of capture, results and recorded captures."""
         gui, context, operator = self._gui, self._context, self._operator
+        self._waiting: dict[Shape, list[str]] = {}
         with gui.add_folder("Capture") as self._capture_folder:
             self._picture = LiveImage(gui, "Live image", width_px=SMALL_PX)
             self._captures = [
                 context.button(
-                    f"Capture {shape}", partial(self._request_capture, shape), icon, None
-                )
-                for shape, icon in _ICONS.items()
+                    "Capture plane", lambda: operator.capture_plane(label.value), "square", None
+                ),
+                context.button(
+                    "Capture sphere", lambda: operator.capture_sphere(label.value), "sphere", None
+                ),
             ]
-            self._label = gui.add_text("Name", "", hint="Optional; numbered by default")
-            self._simulated = SimulatedObject(context, LAYER, tuple(_ICONS))
+            label = gui.add_text("Name", "", hint="Optional; numbered by default")
+            SimulatedObject(self, *_ICONS)
         with gui.add_folder("Result") as self._result_folder:
             self._result = Choice(context, "Result", self._refresh)
             self._figures = Text(gui)
             self._maps = Plot(gui)
-            hint = "The model whose errors colour the cloud"
-            self._model = Choice(context, "3D colours", self._refresh, hint=hint)
+            self._model = Choice(
+                context, "3D colours", self._refresh, hint="The model whose errors colour the cloud"
+            )
             self._legend = Text(gui)
-            context.view_button(self._get_points)
+            context.view_button(self.get_points)
         with gui.add_folder("All results") as self._table_folder:
             self._table = Text(gui)
             context.button("Write CSV", lambda: operator.export("table"), "table-export")
             self._file = Text(gui)
         with gui.add_folder("Recorded captures") as self._recorded_folder:
             self._recorded = Choice(context, "Capture")
-            hint = "Approximate radius of a sphere, to detect it; 0: unknown"
-            self._radius = gui.add_number("Radius, mm", 0.0, min=0.0, max=2000.0, hint=hint)
+            self._radius = gui.add_number(
+                "Radius, mm",
+                0.0,
+                min=0.0,
+                max=2000.0,
+                hint="Approximate radius of a sphere, to detect it; 0: unknown",
+            )
             for shape, icon in _ICONS.items():
-                context.button(f"Measure {shape}", partial(self._request_recorded, shape), icon)
+                context.button(f"Measure {shape}", partial(self._request, shape), icon)
             self._all = {
                 shape: context.button(
-                    f"Measure all {shape}s", partial(self._request_all, shape), icon
+                    f"Measure all {shape}s", partial(self._request, shape, every=True), icon
                 )
                 for shape, icon in _ICONS.items()
             }
@@ -78,13 +83,24 @@ class VerifyPanel(StepPanel):
         self._capture_folder.visible = rig.state != "none"
         for button in self._captures:
             button.disabled = not (ready and rig.is_idle)
-        self._simulated.draw(snapshot)
         rows = session.list_records(Verification)
         self._recorded_folder.visible = ready and bool(session.scans)
         self._result_folder.visible = self._table_folder.visible = ready and bool(rows)
         if not ready:
             return
-        self._draw_recorded(session)
+        # those without an up-to-date verification first
+        measured = {row.name for row in rows if not row.stale}
+        waiting = [scan for scan in session.scans if scan.name not in measured]
+        options = [
+            (name, f"{text}, measured")
+            for name, text in scan_options(session.scans)
+            if name in measured
+        ]
+        self._recorded.offer(scan_options(waiting) + options)
+        for shape, button in self._all.items():
+            self._waiting[shape] = [scan.name for scan in waiting if shape_of(scan) == shape]
+            n = len(self._waiting[shape])
+            button.visible, button.label = n > 0, f"Measure all {n} {shape}s"
         labels = {row.name: row.label for row in rows}
         self._result.offer((name, display_name(name, label)) for name, label in labels.items())
         if new := [name for name in labels if name not in self._measured]:
@@ -99,28 +115,7 @@ class VerifyPanel(StepPanel):
         """Show the live image."""
         self._picture.draw(preview)
 
-    def show(self, visible: bool) -> None:
-        """Show or hide the layers, and move the views to the cloud."""
-        super().show(visible)
-        self._show_view()
-
     # drawing
-
-    def _draw_recorded(self, session: SessionView) -> None:
-        """Offer the recorded captures, those without verification first."""
-        waiting = _list_unverified(session)
-        names = {scan.name for scan in waiting}
-        self._recorded.offer(
-            scan_options(waiting)
-            + [
-                (scan.name, f"{display_name(scan.name, scan.label)}, measured")
-                for scan in session.scans
-                if scan.name not in names
-            ]
-        )
-        for shape, button in self._all.items():
-            n = sum(shape_of(scan) == shape for scan in waiting)
-            button.visible, button.label = n > 0, f"Measure all {n} {shape}s"
 
     def _refresh(self) -> None:
         """Request the error maps and the cloud of the chosen result."""
@@ -134,11 +129,16 @@ class VerifyPanel(StepPanel):
             self._model.offer_names(models, models[-1])
             self._figures.set(records_html([view], named=False))
             context, key = self._context, (name, view.record.summary())
-            self._painter.request(
-                "maps", key, lambda: _draw_maps(context.session, view), self._maps.set
-            )
+
+            def draw_maps() -> Figure:
+                """Draw the error maps of the capture by model."""
+                arrays = load_arrays(context.session, f"{Verification.kind}/{name}")
+                title = display_name(name, view.label)
+                return verification_maps(title, view.record, arrays, PLOT_PX)
+
+            self.painter.request("maps", key, draw_maps, self._maps.set)
             model = self._model.value
-            self._painter.request(
+            self.painter.request(
                 "cloud",
                 (key, model),
                 lambda: (result_views.whole_cloud(context.session, name), model, shape),
@@ -148,44 +148,23 @@ class VerifyPanel(StepPanel):
     def _draw_cloud(self, made: tuple[result_views.ScanCloud, str, Shape]) -> None:
         """Draw a cloud coloured by the error of a model, with its legend."""
         cloud, model, shape = made
-        self._shown = cloud.name, cloud.points
         limit = error_limit(list(cloud.errors.values()))
-        self._scene.cloud(
-            LAYER, "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error")
+        self.layer.cloud(
+            "cloud", cloud.points, colours(cloud.errors[model], -limit, limit, "error")
         )
         title = f"error of {model}; {SIGN[shape]}; grey: not evaluated"
         self._legend.set(colour_bar(f"−{limit:g} mm", f"+{limit:g} mm", "error", title))
-        self._show_view()
+        self.show_points(cloud.name, cloud.points)
 
     # requests
 
-    def _request_capture(self, shape: Shape) -> None:
-        """Request the capture of a plane or sphere."""
-        capture = {"plane": self._operator.capture_plane, "sphere": self._operator.capture_sphere}
-        capture[shape](self._label.value)
-
-    def _request_verification(self, names: Sequence[str], shape: Shape) -> None:
-        """Request the verification of captures as a plane or sphere."""
+    def _request(self, shape: Shape, every: bool = False) -> None:
+        """Request the verification of the chosen capture as a plane or sphere, or of every capture
+        of the shape that has none yet."""
+        names = self._waiting[shape] if every else [self._recorded.value]
         radius = float(self._radius.value) if shape == "sphere" else 0.0
         if any(names):
             self._operator.verify(names, shape, radius or None)
-
-    def _request_recorded(self, shape: Shape) -> None:
-        """Request a verification of the chosen capture."""
-        self._request_verification([self._recorded.value], shape)
-
-    def _request_all(self, shape: Shape) -> None:
-        """Request the verification of all captures of a shape that have none yet."""
-        waiting = _list_unverified(self._session)
-        self._request_verification(
-            [scan.name for scan in waiting if shape_of(scan) == shape], shape
-        )
-
-
-def _list_unverified(session: SessionView) -> list[ScanView]:
-    """List the captures without an up-to-date verification."""
-    measured = {each.name for each in session.list_records(Verification) if not each.stale}
-    return [scan for scan in session.scans if scan.name not in measured]
 
 
 def shape_of(scan: ScanView) -> str:
@@ -194,9 +173,3 @@ def shape_of(scan: ScanView) -> str:
     if scan.purpose != "scan":
         return scan.purpose
     return next((shape for shape in _ICONS if scan.name.lower().startswith(shape)), "scan")
-
-
-def _draw_maps(session: Session, view: Stored[Verification]) -> Figure:
-    """Draw the error maps of a capture by model."""
-    arrays = load_arrays(session, f"{Verification.kind}/{view.name}")
-    return verification_maps(display_name(view.name, view.label), view.record, arrays, PLOT_PX)
