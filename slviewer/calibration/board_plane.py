@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import finite_rows, lengths, rms
 
 MIN_FEATURES = 12
@@ -29,14 +30,12 @@ class BoardPlane:
 
     H: np.ndarray
     bend: float
-    centre: np.ndarray
+    centre: Floats
     radius: float
-    reach: np.ndarray
+    reach: Floats
 
     @classmethod
-    def fit(
-        cls, camera: np.ndarray, projector: np.ndarray, size: tuple[int, int]
-    ) -> "BoardPlane | None":
+    def fit(cls, camera: Floats, projector: Floats, size: tuple[int, int]) -> "BoardPlane | None":
         """Fit the plane robustly to features at ``camera`` and ``projector`` pixels (n, 2), NaN
         where unknown.
 
@@ -53,27 +52,26 @@ class BoardPlane:
             if plane is None:
                 return None
             residual = lengths(plane.predict(camera[:, 0], camera[:, 1]) - projector)
-            before = inlier
-            inlier = residual < np.maximum(
-                OUTLIER_SIGMAS * np.median(residual[inlier]) / 1.1774, 0.5
-            )
+            before, typical = inlier, np.median(residual[inlier])
+            inlier = residual < np.maximum(OUTLIER_SIGMAS * typical / 1.1774, 0.5)
             if np.array_equal(inlier, before):
                 break
         return plane
 
     @classmethod
     def _fit_inliers(
-        cls, camera: np.ndarray, projector: np.ndarray, centre: np.ndarray, radius: float
+        cls, camera: Floats, projector: Floats, centre: Floats, radius: float
     ) -> "BoardPlane | None":
         """Fit the homography for a range of distortions, refined twice, and return the plane with
         the smallest RMS."""
         bends, step = np.linspace(-0.5, 0.3, 9), 0.1
         best: tuple[float, BoardPlane] | None = None
+        normalised = (camera - centre) / radius
+        squares = np.sum(normalised**2, axis=1, keepdims=True)
         for _ in range(3):
             for bend in bends:
-                H, _ = cv2.findHomography(
-                    _undistort_division((camera - centre) / radius, bend), projector
-                )
+                # undistorted by the division model
+                H, _ = cv2.findHomography(normalised / (1 + bend * squares), projector)
                 if H is None:
                     continue
                 plane = cls(H, float(bend), centre, radius, np.zeros(2))
@@ -88,7 +86,7 @@ class BoardPlane:
             step /= 3
         return best[1] if best else None
 
-    def predict(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def predict(self, u: np.ndarray, v: np.ndarray) -> Floats:
         """Return the plane's projector coordinates (..., 2) px at camera pixels (u, v), which
         broadcast."""
         x, y = (u - self.centre[0]) / self.radius, (v - self.centre[1]) / self.radius
@@ -97,7 +95,7 @@ class BoardPlane:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([a / w, b / w], axis=-1)
 
-    def contains(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> np.ndarray:
+    def contains(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> Mask:
         """(h', w') bool: projector coordinates (h', w') px within the tolerance of the plane; False
         for NaN.
 
@@ -110,8 +108,3 @@ class BoardPlane:
         )
         with np.errstate(invalid="ignore"):
             return np.abs(coordinate - expected[..., along]) < self.reach[along]
-
-
-def _undistort_division(normalised: np.ndarray, bend: float) -> np.ndarray:
-    """Undistort normalised pixels (n, 2) by the division model."""
-    return normalised / (1 + bend * np.sum(normalised**2, axis=1, keepdims=True))

@@ -14,10 +14,10 @@ CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, ITERATIONS, 1e-9)
 
 
 def solve_pose(
-    points: np.ndarray,
-    pixels: np.ndarray,
-    K: np.ndarray,
-    D: np.ndarray,
+    points: Floats,
+    pixels: Floats,
+    K: Floats,
+    D: Floats,
     flags: int = cv2.SOLVEPNP_ITERATIVE,
 ) -> Floats | None:
     """Solve T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None without a finite
@@ -27,12 +27,20 @@ def solve_pose(
     """
     try:
         success, rvec, tvec = cv2.solvePnP(
-            np.asarray(points, float), np.asarray(pixels, float), K, D, flags=flags
+            points.astype(float), pixels.astype(float), K, D, flags=flags
         )
     except cv2.error:
         return None
     T = transform_from_rvec(rvec, tvec) if success else np.full((4, 4), np.nan)
     return T if np.isfinite(T).all() else None
+
+
+def intersect_board(T: Floats, rays: Floats) -> Floats:
+    """Return where normalised ``rays`` (n, 2) meet the plane of a board at T_camera_board (4, 4):
+    (n, 3) mm; NaN where they do not."""
+    directions = np.column_stack([rays, np.ones(len(rays))])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return directions * ((T[:3, 2] @ T[:3, 3]) / (directions @ T[:3, 2]))[:, None]
 
 
 def solve_device(

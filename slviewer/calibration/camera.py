@@ -1,23 +1,22 @@
 """A camera calibrated alone, from pictures of the board: pinhole and Brown, no projector."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from slviewer.calibration.board_pose import solve_device
 from slviewer.calibration.centres import centroid_shifts
-from slviewer.calibration.diagnosis.poses import FEW_POSES
 from slviewer.calibration.diagnosis.rules import (
+    FEW_POSES,
     HIGH_REPROJECTION_PX,
     MAX_FOCAL_UNCERTAINTY,
     MIN_TILT_DEG,
 )
-from slviewer.calibration.soundness import check_pose_count
-from slviewer.calibration.stereo import MAX_FOCAL_SIGMA
+from slviewer.calibration.stereo import MAX_FOCAL_SIGMA, check_pose_count
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import largest_angle_deg, move_points
+from slviewer.geometry.rigid import Floats, largest_angle_deg, move_points
 from slviewer.geometry.vectors import rms_length
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.target.board import Board
@@ -91,12 +90,11 @@ def calibrate_camera(
     ``excluded``: pictures without a board, with the reason. Raises CalibrationRejected for fewer
     than three pictures.
     """
-    names = list(detections)
-    check_pose_count(len(names), excluded or {})
-    points = [board.points[detections[name].ids] for name in names]
-    pixels = [np.asarray(detections[name].pixels, float) for name in names]
+    check_pose_count(len(detections), excluded or {})
+    points = [board.points[each.ids] for each in detections.values()]
+    pixels = [each.pixels for each in detections.values()]
     lens, poses, sigma = _solve_camera(points, pixels, size)
-    radii = [detections[name].radius_mm for name in names]
+    radii = [each.radius_mm for each in detections.values()]
     if any(radii):
         pixels = [
             centroids - centroid_shifts(lens, T, X, float(np.median(radii)))
@@ -107,90 +105,76 @@ def calibrate_camera(
         lens.project(move_points(T, X)) - measured
         for X, T, measured in zip(points, poses, pixels, strict=True)
     ]
-    picture_rms = {name: rms_length(r) for name, r in zip(names, residuals, strict=True)}
-    total_rms = rms_length(np.concatenate(residuals))
-    verdict = _judge_camera(picture_rms, total_rms, lens, poses, sigma)
-    return CameraCalibration(
-        lens, str(board), total_rms, picture_rms, sigma, dict(excluded or {}), verdict
+    picture_rms = {name: rms_length(r) for name, r in zip(detections, residuals, strict=True)}
+    unjudged = CameraCalibration(
+        lens,
+        str(board),
+        rms_length(np.concatenate(residuals)),
+        picture_rms,
+        sigma,
+        dict(excluded or {}),
+        Verdict(),
     )
+    return replace(unjudged, verdict=Verdict.of(_judge_camera(unjudged, poses)))
 
 
 def _solve_camera(
-    points: list[np.ndarray], pixels: list[np.ndarray], size: tuple[int, int]
-) -> tuple[Lens, list[np.ndarray], tuple[float, float]]:
+    points: list[Floats], pixels: list[Floats], size: tuple[int, int]
+) -> tuple[Lens, list[Floats], tuple[float, float]]:
     """Solve the camera's lens from points (n, 3) mm and pixels (n, 2) by picture, as
     ``solve_device`` does.
 
     Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx
     and fy in px.
     """
-    objects, images = [p.astype(np.float32) for p in points], [p.astype(np.float32) for p in pixels]
+    objects, images = ([each.astype(np.float32) for each in arrays] for arrays in (points, pixels))
     K, D, poses, sigma = solve_device("camera", objects, images, size)
     return Lens(K, D, size), poses, sigma
 
 
-def _judge_camera(
-    picture_rms: Mapping[str, float],
-    total_rms: float,
-    lens: Lens,
-    poses: list[np.ndarray],
-    focal_sigma: tuple[float, float],
-) -> Verdict:
+def _judge_camera(solved: CameraCalibration, poses: list[Floats]) -> Iterator[Finding]:
     """Judge a camera calibration by its number of pictures, their tilts, and the reprojection
-    errors in px."""
-    findings = []
-    if len(picture_rms) < FEW_POSES:
-        findings.append(
-            Finding(
-                "too-few-poses",
-                "doubtful",
-                f"{len(picture_rms)} pictures",
-                f"take {FEW_POSES} at least, better a dozen",
-            )
+    errors."""
+    pictures = solved.picture_rms_px
+    if len(pictures) < FEW_POSES:
+        yield Finding(
+            "too-few-poses",
+            "doubtful",
+            f"{len(pictures)} pictures",
+            f"take {FEW_POSES} at least, better a dozen",
         )
     spread = largest_angle_deg(np.array([T[:3, 2] for T in poses]))
     if spread < MIN_TILT_DEG:
-        findings.append(
-            Finding(
-                "parallel-poses",
-                "doubtful",
-                f"all boards are nearly parallel (tilts differ by {spread:.1f} degrees)",
-                "tilt the board by 15 to 30 degrees, in different directions",
-            )
+        yield Finding(
+            "parallel-poses",
+            "doubtful",
+            f"all boards are nearly parallel (tilts differ by {spread:.1f} degrees)",
+            "tilt the board by 15 to 30 degrees, in different directions",
         )
-    relative_sigma = max(focal_sigma[0] / lens.K[0, 0], focal_sigma[1] / lens.K[1, 1])
+    relative_sigma = (np.array(solved.focal_sigma_px) / np.diag(solved.lens.K)[:2]).max()
     if not relative_sigma < MAX_FOCAL_UNCERTAINTY:
-        findings.append(
-            Finding(
-                "uncertain",
-                "rejected" if not relative_sigma < MAX_FOCAL_SIGMA else "doubtful",
-                f"the pictures leave the focal length uncertain by {100 * relative_sigma:.1f} %",
-                "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
-            )
+        yield Finding(
+            "uncertain",
+            "rejected" if not relative_sigma < MAX_FOCAL_SIGMA else "doubtful",
+            f"the pictures leave the focal length uncertain by {100 * relative_sigma:.1f} %",
+            "tilt the board by 15 to 30 degrees in different directions, and vary its distance",
         )
-    if total_rms > HIGH_REPROJECTION_PX:
-        findings.append(
-            Finding(
-                "residuals",
-                "doubtful",
-                f"the reprojection error is {total_rms:.1f} px",
-                "see that the board is flat, in focus and held still, and that its notation is"
-                " right",
-            )
+    if solved.rms_px > HIGH_REPROJECTION_PX:
+        yield Finding(
+            "residuals",
+            "doubtful",
+            f"the reprojection error is {solved.rms_px:.1f} px",
+            "see that the board is flat, in focus and held still, and that its notation is right",
         )
-    median_rms = float(np.median(list(picture_rms.values())))
-    outliers = tuple(
-        name for name, px in picture_rms.items() if px > max(MAX_ERROR_RATIO * median_rms, 0.1)
-    )
+    usual_px = float(np.median([*pictures.values()]))
+    limit_px = max(MAX_ERROR_RATIO * usual_px, 0.1)
+    outliers = tuple(name for name, px in pictures.items() if px > limit_px)
     if outliers:
-        findings.append(
-            Finding(
-                "outlier",
-                "doubtful",
-                f"in {', '.join(outliers)} the reprojection error is more than {MAX_ERROR_RATIO:g}"
-                f" times the usual {median_rms:.2f} px",
-                "check these pictures, and calibrate again with --exclude",
-                outliers,
-            )
+        yield Finding(
+            "outlier",
+            "doubtful",
+            f"in {', '.join(outliers)} the reprojection error is more than {MAX_ERROR_RATIO:g}"
+            f" times the usual {usual_px:.2f} px",
+            "check these pictures, and calibrate again with --exclude",
+            outliers,
         )
-    return Verdict.of(findings)

@@ -60,9 +60,8 @@ def centroid_shifts(lens: Lens, T_camera_board: Floats, points: Floats, radius_m
     rim = reach * np.stack([np.cos(angles), np.sin(angles), np.zeros(CORNERS)], axis=1)
     centre = lens.project(move_points(T_camera_board, points))
     outline = lens.project(move_points(T_camera_board, points[:, None] + rim)) - centre[:, None]
-    x, y = outline[..., 0], outline[..., 1]
     ahead = np.roll(outline, -1, axis=1)
-    cross = x * ahead[..., 1] - ahead[..., 0] * y
+    cross = outline[..., 0] * ahead[..., 1] - ahead[..., 0] * outline[..., 1]
     area = cross.sum(1)
     with np.errstate(invalid="ignore", divide="ignore"):
         moment = ((outline + ahead) * cross[..., None]).sum(1) / (3 * area[:, None])
@@ -79,22 +78,13 @@ def move_to_centres(observations: Sequence[Observation], stereo: StereoModel) ->
     radii = [o.radius_mm for o in observations if o.radius_mm]
     # one board: what differs between poses is noise
     radius = float(np.median(radii)) if radii else 0.0
-    return [
-        _move_to_centres(o, stereo, radius) if o.radius_mm and o.name in stereo.poses else o
-        for o in observations
-    ]
-
-
-def _move_to_centres(
-    observation: Observation, stereo: StereoModel, radius_mm: float
-) -> Observation:
-    """Return one observation with its circles of ``radius_mm`` at their centres."""
-    shift = centroid_shifts(
-        stereo.rig.camera, stereo.poses[observation.name], observation.points, radius_mm
-    )
-    projector = observation.projector
-    if observation.slopes is not None:
-        projector = projector - np.einsum("nij,nj->ni", observation.slopes, shift)
-    return replace(
-        observation, camera=observation.camera - shift, projector=projector, radius_mm=0.0
-    )
+    corrected = []
+    for o in observations:
+        if o.radius_mm and o.name in stereo.poses:
+            shift = centroid_shifts(stereo.rig.camera, stereo.poses[o.name], o.points, radius)
+            projector = o.projector
+            if o.slopes is not None:
+                projector = projector - np.einsum("nij,nj->ni", o.slopes, shift)
+            o = replace(o, camera=o.camera - shift, projector=projector, radius_mm=0.0)
+        corrected.append(o)
+    return corrected

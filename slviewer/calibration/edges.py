@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from slviewer.fringe.phase import PhaseMap
+from slviewer.geometry.rigid import Mask
 
 CLEARANCE_SIGMAS = 2.0
 """Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is
@@ -30,7 +31,7 @@ EDGE_BAND = 0.25
 an edge; with a Gaussian blur they are within 0.6745 sigma of it."""
 
 
-def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarray:
+def bright_pixels(phase: PhaseMap, inside: Mask, pitch: float) -> Mask:
     """Select the valid pixels (h, w) bool of the board's bright parts at a distance from contrast
     edges.
 
@@ -41,9 +42,8 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
     crest = _local_extreme(cv2.dilate, modulation, pitch)
     bright = (modulation > 0.5 * crest) & (modulation > 0)
-    dark = cv2.morphologyEx(  # a lone pixel lost to noise is not an edge
-        (~bright).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-    )
+    # a lone pixel lost to noise is not an edge
+    dark = cv2.morphologyEx((~bright).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     sigma = edge_blur_px(phase, inside, pitch)
     # px from the edge, half a px before the first dark pixel's middle
     apart = cv2.distanceTransform(1 - dark, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
@@ -56,7 +56,7 @@ def bright_pixels(phase: PhaseMap, inside: np.ndarray, pitch: float) -> np.ndarr
     return clear
 
 
-def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
+def edge_blur_px(phase: PhaseMap, inside: Mask, pitch: float) -> float:
     """Estimate the blur of the board's contrast edges by lens and pixels, standard deviation in px.
 
     It is proportional to the area of intermediate pixels over the length of the edges.
@@ -75,9 +75,8 @@ def edge_blur_px(phase: PhaseMap, inside: np.ndarray, pitch: float) -> float:
     # an edge of length L with its normal at (n_u, n_v) crosses L n_u rows and L n_v columns
     rows = (high[:, 1:] != high[:, :-1]) & edged[:, 1:] & edged[:, :-1]
     columns = (high[1:] != high[:-1]) & edged[1:] & edged[:-1]
-    length = float(
-        (np.abs(across) / steep)[:, 1:][rows].sum() + (np.abs(down) / steep)[1:][columns].sum()
-    )
+    across, down = np.abs(across) / steep, np.abs(down) / steep
+    length = float(across[:, 1:][rows].sum() + down[1:][columns].sum())
     if length < pitch:
         return SHARPEST_PX
     return float(np.clip(area / length / (2 * 0.6745), SHARPEST_PX, pitch / 8))

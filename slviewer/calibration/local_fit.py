@@ -26,15 +26,8 @@ def fit_local_values(
     samples in the window, or samples on one side only.
     """
     out = np.full((len(pixels), 3), np.nan)
-    run_rows(
-        _fit_windows,
-        len(pixels),
-        np.ascontiguousarray(field, np.float64),
-        np.ascontiguousarray(weight, np.float64),
-        np.ascontiguousarray(pixels, np.float64),
-        np.ascontiguousarray(radius, np.float64),
-        out,
-    )
+    arrays = (np.ascontiguousarray(a, np.float64) for a in (field, weight, pixels, radius))
+    run_rows(_fit_windows, len(pixels), *arrays, out)
     return out[:, 0], out[:, 1:]
 
 
@@ -106,14 +99,8 @@ def _collect_samples(field, weight, cu, cv, r, basis, value, base):  # type: ign
             if weight[v, u] > 0 and count < MAX_SAMPLES:
                 x, y = (u - cu) / r, (v - cv) / r
                 terms = basis[count]
-                terms[0], terms[1], terms[2], terms[3], terms[4], terms[5] = (
-                    1.0,
-                    x,
-                    y,
-                    x * x,
-                    x * y,
-                    y * y,
-                )
+                terms[0], terms[1], terms[2] = 1.0, x, y
+                terms[3], terms[4], terms[5] = x * x, x * y, y * y
                 value[count], base[count] = field[v, u], weight[v, u]
                 mean_x += x
                 mean_y += y

@@ -17,7 +17,7 @@ from slviewer.calibration.board_pose import solve_pose
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
-from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
 from slviewer.geometry.vectors import box_middle, finite_rows, lengths
 from slviewer.target.board import Board
 
@@ -37,10 +37,7 @@ NOMINAL_FOCAL = 1.5
 lens's."""
 
 # nearest: the squarely held board fills so much of the image; farthest: times this
-_NEAR_FILL, _DEPTH_RATIO = (
-    0.9,
-    1.45,
-)
+_NEAR_FILL, _DEPTH_RATIO = 0.9, 1.45
 _CELL_SHARE = 0.5  # of a cell that the board must cover
 _REACH_MARGIN = 0.02  # of the projector's image, inside which points are reached
 _FREE = 0.015  # of the image's width, left free around the board
@@ -76,8 +73,8 @@ class Suggestion:
     """A recommended pose, T_camera_board (4, 4) mm, its outline (4, 2) in camera px, and an
     instruction in words."""
 
-    T_camera_board: np.ndarray
-    outline_px: np.ndarray
+    T_camera_board: Floats
+    outline_px: Floats
     sentence: str
 
 
@@ -89,7 +86,7 @@ def nominal_lens(size: tuple[int, int], focal_px: float | None = None) -> Lens:
 
 
 def estimated_lens(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
+    points: Sequence[Floats], pixels: Sequence[Floats], size: tuple[int, int]
 ) -> Lens:
     """Estimate a lens of one focal length, undistorted, from points (n, 3) mm and pixels (n, 2) of
     several boards.
@@ -97,16 +94,14 @@ def estimated_lens(
     Returns the nominal lens for fewer than two boards, and where the estimate is not plausible.
     """
     if len(points) >= 2:
-        objects, images = (
-            [np.asarray(a, np.float32) for a in arrays] for arrays in (points, pixels)
-        )
+        objects, images = ([a.astype(np.float32) for a in arrays] for arrays in (points, pixels))
         f = float(cv2.initCameraMatrix2D(objects, images, size, aspectRatio=1.0)[0, 0])
         if np.isfinite(f) and 0.5 < f / size[0] < 8:
             return nominal_lens(size, f)
     return nominal_lens(size)
 
 
-def approximate_pose(points: np.ndarray, pixels: np.ndarray, lens: Lens) -> np.ndarray | None:
+def approximate_pose(points: Floats, pixels: Floats, lens: Lens) -> Floats | None:
     """Estimate T_camera_board (4, 4) mm from points (n, 3) mm and pixels (n, 2); None where there
     is no solution."""
     if len(points) < 4:
@@ -123,7 +118,7 @@ def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
     return near, _DEPTH_RATIO * near
 
 
-def count_coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Coverage:
+def count_coverage(board: Board, lens: Lens, poses: Sequence[Floats]) -> Coverage:
     """Count how often `poses`, T_camera_board (4, 4) mm each, cover the cells, depths and tilts."""
     span = depth_range(board, lens)
     covered, thirds, tilts = _classify(board, lens, np.reshape(poses, (-1, 4, 4)), span)
@@ -131,7 +126,17 @@ def count_coverage(board: Board, lens: Lens, poses: Sequence[np.ndarray]) -> Cov
     return Coverage(covered.sum(axis=0), depths, np.bincount(tilts, minlength=len(TILTS)), span)
 
 
-def outline_px(board: Board, lens: Lens, T: np.ndarray) -> np.ndarray:
+def place_board(board: Board, lens: Lens, R: Floats, depths: Floats, pixels: Floats) -> Floats:
+    """Return poses (..., 4, 4) of the board turned by ``R`` (..., 3, 3), with its middle at
+    ``depths`` (...) mm on the rays of ``pixels`` (..., 2), without distortion."""
+    rays = np.concatenate(
+        [(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:-1], 1))], axis=-1
+    )
+    t = depths[..., None] * rays - R @ box_middle(board.points)
+    return rigid_transform(np.broadcast_to(R, (*t.shape, 3)), t)
+
+
+def outline_px(board: Board, lens: Lens, T: Floats) -> Floats:
     """(..., 4, 2) px: the board's outline in the image at poses T (..., 4, 4), NaN behind the
     camera."""
     return lens.project(move_points(T, board.outline()))
@@ -140,7 +145,7 @@ def outline_px(board: Board, lens: Lens, T: np.ndarray) -> np.ndarray:
 def suggest(
     board: Board,
     lens: Lens,
-    poses: Sequence[np.ndarray],
+    poses: Sequence[Floats],
     *,
     illuminated: Illumination | None = None,
     skip: int = 0,
@@ -177,18 +182,19 @@ def suggest(
     return describe_suggestion(board, lens, candidates[order[skip % len(order)]])
 
 
-def describe_suggestion(board: Board, lens: Lens, T_camera_board: np.ndarray) -> Suggestion:
+def describe_suggestion(board: Board, lens: Lens, T_camera_board: Floats) -> Suggestion:
     """Return a suggestion for a given pose, with its outline and instruction."""
     corners = outline_px(board, lens, T_camera_board)
     _, thirds, tilts = _classify(board, lens, T_camera_board[None], depth_range(board, lens))
-    return Suggestion(
-        T_camera_board, corners, _describe_pose(thirds[0], tilts[0], corners.mean(0), lens.size)
-    )
+    across, down = corners.mean(0) / np.array(lens.size) - 0.5
+    offsets = {"top": -down, "bottom": down, "left": -across, "right": across}
+    where = " ".join(word for word, offset in offsets.items() if offset > 0.06)
+    place = f"to the {where}" if where else "in the middle"
+    attitude = f"Tilt the {TILTS[tilts[0]]}" if tilts[0] else "Face the camera squarely"
+    return Suggestion(T_camera_board, corners, f"{attitude}, {THIRDS[thirds[0]]}, {place}")
 
 
-def projector_reach(
-    points: np.ndarray, pixels: np.ndarray, size: tuple[int, int]
-) -> Illumination | None:
+def projector_reach(points: Floats, pixels: Floats, size: tuple[int, int]) -> Illumination | None:
     """Estimate the projector's field of view by linear resection (DLT) from points (n, 3) mm and
     pixels (n, 2).
 
@@ -212,7 +218,7 @@ def projector_reach(
         return None
     P = basis[-1].reshape(3, 4)
 
-    def reaches(points: np.ndarray) -> np.ndarray:
+    def reaches(points: Floats) -> np.ndarray:
         """(k,) bool: whether points (k, 3) mm project into the projector's image less a margin."""
         h = np.column_stack([(points - middle) / scale, np.ones(len(points))]) @ P.T
         return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - _REACH_MARGIN).all(1)
@@ -226,7 +232,7 @@ def _list_candidates(
     span: tuple[float, float],
     count: int,
     illuminated: Illumination | None,
-) -> np.ndarray:
+) -> Floats:
     """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the
     whole board is visible.
 
@@ -234,32 +240,24 @@ def _list_candidates(
     """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
     near, far = span
-    middle = box_middle(board.points)
     # Before two poses have shown the projector's field of view, the middle of the image is most
     # likely inside it.
     places = np.array(list(product((-1, 0, 1), repeat=2)) if illuminated is not None else [(0, 0)])
     shares = np.linspace(1, 0, 11)  # of the way from the image's middle to its border
-    pixels = (np.array(lens.size) - 1) / 2 + shares[:, None] * (places * np.array(lens.size) / 2)[
-        :, None
-    ]
-    rays = np.concatenate(
-        [(pixels - lens.K[:2, 2]) / np.diag(lens.K)[:2], np.ones((*pixels.shape[:2], 1))], axis=-1
-    )
+    size = np.array(lens.size)
+    pixels = (size - 1) / 2 + shares[:, None] * (places * size / 2)[:, None]
     depths = near + (far - near) * (np.arange(3) + 0.5) / 3
     R = Rotation.from_rotvec([(angle * x, angle * y, 0.0) for x, y in _TILT_AXES]).as_matrix()
-    t = depths[:, None, None, None, None] * rays - (R @ middle)[:, None, None]
     # by depth, tilt, place and share
-    T = rigid_transform(np.broadcast_to(R[:, None, None], (*t.shape, 3)), t)
-    visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(t.shape[:-1])
+    T = place_board(board, lens, R[:, None, None], depths[:, None, None, None], pixels)
+    visible = _is_visible(board, lens, T.reshape(-1, 4, 4), illuminated).reshape(T.shape[:-2])
     farthest = visible.argmax(axis=-1)
     far_enough = (shares[farthest] > 0.15) | (places == 0).all(axis=1)
     chosen = np.take_along_axis(T, farthest[..., None, None, None], axis=3)[..., 0, :, :]
     return chosen[visible.any(axis=-1) & far_enough]
 
 
-def _is_visible(
-    board: Board, lens: Lens, T: np.ndarray, illuminated: Illumination | None
-) -> np.ndarray:
+def _is_visible(board: Board, lens: Lens, T: Floats, illuminated: Illumination | None) -> Mask:
     """(n,) bool: whether the board's outline at poses (n, 4, 4) is inside the image, with a margin,
     and illuminated."""
     corners = move_points(T, board.outline())
@@ -274,7 +272,7 @@ def _is_visible(
 
 
 def _classify(
-    board: Board, lens: Lens, T: np.ndarray, span: tuple[float, float]
+    board: Board, lens: Lens, T: Floats, span: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of
     poses (n, 4, 4)."""
@@ -289,11 +287,6 @@ def _classify(
     cells = inside.reshape(-1, ROWS, _FINE, COLUMNS, _FINE).mean((2, 4)) >= _CELL_SHARE
     near, far = span
     thirds = np.clip(3 * (_board_middle(T, board)[:, 2] - near) / (far - near), 0, 2).astype(int)
-    return cells, thirds, _classify_tilt(T)
-
-
-def _classify_tilt(T: np.ndarray) -> np.ndarray:
-    """Return the index in `TILTS` of poses (n, 4, 4)."""
     normal = T[:, :3, 2] * np.where(T[:, 2, 2] >= 0, 1, -1)[:, None]
     # the side towards which depth grows: dz/dx = -n_x/n_z, dz/dy = -n_y/n_z, and up in the image is
     # -y
@@ -302,10 +295,10 @@ def _classify_tilt(T: np.ndarray) -> np.ndarray:
         np.abs(top) >= np.abs(right), np.where(top > 0, 1, 3), np.where(right > 0, 2, 4)
     )
     facing = np.degrees(np.arccos(np.clip(normal[:, 2], -1, 1))) < FACING_DEG
-    return np.where(facing, 0, tilted)
+    return cells, thirds, np.where(facing, 0, tilted)
 
 
-def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]) -> np.ndarray:
+def _describe_numerically(T: Floats, board: Board, span: tuple[float, float]) -> Floats:
     """Return descriptors (n, 5) of poses (n, 4, 4), to compare them: position, depth and tilt in
     units of about 1."""
     middle = _board_middle(T, board)
@@ -314,25 +307,7 @@ def _describe_numerically(T: np.ndarray, board: Board, span: tuple[float, float]
     return np.hstack([middle[:, :2] / reach, depth, T[:, :2, 2] / np.sin(np.radians(25))])
 
 
-def _board_middle(T: np.ndarray, board: Board) -> np.ndarray:
+def _board_middle(T: Floats, board: Board) -> Floats:
     """Return the middle (n, 3) mm of the board's features at poses (n, 4, 4), in the camera's
     frame."""
     return move_points(T, box_middle(board.points)[None])[:, 0]
-
-
-def _describe_pose(third: int, tilt: int, middle_px: np.ndarray, size: tuple[int, int]) -> str:
-    """Return the instruction for a pose: its tilt, depth and position in the image in words."""
-    across, down = middle_px / np.array(size) - 0.5
-    words = {
-        "top": down < -0.06,
-        "bottom": down > 0.06,
-        "left": across < -0.06,
-        "right": across > 0.06,
-    }
-    where = " ".join(word for word, here in words.items() if here)
-    attitude = (
-        "Face the camera squarely"
-        if tilt == 0
-        else f"Tilt the {TILTS[tilt].removesuffix(' away')} away"
-    )
-    return f"{attitude}, {THIRDS[third]}, {f'to the {where}' if where else 'in the middle'}"

@@ -5,13 +5,13 @@ An observation is small whatever the image size, so any number of poses fits in 
 phase maps are released.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.calibration.board_plane import BoardPlane
 from slviewer.calibration.edges import bright_pixels
@@ -20,12 +20,14 @@ from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.splines import SplineSurface, fit_spline
 from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
+T = TypeVar("T")
+Result = TypeVar("Result")
 READING_VERSION = 4
 """Version of ``observe``; observations that a session saved with another version are computed
 again."""
@@ -68,15 +70,11 @@ class Samples:
 
 def block_samples(
     phases: Mapping[Axis, PhaseMap],
-    bright: Mapping[Axis, np.ndarray],
-    axes: Sequence[Axis],
+    bright: Mapping[Axis, Mask],
     count: int = COUNT,
 ) -> Samples:
     """Average the projector coordinates over at most ``count`` blocks of the pixels that are
-    ``bright`` in every axis.
-
-    ``bright``: (h, w) bool by axis; ``axes``: the columns of the result.
-    """
+    ``bright`` (h, w) bool in every axis."""
     usable = np.logical_and.reduce(list(bright.values()))
     v, u = np.nonzero(usable)
     side = int(np.clip(np.sqrt(len(v) / count), 1, MAX_BLOCK_PX))
@@ -95,7 +93,7 @@ def block_samples(
     camera = np.stack([mean(u), mean(v)], axis=1)
     projector, sigma = np.full((2, len(chosen), 2), np.nan)
     for axis, phase in phases.items():
-        column, px = axes.index(axis), phase.period_px / (2 * np.pi)
+        column, px = AXES.index(axis), phase.period_px / (2 * np.pi)
         projector[:, column] = mean(phase.phase[v, u].astype(float) * px)
         sigma[:, column] = np.sqrt(
             mean((phase.sigma_phase[v, u].astype(float) * px) ** 2) * inverse
@@ -140,25 +138,28 @@ class Observation:
     name: str
     points: Floats
     camera: Floats
-    projector: np.ndarray
+    projector: Floats
     surfaces: Mapping[Axis, SplineSurface | Polynomial2D]
     periods_px: Mapping[Axis, float]
     size: tuple[int, int]
     box: tuple[int, int, int, int]
     packed_region: np.ndarray = field(repr=False)
-    slopes: np.ndarray | None = field(default=None, repr=False)
+    slopes: Floats | None = field(default=None, repr=False)
     radius_mm: float = 0.0
     marked: bool = False
     samples: Samples | None = field(default=None, repr=False)
 
     @property
-    def region(self) -> NDArray[np.bool_]:
+    def region(self) -> Mask:
         """(v1 - v0, u1 - u0) bool over ``box`` = (u0, v0, u1, v1)."""
-        u0, v0, u1, v1 = self.box
-        shape = (v1 - v0, u1 - u0)
-        return (
-            np.unpackbits(self.packed_region, count=shape[0] * shape[1]).view(bool).reshape(shape)
-        )
+        return self.region_rows(0, self.box[3] - self.box[1])
+
+    def region_rows(self, first: int, last: int) -> Mask:
+        """Return rows ``first`` to ``last`` of the region, (last - first, width) bool."""
+        width = self.box[2] - self.box[0]
+        start, stop = first * width, last * width
+        bits = np.unpackbits(self.packed_region[start // 8 : -(-stop // 8)])
+        return bits[start % 8 :][: stop - start].view(bool).reshape(-1, width)
 
     def smoothed_phase(self, axis: Axis) -> Floats:
         """(v1 - v0, u1 - u0) float64 rad over ``box``: the smoothed absolute phase, NaN outside the
@@ -168,18 +169,15 @@ class Observation:
             self.region, self.surfaces[axis].evaluate_grid((v1 - v0, u1 - u0), (u0, v0)), np.nan
         )
 
+    def coordinate(self, axis: Axis, u: np.ndarray, v: np.ndarray) -> Floats:
+        """Return the smoothed projector coordinate (n,) px at camera pixels ``u``, ``v`` (n,)."""
+        return self.surfaces[axis].evaluate(u, v) * (self.periods_px[axis] / (2 * np.pi))
+
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return named arrays for saving."""
-        arrays = {
-            "points": self.points,
-            "camera": self.camera,
-            "projector": self.projector,
-            "size": np.array(self.size),
-            "box": np.array(self.box),
-            "region": self.packed_region,
-            "radius_mm": np.array(self.radius_mm),
-            "marked": np.array(self.marked),
-        }
+        names = ("points", "camera", "projector", "size", "box", "radius_mm", "marked")
+        arrays = {name: np.asarray(getattr(self, name)) for name in names}
+        arrays["region"] = self.packed_region
         if self.slopes is not None:
             arrays["slopes"] = self.slopes
         if self.samples is not None:
@@ -201,12 +199,12 @@ class Observation:
         surfaces: dict[Axis, SplineSurface | Polynomial2D] = {}
         captured: list[Axis] = [axis for axis in AXES if f"{axis}_trend" in arrays]
         for axis in captured:
-            u0, v0, u1, v1 = (float(edge) for edge in arrays[f"{axis}_extent"])
-            trend = Polynomial2D(arrays[f"{axis}_trend"], (u0, v0, u1, v1))
+            trend = Polynomial2D(arrays[f"{axis}_trend"], tuple(arrays[f"{axis}_extent"].tolist()))
             spline = arrays.get(f"{axis}_spline")
             surfaces[axis] = trend if spline is None else SplineSurface(trend, spline)
-        width, height = (int(n) for n in arrays["size"])
-        left, top, right, bottom = (int(edge) for edge in arrays["box"])
+        samples = None
+        if "samples_camera" in arrays:
+            samples = Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
         return cls(
             name,
             arrays["points"],
@@ -214,17 +212,13 @@ class Observation:
             arrays["projector"],
             surfaces,
             {axis: float(arrays[f"{axis}_period_px"]) for axis in captured},
-            (width, height),
-            (left, top, right, bottom),
+            tuple(arrays["size"].tolist()),
+            tuple(arrays["box"].tolist()),
             arrays["region"],
             arrays.get("slopes"),
             float(arrays.get("radius_mm", 0.0)),
             bool(arrays.get("marked", False)),
-            (
-                Samples(*(arrays[f"samples_{name}"] for name in Samples.__annotations__))
-                if "samples_camera" in arrays
-                else None
-            ),
+            samples,
         )
 
 
@@ -240,73 +234,64 @@ def observe(
 
     Raises DetectionError where too few pixels of the board carry a usable pattern.
     """
-    smoothing = smoothing or Smoothing()
-    any_phase = next(iter(phases.values()))
-    height, width = any_phase.phase.shape
+    height, width = next(iter(phases.values())).phase.shape
     inside = board_mask(board, detection, (height, width))
     pitch = pitch_px(board, detection)
     typical_pitch = float(np.median(pitch))
-    box = _bounding_box(inside)
-    with ThreadPoolExecutor(max(1, len(phases))) as threads:
-        each = threads.map(
-            lambda phase: bright_pixels(phase, inside, typical_pitch), phases.values()
-        )
-        bright = dict(zip(phases, each, strict=True))
+    u0, v0, u1, v1 = box = _bounding_box(inside)
+    part = slice(v0, v1), slice(u0, u1)
+    bright = _map_axes(lambda phase: bright_pixels(phase, inside, typical_pitch), phases)
     projector, _ = _projector_pixels(detection, phases, bright, pitch)
     plane = BoardPlane.fit(detection.pixels, projector, (width, height))
     for axis in phases:
         if plane:  # excludes objects in front of the board
-            u0, v0, u1, v1 = box
-            coordinate = phases[axis].coordinate[v0:v1, u0:u1]
-            bright[axis][v0:v1, u0:u1] &= plane.contains(coordinate, AXES.index(axis), (u0, v0))
+            coordinate = phases[axis].coordinate[part]
+            bright[axis][part] &= plane.contains(coordinate, AXES.index(axis), (u0, v0))
         if np.count_nonzero(bright[axis]) < 400:
             raise DetectionError(
                 f"only {np.count_nonzero(bright[axis])} pixels of the board carry a usable {axis}"
                 " pattern: illuminate the whole board with the projector, and raise the exposure"
             )
     projector, slopes = _projector_pixels(detection, phases, bright, pitch)
-    u0, v0, u1, v1 = box
     supported = inside.copy()
     weighted = {}
     for axis, phase in phases.items():
-        weighted[axis] = phase.phase[v0:v1, u0:u1], _phase_weight(phase, bright[axis])[v0:v1, u0:u1]
+        weighted[axis] = phase.phase[part], _phase_weight(phase, bright[axis])[part]
         supported &= _is_near_bright(bright[axis], reach=typical_pitch)
-    surfaces = smooth_axes(weighted, box, width, typical_pitch, smoothing)
+    surfaces = smooth_axes(weighted, box, width, typical_pitch, smoothing or Smoothing())
     return Observation(
         name=name,
         points=board.points[detection.ids],
-        camera=np.asarray(detection.pixels, float),
+        camera=detection.pixels,
         projector=projector,
         surfaces=surfaces,
         periods_px={axis: phase.period_px for axis, phase in phases.items()},
         size=(width, height),
         box=box,
-        packed_region=np.packbits(supported[v0:v1, u0:u1]),
+        packed_region=np.packbits(supported[part]),
         slopes=slopes,
         radius_mm=detection.radius_mm,
         marked=detection.marked,
-        samples=block_samples(phases, bright, AXES),
+        samples=block_samples(phases, bright),
     )
 
 
 def pitch_px(board: Board, detection: Detection) -> Floats:
     """Return the board's pitch (n,) in camera px at each feature."""
     points = board.points[detection.ids][:, :2]
-    H, _ = cv2.findHomography(points, np.asarray(detection.pixels, float))
+    H, _ = cv2.findHomography(points, detection.pixels)
     half = board.pitch_mm / 2
-    sides = []
-    for step in (np.array([half, 0.0]), np.array([0.0, half])):
-        ahead, behind = (cv2.perspectiveTransform((points + s)[None], H)[0] for s in (step, -step))
-        sides.append(lengths(ahead - behind))
-    return np.minimum(*sides)
+    steps = half * np.array([[[1, 0]], [[-1, 0]], [[0, 1]], [[0, -1]]])
+    right, left, below, above = (cv2.perspectiveTransform(points[None] + s, H)[0] for s in steps)
+    return np.minimum(lengths(right - left), lengths(below - above))
 
 
 def _projector_pixels(
     detection: Detection,
     phases: Mapping[Axis, PhaseMap],
-    bright: Mapping[Axis, np.ndarray],
-    pitch: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    bright: Mapping[Axis, Mask],
+    pitch: Floats,
+) -> tuple[Floats, Floats]:
     """Fit the projector coordinates (n, 2) px of the features, and their Jacobians (n, 2, 2) by
     camera pixels.
 
@@ -315,14 +300,21 @@ def _projector_pixels(
     projector = np.full((len(detection.ids), 2), np.nan)
     slopes = np.full((len(detection.ids), 2, 2), np.nan)
     for axis, phase in phases.items():
-        coordinate = np.where(bright[axis], phase.coordinate, 0.0)
+        coordinate, k = np.where(bright[axis], phase.coordinate, 0.0), AXES.index(axis)
         weight = _phase_weight(phase, bright[axis])
-        values = fit_local_values(coordinate, weight, detection.pixels, 0.8 * pitch)
-        projector[:, AXES.index(axis)], slopes[:, AXES.index(axis)] = values
+        projector[:, k], slopes[:, k] = fit_local_values(
+            coordinate, weight, detection.pixels, 0.8 * pitch
+        )
     return projector, slopes
 
 
-def _phase_weight(phase: PhaseMap, bright: np.ndarray) -> np.ndarray:
+def _map_axes(function: Callable[[T], Result], by_axis: Mapping[Axis, T]) -> dict[Axis, Result]:
+    """Apply a function to what belongs to each axis, in parallel threads."""
+    with ThreadPoolExecutor(max(1, len(by_axis))) as threads:
+        return dict(zip(by_axis, threads.map(function, by_axis.values()), strict=True))
+
+
+def _phase_weight(phase: PhaseMap, bright: Mask) -> Floats:
     """Return weights (h, w): the inverse variance of the phase of bright pixels over its maximum,
     else 0."""
     weight = np.where(bright, 1.0 / np.maximum(phase.sigma_phase, 1e-6) ** 2, 0.0)
@@ -336,64 +328,47 @@ def smooth_axes(
     pitch: float,
     smoothing: Smoothing,
 ) -> dict[Axis, SplineSurface | Polynomial2D]:
-    """Run ``smooth_phase`` on each axis' (phase, weight) in parallel threads; see there for the
-    parameters."""
-    with ThreadPoolExecutor(max(1, len(weighted))) as threads:
-        surfaces = threads.map(
-            lambda pair: smooth_phase(pair[0], pair[1], box, width, pitch, smoothing),
-            weighted.values(),
-        )
-        return dict(zip(weighted, surfaces, strict=True))
+    """Fit a smooth surface to a board's absolute phase in each axis (step 2).
 
-
-def smooth_phase(
-    phase: np.ndarray,
-    weight: np.ndarray,
-    box: tuple[int, int, int, int],
-    width: int,
-    pitch: float,
-    smoothing: Smoothing,
-) -> SplineSurface | Polynomial2D:
-    """Fit a smooth surface to a board's absolute phase (step 2).
-
-    ``phase`` (v1 - v0, u1 - u0) rad and its ``weight`` over the ``box`` (u0, v0, u1, v1); ``width``
-    of the image and ``pitch`` of the board in px.
+    ``weighted``: phase (v1 - v0, u1 - u0) rad and its weight over the ``box`` (u0, v0, u1, v1);
+    ``width`` of the image and ``pitch`` of the board in px.
     """
     u0, v0, u1, v1 = box
-    v, u = np.nonzero(weight)
-    if len(v) > SAMPLES:
-        chosen = np.random.default_rng(0).choice(len(v), SAMPLES, replace=False)
-        v, u = v[chosen], u[chosen]
-    values, weights = phase[v, u].astype(float), weight[v, u]
-    v, u = v + v0, u + u0
     extent = (u0 - 0.5, v0 - 0.5, u1 - 0.5, v1 - 0.5)
-    if smoothing.kind == "polynomial":
-        return fit_polynomial(u, v, values, weights, extent, smoothing.degree, robust=True)
     cell = max(width / CELLS_PER_WIDTH, 1.2 * pitch)
     cells = (max(1, round((u1 - u0) / cell)), max(1, round((v1 - v0) / cell)))
-    return fit_spline(u, v, values, weights, extent, cells, robust=True)
+
+    def smooth(axis: tuple[np.ndarray, np.ndarray]) -> SplineSurface | Polynomial2D:
+        """Return the surface of one axis."""
+        phase, weight = axis
+        v, u = np.nonzero(weight)
+        if len(v) > SAMPLES:
+            chosen = np.random.default_rng(0).choice(len(v), SAMPLES, replace=False)
+            v, u = v[chosen], u[chosen]
+        samples = u + u0, v + v0, phase[v, u].astype(float), weight[v, u], extent
+        if smoothing.kind == "polynomial":
+            return fit_polynomial(*samples, smoothing.degree, robust=True)
+        return fit_spline(*samples, cells, robust=True)
+
+    return _map_axes(smooth, weighted)
 
 
-def _is_near_bright(bright: np.ndarray, reach: float) -> np.ndarray:
+def _is_near_bright(bright: Mask, reach: float) -> Mask:
     """(h, w) bool: pixels that have bright ones within ``reach`` px on every side of a closing."""
     step = max(1, int(reach // 8))
     height, width = bright.shape
-    small = cv2.resize(
-        bright.astype(np.uint8),
-        (-(-width // step), -(-height // step)),
-        interpolation=cv2.INTER_AREA,
-    )
+    shape = -(-width // step), -(-height // step)
+    small = cv2.resize(bright.astype(np.uint8), shape, interpolation=cv2.INTER_AREA)
     size = 2 * int(np.ceil(reach / step)) + 1
-    closed = cv2.morphologyEx(
-        small, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    )
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, disc)
     grown = cv2.dilate(closed, np.ones((3, 3), np.uint8))
     return cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
 
-def _bounding_box(mask: np.ndarray) -> tuple[int, int, int, int]:
+def _bounding_box(mask: Mask) -> tuple[int, int, int, int]:
     """Return (u0, v0, u1, v1) px around a mask (h, w); raises DetectionError where it is empty."""
-    rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
-    if not len(rows):
+    u0, v0, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if not width:
         raise DetectionError("the board's outline is outside the image: move the board into view")
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+    return u0, v0, u0 + width, v0 + height

@@ -14,6 +14,7 @@ from slviewer.calibration.splined.volume import in_illuminated_cells
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import finite_rows, lengths, rms
 
 GRID = 80
@@ -35,14 +36,7 @@ class PinholeFit:
 def fit_splined(model: SplinedModel) -> tuple[PinholeFit, PinholeFit]:
     """Fit lenses to a splined model's camera and projector, over the cells that target poses
     illuminated."""
-    bundle = model.bundle
-    camera, projector = (
-        _fit_device(device, poses > 0)
-        for device, poses in (
-            (model.rig.camera, bundle.camera_poses),
-            (model.rig.projector, bundle.projector_poses),
-        )
-    )
+    camera, projector = map(_fit_device, model.rig[:2], model.bundle.illuminated)
     return camera, projector
 
 
@@ -55,7 +49,7 @@ def pixelwise_residuals(model: PixelwiseModel, lens: Lens) -> PinholeFit:
     return _measure_residuals(lens, pixels, coefficients[3:5, ::step, ::step].reshape(2, -1).T)
 
 
-def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
+def fit_lens(pixels: Floats, rays: Floats, start: Lens) -> PinholeFit:
     """Fit a lens that projects undistorted normalised ``rays`` (n, 2) to ``pixels`` (n, 2) px, by
     least squares.
 
@@ -69,20 +63,19 @@ def fit_lens(pixels: np.ndarray, rays: np.ndarray, start: Lens) -> PinholeFit:
         )
     observed, directions = pixels[known], rays[known]
 
-    def residuals(numbers: np.ndarray) -> np.ndarray:
+    def residuals(numbers: Floats) -> Floats:
         """Return the residuals (2 n,) px of a lens with these nine parameters."""
         return np.nan_to_num(
             Lens.from_parameters(numbers, start.size).distort(directions) - observed, nan=1e3
         ).ravel()
 
-    K = start.K
     first = start.parameters[:9]
-    scale = np.array([K[0, 0], K[1, 1], K[0, 0], K[1, 1], 0.1, 0.1, 0.01, 0.01, 0.1])
+    scale = np.array([*first[:2], *first[:2], 0.1, 0.1, 0.01, 0.01, 0.1])
     solved = least_squares(residuals, first, x_scale=scale, xtol=1e-12, ftol=1e-12)
     return _measure_residuals(Lens.from_parameters(solved.x, start.size), pixels, rays)
 
 
-def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> PinholeFit:
+def _measure_residuals(lens: Lens, pixels: Floats, rays: Floats) -> PinholeFit:
     """Measure the residuals of a lens at pixels (n, 2) with known rays (n, 2); rows with NaN are
     ignored."""
     length = lengths(lens.distort(rays) - pixels)
@@ -92,7 +85,7 @@ def _measure_residuals(lens: Lens, pixels: np.ndarray, rays: np.ndarray) -> Pinh
     return PinholeFit(lens, rms(length[known]), float(length[known].max()), float(known.mean()))
 
 
-def _fit_device(device: Device, illuminated: np.ndarray) -> PinholeFit:
+def _fit_device(device: Device, illuminated: Mask) -> PinholeFit:
     """Fit a pinhole and Brown lens to a device over the cells (rows, columns) bool that target
     poses illuminated."""
     width, height = device.size

@@ -3,6 +3,10 @@
 For every camera pixel ``z = (c0 + c1 phi)/(1 + c2 phi)`` (eq. 9), ``x = c3 z`` and ``y = c4 z``
 (eq. 10, 11), fitted to target poses that stereo reconstructed and that were projected onto their
 ideal planes (eq. 12, 13).
+
+The fit works with moments in float64, some image rows at a time. Depth and phase are relative to a
+reference point of each pixel (``zeta = z - z_ref``, ``s = phi - phi_ref``), which leaves the
+rational family as it is, ``zeta = (a0 + a1 s)/(1 + a2 s)``, and keeps the sums well conditioned.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,17 +14,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import prange
+from numba import njit, prange
 from numpy.typing import NDArray
 
-from slviewer.calibration.moments import fit_rational
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.shapes import Plane, fit_plane
 from slviewer.geometry.triangulation import MARGIN, depth_per_px, ray_depth, triangulate_pixels
 from slviewer.records.calibration import AxisFit, PixelwiseFit
@@ -48,11 +51,11 @@ class PixelFit:
     """
 
     coefficients: Floats
-    rms_mm: NDArray[np.float32]
+    rms_mm: Floats32
     poses: NDArray[np.uint16]
-    phase_min: NDArray[np.float32]
-    phase_max: NDArray[np.float32]
-    condition: NDArray[np.float32]
+    phase_min: Floats32
+    phase_max: Floats32
+    condition: Floats32
 
 
 @dataclass(frozen=True)
@@ -77,21 +80,13 @@ class PixelwiseModel:
         """The captured axes."""
         return tuple(self.fits)
 
-    def points(self, phase: PhaseMap) -> NDArray[np.float32]:
+    def points(self, phase: PhaseMap) -> Floats32:
         """Return points (h, w, 3) float32 mm; NaN where phase or fit are invalid, or too far from
         the fitted range."""
         fit = self.fits[phase.axis]
         out = np.empty((*phase.phase.shape, 3), np.float32)
         ratio = phase.period_px / self.periods_px[phase.axis]
-        _evaluate(
-            phase.phase,
-            ratio,
-            fit.coefficients,
-            fit.phase_min,
-            fit.phase_max,
-            MAX_EXTRAPOLATION,
-            out,
-        )
+        _evaluate(phase.phase, ratio, fit.coefficients, fit.phase_min, fit.phase_max, out)
         return out
 
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
@@ -169,31 +164,30 @@ def calibrate_pixelwise(
             " in more positions"
         )
     depth_axis = best_axis(used, stereo)
-    planes = {o.name: ideal_plane(o, stereo, depth_axis) for o in used}
-    z_ref = mid_depth(stereo)
     width, height = used[0].size
     axes = [axis for axis in stereo.axes if all(axis in o.surfaces for o in used)]
-    periods = {axis: used[0].periods_px[axis] for axis in axes}
-    fits = {axis: _empty_fit(height, width) for axis in axes}
+    model = PixelwiseModel(
+        {axis: _empty_fit(height, width) for axis in axes},
+        {axis: used[0].periods_px[axis] for axis in axes},
+        {o.name: ideal_plane(o, stereo, depth_axis) for o in used},
+        depth_axis,
+    )
     band = max(1, min(height, BAND_BYTES // (8 * len(used) * width * (len(axes) + 1))))
     # allocated once: new memory is slow at first
     buffer = np.empty((len(axes) + 1, len(used) * band * width))
     for first in range(0, height, band):
         rows = slice(first, min(first + band, height))
-        phases, z, rays = _collect_rows(
-            used, stereo, planes, axes, periods, depth_axis, rows, buffer
-        )
-        for axis in axes:
-            reference = _reference_phase(stereo, axis, periods[axis], z_ref, rows)
-            _fit_rows(phases[axis], z, reference, z_ref, rays, rows, fits[axis])
+        phases, z, sums = _collect_rows(model, used, stereo, rows, buffer)
+        for axis, phase in zip(axes, phases, strict=True):
+            _fit_rows(model, axis, stereo, rows, (phase, z, sums))
         if progress:
             progress(rows.stop / height)
-    if not any((fit.poses >= MIN_POSES).any() for fit in fits.values()):
+    if not any((fit.poses >= MIN_POSES).any() for fit in model.fits.values()):
         raise CalibrationRejected(
             f"no pixel has a view of the board in {MIN_POSES} poses or more: let the poses overlap"
             " in the image"
         )
-    return PixelwiseModel(fits, periods, planes, depth_axis)
+    return model
 
 
 def pixel_samples(
@@ -216,14 +210,11 @@ def pixel_samples(
             u0 <= u < u1 and v0 <= v < v1 and o.region[v - v0, u - u0]
         ):
             continue
-        coordinate = o.surfaces[model.depth_axis].evaluate(np.array([u]), np.array([v]))
-        coordinate *= o.periods_px[model.depth_axis] / (2 * np.pi)
-        X = triangulate_pixels(stereo.rig, np.array([[u, v]], float), coordinate, model.depth_axis)[
-            0
-        ]
         plane = model.planes[o.name]
+        at = np.array([u]), np.array([v])
+        (X,) = _reconstruct(o, stereo, model.depth_axis, *at)
         points.append(X - (X @ plane.normal - plane.offset) * plane.normal)
-        phase = float(o.surfaces[axis].evaluate(np.array([u]), np.array([v]))[0])
+        (phase,) = o.surfaces[axis].evaluate(*at)
         phases.append(phase * o.periods_px[axis] / model.periods_px[axis])
     return np.array(phases), np.array(points).reshape(-1, 3)
 
@@ -253,11 +244,7 @@ def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Pl
     u0, v0, u1, v1 = observation.box
     step = max(1, int(((u1 - u0) * (v1 - v0) / PLANE_PIXELS) ** 0.5))
     v, u = np.nonzero(observation.region[::step, ::step])
-    v, u = v0 + v * step, u0 + u * step
-    coordinate = observation.surfaces[axis].evaluate(u, v) * (
-        observation.periods_px[axis] / (2 * np.pi)
-    )
-    points = triangulate_pixels(stereo.rig, np.column_stack([u, v]).astype(float), coordinate, axis)
+    points = _reconstruct(observation, stereo, axis, u0 + u * step, v0 + v * step)
     finite = points[np.isfinite(points[:, 2])]
     if len(finite) < 100:
         raise CalibrationRejected(
@@ -267,81 +254,57 @@ def ideal_plane(observation: Observation, stereo: StereoModel, axis: Axis) -> Pl
     return fit_plane(finite)
 
 
+def _reconstruct(
+    o: Observation, stereo: StereoModel, axis: Axis, u: np.ndarray, v: np.ndarray
+) -> Floats:
+    """Return stereo's points (n, 3) mm of a pose's smoothed phase at camera pixels ``u``, ``v``
+    (n,)."""
+    pixels = np.column_stack([u, v]).astype(float)
+    return triangulate_pixels(stereo.rig, pixels, o.coordinate(axis, u, v), axis)
+
+
 def _collect_rows(
+    model: PixelwiseModel,
     used: Sequence[Observation],
     stereo: StereoModel,
-    planes: Mapping[str, Plane],
-    axes: Sequence[Axis],
-    periods: Mapping[Axis, float],
-    depth_axis: Axis,
     rows: slice,
     buffer: np.ndarray,
-) -> tuple[dict[Axis, np.ndarray], np.ndarray, np.ndarray]:
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Collect the samples of all poses in some image rows.
 
-    Returns the phase (n, h', w) rad of each axis in ``periods``, the depth (n, h', w) mm, both
-    views of ``buffer``, and the sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11).
-    Stereo's points are projected along the plane's normal onto it (step 4, eq. 13); NaN outside a
-    pose's board.
+    Returns the phase (n, h', w) rad of each axis, the depth (n, h', w) mm, all views of ``buffer``,
+    and the sums (h', w, 6) for ``x = c3 z`` and ``y = c4 z`` (eq. 10, 11). Stereo's points are
+    projected along the plane's normal onto it (step 4, eq. 13); NaN outside a pose's board.
     """
-    rig, width = stereo.rig, used[0].size[0]
-    shape = len(used), rows.stop - rows.start, width
-    *axis_phases, z = (each[: np.prod(shape)].reshape(shape) for each in buffer)
-    phases, sums = dict(zip(axes, axis_phases, strict=True)), np.zeros((*shape[1:], 6))
-    for each in (*axis_phases, z):
+    rig, depth_axis = stereo.rig, model.depth_axis
+    shape = len(used), rows.stop - rows.start, used[0].size[0]
+    *phases, z = (each[: np.prod(shape)].reshape(shape) for each in buffer)
+    for each in (*phases, z):
         each.fill(np.nan)
+    sums = np.zeros((*shape[1:], 6))
     extent = np.array(rig.projector.size, float)
     for i, o in enumerate(used):
         u0, v0, u1, v1 = o.box
         first, last = max(rows.start, v0), min(rows.stop, v1)
         if first >= last:
             continue
-        here, box = (
-            (last - first, u1 - u0),
-            (
-                slice(first - rows.start, last - rows.start),
-                slice(u0, u1),
-            ),
-        )
-        region = _region_rows(o, first - v0, last - v0)
+        box = slice(first - rows.start, last - rows.start), slice(u0, u1)
+        region = o.region_rows(first - v0, last - v0)
         smooth = {
-            axis: o.surfaces[axis].evaluate_grid(here, (u0, first)) for axis in {*axes, depth_axis}
+            axis: o.surfaces[axis].evaluate_grid(region.shape, (u0, first))
+            for axis in {*model.axes, depth_axis}
         }
-        for axis in axes:
-            np.multiply(
-                smooth[axis],
-                o.periods_px[axis] / periods[axis],
-                out=phases[axis][i][box],
-                where=region,
-            )
-        plane = planes[o.name]
+        for axis, phase in zip(model.axes, phases, strict=True):
+            ratio = o.periods_px[axis] / model.periods_px[axis]
+            np.multiply(smooth[axis], ratio, out=phase[i][box], where=region)
+        plane = model.planes[o.name]
         _project_onto_plane(
-            smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi), rig.camera.rays(),
-            first, u0,
-            rig.R.copy(), rig.t.copy(), rig.projector.parameters, 0 if depth_axis == "x" else 1,
-            extent,
-            plane.normal, plane.offset, z[i], sums, first - rows.start,
+            smooth[depth_axis], region, o.periods_px[depth_axis] / (2 * np.pi),
+            rig.camera.rays()[first:last, u0:u1], rig.R.copy(), rig.t.copy(),
+            rig.projector.parameters, "xy".index(depth_axis), extent, plane.normal, plane.offset,
+            z[i][box], sums[box],
         )  # fmt: skip
     return phases, z, sums
-
-
-def _region_rows(o: Observation, first: int, last: int) -> np.ndarray:
-    """Unpack rows ``first`` to ``last`` of an observation's region, (last - first, width) bool."""
-    width = o.box[2] - o.box[0]
-    start, stop = first * width, last * width
-    bits = np.unpackbits(o.packed_region[start // 8 : -(-stop // 8)])
-    return bits[start % 8 :][: stop - start].view(bool).reshape(last - first, width)
-
-
-def _reference_phase(
-    stereo: StereoModel, axis: Axis, period_px: float, z: float, rows: slice
-) -> np.ndarray:
-    """Return the phase (h', w) rad that stereo predicts at depth ``z`` mm; 0 outside the
-    projector's image."""
-    rays = stereo.rig.camera.rays()[rows]
-    points = np.dstack([rays * z, np.full(rays.shape[:2], z)])
-    coordinate = stereo.rig.project(points)[..., 0 if axis == "x" else 1]
-    return np.nan_to_num(2 * np.pi * coordinate / period_px)
 
 
 def _empty_fit(height: int, width: int) -> PixelFit:
@@ -353,15 +316,22 @@ def _empty_fit(height: int, width: int) -> PixelFit:
 
 
 def _fit_rows(
-    phase: np.ndarray,
-    z: np.ndarray,
-    phase_ref: np.ndarray,
-    z_ref: float,
-    rays: np.ndarray,
+    model: PixelwiseModel,
+    axis: Axis,
+    stereo: StereoModel,
     rows: slice,
-    fit: PixelFit,
+    samples: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Fill the ``rows`` of ``fit`` from the samples of ``_collect_rows`` (step 5)."""
+    """Fill the ``rows`` of an axis' fit from its ``samples`` by ``_collect_rows`` (step 5).
+
+    The reference of each pixel is the phase that stereo predicts at mid depth; 0 outside the
+    projector's image.
+    """
+    (phase, z, sums), fit, z_ref = samples, model.fits[axis], mid_depth(stereo)
+    rays = stereo.rig.camera.rays()[rows]
+    middle = np.dstack([rays * z_ref, np.full(rays.shape[:2], z_ref)])
+    coordinate = stereo.rig.project(middle)[..., "xy".index(axis)]
+    phase_ref = np.nan_to_num(2 * np.pi * coordinate / model.periods_px[axis])
     a, rms_z = np.empty((3, *phase.shape[1:])), np.empty(phase.shape[1:])
     poses, least, most = fit.poses[rows], fit.phase_min[rows], fit.phase_max[rows]
     fit_rational(
@@ -372,49 +342,23 @@ def _fit_rows(
     # terms
     b0, b1 = a0 + z_ref, a1 + z_ref * a2
     scale = 1 - a2 * phase_ref
-    n, zz, xz, yz, xx, yy = np.moveaxis(rays, -1, 0)
+    n, zz, xz, yz, xx, yy = np.moveaxis(sums, -1, 0)
     c, rms = fit.coefficients[:, rows], fit.rms_mm[:, rows]
     with np.errstate(invalid="ignore", divide="ignore"):
-        c[0], c[1], c[2], c[3], c[4] = (
-            (b0 - b1 * phase_ref) / scale,
-            b1 / scale,
-            a2 / scale,
-            xz / zz,
-            yz / zz,
-        )
-        rms[0], rms[1], rms[2] = (
-            rms_z, np.sqrt(np.maximum(xx - c[3] * xz, 0) / n),
-            np.sqrt(np.maximum(yy - c[4] * yz, 0) / n)
-        )  # fmt: skip
+        c[:3] = (b0 - b1 * phase_ref) / scale, b1 / scale, a2 / scale
+        c[3], c[4], rms[0] = xz / zz, yz / zz, rms_z
+        rms[1] = np.sqrt(np.maximum(xx - c[3] * xz, 0) / n)
+        rms[2] = np.sqrt(np.maximum(yy - c[4] * yz, 0) / n)
     missing = ~np.isfinite(c).all(0)
-    c[:, missing] = np.nan
-    rms[:, missing] = np.nan
+    c[:, missing] = rms[:, missing] = np.nan
 
 
 @kernel(parallel=True)
 def _project_onto_plane(  # type: ignore[no-untyped-def]
-    phase,
-    region,
-    px_per_rad,
-    rays,
-    v0,
-    u0,
-    R,
-    t,
-    parameters,
-    row,
-    extent,
-    normal,
-    offset,
-    z,
-    sums,
-    first,
+    phase, region, px_per_rad, rays, R, t, parameters, row, extent, normal, offset, z, sums
 ):
     """Fill depths ``z`` and ``sums`` with stereo's points projected along the ``normal`` onto their
-    plane.
-
-    ``phase`` and ``region`` start at pixel (u0, v0), and at row ``first`` of ``z`` and ``sums``.
-    """
+    plane."""
     low, high = -0.5 - MARGIN * extent[row], (1.0 + MARGIN) * extent[row] - 0.5
     for i in prange(phase.shape[0]):
         shift = 0.0  # the neighbour's distortion is a guess that saves a step or two
@@ -422,7 +366,7 @@ def _project_onto_plane(  # type: ignore[no-untyped-def]
             measured = phase[i, j] * px_per_rad
             if not (region[i, j] and low <= measured <= high):
                 continue
-            uc, vc = rays[v0 + i, u0 + j, 0], rays[v0 + i, u0 + j, 1]
+            uc, vc = rays[i, j, 0], rays[i, j, 1]
             depth, new, _ = ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent)
             if np.isnan(depth) and shift != 0.0:
                 depth, new, _ = ray_depth(uc, vc, measured, 0.0, R, t, parameters, row, extent)
@@ -430,13 +374,10 @@ def _project_onto_plane(  # type: ignore[no-untyped-def]
             if np.isnan(depth):
                 continue
             off = depth * (uc * normal[0] + vc * normal[1] + normal[2]) - offset
-            X, Y, Z = (
-                uc * depth - off * normal[0],
-                vc * depth - off * normal[1],
-                depth - off * normal[2],
-            )
-            z[first + i, u0 + j] = Z
-            a = sums[first + i, u0 + j]
+            X, Y = uc * depth - off * normal[0], vc * depth - off * normal[1]
+            Z = depth - off * normal[2]
+            z[i, j] = Z
+            a = sums[i, j]
             a[0] += 1.0
             a[1] += Z * Z
             a[2] += X * Z
@@ -446,13 +387,13 @@ def _project_onto_plane(  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _evaluate(phase, ratio, c, phase_min, phase_max, reach, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (h, w, 3) with the points of phases times ``ratio``; NaN beyond the fitted range
-    and ``reach``."""
+def _evaluate(phase, ratio, c, phase_min, phase_max, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (h, w, 3) with the points of phases times ``ratio``; NaN too far beyond the
+    fitted range."""
     for v in prange(phase.shape[0]):
         for u in range(phase.shape[1]):
             p = ratio * np.float64(phase[v, u])
-            margin = reach * (phase_max[v, u] - phase_min[v, u])
+            margin = MAX_EXTRAPOLATION * (phase_max[v, u] - phase_min[v, u])
             denominator = 1.0 + c[2, v, u] * p
             z = (c[0, v, u] + c[1, v, u] * p) / denominator
             inside = p >= phase_min[v, u] - margin and p <= phase_max[v, u] + margin
@@ -464,3 +405,116 @@ def _evaluate(phase, ratio, c, phase_min, phase_max, reach, out):  # type: ignor
                 out[v, u, 0] = np.nan
                 out[v, u, 1] = np.nan
                 out[v, u, 2] = np.nan
+
+
+@kernel(parallel=True)
+def fit_rational(
+    phase, z, phase_ref, z_ref, min_poses, coefficients, rms, poses, phase_min, phase_max, condition
+):
+    """Fit pixels of some rows to their poses: phase (n, h', w) rad and depth z (n, h', w) mm, NaN
+    where invalid.
+
+    Fills ``coefficients`` (3, h', w) a0 ... a2 and ``rms`` mm, NaN at pixels of fewer than
+    ``min_poses`` poses; ``poses``, the range of valid ``phase``, and the fit's ``condition``, (h',
+    w) each. First the equation's own residual is minimised, which is linear, ``zeta = a0 + a1 s -
+    a2 zeta s``; then one Gauss-Newton step minimises the residual in depth.
+    """
+    for v in prange(phase.shape[1]):
+        a = np.empty(10)
+        for u in range(phase.shape[2]):
+            reference = phase_ref[v, u]
+            count, low, high = _sum_linear_moments(phase, z, v, u, reference, z_ref, a)
+            poses[v, u], phase_min[v, u], phase_max[v, u] = count, low, high
+            a0 = a1 = a2 = residual = scaled_condition = np.nan
+            if count >= min_poses:
+                a0, a1, a2, _, _ = _solve_moments(a)
+                if not np.isnan(a0):
+                    _sum_gauss_newton_moments(phase, z, v, u, reference, z_ref, a0, a1, a2, a)
+                    b0, b1, b2, explained, scaled_condition = _solve_moments(a)
+                    a0, a1, a2 = a0 + b0, a1 + b1, a2 + b2
+                    residual = np.sqrt(max(0.0, a[9] - explained) / count)
+            coefficients[0, v, u], coefficients[1, v, u], coefficients[2, v, u] = a0, a1, a2
+            rms[v, u], condition[v, u] = residual, scaled_condition
+
+
+@njit
+def _add_moments(a, j0, j1, j2, r):
+    """Add an equation ``j0 x0 + j1 x1 + j2 x2 = r`` to the sums ``a`` (10,).
+
+    a[:6]: upper triangle of the normal matrix, a[6:9]: its right side, a[9]: sum of the squares.
+    """
+    a[0] += j0 * j0
+    a[1] += j0 * j1
+    a[2] += j0 * j2
+    a[3] += j1 * j1
+    a[4] += j1 * j2
+    a[5] += j2 * j2
+    a[6] += j0 * r
+    a[7] += j1 * r
+    a[8] += j2 * r
+    a[9] += r * r
+
+
+@njit
+def _sum_linear_moments(phase, z, v, u, phase_ref, z_ref, a):
+    """Fill the sums ``a`` (10,), see ``_add_moments``. Returns the number of valid poses and the
+    range of their phases."""
+    a[:] = 0.0
+    count, low, high = 0, np.inf, -np.inf
+    for i in range(phase.shape[0]):
+        p = phase[i, v, u]
+        s, zeta = p - phase_ref, z[i, v, u] - z_ref
+        if not (np.isfinite(s) and np.isfinite(zeta)):
+            continue
+        _add_moments(a, 1.0, s, -zeta * s, zeta)
+        count += 1
+        low, high = min(low, p), max(high, p)
+    return count, low, high
+
+
+@njit
+def _sum_gauss_newton_moments(phase, z, v, u, phase_ref, z_ref, a0, a1, a2, a):
+    """Fill ``a`` (10,) with one pixel's Gauss-Newton sums for z = (a0 + a1 s) / (1 + a2 s) over the
+    poses.
+
+    ``s`` is the phase less ``phase_ref``, z less ``z_ref``; poses with NaN are skipped.
+    """
+    a[:] = 0.0
+    for i in range(phase.shape[0]):
+        s = phase[i, v, u] - phase_ref
+        w = 1.0 / (1.0 + a2 * s)
+        model = (a0 + a1 * s) * w
+        r = z[i, v, u] - z_ref - model
+        if not (np.isfinite(s) and np.isfinite(r)):
+            continue
+        _add_moments(a, w, s * w, -s * w * model, r)
+
+
+@njit
+def _solve_moments(a):
+    """Solve the normal equations ``a`` by Cholesky of the normalised matrix.
+
+    Returns the three unknowns, the sum of squares that they explain, and the condition; NaN without
+    a solution.
+    """
+    none = np.nan
+    if a[0] <= 0 or a[3] <= 0 or a[5] <= 0:
+        return none, none, none, none, none
+    d0, d1, d2 = 1 / np.sqrt(a[0]), 1 / np.sqrt(a[3]), 1 / np.sqrt(a[5])
+    m01, m02, m12 = a[1] * d0 * d1, a[2] * d0 * d2, a[4] * d1 * d2
+    y0, b1, b2 = a[6] * d0, a[7] * d1, a[8] * d2
+    l11s = 1 - m01 * m01
+    if not l11s > 1e-12:
+        return none, none, none, none, none
+    l11 = np.sqrt(l11s)
+    l21 = (m12 - m01 * m02) / l11
+    l22s = 1 - m02 * m02 - l21 * l21
+    if not l22s > 1e-12:
+        return none, none, none, none, none
+    l22 = np.sqrt(l22s)
+    y1 = (b1 - m01 * y0) / l11
+    y2 = (b2 - m02 * y0 - l21 * y1) / l22
+    x2 = y2 / l22
+    x1 = (y1 - l21 * x2) / l11
+    x0 = y0 - m01 * x1 - m02 * x2
+    return x0 * d0, x1 * d1, x2 * d2, y0 * y0 + y1 * y1 + y2 * y2, 1 / min(l11, l22)

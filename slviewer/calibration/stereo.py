@@ -6,19 +6,26 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.calibration.board_pose import CRITERIA, solve_device
+from slviewer.calibration.next_pose import nominal_lens
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.soundness import check_handedness, check_pose_count, check_tilts
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.polynomial import fit_slopes
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import Floats, move_points, transform_from_rvec
+from slviewer.geometry.rigid import (
+    Floats,
+    Floats32,
+    Mask,
+    largest_angle_deg,
+    move_points,
+    transform_from_rvec,
+)
 from slviewer.geometry.triangulation import depth_per_px, points_from_depth, triangulate
-from slviewer.geometry.vectors import finite_rows, lengths, rms_length
+from slviewer.geometry.vectors import finite_rows, lengths, rms_length, unit_vectors
 from slviewer.records.calibration import StereoFit, describe_stereo
 from slviewer.records.plain import from_plain, to_plain
 
@@ -28,8 +35,11 @@ MAX_FOCAL_SIGMA = 0.05
 MAX_REPROJECTION_PX = 2.0
 """Above this the features and the model do not belong together, whatever the cause."""
 ROBUST_SIGMAS = 6.0
+DEVICES = ("camera", "projector")
 _SAVED_KEYS = {"excluded": "left_out", "features_excluded": "features_set_aside"}
 """Keys on disk of the fields whose names differ from them."""
+MIN_POSES = 3
+MIN_TILT_SPREAD_DEG = 4.0
 
 
 @dataclass(frozen=True)
@@ -50,13 +60,13 @@ class StereoModel:
     board: str
     axes: tuple[Axis, ...]
     reprojection_rms_px: Mapping[str, float]
-    poses: Mapping[str, np.ndarray]
+    poses: Mapping[str, Floats]
     pose_rms_px: Mapping[str, tuple[float, float]]
     excluded: Mapping[str, str]
     depth_range_mm: tuple[float, float] | None
     focal_sigma_px: Mapping[str, float]
     features_excluded: int = 0
-    residuals_px: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+    residuals_px: Mapping[str, Floats] = field(default_factory=dict, repr=False)
 
     name = "stereo"
 
@@ -96,7 +106,7 @@ class StereoModel:
             projector_pixels
         )
 
-    def points(self, phase: PhaseMap) -> NDArray[np.float32]:
+    def points(self, phase: PhaseMap) -> Floats32:
         """Triangulate the absolute phase of one axis (eq. 6-8, with exact inversion of the
         projector's distortion).
 
@@ -105,7 +115,7 @@ class StereoModel:
         z = triangulate(self.rig, phase.coordinate, phase.axis)
         return points_from_depth(self.rig.camera.rays(), z)
 
-    def sigma_z(self, phase: PhaseMap, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    def sigma_z(self, phase: PhaseMap, points: Floats32) -> Floats32:
         """Predict the standard deviation of depth (h, w) mm from the phase noise, ``|dz/dphi|
         sigma_phi``."""
         z = points[..., 2].astype(float)
@@ -155,7 +165,7 @@ def calibrate_stereo(
     no solution.
     """
     excluded = dict(excluded or {})
-    inliers: dict[str, NDArray[np.bool_]] = {}
+    inliers: dict[str, Mask] = {}
     for observation in observations:
         measured = finite_rows(observation.projector, observation.camera)
         if len(observation.surfaces) < 2:
@@ -211,7 +221,7 @@ class _Solution:
     def fit(
         cls,
         used: Sequence[Observation],
-        inliers: Mapping[str, NDArray[np.bool_]],
+        inliers: Mapping[str, Mask],
         projector_size: tuple[int, int],
         strict: bool,
     ) -> "_Solution":
@@ -225,12 +235,10 @@ class _Solution:
             [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
             for name in ("points", "camera", "projector")
         )
+        sizes = used[0].size, projector_size
         sigma: dict[str, float] = {}
         intrinsics = []
-        for device, images, size in (
-            ("camera", cameras, used[0].size),
-            ("projector", projectors, projector_size),
-        ):
+        for device, images, size in zip(DEVICES, (cameras, projectors), sizes, strict=True):
             K, D, _, sigmas = solve_device(device, objects, images, size)
             sigma[device] = max(sigmas)
             relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
@@ -240,8 +248,8 @@ class _Solution:
                     " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
                     " distance"
                 )
-            intrinsics.append((K, D))
-        (K_c, D_c), (K_p, D_p) = intrinsics
+            intrinsics += [K, D]
+        K_c, D_c, K_p, D_p = intrinsics
         alone = [np.diag(K).copy() for K in (K_c, K_p)]  # OpenCV overwrites both
         _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
             objects,
@@ -251,40 +259,40 @@ class _Solution:
             D_c,
             K_p,
             D_p,
-            used[0].size,
+            sizes[0],
             np.eye(3),
             np.zeros((3, 1)),
             flags=cv2.CALIB_USE_INTRINSIC_GUESS,
             criteria=CRITERIA,
         )
-        for device, K in (("camera", K_c), ("projector", K_p)):
+        for device, K in zip(DEVICES, (K_c, K_p), strict=True):
             if not min(K[0, 0], K[1, 1]) > 0:
                 raise CalibrationRejected(
                     f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px,"
                     " as no lens has: check the target's notation, the projector's size, the"
                     " fringe period, and that x and y are not exchanged"
                 )
-        for device, f, K in zip(sigma, alone, (K_c, K_p), strict=True):
+        for device, f, K in zip(DEVICES, alone, (K_c, K_p), strict=True):
             # systematic errors, which the standard deviations lack, change the two fits differently
             change = np.abs(f / np.diag(K) - 1).max()
             sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
-        camera = Lens(np.array(K_c), np.array(D_c).ravel()[:5], used[0].size)
-        projector = Lens(np.array(K_p), np.array(D_p).ravel()[:5], projector_size)
+        camera = Lens(K_c, np.ravel(D_c)[:5], sizes[0])
+        projector = Lens(K_p, np.ravel(D_p)[:5], sizes[1])
         poses = {
             o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)
         }
-        return cls(StereoRig(camera, projector, np.array(R), np.array(T)), poses, sigma)
+        return cls(StereoRig(camera, projector, R, T), poses, sigma)
 
     def residuals(self, observation: Observation) -> Floats:
         """Return the camera and projector residuals (n, 4) px of every feature of one pose."""
         X = move_points(self.poses[observation.name], observation.points)
-        predicted = self.rig.camera.project(X), self.rig.project(X)
-        return np.hstack([observation.camera - predicted[0], observation.projector - predicted[1]])
+        measured = np.hstack([observation.camera, observation.projector])
+        return measured - np.hstack([self.rig.camera.project(X), self.rig.project(X)])
 
     def to_model(
         self,
         used: Sequence[Observation],
-        inliers: Mapping[str, NDArray[np.bool_]],
+        inliers: Mapping[str, Mask],
         board: str,
         excluded: Mapping[str, str],
     ) -> StereoModel:
@@ -293,27 +301,26 @@ class _Solution:
             o.name: np.where(inliers[o.name][:, None], self.residuals(o), np.nan) for o in used
         }
         z = np.concatenate([move_points(self.poses[o.name], o.points)[:, 2] for o in used])
-        all_residuals = np.concatenate(list(residuals.values()))
-        rms = {
-            "camera": rms_length(all_residuals[:, :2]),
-            "projector": rms_length(all_residuals[:, 2:]),
-        }
-        rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
+        camera, projector = _device_rms(np.concatenate([*residuals.values()]))
+        stereo = float(np.sqrt((camera**2 + projector**2) / 2))
         return StereoModel(
             rig=self.rig,
             board=board,
             axes=("x", "y"),
-            reprojection_rms_px=rms,
+            reprojection_rms_px={"camera": camera, "projector": projector, "stereo": stereo},
             poses=self.poses,
-            pose_rms_px={
-                name: (rms_length(r[:, :2]), rms_length(r[:, 2:])) for name, r in residuals.items()
-            },
+            pose_rms_px={name: _device_rms(each) for name, each in residuals.items()},
             excluded=excluded,
             depth_range_mm=(float(z.min()), float(z.max())),
             focal_sigma_px=self.focal_sigma_px,
             features_excluded=int(sum((~inliers[name]).sum() for name in residuals)),
             residuals_px=residuals,
         )
+
+
+def _device_rms(residuals: Floats) -> tuple[float, float]:
+    """Return the RMS length of the residuals (n, 4) px in the camera and in the projector."""
+    return rms_length(residuals[:, :2]), rms_length(residuals[:, 2:])
 
 
 def _check_agreement(model: StereoModel) -> None:
@@ -334,8 +341,8 @@ def _check_agreement(model: StereoModel) -> None:
 
 
 def _detect_outliers(
-    solution: _Solution, used: Sequence[Observation], inliers: Mapping[str, NDArray[np.bool_]]
-) -> dict[str, NDArray[np.bool_]]:
+    solution: _Solution, used: Sequence[Observation], inliers: Mapping[str, Mask]
+) -> dict[str, Mask]:
     """Return the outliers (n,) bool among the inliers so far, of each pose that has some.
 
     An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either
@@ -343,10 +350,63 @@ def _detect_outliers(
     """
     # in the camera and projector
     errors = {o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used}
-    # Rayleigh
-    sigma = (
-        np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0) / 1.1774
-    )
-    limit = np.maximum(ROBUST_SIGMAS * sigma, 0.05)
+    typical = np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0)
+    limit = np.maximum(ROBUST_SIGMAS * typical / 1.1774, 0.05)  # Rayleigh
     outliers = {o.name: inliers[o.name] & (errors[o.name] > limit).any(1) for o in used}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}
+
+
+def check_pose_count(count: int, excluded: Mapping[str, str]) -> None:
+    """Raise CalibrationRejected for fewer than MIN_POSES poses; the message lists the ``excluded``
+    ones."""
+    if count < MIN_POSES:
+        why = "".join(f"; {name}: {reason}" for name, reason in excluded.items())
+        raise CalibrationRejected(
+            f"{count} usable pose{'s' * (count != 1)}, and at least {MIN_POSES} are needed: "
+            f"capture the board in more positions and tilts{why}"
+        )
+
+
+def check_tilts(used: Sequence[Observation]) -> None:
+    """Raise CalibrationRejected where all boards are nearly parallel.
+
+    Parallel boards share their vanishing line and do not determine the focal length.
+    """
+    spread = nominal_tilt_spread_deg(used)
+    if spread < MIN_TILT_SPREAD_DEG:
+        raise CalibrationRejected(
+            f"all {len(used)} poses are nearly parallel (tilts differ by {spread:.1f} degrees): "
+            "tilt the board by 15 to 30 degrees, in different directions"
+        )
+
+
+def nominal_tilt_spread_deg(used: Sequence[Observation]) -> float:
+    """Estimate the largest angle in degrees between two boards with a nominal lens; 0 for fewer
+    than two boards."""
+    normals = []
+    for o in used:
+        H, _ = cv2.findHomography(o.points[:, :2], o.camera)
+        line = np.linalg.inv(H).T @ np.array([0.0, 0.0, 1.0])
+        normal = nominal_lens(o.size).K.T @ line
+        normals.append(unit_vectors(normal) * np.sign(normal[2] or 1))
+    return largest_angle_deg(np.array(normals)) if len(normals) > 1 else 0.0
+
+
+def check_handedness(used: Sequence[Observation]) -> None:
+    """Raise CalibrationRejected where projector coordinates are a mirror image of the camera's in
+    most poses."""
+    mirrored = sum(
+        _handedness(o.points, o.camera) * _handedness(o.points, o.projector) < 0 for o in used
+    )
+    if mirrored > len(used) / 2:
+        raise CalibrationRejected(
+            f"in {mirrored} of {len(used)} poses the projector's coordinates are a mirror image of"
+            " what the camera sees: switch off the projector's rear or mirror mode, or exchange"
+            " the x and y (V and H) patterns"
+        )
+
+
+def _handedness(points: Floats, pixels: Floats) -> float:
+    """Return the determinant of the affine map from board points (n, 3) mm to pixels (n, 2):
+    negative if mirrored."""
+    return float(np.linalg.det(fit_slopes(points[:, :2], pixels)))

@@ -5,6 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 def rigid_transform(R: Floats, t: Floats) -> Floats:

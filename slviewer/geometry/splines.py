@@ -59,8 +59,8 @@ class SplineSurface:
         height, width = shape
         ny, nx = (n - 3 for n in self.coefficients.shape)
         u0, v0, u1, v1 = self.trend.box
-        along = _basis_matrix(origin[0] + np.arange(width, dtype=np.float64), u0, u1, nx)
-        down = _basis_matrix(origin[1] + np.arange(height, dtype=np.float64), v0, v1, ny)
+        along = basis_matrix(origin[0] + np.arange(width, dtype=np.float64), u0, u1, nx)
+        down = basis_matrix(origin[1] + np.arange(height, dtype=np.float64), v0, v1, ny)
         return self.trend.evaluate_grid(shape, origin) + down @ self.coefficients @ along.T
 
 
@@ -122,7 +122,7 @@ def fit_spline(
     )
 
 
-def _basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) -> np.ndarray:
+def basis_matrix(positions: np.ndarray, start: float, end: float, cells: int) -> np.ndarray:
     """(n, cells + 3): weight of each coefficient at each position."""
     cell, weights = cubic_basis(positions, start, end, cells)
     matrix = np.zeros((len(positions), cells + 3))

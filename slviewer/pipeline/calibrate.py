@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
-from slviewer.calibration.diagnosis.verdict import judge_splined
+from slviewer.calibration.diagnosis.rules import judge_splined
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.geometry.rigid import Floats
+from slviewer.target.images import resize_image
 
 MIN_AREA_PX = 12
 """Smallest area of a blob whose shape can be judged."""
@@ -31,7 +32,7 @@ class Blobs:
     def roundness(self) -> Floats:
         """(n,) area over that of the ellipse with the same second moments: 1 for ellipses, 0.955
         for rectangles."""
-        return np.asarray(self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances))))
+        return self.areas / (4 * np.pi * np.sqrt(np.linalg.det(self.covariances)))
 
     def select(self, which: np.ndarray) -> "Blobs":
         """Return a subset of the blobs, by index or mask."""
@@ -40,13 +41,8 @@ class Blobs:
     def rescale(self, scale: Floats) -> "Blobs":
         """Return the blobs in the pixels of an image that is ``scale`` (2,) times as wide and as
         high."""
-        centres = (self.centres + 0.5) * scale - 0.5
-        return Blobs(
-            centres,
-            self.areas * scale.prod(),
-            self.covariances * np.outer(scale, scale),
-            self.inverted,
-        )
+        centres, areas = (self.centres + 0.5) * scale - 0.5, self.areas * scale.prod()
+        return Blobs(centres, areas, self.covariances * np.outer(scale, scale), self.inverted)
 
 
 def detect_blobs(grey: NDArray[np.uint8], pitch: float, inverted: bool) -> Iterator[Blobs]:
@@ -68,23 +64,17 @@ def detect_blobs(grey: NDArray[np.uint8], pitch: float, inverted: bool) -> Itera
 def _threshold_by_extremes(image: np.ndarray, window: float) -> np.ndarray:
     """Return (h, w) uint8: 1 where darker than the mean of the neighbourhood's minimum and
     maximum."""
-    size = image.shape[::-1]
     factor = min(1.0, 16.0 / window)
-    small = (
-        cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-        if factor < 1
-        else image
-    )
+    small = resize_image(image, factor)
     reach = 2 * round(window * factor / 2) + 1
     kernel = np.ones((reach, reach), np.uint8)
     bright = cv2.blur(cv2.dilate(small, kernel), (reach, reach))
     dark = cv2.blur(cv2.erode(small, kernel), (reach, reach))
-    contrast = cv2.subtract(bright, dark)
-    middle = np.where(
-        contrast > np.maximum(8, bright // 10), cv2.addWeighted(bright, 0.5, dark, 0.5, 0), 0
-    )
-    middle = middle.astype(np.uint8)
-    return np.asarray(image < (cv2.resize(middle, size) if factor < 1 else middle), np.uint8)
+    middle = cv2.addWeighted(bright, 0.5, dark, 0.5, 0)
+    middle[cv2.subtract(bright, dark) <= np.maximum(8, bright // 10)] = 0
+    if factor < 1:
+        middle = cv2.resize(middle, image.shape[::-1])
+    return np.asarray(image < middle, np.uint8)
 
 
 def _threshold_by_mean(image: np.ndarray, window: float) -> np.ndarray:
@@ -103,20 +93,20 @@ def _select_ellipses(mask: np.ndarray, inverted: bool) -> Blobs:
         mask, connectivity=4, ltype=cv2.CV_32S
     )
     left, top, across, down, area = stats.T
-    plausible = (
-        (area >= MIN_AREA_PX) & (area <= height * width / 8) & (area >= 0.25 * across * down)
+    plausible = (area >= MIN_AREA_PX) & (area <= height * width / 8)
+    plausible &= (
+        (area >= 0.25 * across * down)
+        & (across <= MAX_ELONGATION * down)
+        & (down <= MAX_ELONGATION * across)
     )
-    plausible &= (across <= MAX_ELONGATION * down) & (down <= MAX_ELONGATION * across)
     plausible &= (left > 0) & (top > 0) & (left + across < width) & (top + down < height)
     plausible[0] = False
     number = np.cumsum(plausible, dtype=np.int32) - 1
-    count = int(np.count_nonzero(plausible))
-    v, u = np.nonzero(mask)
+    v, u = np.nonzero(plausible[labels])
     label = labels[v, u]
-    mine = plausible[label]
-    v, u, label = v[mine], u[mine], label[mine]
     du, dv = u - centres[label, 0], v - centres[label, 1]
     label, n = number[label], area[plausible].astype(float)
+    count = len(n)
     covariances = np.empty((count, 2, 2))
     # a pixel is a square, not a point
     covariances[:, 0, 0] = np.bincount(label, du * du, count) / n + 1 / 12

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from slviewer.entry_points import PluginGroup
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 
 Kind = Literal["circles", "acircles", "chessboard", "charuco"]
 
@@ -60,8 +61,8 @@ class BoardType:
     counts: str
     example: str
     features: Callable[["Board"], tuple[int, int]]
-    points: Callable[["Board"], NDArray[np.float64]]
-    detect: Callable[["Board", NDArray[np.uint8]], tuple[NDArray[np.float64], np.ndarray]]
+    points: Callable[["Board"], Floats]
+    detect: Callable[["Board", NDArray[np.uint8]], tuple[Floats, np.ndarray]]
     margin_pitches: float = 0.0
 
 
@@ -194,11 +195,8 @@ class Board:
         corners."""
         if added := self.plugin_type:
             return added.features(self)
-        return (
-            (self.columns - 1, self.rows - 1)
-            if self.kind == "charuco"
-            else (self.columns, self.rows)
-        )
+        lost = 1 if self.kind == "charuco" else 0
+        return self.columns - lost, self.rows - lost
 
     @property
     def plugin_type(self) -> BoardType | None:
@@ -206,7 +204,7 @@ class Board:
         return None if self.kind in EXAMPLES else plugin_boards()[self.kind]
 
     @cached_property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Floats:
         """(n, 3) float64 mm, z = 0, row by row; read-only."""
         columns, rows = self.features
         i, j = np.divmod(np.arange(columns * rows), columns)
@@ -214,11 +212,8 @@ class Board:
         points = np.stack([x, i, np.zeros(len(i))], axis=1) * self.pitch_mm
         if added := self.plugin_type:
             points = np.array(added.points(self), np.float64)
-            if (
-                points.shape != (columns * rows, 3)
-                or not np.isfinite(points).all()
-                or points[:, 2].any()
-            ):
+            is_flat = points.shape == (columns * rows, 3) and not points[:, 2].any()
+            if not (is_flat and np.isfinite(points).all()):
                 raise InputError(
                     f"the plugin of {self.kind} boards gives points of shape {points.shape} for"
                     f" {columns}x{rows} features: it must give (n, 3) mm with z = 0, row by row"
@@ -226,7 +221,7 @@ class Board:
         points.flags.writeable = False
         return points
 
-    def outline(self, margin_mm: float | None = None) -> NDArray[np.float64]:
+    def outline(self, margin_mm: float | None = None) -> Floats:
         """Return a rectangle (4, 3) float64 mm around the features, from top left over top right to
         bottom left.
 

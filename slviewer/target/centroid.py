@@ -2,9 +2,10 @@
 around them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.geometry.jit import kernel, read_only, run_rows
+from slviewer.geometry.rigid import Floats, Floats32
+from slviewer.geometry.vectors import lengths
 from slviewer.target.blobs import Blobs
 
 EDGE_WIDTH_PX = 2.5
@@ -24,7 +25,7 @@ MIN_RING_PIXELS = 8
 """Smallest number of pixels for a plane fit."""
 
 
-def refine_centres(image: NDArray[np.float32], blobs: Blobs) -> NDArray[np.float64]:
+def refine_centres(image: Floats32, blobs: Blobs) -> Floats:
     """Return the centroids (n, 2) float64 px of the circles' ink, relative to the brightness around
     each circle.
 
@@ -34,30 +35,23 @@ def refine_centres(image: NDArray[np.float32], blobs: Blobs) -> NDArray[np.float
     background, divided by the plane of their own brightness. NaN where too little paper is visible
     around a circle, or where the result is too far from the initial centre.
     """
-    centres, covariances, inverted = blobs.centres, blobs.covariances, blobs.inverted
-    ring_px = _ring_widths(centres, covariances)
+    centres, covariances = blobs.centres, blobs.covariances
     refined = np.full(centres.shape, np.nan)
     arrays = [
         read_only(np.ascontiguousarray(each, np.float64))
-        for each in (centres, covariances, ring_px)
+        for each in (centres, covariances, _ring_widths(centres, covariances))
     ]
-    run_rows(
-        _measure_centroids,
-        len(centres),
-        read_only(np.ascontiguousarray(image)),
-        *arrays,
-        inverted,
-        refined,
-    )
-    off = np.linalg.norm(refined - centres, axis=1)
+    image = read_only(np.ascontiguousarray(image))
+    run_rows(_measure_centroids, len(centres), image, *arrays, blobs.inverted, refined)
+    off = lengths(refined - centres)
     refined[~(off < np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))] = np.nan
     return refined
 
 
-def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+def _ring_widths(centres: Floats, covariances: Floats) -> Floats:
     """Return the width (n,) px of the paper between each circle's edge and its nearest
     neighbour's."""
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    apart = lengths(centres[:, None] - centres)
     np.fill_diagonal(apart, np.inf)
     nearest = apart.argmin(1)
     towards = (centres[nearest] - centres) / apart.min(1)[:, None]
@@ -67,7 +61,7 @@ def _ring_widths(centres: np.ndarray, covariances: np.ndarray) -> np.ndarray:
         2 * np.sqrt(np.einsum("ni,nij,nj->n", towards, c, towards))
         for c in (covariances, covariances[nearest])
     )
-    return np.asarray(apart.min(1) - own - other)
+    return apart.min(1) - own - other
 
 
 @kernel()
@@ -91,11 +85,7 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
         u1, v1 = min(int(np.ceil(u + far_u)) + 1, width), min(int(np.ceil(v + far_v)) + 1, height)
         size = max(u1 - u0, 0) * max(v1 - v0, 0)
         place, level = np.empty((2, size)), np.empty(size)
-        within, ring, core = (
-            np.zeros(size, np.bool_),
-            np.zeros(size, np.bool_),
-            np.zeros(size, np.bool_),
-        )
+        within, ring, core = np.zeros((3, size), np.bool_)
         i = 0
         for row in range(v0, v1):
             for column in range(u0, u1):
@@ -105,11 +95,8 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
                 # px from the edge, outwards
                 beyond = np.sqrt(du * du + dv * dv) * (1 - 1 / max(radius, 1e-6))
                 place[0, i], place[1, i], level[i] = du, dv, image[row, column]
-                within[i], ring[i], core[i] = (
-                    beyond < soft,
-                    soft < beyond < end,
-                    radius < CORE_RADIUS,
-                )
+                within[i], ring[i] = beyond < soft, soft < beyond < end
+                core[i] = radius < CORE_RADIUS
                 i += 1
         if np.count_nonzero(ring) < MIN_RING_PIXELS or not core.any():
             continue
@@ -171,34 +158,25 @@ def _fit_plane(place, level, where):
     count, mean_u, mean_v, mean = 0, 0.0, 0.0, 0.0
     for i in range(len(level)):
         if where[i]:
-            count, mean_u, mean_v, mean = (
-                count + 1,
-                mean_u + place[0, i],
-                mean_v + place[1, i],
-                mean + level[i],
-            )
+            count += 1
+            mean_u += place[0, i]
+            mean_v += place[1, i]
+            mean += level[i]
     mean_u, mean_v, mean = mean_u / count, mean_v / count, mean / count
     uu, uv, vv, ul, vl = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(level)):
         if where[i]:
             du, dv, dl = place[0, i] - mean_u, place[1, i] - mean_v, level[i] - mean
-            uu, uv, vv, ul, vl = (
-                uu + du * du,
-                uv + du * dv,
-                vv + dv * dv,
-                ul + du * dl,
-                vl + dv * dl,
-            )
+            uu += du * du
+            uv += du * dv
+            vv += dv * dv
+            ul += du * dl
+            vl += dv * dl
     determinant = uu * vv - uv * uv
     if not determinant > 1e-9 * uu * vv:
         return mean, 0.0, 0.0, mean_u, mean_v
-    return (
-        mean,
-        (vv * ul - uv * vl) / determinant,
-        (uu * vl - uv * ul) / determinant,
-        mean_u,
-        mean_v,
-    )
+    along_u, along_v = (vv * ul - uv * vl) / determinant, (uu * vl - uv * ul) / determinant
+    return mean, along_u, along_v, mean_u, mean_v
 
 
 @kernel()

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError
+from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.target.blobs import Blobs, detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.centroid import refine_centres
@@ -21,13 +22,16 @@ from slviewer.target.lattice import (
     match_pattern,
 )
 from slviewer.target.mark import select_numbering_by_mark
-from slviewer.target.numbering import (
+from slviewer.target.planar import (
     MAX_GRID_OFFSET,
     MAX_GRID_OFFSET_SIGMAS,
+    GridMap,
     check_grid,
+    fit_grid_map,
+    fit_homography,
+    jacobians,
     select_upright,
 )
-from slviewer.target.planar import GridMap, fit_grid_map, fit_homography, jacobians
 
 CLUTTER_FREE_SHARE = 1 / 3
 """Share of the board's circles in one lattice that clutter never reaches."""
@@ -63,13 +67,17 @@ class _Grid:
     numberings: list[np.ndarray]
 
     @property
+    def centres(self) -> Floats:
+        """(n, 2) px: the circles' centres."""
+        return self.blobs.centres[self.numberings[0]]
+
+    @property
     def area_px(self) -> float:
         """Area of the grid's convex hull in the image."""
-        hull = cv2.convexHull(np.asarray(self.blobs.centres[self.numberings[0]], np.float32))
-        return float(cv2.contourArea(hull))
+        return cv2.contourArea(cv2.convexHull(self.centres.astype(np.float32)))
 
 
-def detect_circles(board: Board, image: BoardImage) -> tuple[NDArray[np.float64], float, bool]:
+def detect_circles(board: Board, image: BoardImage) -> tuple[Floats, float, bool]:
     """Detect every circle of a board.
 
     Returns the centres (n, 2) float64 px in the order of ``board.points``, the circles' radius in
@@ -171,11 +179,8 @@ def _fit_map(board: Board, blobs: Blobs) -> GridMap | None:
     pitch = grid_map.pitch_px(points)
     size = np.sqrt(blobs.areas) / np.maximum(pitch, 1e-9)
     alike = np.abs(np.log(size / np.median(size))) < np.log(AREA_RATIO) / 2
-    return (
-        grid_map
-        if (alike & (np.linalg.norm(grid_map.residuals, axis=1) < NODE_RADIUS * pitch)).all()
-        else None
-    )
+    is_grid = (alike & (lengths(grid_map.residuals) < NODE_RADIUS * pitch)).all()
+    return grid_map if is_grid else None
 
 
 def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np.ndarray) -> bool:
@@ -185,44 +190,33 @@ def _grid_continues(board: Board, grid_map: GridMap, blobs: Blobs, numbering: np
     most clutter next to a board is not.
     """
     points = board.points[:, :2] / board.pitch_mm
-    size = float(
-        np.median(np.sqrt(blobs.areas[numbering]) / np.maximum(grid_map.pitch_px(points), 1e-9))
-    )
-    others = np.delete(np.arange(len(blobs.centres)), numbering)
-    if not len(others):
+    pitch = np.maximum(grid_map.pitch_px(points), 1e-9)
+    size = np.median(np.sqrt(blobs.areas[numbering]) / pitch)
+    others = blobs.select(np.delete(np.arange(len(blobs.centres)), numbering))
+    if not len(others.centres):
         return False
     for side in _neighbouring_rows(board):
         pitch = grid_map.pitch_px(side)
-        apart = np.linalg.norm(
-            grid_map.to_image(side)[:, None] - blobs.centres[others][None], axis=2
-        )
-        nearest = apart.argmin(1)
+        apart = lengths(grid_map.to_image(side)[:, None] - others.centres)
         gate = np.maximum(MAX_GRID_OFFSET * pitch, 2 * MAX_GRID_OFFSET_SIGMAS * grid_map.sigma_px)
-        ratio = np.sqrt(blobs.areas[others[nearest]]) / np.maximum(size * pitch, 1e-9)
-        on = (
-            (pitch > 0)
-            & (apart.min(1) < gate)
-            & (np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25))
-        )
+        ratio = np.sqrt(others.areas[apart.argmin(1)]) / np.maximum(size * pitch, 1e-9)
+        is_alike = np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(1.25)
+        on = (pitch > 0) & (apart.min(1) < gate) & is_alike
         if np.count_nonzero(on) >= max(2.0, CONTINUATION_SHARE * len(side)):
             return True
     return False
 
 
-def _neighbouring_rows(board: Board) -> list[np.ndarray]:
+def _neighbouring_rows(board: Board) -> list[Floats]:
     """Return the positions (k, 2), in pitches, of one more row or column of circles at each of the
     four sides."""
     columns, rows = board.features
-    i, j = np.arange(rows), np.arange(columns)
-    if board.kind == "acircles":
-        above, below = (
-            np.stack([2 * j + row % 2, np.full(columns, row)], axis=1) for row in (-1, rows)
-        )
-        left, right = (np.stack([2 * column + i % 2, i], axis=1) for column in (-1, columns))
-    else:
-        above, below = (np.stack([j, np.full(columns, row)], axis=1) for row in (-1, rows))
-        left, right = (np.stack([np.full(rows, column), i], axis=1) for column in (-1, columns))
-    return [side.astype(float) for side in (above, below, left, right)]
+    across, down = np.arange(columns), np.arange(rows)
+    sides = []
+    for j, i in ((across, -1), (across, rows), (-1, down), (columns, down)):
+        x = 2 * j + i % 2 if board.kind == "acircles" else j
+        sides.append(np.stack(np.broadcast_arrays(x, i), axis=1).astype(float))
+    return sides
 
 
 def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
@@ -230,7 +224,7 @@ def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
     similar area."""
     grids = sorted(grids, key=lambda grid: -grid.area_px)
     if len(grids) > 1 and grids[0].area_px < DOMINANT_AREA_RATIO * grids[1].area_px:
-        (a, b), (c, d) = (grid.blobs.centres[grid.numberings[0]].mean(0) for grid in grids[:2])
+        (a, b), (c, d) = (grid.centres.mean(0) for grid in grids[:2])
         raise DetectionError(
             f"{len(grids)} boards {board} detected, around pixels {a:.0f}, {b:.0f} and {c:.0f},"
             f" {d:.0f}: take one out of view; a mirror image counts as well"
@@ -238,18 +232,16 @@ def _select_board(board: Board, grids: list[_Grid]) -> _Grid:
     return grids[0]
 
 
-def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[np.ndarray, float, bool]:
+def _measure(board: Board, image: BoardImage, grid: _Grid) -> tuple[Floats, float, bool]:
     """Number the grid and refine its centres; returns (pixels (n, 2), radius in mm, whether the
-    mark was detected)."""
+    mark was detected).
+
+    Raises DetectionError where blobs are squares or partly covered circles, and where a centre
+    cannot be measured or fits no grid.
+    """
     marked = select_numbering_by_mark(board, image.deep, grid.blobs.centres, grid.numberings)
     order = select_upright(board, grid.blobs.centres, grid.numberings) if marked is None else marked
     blobs = grid.blobs.select(order)
-    _refuse_misshapen(board, blobs)
-    return _refine_centres(board, image, blobs), _measure_radius(board, blobs), marked is not None
-
-
-def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
-    """Raise DetectionError where blobs are squares or partly covered circles."""
     large = blobs.areas > MIN_SHAPE_AREA_PX
     if large.all() and np.median(blobs.roundness) < SQUARE_LIMIT_ROUNDNESS:
         raise DetectionError(
@@ -261,27 +253,18 @@ def _refuse_misshapen(board: Board, blobs: Blobs) -> None:
             f"{covered} of {len(blobs.areas)} circles are partly covered, or reflect: "
             "uncover the board, and turn it away from the lights"
         )
-
-
-def _refine_centres(board: Board, image: BoardImage, blobs: Blobs) -> np.ndarray:
-    """Return the sub-pixel centres (n, 2) px; raises DetectionError where one cannot be measured or
-    fits no grid."""
     pixels = refine_centres(image.deep, blobs)
-    unmeasured = np.isnan(pixels).any(1)
-    if unmeasured.any():
+    unmeasured = np.count_nonzero(~finite_rows(pixels))
+    if unmeasured:
         raise DetectionError(
-            f"{np.count_nonzero(unmeasured)} of {len(pixels)} circles are too close to their"
-            " neighbours or too faint to measure: move the board closer, or focus the camera"
+            f"{unmeasured} of {len(pixels)} circles are too close to their neighbours or too faint"
+            " to measure: move the board closer, or focus the camera"
         )
     check_grid(board, pixels, np.arange(len(pixels)), "circles")
-    return pixels
-
-
-def _measure_radius(board: Board, blobs: Blobs) -> float:
-    """Estimate the circles' radius in mm from the blobs' areas and the scale of the homography."""
     points = board.points[:, :2]
     scale = np.linalg.det(jacobians(fit_homography(points, blobs.centres), points))
-    return float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
+    radius_mm = float(np.sqrt(np.median(blobs.areas / scale) / np.pi))
+    return pixels, radius_mm, marked is not None
 
 
 def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
@@ -289,12 +272,12 @@ def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
     remains."""
     pool = first
     for blobs in others:
-        apart = np.linalg.norm(blobs.centres[:, None] - pool.centres[None], axis=2).min(1)
-        new = apart > 0.5 * np.sqrt(blobs.areas)
+        apart = lengths(blobs.centres[:, None] - pool.centres).min(1)
+        new = blobs.select(apart > 0.5 * np.sqrt(blobs.areas))
         pool = Blobs(
-            np.concatenate([pool.centres, blobs.centres[new]]),
-            np.concatenate([pool.areas, blobs.areas[new]]),
-            np.concatenate([pool.covariances, blobs.covariances[new]]),
+            np.concatenate([pool.centres, new.centres]),
+            np.concatenate([pool.areas, new.areas]),
+            np.concatenate([pool.covariances, new.covariances]),
             pool.inverted,
         )
     return pool
@@ -318,12 +301,10 @@ def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None
     if others:
         facts.append(f"among {others} other round blobs")
     centres = most.blobs.centres[lattice.blobs]
-    spacing = float(
-        np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1)))
-    )
-    height, width = image.grey.shape
-    gaps = {"left": centres[:, 0].min(), "right": width - 1 - centres[:, 0].max()}
-    gaps |= {"upper": centres[:, 1].min(), "lower": height - 1 - centres[:, 1].max()}
+    spacing = np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1)))
+    left, upper = centres.min(0)
+    right, lower = np.array(image.grey.shape[::-1]) - 1 - centres.max(0)
+    gaps = {"left": left, "right": right, "upper": upper, "lower": lower}
     # a circle that the border cuts is not detected
     sides = [side for side, gap in gaps.items() if gap < 1.5 * spacing]
     if sides:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import lengths
 from slviewer.target.drawing import Drawing
 
 DICTIONARIES = ("DICT_APRILTAG_36h11", "DICT_5X5_250", "DICT_6X6_250")
@@ -49,37 +50,21 @@ def detect_markers(grey: NDArray[np.uint8]) -> CodedMarkers:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         found, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
         if ids is not None and len(ids):
-            return _select(
-                grey,
-                np.ravel(ids),
-                np.reshape(found, (-1, 4, 2)).astype(np.float64),
-                dictionary.markerSize + 2,
-            )
-    return CodedMarkers(np.zeros(0, int), np.zeros((0, 4, 2)))
-
-
-def _select(grey: np.ndarray, ids: np.ndarray, corners: np.ndarray, modules: int) -> CodedMarkers:
-    """Keep markers that are large enough, were seen once and have sharp sides, ordered by number;
-    refine corners."""
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
-    ids, corners = ids[sides >= SMALLEST_PX], corners[sides >= SMALLEST_PX]
-    numbers, counts = np.unique(ids, return_counts=True)
+            break
+    corners = np.reshape(found, (-1, 4, 2)).astype(np.float64)
+    is_large = lengths(corners - np.roll(corners, 1, axis=1)).min(axis=1) >= SMALLEST_PX
+    corners, ids = corners[is_large], np.reshape([] if ids is None else ids, -1)[is_large]
+    numbers, first, counts = np.unique(ids, return_index=True, return_counts=True)
     refined = {
         int(number): quad
-        for number, rough in zip(ids, corners, strict=True)
-        if number in numbers[counts == 1]
-        and (quad := _refine_corners(grey, rough, modules)) is not None
+        for number, rough in zip(numbers[counts == 1], corners[first[counts == 1]], strict=True)
+        if (quad := _refine_corners(grey, rough, dictionary.markerSize + 2)) is not None
     }
-    order = sorted(refined)
-    repeated = tuple(int(number) for number in numbers[counts > 1])
-    return CodedMarkers(
-        np.array(order, int),
-        np.reshape([refined[k] for k in order], (-1, 4, 2)).astype(float),
-        repeated,
-    )
+    quads = np.reshape([*refined.values()], (-1, 4, 2)).astype(float)
+    return CodedMarkers(np.array([*refined], int), quads, tuple(numbers[counts > 1].tolist()))
 
 
-def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats | None:
+def _refine_corners(grey: np.ndarray, quad: Floats, modules: int) -> Floats | None:
     """Return the corners (4, 2) px where the marker's four sides meet, each a parabola through the
     places where the brightness is half way from the black border to the white around it; None where
     a side is not seen.
@@ -87,40 +72,36 @@ def _refine_corners(grey: np.ndarray, quad: np.ndarray, modules: int) -> Floats 
     The border alone decides: the windows of general corner detectors would reach into the modules
     inside of it.
     """
+    quad = quad.copy()
     for _ in range(2):
-        sides = [_fit_side(grey, quad[k], quad[(k + 1) % 4], modules) for k in range(4)]
-        if any(side is None for side in sides):
-            return None
-        meeting = []
+        sides = []
+        for start, end in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+            side = _fit_side(grey, start, end, modules)
+            if side is None:
+                return None
+            sides.append(side)
         for k in range(4):
-            before, after = sides[k - 1], sides[k]
-            assert before is not None and after is not None
             # places and directions of the sides at their common corner
-            (p, d), (q, e) = (
-                before[1],
-                after[0],
-            )
+            (p, d), (q, e) = sides[k - 1][1], sides[k][0]
             along = np.linalg.lstsq(np.stack([d, -e], axis=1), q - p, rcond=None)[0]
-            meeting.append(p + along[0] * d)
-        quad = np.array(meeting)
+            quad[k] = p + along[0] * d
     return quad
 
 
 def _fit_side(
-    grey: np.ndarray, start: np.ndarray, end: np.ndarray, modules: int
-) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None:
+    grey: np.ndarray, start: Floats, end: Floats, modules: int
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]] | None:
     """Return place (2,) px and direction (2,) of a marker's side at its start and end; None if it
     is not seen."""
-    length = float(np.linalg.norm(end - start))
+    length = float(lengths(end - start))
     way = (end - start) / length
     outward = np.array([way[1], -way[0]])  # corners run clockwise in the image
     reach = min(0.7 * length / modules, 6.0)
     t = np.linspace(0.06, 0.94, max(12, int(length)))
     offsets = np.linspace(-reach, reach, 4 * int(np.ceil(reach)) + 1)
-    places = (start + t[:, None, None] * (end - start) + offsets[:, None] * outward).astype(
-        np.float32
-    )
-    profile = np.asarray(cv2.remap(grey, places[..., 0], places[..., 1], cv2.INTER_CUBIC), float)
+    places = start + t[:, None, None] * (end - start) + offsets[:, None] * outward
+    u, v = np.moveaxis(places.astype(np.float32), -1, 0)
+    profile = cv2.remap(grey, u, v, cv2.INTER_CUBIC).astype(float)
     dark, bright = np.median(profile[:, 0]), np.median(profile[:, -1])
     if not bright - dark > _CONTRAST:
         return None
@@ -129,23 +110,21 @@ def _fit_side(
     clear = crosses.sum(axis=1) == 1
     if np.count_nonzero(clear) < _SEEN * len(t):
         return None
-    at = np.argmax(crosses[clear], axis=1)
-    rows = np.flatnonzero(clear)
-    a, b = over[rows, at], over[rows, at + 1]
-    place = offsets[at] - a / (b - a) * (offsets[1] - offsets[0])
-    curve = np.polyfit(t[clear], place, 2)
-    left = np.abs(place - np.polyval(curve, t[clear]))
+    at, t = np.argmax(crosses[clear], axis=1)[:, None], t[clear]
+    a, b = (np.take_along_axis(over[clear], k, axis=1)[:, 0] for k in (at, at + 1))
+    place = offsets[at[:, 0]] - a / (b - a) * (offsets[1] - offsets[0])
+    left = np.abs(place - np.polyval(np.polyfit(t, place, 2), t))
     good = left <= max(4 * float(np.median(left)), 0.02)
-    curve = np.polyfit(t[clear][good], place[good], 2)
+    curve = np.polyfit(t[good], place[good], 2)
     slope = np.polyder(curve)
-    ends = [
+    first, last = (
         (
             start + k * (end - start) + np.polyval(curve, k) * outward,
             way * length + np.polyval(slope, k) * outward,
         )
         for k in (0.0, 1.0)
-    ]
-    return ends[0], ends[1]
+    )
+    return first, last
 
 
 def marker_modules(number: int) -> NDArray[np.uint8]:
@@ -189,11 +168,12 @@ def _draw_numbers(first: int, last: int, side: float) -> Drawing:
     drawing = Drawing(210.0, 297.0)
     for i in range(count):
         left, top = 10.0 + pitch * (i % columns), 10.0 + pitch * (i // columns)
-        _add_marker(drawing, first + i, left + side * _QUIET, top + side * _QUIET, side)
+        quiet = side * _QUIET
+        drawing.add_cells(marker_modules(first + i) == 0, left + quiet, top + quiet, side)
         edge = side * (1 + 2 * _QUIET)
         for x, y in ((0, 0), (edge, 0), (0, edge), (edge, edge)):
             drawing.circles.append((left + x, top + y, 0.15))
-        drawing.texts.append((left + side * _QUIET, top + edge + 2.6, 2.2, str(first + i)))
+        drawing.texts.append((left + quiet, top + edge + 2.6, 2.2, str(first + i)))
     return drawing
 
 
@@ -209,23 +189,14 @@ def _draw_mat(side: float) -> Drawing:
         around = int(2 * np.pi * radius / (1.5 * pitch))
         for angle in 2 * np.pi * np.arange(around) / max(around, 1):
             x, y = centre + radius * np.array([np.cos(angle), np.sin(angle)]) - side / 2
-            _add_marker(drawing, number, float(x), float(y), side)
+            drawing.add_cells(marker_modules(number) == 0, float(x), float(y), side)
             number += 1
-    drawing.rectangles += [
-        (centre[0] - 5, centre[1] - 0.1, 10, 0.2),
-        (centre[0] - 0.1, centre[1] - 5, 0.2, 10),
-    ]
+    u, v = centre
+    drawing.rectangles += [(u - 5, v - 0.1, 10, 0.2), (u - 0.1, v - 5, 0.2, 10)]
     drawing.circles += [
-        (centre[0] + 95 * np.cos(a), centre[1] + 95 * np.sin(a), 0.2)
-        for a in np.arange(0, 6.28, 0.05)
+        (u + 95 * np.cos(a), v + 95 * np.sin(a), 0.2) for a in np.arange(0, 6.28, 0.05)
     ]
     drawing.texts.append(
         (10.0, 10.0, 3.0, f"slviewer mat, markers of {side:g} mm: put the cross on the axis")
     )
     return drawing
-
-
-def _add_marker(drawing: Drawing, number: int, left: float, top: float, side: float) -> None:
-    """Add the black modules of a marker whose upper left corner is at (left, top) mm, neighbours in
-    a row merged."""
-    drawing.add_cells(marker_modules(number) == 0, left, top, side)

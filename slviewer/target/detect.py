@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import DetectionError, InputError
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.target.board import Board
-from slviewer.target.charuco import detect_charuco
-from slviewer.target.chessboard import detect_chessboard
 from slviewer.target.circles import detect_circles
+from slviewer.target.corners import detect_charuco, detect_chessboard
 from slviewer.target.images import BoardImage
 from slviewer.target.planar import fit_homography, to_image
 
@@ -30,7 +29,7 @@ class Detection:
     detected, so that the numbering is the board's own at any turn.
     """
 
-    pixels: NDArray[np.float64]
+    pixels: Floats
     ids: np.ndarray
     radius_mm: float = 0.0
     marked: bool = False
@@ -41,7 +40,7 @@ def detect(board: Board, image: np.ndarray) -> Detection:
 
     The numbering's x axis turns clockwise into its y axis in the image, always. A symmetric board
     is numbered from its mark (``slviewer.target.mark``); where none is detected, the rule of
-    ``slviewer.target.numbering`` selects the numbering. Raises DetectionError, whose message states
+    ``slviewer.target.planar`` selects the numbering. Raises DetectionError, whose message states
     what was detected and what to do, rather than return a grid with a feature missing, misplaced or
     shifted.
     """
@@ -64,12 +63,8 @@ def _check_detection(board: Board, pixels: np.ndarray, ids: np.ndarray) -> Detec
     those of the board."""
     pixels, ids = np.asarray(pixels, np.float64), np.asarray(ids)
     known = len(board.points)
-    distinct = (
-        pixels.shape == (len(ids), 2)
-        and np.isfinite(pixels).all()
-        and len(np.unique(ids)) == len(ids)
-    )
-    if not distinct or (len(ids) and (ids.min() < 0 or ids.max() >= known)):
+    is_valid = pixels.shape == (len(ids), 2) and np.isfinite(pixels).all()
+    if not is_valid or len(np.intersect1d(ids, np.arange(known))) < len(ids):
         raise DetectionError(
             f"the plugin of {board.kind} boards returned features that are not distinct, or not"
             f" among the {known} of the board: report it to its maker"
@@ -81,7 +76,7 @@ def _check_detection(board: Board, pixels: np.ndarray, ids: np.ndarray) -> Detec
     return Detection(pixels, ids.astype(int))
 
 
-def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> Mask:
     """Return the mask (h, w) bool of the pixels inside ``board.outline()``, by the homography of
     the detected features.
 
@@ -91,7 +86,7 @@ def board_mask(board: Board, detection: Detection, shape: tuple[int, ...]) -> ND
         raise InputError(
             f"{len(detection.ids)} features do not give a board's outline: detect at least 4"
         )
-    H = fit_homography(board.points[detection.ids][:, :2], np.asarray(detection.pixels, float))
+    H = fit_homography(board.points[detection.ids][:, :2], detection.pixels)
     corners = to_image(H, board.outline()[:, :2])
     mask = np.zeros(shape[:2], np.uint8)
     cv2.fillConvexPoly(mask, np.round(corners * 16).astype(np.int32), 1, shift=4)

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slviewer.geometry.rigid import Mask
+
 MM_PER_POINT = 25.4 / 72
 LARGEST_PDF_MM = 14_400 * MM_PER_POINT
 """Side of the largest page that PDF viewers accept."""
@@ -26,7 +28,7 @@ class Drawing:
     texts: list[tuple[float, float, float, str]] = field(default_factory=list)
     """(x, y of the baseline, size of the letters, ASCII text)"""
 
-    def add_cells(self, black: np.ndarray, left: float, top: float, side: float) -> None:
+    def add_cells(self, black: Mask, left: float, top: float, side: float) -> None:
         """Add the black cells (m, m) bool of a square of ``side`` mm at (left, top), neighbours in
         a row merged."""
         cell = side / len(black)
@@ -83,7 +85,7 @@ class Drawing:
         ]
         content = "\n".join(lines)
         page = f"0 0 {self.width * scale:.6f} {self.height * scale:.6f}"
-        return _pdf_file(
+        objects = (
             "<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
             "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
             f"<< /Type /Page /Parent 2 0 R /MediaBox [{page}] /Contents 4 0 R "
@@ -91,6 +93,12 @@ class Drawing:
             f"<< /Length {len(content)} >>\nstream\n{content}\nendstream",
             "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
         )
+        body, table = "%PDF-1.7\n", "xref\n0 6\n0000000000 65535 f \n"
+        for number, text in enumerate(objects, 1):
+            table += f"{len(body):010d} 00000 n \n"
+            body += f"{number} 0 obj\n{text}\nendobj\n"
+        trailer = f"trailer\n<< /Size 6 /Root 1 0 R >>\nstartxref\n{len(body)}\n%%EOF\n"
+        return (body + table + trailer).encode("ascii")
 
 
 def _mm(value: float) -> str:
@@ -101,18 +109,3 @@ def _mm(value: float) -> str:
 def _curve(*coordinates: float) -> str:
     """Return a PDF operator for a Bezier curve."""
     return " ".join(_mm(c) for c in coordinates) + " c"
-
-
-def _pdf_file(*objects: str) -> bytes:
-    """Assemble the objects of a PDF file, with its cross-reference table."""
-    body, offsets = "%PDF-1.7\n", []
-    for number, text in enumerate(objects, 1):
-        offsets.append(len(body))
-        body += f"{number} 0 obj\n{text}\nendobj\n"
-    table = "".join(f"{offset:010d} 00000 n \n" for offset in offsets)
-    trailer = f"<< /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{len(body)}\n%%EOF\n"
-    return (
-        f"{body}xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}trailer\n{trailer}".encode(
-            "ascii"
-        )
-    )

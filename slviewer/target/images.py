@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, Floats32
 
 SEARCH_PX = 1600
 """Longest side of the downscaled image for the first search; features are measured in the full
@@ -22,7 +23,7 @@ class BoardImage:
     """
 
     grey: NDArray[np.uint8]
-    deep: NDArray[np.float32]
+    deep: Floats32
 
     @classmethod
     def from_image(cls, image: np.ndarray) -> "BoardImage":
@@ -48,13 +49,11 @@ class BoardImage:
 def light_advice(grey: NDArray[np.uint8]) -> str:
     """Return advice on exposure and board position for an error message, by the share of saturated
     pixels."""
-    saturated = float(np.mean(grey[::4, ::4] == 255))
-    exposure = (
-        f"lower the exposure ({saturated:.0%} of the image is saturated), or "
-        if saturated > 0.02
-        else ""
-    )
-    return f"{exposure}move the board so that all of it is in view, evenly illuminated and in focus"
+    saturated = np.mean(grey[::4, ::4] == 255)
+    advice = "move the board so that all of it is in view, evenly illuminated and in focus"
+    if saturated > 0.02:
+        return f"lower the exposure ({saturated:.0%} of the image is saturated), or {advice}"
+    return advice
 
 
 def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
@@ -62,25 +61,19 @@ def resize_image(image: np.ndarray, factor: float) -> np.ndarray:
     larger."""
     if factor == 1:
         return image
-    return cv2.resize(
-        image,
-        None,
-        fx=factor,
-        fy=factor,
-        interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC,
-    )
+    interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return cv2.resize(image, None, fx=factor, fy=factor, interpolation=interpolation)
 
 
-def to_full_image(pixels: np.ndarray, factor: float) -> np.ndarray:
+def to_full_image(pixels: np.ndarray, factor: float) -> Floats:
     """Convert pixels of an image ``factor`` times as large to those of the full image."""
-    return np.asarray((pixels.astype(float) + 0.5) / factor - 0.5)
+    return (pixels.astype(float) + 0.5) / factor - 0.5
 
 
 def flatten_light(grey: NDArray[np.uint8]) -> np.ndarray:
     """Divide an image (h, w) uint8 by the local maximum brightness, so that paper becomes evenly
     white."""
-    factor = 64 / max(grey.shape)
-    small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    small = resize_image(grey, 64 / max(grey.shape))
     white = cv2.GaussianBlur(cv2.dilate(small, np.ones((9, 9), np.uint8)), (9, 9), 0)
     white = cv2.resize(white, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return cv2.divide(grey, np.maximum(white, 8), scale=230)

@@ -7,11 +7,15 @@ that could be shifted by a row is refused.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import DetectionError
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.rigid import Floats, Mask
+from slviewer.geometry.vectors import lengths
 from slviewer.target.blobs import Blobs
 from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map
@@ -70,16 +74,11 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
         return
     tree = cKDTree(blobs.centres)
     free = np.ones(len(blobs.centres), bool)
-    grown = 0
-    for seed, first, second in _list_seeds(tree, blobs):
-        if not free[seed]:
-            continue
-        lattice = _grow(tree, blobs, free, seed, first, second)
+    seeds = (seed for seed in _list_seeds(tree, blobs) if free[seed[0]])
+    for seed in islice(seeds, SEEDS):
+        lattice = _grow(tree, blobs, free, *seed)
         free[lattice.blobs] = False
         yield lattice
-        grown += 1
-        if grown == SEEDS:
-            return
 
 
 def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
@@ -99,14 +98,10 @@ def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
         low, high = lattice.nodes.min(0) - 1, lattice.nodes.max(0) + 1
         if (high - low).max() > MAX_SIDE_NODES:
             return lattice
-        nodes = np.stack(
-            np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)), -1
-        ).reshape(-1, 2)
+        nodes = grid_points(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
         pitch = grid_map.pitch_px(nodes.astype(float))
-        typical = np.median(
-            np.sqrt(blobs.areas[lattice.blobs])
-            / np.maximum(grid_map.pitch_px(lattice.nodes * 1.0), 1e-9)
-        )
+        own_pitch = np.maximum(grid_map.pitch_px(lattice.nodes * 1.0), 1e-9)
+        typical = np.median(np.sqrt(blobs.areas[lattice.blobs]) / own_pitch)
         apart, nearest = cKDTree(blobs.centres).query(grid_map.to_image(nodes.astype(float)))
         ratio = np.sqrt(blobs.areas[nearest]) / np.maximum(typical * pitch, 1e-9)
         is_alike = np.abs(np.log(np.maximum(ratio, 1e-9))) < np.log(AREA_RATIO) / 2
@@ -151,7 +146,7 @@ def match_pattern(board: Board, lattice: Lattice) -> list[np.ndarray]:
     return []
 
 
-def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, Floats, Floats]]:
     """Return (blob, step, step) of blobs with similar neighbours opposite each other in two
     directions, best first."""
     centres, areas = blobs.centres, blobs.areas
@@ -162,8 +157,8 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.n
     first = np.argsort(~alike, axis=1, kind="stable")[:, :8]
     near, alike = np.take_along_axis(near, first, axis=1), np.take_along_axis(alike, first, axis=1)
     step = centres[near] - centres[:, None]
-    length = np.linalg.norm(step, axis=2)
-    gap = np.linalg.norm(step[:, :, None] + step[:, None], axis=3)
+    length = lengths(step)
+    gap = lengths(step[:, :, None] + step[:, None])
     shorter = np.minimum(length[:, :, None], length[:, None])
     regular = np.where(alike[:, :, None] & alike[:, None], gap / np.maximum(shorter, 1e-9), np.inf)
     seeds = []
@@ -172,9 +167,9 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.n
         order = np.argsort(length[blob, a] + length[blob, b])
         a, b = a[order], b[order]
         axes = (step[blob, a] - step[blob, b]) / 2
-        lengths = np.linalg.norm(axes, axis=1)
+        sides = lengths(axes)
         cross = axes[0, 0] * axes[:, 1] - axes[0, 1] * axes[:, 0]
-        across = np.nonzero(np.abs(cross) > 0.35 * lengths[0] * lengths)[0]
+        across = np.nonzero(np.abs(cross) > 0.35 * sides[0] * sides)[0]
         if len(across):
             k = across[0]
             score = regular[blob, a[0], b[0]] + regular[blob, a[k], b[k]]
@@ -185,7 +180,7 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, np.ndarray, np.n
 
 
 def _grow(
-    tree: cKDTree, blobs: Blobs, free: np.ndarray, seed: int, first: np.ndarray, second: np.ndarray
+    tree: cKDTree, blobs: Blobs, free: Mask, seed: int, first: Floats, second: Floats
 ) -> Lattice:
     """Grow the lattice around a ``seed`` blob with steps ``first`` and ``second`` (2,) px along its
     two directions.
@@ -216,14 +211,15 @@ def _grow(
                     diagonal = at.get((i + di + side * dj, j + dj + side * di))
                     if lateral is not None and diagonal is not None:
                         step = centres[diagonal] - centres[lateral]
-            neighbour = _nearest_similar_blob(
-                tree,
-                here + step,
-                PREDICTION_RADIUS * float(np.hypot(*step)),
-                areas,
-                areas[at[node]],
-                free,
-                used,
+            reach = PREDICTION_RADIUS * float(np.hypot(*step))
+            near = tree.query(here + step, k=3, distance_upper_bound=reach)[1]
+            ratios = {
+                k: areas[k] / areas[at[node]]
+                for k in near[near < len(areas)].tolist()
+                if free[k] and k not in used
+            }
+            neighbour = next(
+                (k for k, ratio in ratios.items() if 1 / AREA_RATIO < ratio < AREA_RATIO), None
             )
             if neighbour is None:
                 continue
@@ -233,23 +229,3 @@ def _grow(
             steps[ahead] = (measured, steps[node][1]) if axis == 0 else (steps[node][0], measured)
             queue.append(ahead)
     return Lattice(np.array(list(at)), np.array(list(at.values())))
-
-
-def _nearest_similar_blob(
-    tree: cKDTree,
-    place: np.ndarray,
-    reach: float,
-    areas: np.ndarray,
-    area: float,
-    free: np.ndarray,
-    used: set[int],
-) -> int | None:
-    """Return the nearest unused blob of similar ``area`` within ``reach`` px of ``place`` (2,) px;
-    None without one."""
-    distances, indices = tree.query(place, k=3, distance_upper_bound=reach)
-    for distance, index in zip(distances, indices, strict=True):
-        if not np.isfinite(distance) or not free[index] or index in used:
-            continue
-        if 1 / AREA_RATIO < areas[index] / area < AREA_RATIO:
-            return int(index)
-    return None

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import lengths
 from slviewer.target.board import Board
 from slviewer.target.planar import fit_grid_map, fit_homography, jacobians, to_image
 
@@ -68,7 +70,7 @@ def neighbour_distance_mm(board: Board) -> float:
 
 
 def select_numbering_by_mark(
-    board: Board, image: np.ndarray, centres: np.ndarray, numberings: list[np.ndarray]
+    board: Board, image: np.ndarray, centres: Floats, numberings: list[np.ndarray]
 ) -> np.ndarray | None:
     """Select the one of several valid numberings whose first circle has the mark next to it.
 
@@ -82,16 +84,11 @@ def select_numbering_by_mark(
     contrasts = np.array([contrast for contrast, _ in dots])
     best = int(np.argmax(contrasts))
     others = np.delete(contrasts, best)
-    return (
-        numberings[best]
-        if contrasts[best] > PRESENT and dots[best][1] and (others < ABSENT).all()
-        else None
-    )
+    is_marked = contrasts[best] > PRESENT and dots[best][1] and (others < ABSENT).all()
+    return numberings[best] if is_marked else None
 
 
-def _detect_dot(
-    board: Board, mark: Mark, image: np.ndarray, pixels: np.ndarray
-) -> tuple[float, bool]:
+def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: Floats) -> tuple[float, bool]:
     """Return the contrast at the mark's position over the first circle's, and whether a dot there
     may be the mark.
 
@@ -99,7 +96,7 @@ def _detect_dot(
     """
     points = board.points[:, :2]
     centre = np.array([mark.x, mark.y])
-    near = np.argsort(np.linalg.norm(points - centre, axis=1))[:PREDICTING_CIRCLES]
+    near = np.argsort(lengths(points - centre))[:PREDICTING_CIRCLES]
     H = fit_homography(points[near], pixels[near])
     bent = fit_grid_map(points / board.pitch_mm, pixels).to_image(centre[None] / board.pitch_mm)[0]
     if not np.linalg.det(jacobians(H, centre[None]))[0] > 0:
@@ -136,7 +133,7 @@ class _Profile:
 
 
 def _measure_profile(
-    image: np.ndarray, H: np.ndarray, centre: np.ndarray, radius: float
+    image: np.ndarray, H: Floats, centre: Floats, radius: float
 ) -> _Profile | None:
     """Measure the profile around a point ``centre`` (2,) mm of the board, out to 2.2 radii; None
     where cut off.
@@ -147,21 +144,15 @@ def _measure_profile(
     angles = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     offsets = _RADII[:, None, None] * radius * directions
-    pixels = to_image(H, centre + offsets.reshape(-1, 2)).astype(np.float32)
-    levels = cv2.remap(
-        image,
-        pixels[:, 0],
-        pixels[:, 1],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=np.nan,
-    ).reshape(len(_RADII), _ANGLES)
+    u, v = to_image(H, centre + offsets.reshape(-1, 2)).astype(np.float32).T
+    levels = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderValue=np.nan)
+    levels = levels.reshape(len(_RADII), _ANGLES)
     inner, outer = levels[_RADII <= 0.6], levels[_RADII >= 1.8]
     if np.isnan(inner).any() or np.isnan(outer).mean() > MAX_CUT_OFF:
         return None
     own = float(inner.mean())
-    ring = np.nanmean(outer, axis=0) if np.isfinite(outer).all() else outer[np.isfinite(outer)]
     flat = outer[np.isfinite(outer)]
+    ring = outer.mean(axis=0) if len(flat) == outer.size else flat
     paper = float(np.quantile(flat, 0.2 if own < np.median(flat) else 0.8))
     difference = paper - own
     if abs(difference) < 1e-3:
@@ -176,4 +167,4 @@ def _measure_profile(
     below = np.nonzero(means < 0.5)[0]
     size = float(_RADII[below[0]]) if len(below) else np.inf
     contrast = difference / max(paper, own, 1.0)
-    return _Profile(own, paper, contrast, float(np.linalg.norm(centroid)), size, is_alone)
+    return _Profile(own, paper, contrast, float(lengths(centroid)), size, is_alone)

@@ -1,5 +1,16 @@
 """The homography between a flat board and its image, and a polynomial model of the lens
-distortion."""
+distortion; orientation of a board's numbering, and the check that a numbered grid is the image of a
+flat board.
+
+Without a mark (``slviewer.target.mark``), a board that looks the same turned by 180 degrees
+(symmetric circles, asymmetric circles with an even number of rows, chessboards whose columns + rows
+are even) is numbered with its x axis to the right in the image: of the two numberings, the one
+whose x axis points more along (2, 1) px, right and a little down. So an upright board counts from
+its top-left feature, a board whose rows run vertically counts from the top right, and neither
+changes when the board rolls by 60 degrees clockwise or 25 degrees the other way. A board that looks
+the same turned by 90 degrees takes, of its four numberings, the one whose x axis points most to the
+right.
+"""
 
 from dataclasses import dataclass
 
@@ -9,10 +20,18 @@ import numpy as np
 from slviewer.errors import DetectionError
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import Floats
+from slviewer.geometry.vectors import lengths
+from slviewer.target.board import Board
 
 HUBER_SIGMAS = 3.0
 """Residuals beyond so many robust standard deviations are down-weighted in the fit of a grid's
 map."""
+MAX_GRID_OFFSET = 0.08
+"""Largest distance, in pitches, of a feature from the grid fitted to all features."""
+MAX_GRID_OFFSET_SIGMAS = 8.0
+"""The same in robust standard deviations; hand-held paper boards reach 6."""
+MAX_BEND = 0.6
+"""Largest distance, in pitches, by which a lens may distort the grid."""
 
 
 def fit_homography(points: Floats, pixels: Floats, robust: bool = False) -> Floats:
@@ -22,30 +41,26 @@ def fit_homography(points: Floats, pixels: Floats, robust: bool = False) -> Floa
     By least squares; ``robust``: by least median of squares, with up to half outliers. Raises
     DetectionError where the points do not determine one.
     """
-    H = (
-        cv2.findHomography(points, pixels, cv2.LMEDS if robust else 0)[0]
-        if len(points) >= 4
-        else None
-    )
+    H = None
+    if len(points) >= 4:
+        H, _ = cv2.findHomography(points, pixels, cv2.LMEDS if robust else 0)
     if H is None or abs(np.linalg.det(H)) < 1e-12:
         raise DetectionError(
             f"the {len(points)} detected features lie on one line: turn the board towards the"
             " camera"
         )
-    return np.asarray(H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2]))
+    return H * np.sign(points.mean(0) @ H[2, :2] + H[2, 2])
 
 
 def to_image(H: Floats, points: Floats) -> Floats:
     """Project points (n, 2) mm to pixels (n, 2) by a homography (3, 3)."""
-    return np.asarray((points @ H[:2, :2].T + H[:2, 2]) / (points @ H[2, :2] + H[2, 2])[:, None])
+    return (points @ H[:2, :2].T + H[:2, 2]) / (points @ H[2, :2] + H[2, 2])[:, None]
 
 
 def jacobians(H: Floats, points: Floats) -> Floats:
     """Return the Jacobians (n, 2, 2) px per mm of a homography (3, 3) at points (n, 2) mm."""
     w = points @ H[2, :2] + H[2, 2]
-    return np.asarray(
-        (H[None, :2, :2] - to_image(H, points)[:, :, None] * H[2, :2]) / w[:, None, None]
-    )
+    return (H[:2, :2] - to_image(H, points)[:, :, None] * H[2, :2]) / w[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -91,11 +106,58 @@ def fit_grid_map(points: Floats, pixels: Floats, robust: bool = False) -> GridMa
     bent = pixels - to_image(H, points)
     weight = np.ones(len(points))
     for _ in range(8 if robust else 1):
-        coefficients = np.linalg.lstsq(terms * weight[:, None], bent * weight[:, None], rcond=None)[
-            0
-        ]
+        weighted = terms * weight[:, None], bent * weight[:, None]
+        coefficients, *_ = np.linalg.lstsq(*weighted, rcond=None)
         residuals = bent - terms @ coefficients
-        off = np.linalg.norm(residuals, axis=1)
+        off = lengths(residuals)
         sigma = 1.26 * float(np.median(off))  # of two coordinates, robustly
         weight = np.sqrt(np.minimum(1.0, HUBER_SIGMAS * sigma / np.maximum(off, 1e-9)))
     return GridMap(H, low, span, degree, coefficients, residuals, sigma)
+
+
+def select_upright(board: Board, pixels: Floats, numberings: list[np.ndarray]) -> np.ndarray:
+    """Select one of several valid numberings, (n,) indices into ``pixels`` (m, 2), by the rule of
+    this module."""
+    preferred = np.array([1.0, 0.0] if len(numberings) == 4 else [2.0, 1.0])
+    return max(numberings, key=lambda order: float(x_direction(board, pixels[order]) @ preferred))
+
+
+def x_direction(board: Board, pixels: Floats) -> Floats:
+    """Return the mean direction (2,) of the board's x axis in the image, a unit vector."""
+    x = board.points[:, 0] - board.points[:, 0].mean()
+    direction = x @ (pixels - pixels.mean(0))
+    return direction / np.linalg.norm(direction)
+
+
+def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None:
+    """Raise DetectionError unless features at ``pixels`` (n, 2) are the image of a flat board
+    through a real lens.
+
+    ``ids`` (n,): indices into the board's points; ``what``: the features' name in messages. The
+    pixels must agree with a homography and a smooth distortion (``planar.GridMap``), and the
+    numbering must be right-handed.
+    """
+    advice = "keep the board flat and in focus, without reflections, and take the pose again"
+    points = board.points[ids][:, :2] / board.pitch_mm
+    H = fit_homography(points, pixels)
+    areas = np.linalg.det(jacobians(H, points))
+    if areas.max() <= 0:
+        raise DetectionError(
+            f"the {what} appear mirrored: point the camera at the board, not at a mirror"
+        )
+    pitch = np.sqrt(np.maximum(areas, 1e-9))
+    if (lengths(pixels - to_image(H, points)) > MAX_BEND * pitch).any():
+        raise DetectionError(f"the {what} detected do not lie on a flat grid: {advice}")
+    fitted = fit_grid_map(points, pixels)
+    off = lengths(fitted.residuals)
+    limit = MAX_GRID_OFFSET_SIGMAS * fitted.sigma_px
+    wrong = off > np.clip(
+        limit, np.maximum(0.3, 0.01 * pitch), np.maximum(0.5, MAX_GRID_OFFSET * pitch)
+    )
+    if wrong.any():
+        worst = int(np.argmax(off / pitch))
+        u, v = pixels[worst]
+        raise DetectionError(
+            f"{np.count_nonzero(wrong)} of {len(ids)} {what} do not fit the grid "
+            f"(the worst, at pixel {u:.0f}, {v:.0f}, is {off[worst]:.1f} px off): {advice}"
+        )

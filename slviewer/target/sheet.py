@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.target.board import Board
-from slviewer.target.charuco import opencv_board
+from slviewer.target.corners import opencv_board
 from slviewer.target.drawing import LARGEST_PDF_MM, Drawing
 from slviewer.target.mark import OFFSET, PAPER_WIDTH, RADIUS, mark_geometry, neighbour_distance_mm
 

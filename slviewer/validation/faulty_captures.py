@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
-from slviewer.calibration.diagnosis.poses import FEW_POSES
+from slviewer.calibration.diagnosis.rules import FEW_POSES
 from slviewer.calibration.observe import Smoothing
 from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile

@@ -7,7 +7,7 @@ Everything here follows from the session's files and the rig.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from slviewer.calibration.soundness import MIN_POSES
+from slviewer.calibration.stereo import MIN_POSES
 from slviewer.evaluation.render import format_count
 from slviewer.pipeline.capture import Space
 from slviewer.pipeline.models import POSES_FOR_PIXELWISE

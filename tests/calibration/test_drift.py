@@ -9,8 +9,7 @@ import pytest
 from facts import missing_facts, raises
 from simulated_views import BOARD, moved, poses, seen
 
-from slviewer.calibration.drift.check import check_drift
-from slviewer.calibration.drift.reference import MIN_POSES, DriftReference, build_reference
+from slviewer.calibration.drift.check import MIN_POSES, DriftReference, build_reference, check_drift
 from slviewer.calibration.drift.view import DriftView
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
@@ -39,7 +38,7 @@ def reference():
         model.rig, [DriftView.from_observation(o) for o in observations if o.name in model.poses]
     )
     kept = DriftReference.from_arrays(model.rig, found.to_arrays())  # as a session keeps it
-    assert kept.sigmas == found.sigmas
+    assert np.array_equal(kept.sigmas, found.sigmas)
     return kept
 
 

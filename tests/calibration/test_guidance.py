@@ -6,12 +6,12 @@ import pytest
 from splined_rig import BOARD, poses, rig
 
 from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
-from slviewer.calibration.guidance.information import (
+from slviewer.calibration.guidance.pose_selection import (
     RigInformation,
     VolumeSensitivity,
     information_rows,
+    suggest_poses,
 )
-from slviewer.calibration.guidance.pose_selection import suggest_poses
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
 from slviewer.wizard.pose_plan import MIN_POSES, PlanInput, PoseFeatures, plan_next_pose

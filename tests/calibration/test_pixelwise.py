@@ -5,9 +5,13 @@ import pytest
 from analytic_rig import BOARD, PERIOD, PROJECTOR, board_poses, cv_project, observation, rig
 from facts import raises
 
-from slviewer.calibration.moments import fit_rational
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise, pixel_samples
+from slviewer.calibration.pixelwise import (
+    PixelwiseModel,
+    calibrate_pixelwise,
+    fit_rational,
+    pixel_samples,
+)
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import CalibrationRejected
 from slviewer.fringe.phase import PhaseMap

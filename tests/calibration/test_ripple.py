@@ -8,16 +8,15 @@ import pytest
 from facts import missing_facts
 from splined_rig import BOARD, PERIOD, SAMPLE_PX, observation, poses, rig
 
-from slviewer.calibration.diagnosis.capture_rules import diagnose_period, diagnose_ripple
 from slviewer.calibration.diagnosis.evidence import (
     AxisEvidence,
     Evidence,
     PoseEvidence,
+    Ripple,
     SolutionEvidence,
 )
-from slviewer.calibration.diagnosis.ripple import Ripple, measure_ripple
-from slviewer.calibration.diagnosis.solution import measure_solution
-from slviewer.calibration.diagnosis.verdict import judge_splined
+from slviewer.calibration.diagnosis.rules import diagnose_period, diagnose_ripple, judge_splined
+from slviewer.calibration.diagnosis.solution import measure_ripple, measure_solution
 from slviewer.calibration.observe import Observation, Samples
 from slviewer.calibration.splined.residual_noise import Noise, estimate_noise
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo

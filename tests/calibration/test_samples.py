@@ -26,7 +26,7 @@ def test_blocks_average_position_and_coordinate_alike_and_know_their_noise() -> 
     rng = np.random.default_rng(1)
     bright = rng.random(SHAPE) < 0.8
     x = phase_map("x", 100 + 0.9 * u + 0.1 * v, rng)
-    samples = block_samples({"x": x}, {"x": bright}, ("x", "y"), count=2000)
+    samples = block_samples({"x": x}, {"x": bright}, count=2000)
     assert 1500 < len(samples.camera) <= 2000
     assert np.isnan(samples.projector[:, 1]).all() and np.isnan(samples.sigma[:, 1]).all()
     error = samples.projector[:, 0] - (

@@ -1,6 +1,8 @@
 """Derivatives against differences, the compiled form against the exact one, the covariance against
 true errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from facts import raises
@@ -100,7 +102,7 @@ def test_a_factor_by_blocks_solves_the_normal_equations(seen, stereo, damping: f
     state = bent(State.from_stereo(stereo, names, len(data.points), CELLS), rng)
     residuals = tuple(rng.normal(size=p.shape) for p in predict_observations(state, data))
     A, b = normal_equations(state, data, residuals, tuple(rng.random(r.shape) for r in residuals))
-    Prior.build(state, data).add(A, b, state, (10.0, 20.0))
+    replace(Prior.build(state, data), strengths=(10.0, 20.0)).add(A, b, state)
     before, at = A.copy(), state.layout
     others = rng.normal(size=(at.size, 2))
     factor = BlockFactor(A, at, damping)

@@ -8,8 +8,7 @@ import pytest
 from analytic_rig import BOARD, PROJECTOR, board_poses, observation, rig
 from facts import missing_facts, raises
 
-from slviewer.calibration.soundness import MIN_POSES
-from slviewer.calibration.stereo import StereoModel, calibrate_stereo
+from slviewer.calibration.stereo import MIN_POSES, StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected
 
 pytestmark = pytest.mark.computes

@@ -13,7 +13,7 @@ from variants import crossed, often
 from slviewer.errors import DetectionError, InputError
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
-from slviewer.target.numbering import x_direction
+from slviewer.target.planar import x_direction
 
 pytestmark = pytest.mark.computes
 

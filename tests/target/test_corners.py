@@ -11,7 +11,7 @@ from variants import crossed, often
 from slviewer.errors import DetectionError
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
-from slviewer.target.numbering import check_grid
+from slviewer.target.planar import check_grid
 
 pytestmark = pytest.mark.computes
 

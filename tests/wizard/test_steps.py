@@ -7,8 +7,7 @@ import numpy as np
 from facts import missing_facts
 
 from slviewer.calibration.next_pose import Coverage, nominal_lens
-from slviewer.calibration.soundness import MIN_POSES
-from slviewer.calibration.stereo import StereoModel
+from slviewer.calibration.stereo import MIN_POSES, StereoModel
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture import Space
 from slviewer.target.board import Board

@@ -1,7 +1,6 @@
 """Diagnosis of calibrations: evidence from frames, poses and the solution; rules that turn it into
 a verdict.
 
-`frames` and `numbering` examine one pose, `solution` and `ripple` all of them together; their
-results are `evidence`. `rules` turn evidence into findings, each a cause with its remedy, and
-`verdict` orders the findings.
+`frames` and `numbering` examine one pose, `solution` all of them together; their results are
+`evidence`. `rules` turn evidence into findings, each a cause with its remedy.
 """

@@ -1,7 +1,7 @@
 """Stereo calibration with diagnosis: exclude unfit poses, calibrate, and judge the result."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +9,14 @@ import numpy as np
 from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.diagnosis.evidence import Evidence, PoseEvidence
 from slviewer.calibration.diagnosis.numbering import describe_misnumbering, reconcile_marks
-from slviewer.calibration.diagnosis.poses import motion_limit_px, reason_to_exclude
-from slviewer.calibration.diagnosis.rules import judge_evidence
+from slviewer.calibration.diagnosis.rules import (
+    judge_evidence,
+    motion_limit_px,
+    reason_to_exclude,
+)
 from slviewer.calibration.diagnosis.solution import measure_solution
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.soundness import MIN_POSES, nominal_tilt_spread_deg
-from slviewer.calibration.stereo import StereoModel
+from slviewer.calibration.stereo import MIN_POSES, StereoModel, nominal_tilt_spread_deg
 from slviewer.errors import CalibrationRejected
 from slviewer.records.verdict import Verdict
 from slviewer.target.board import Board
@@ -52,8 +54,14 @@ def calibrate_with_diagnosis(
     the reason. A calibration that cannot be made is returned with a rejecting verdict, not raised.
     """
     observations, warning = reconcile_marks(board, observations)
-    poses = [_add_numbering(pose, board, observations) for pose in poses]
-    unfit = _select_unfit_poses(poses, observations)
+    readable = {o.name: o for o in observations}
+    poses = [
+        replace(pose, numbering=describe_misnumbering(board, o.points, o.camera))
+        if (o := readable.get(pose.name))
+        else pose
+        for pose in poses
+    ]
+    unfit = _select_unfit_poses(poses, readable)
     fit = [o for o in observations if o.name not in unfit]
     excluded_before = {**(excluded or {}), **unfit}
     refusal = ""
@@ -106,32 +114,16 @@ def _solve_unchecked(
     return (stereo, used) if is_finite and stereo.depth_range_mm is not None else (None, [])
 
 
-def _add_numbering(
-    pose: PoseEvidence, board: Board, observations: Sequence[Observation]
-) -> PoseEvidence:
-    """Return the evidence of a pose with the check of its features' numbering added, if the pose
-    was read."""
-    o = next((o for o in observations if o.name == pose.name), None)
-    return (
-        pose
-        if o is None
-        else replace(pose, numbering=describe_misnumbering(board, o.points, o.camera))
-    )
-
-
-def _select_unfit_poses(
-    poses: Sequence[PoseEvidence], observations: Sequence[Observation]
-) -> dict[str, str]:
+def _select_unfit_poses(poses: Sequence[PoseEvidence], readable: Collection[str]) -> dict[str, str]:
     """Return the readable poses to exclude from the fit, with the reason.
 
     Empty where fewer than MIN_POSES or half of the poses would remain: the fault is then common to
     all of them.
     """
-    names = {o.name for o in observations}
     limit = motion_limit_px(poses)
     unfit = {
         pose.name: why
         for pose in poses
-        if pose.name in names and (why := reason_to_exclude(pose, limit))
+        if pose.name in readable and (why := reason_to_exclude(pose, limit))
     }
-    return unfit if len(names) - len(unfit) >= max(MIN_POSES, len(names) / 2) else {}
+    return unfit if len(readable) - len(unfit) >= max(MIN_POSES, len(readable) / 2) else {}

@@ -6,11 +6,41 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.ripple import Ripple
-from slviewer.calibration.soundness import MIN_TILT_SPREAD_DEG
+from slviewer.calibration.stereo import MIN_TILT_SPREAD_DEG
 from slviewer.fringe.sequence import Axis
 from slviewer.records.plain import from_plain
 from slviewer.records.verdict import Finding
+
+MIN_DEPTH_SHARE = 3e-5
+"""Depth errors of a smaller share of the depth do not matter: 18 um at 600 mm, half the Letter
+rig's noise floor."""
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """Ripple of one axis in projector px.
+
+    ``rms_px``: RMS of all residuals that repeat with the fringe; ``waves``: waves per period of
+    their strongest component, ``strongest_px`` its RMS; ``noise_px``: predicted noise of one camera
+    pixel, median over the samples; ``mm_per_px``: change of depth by one projector px, in the axis
+    that gives the depth; ``depth_mm``: median depth of the samples.
+    """
+
+    rms_px: float
+    waves: int
+    strongest_px: float
+    noise_px: float
+    mm_per_px: float
+    depth_mm: float
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is larger than the noise of a point and than `MIN_DEPTH_SHARE` of the
+        depth."""
+        return (
+            self.rms_px > self.noise_px
+            and self.rms_px * self.mm_per_px > MIN_DEPTH_SHARE * self.depth_mm
+        )
 
 
 @dataclass(frozen=True)
@@ -121,6 +151,11 @@ class Evidence:
         """Whether the boards are so nearly parallel that a fit's angles and focal lengths are
         undetermined."""
         return self.tilt_spread_deg < MIN_TILT_SPREAD_DEG
+
+    @property
+    def ripple(self) -> Mapping[Axis, Ripple]:
+        """Residuals of the solution that repeat with the fringe, by axis; empty without one."""
+        return self.solution.ripple if self.solution else {}
 
     @property
     def usable(self) -> tuple[PoseEvidence, ...]:

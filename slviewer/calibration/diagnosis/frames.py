@@ -10,6 +10,7 @@ from slviewer.fringe.origin import measure_code_origin
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.polynomial import fit_slopes
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import finite_rows, lengths
 
 MIN_ORIGIN_PX = 0.2
@@ -27,16 +28,13 @@ def measure_axis(
     ``stack`` (n, h, w): all frames of the capture; ``board`` (h, w) bool: the detected board's
     pixels, None for the whole image.
     """
-    valid = phase.reason == Reason.VALID
-    where = np.ones(phase.reason.shape, bool) if board is None else board
-    illuminated = (phase.reason != Reason.DARK) & where
-    saturated = (phase.reason == Reason.SATURATED) & where
-    total = max(1.0, float(np.count_nonzero(illuminated)))
+    reason = phase.reason if board is None else phase.reason[board]
+    total = max(1.0, float(np.count_nonzero(reason != Reason.DARK)))
     return AxisEvidence(
         period_px=phase.period_px,
         steps=phase.steps,
-        readable=np.count_nonzero(valid & where) / total,
-        saturated=np.count_nonzero(saturated) / total,
+        readable=np.count_nonzero(reason == Reason.VALID) / total,
+        saturated=np.count_nonzero(reason == Reason.SATURATED) / total,
         harmonic=measure_second_harmonic(sequence, stack, phase.axis),
         period_seen_px=measure_period(sequence, stack, phase.axis),
     )
@@ -57,19 +55,10 @@ def measure_second_harmonic(sequence: PatternSequence, stack: np.ndarray, axis: 
     frames = np.stack([stack[i][rows].ravel() for i in indices])
     white = white_level(sequence, stack, indices)
     frames = frames[:, (frames.max(0) < white) & (frames.min(0) > 0)].astype(np.float32)
-    n = len(indices)
-    first, second = (
-        np.einsum(
-            "k,kp->p",
-            np.exp(-2j * np.pi * m * np.arange(n) / n).astype(np.complex64) * np.float32(2 / n),
-            frames,
-        )
-        for m in (1, 2)
-    )
+    first, second = np.fft.fft(frames, axis=0)[1:3] * (2 / len(indices))
     strength = np.abs(first)
-    modulated = strength > max(
-        8.0 * white / 255, 0.3 * float(np.quantile(strength, 0.95)) if strength.size else np.inf
-    )
+    weakest = 0.3 * np.quantile(strength, 0.95) if strength.size else np.inf
+    modulated = strength > max(8.0 * white / 255, weakest)
     if np.count_nonzero(modulated) < FEWEST:
         return np.nan
     first, second, strength = first[modulated], second[modulated], strength[modulated]
@@ -121,7 +110,7 @@ def measure_white_delay(sequence: PatternSequence, stack: np.ndarray) -> int:
 
 
 def measure_motion_px(
-    sequence: PatternSequence, stack: np.ndarray, pixels: np.ndarray, pitch: float
+    sequence: PatternSequence, stack: np.ndarray, pixels: Floats, pitch: float
 ) -> float:
     """Measure the median motion in px of features at ``pixels`` (n, 2) between the frames of the
     two axes.
@@ -129,11 +118,8 @@ def measure_motion_px(
     ``pitch``: distance of neighbouring features, px. NaN where only one axis was captured, or where
     fewer than four features can be tracked.
     """
-    scenes = [
-        image
-        for axis in sequence.axes
-        if (image := _scene_image(sequence, stack, axis)) is not None
-    ]
+    images = (_scene_image(sequence, stack, axis) for axis in sequence.axes)
+    scenes = [image for image in images if image is not None]
     if len(scenes) < 2 or len(pixels) < 4:
         return np.nan
     top = max(1.0, *(float(np.percentile(image[::4, ::4], 99.5)) for image in scenes))
@@ -153,15 +139,10 @@ def _scene_image(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> np
     """Average the frames of one axis to an image (h, w) float32 without patterns; None where they
     do not cancel."""
     layout = axis_layout(sequence, axis)
-    frames = list(layout.shifts[-1].indices) if layout.shifts else []
-    if not frames and layout.inverse:
-        frames = [*layout.gray, *layout.inverse]
-    if not frames:
-        return None
-    total = np.zeros(stack.shape[1:], np.float32)
-    for i in frames:
-        total += stack[i]
-    return total / len(frames)
+    frames = [*layout.gray, *layout.inverse] if layout.inverse else []
+    if layout.shifts:
+        frames = list(layout.shifts[-1].indices)
+    return np.asarray(stack[frames].mean(0, np.float32)) if frames else None
 
 
 def gamma_from_harmonic(harmonic: float) -> float:
@@ -175,7 +156,7 @@ def gamma_from_harmonic(harmonic: float) -> float:
 
 
 def fit_mean_turn(
-    camera: np.ndarray, projector: np.ndarray
+    camera: Floats, projector: Floats
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Fit the Jacobian (2, 2) of projector pixels (n, 2) by camera pixels (n, 2), least squares
     over all features.

@@ -10,13 +10,13 @@ import numpy as np
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.half_turns import opposite_features
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import lengths
 from slviewer.target.blobs import detect_blobs
 from slviewer.target.board import Board
 from slviewer.target.images import SEARCH_PX, BoardImage, resize_image
-from slviewer.target.lattice import grow_lattices
-from slviewer.target.numbering import select_upright
-from slviewer.target.planar import to_image
+from slviewer.target.lattice import Lattice, grow_lattices
+from slviewer.target.planar import select_upright, to_image
 
 MISNUMBERED_PITCHES = 0.8
 """A residual of this many pitches shows that features are misnumbered."""
@@ -26,7 +26,7 @@ _FULL_SHARE = 0.9  # least share of a lattice's nodes that are occupied in a who
 _INLIER_PITCHES = 0.25  # largest residual of inliers in the fit of homography and lens distortion
 
 
-def describe_misnumbering(board: Board, points: np.ndarray, pixels: np.ndarray) -> str:
+def describe_misnumbering(board: Board, points: Floats, pixels: Floats) -> str:
     """Describe how features with ``points`` (n, 3) mm at ``pixels`` (n, 2) are misnumbered; ""
     where they are not.
 
@@ -42,18 +42,19 @@ def describe_misnumbering(board: Board, points: np.ndarray, pixels: np.ndarray) 
         return "mixed up"
     index = np.arange(columns * rows).reshape(rows, columns)
     hypotheses = {
-        "transposed": [index.T, np.arange(columns * rows).reshape(columns, rows).T],
+        "transposed": [index.T, index.reshape(columns, rows).T],
         "shifted by a row": [np.roll(index, k, axis=0) for k in (1, -1, 2, -2)],
         "shifted by a column": [np.roll(index, k, axis=1) for k in (1, -1, 2, -2)],
-        "shifted": [np.roll(index.ravel(), k).reshape(rows, columns) for k in (1, -1)],
+        "shifted": [np.roll(index, k) for k in (1, -1)],
     }
-    best, least = "mixed up", FIT_PITCHES
-    for description, orders in hypotheses.items():
-        for order in orders:
-            residual, _ = _measure_misfit(points, pixels[order.ravel()], board.pitch_mm)
-            if residual < least:
-                best, least = description, residual
-    return best
+    residuals = {
+        description: min(
+            _measure_misfit(points, pixels[order.ravel()], board.pitch_mm)[0] for order in orders
+        )
+        for description, orders in hypotheses.items()
+    }
+    best = min(residuals, key=lambda description: residuals[description])
+    return best if residuals[best] < FIT_PITCHES else "mixed up"
 
 
 def reconcile_marks(
@@ -64,20 +65,18 @@ def reconcile_marks(
 
     A board has a mark in all poses or in none. Marks that only a minority of poses shows are
     treated as clutter: these poses are renumbered by the rule for boards without a mark
-    (``slviewer.target.numbering``). The warning is "" where nothing was changed.
+    (``slviewer.target.planar``). The warning is "" where nothing was changed.
     """
     doubtful = [o.name for o in observations if o.marked]
     if not doubtful or 2 * len(doubtful) >= len(observations):
         return list(observations), ""
     numbered = [_number_by_rule(board, o) if o.marked else o for o in observations]
-    return (
-        numbered,
-        (
-            f"a mark was detected in {len(doubtful)} of {len(observations)} poses"
-            f" ({', '.join(doubtful)}) only: treated as clutter next to the board, these poses are"
-            " numbered like the others; if the board has a mark, keep it in view and uncovered"
-        ),
+    warning = (
+        f"a mark was detected in {len(doubtful)} of {len(observations)} poses"
+        f" ({', '.join(doubtful)}) only: treated as clutter next to the board, these poses are"
+        " numbered like the others; if the board has a mark, keep it in view and uncovered"
     )
+    return numbered, warning
 
 
 def _number_by_rule(board: Board, observation: Observation) -> Observation:
@@ -89,12 +88,11 @@ def _number_by_rule(board: Board, observation: Observation) -> Observation:
     same = np.arange(len(board.points))
     if np.array_equal(select_upright(board, observation.camera, [same, partner]), same):
         return plain
-    slopes = None if observation.slopes is None else observation.slopes[partner]
     return replace(
         plain,
-        camera=observation.camera[partner],
-        projector=observation.projector[partner],
-        slopes=slopes,
+        camera=plain.camera[partner],
+        projector=plain.projector[partner],
+        slopes=None if plain.slopes is None else plain.slopes[partner],
     )
 
 
@@ -110,22 +108,21 @@ def detect_grid_size(board: Board, image: np.ndarray) -> tuple[int, int] | None:
     grey = BoardImage.from_image(image).grey
     small = resize_image(grey, min(1.0, SEARCH_PX / max(grey.shape)))
     pitch = max(small.shape) / (min(board.columns, board.rows) - 1)
-    most: tuple[int, tuple[int, int]] | None = None
+    most: Lattice | None = None
     for inverted in (False, True):
         for blobs in detect_blobs(small, pitch, inverted):
             for lattice in grow_lattices(blobs):
                 longer, shorter = lattice.extent
-                count = len(lattice.nodes)
-                is_full = count >= _FULL_SHARE * longer * shorter
-                if is_full and min(longer, shorter) >= 3 and (not most or count > most[0]):
-                    most = count, (longer, shorter)
-            if most and most[0] > len(board.points) / 2:
-                longer, shorter = most[1]
+                is_full = len(lattice) >= _FULL_SHARE * longer * shorter and shorter >= 3
+                if is_full and (most is None or len(lattice) > len(most)):
+                    most = lattice
+            if most is not None and len(most) > len(board.points) / 2:
+                longer, shorter = most.extent
                 return (longer, shorter) if board.columns >= board.rows else (shorter, longer)
     return None
 
 
-def _measure_misfit(points: np.ndarray, pixels: np.ndarray, pitch_mm: float) -> tuple[float, bool]:
+def _measure_misfit(points: Floats, pixels: Floats, pitch_mm: float) -> tuple[float, bool]:
     """Return (residual of the worst 1 % of the features in pitches, whether the homography is
     mirrored).
 

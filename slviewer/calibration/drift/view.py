@@ -12,16 +12,15 @@ from functools import cached_property
 import cv2
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from slviewer.calibration.board_pose import solve_pose
+from slviewer.calibration.board_pose import intersect_board, solve_pose
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import Floats
-from slviewer.geometry.splines import cubic_basis, second_differences
-from slviewer.geometry.vectors import unit_vectors
+from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
+from slviewer.geometry.splines import basis_matrix, second_differences
+from slviewer.geometry.vectors import finite_rows, unit_vectors
 
 SAMPLES = 1000
 """Number of pixels of the board at which the projector's coordinates are compared."""
@@ -59,9 +58,8 @@ class DriftView:
         on_grid = (u % step == 0) & (v % step == 0)
         pixels = np.stack([u[on_grid] + u0, v[on_grid] + v0], 1).astype(float)
         projector = np.full((len(pixels), 2), np.nan)
-        for axis, surface in observation.surfaces.items():
-            phase = surface.evaluate(pixels[:, 0], pixels[:, 1])
-            projector[:, AXES.index(axis)] = phase * observation.periods_px[axis] / (2 * np.pi)
+        for axis in observation.surfaces:
+            projector[:, AXES.index(axis)] = observation.coordinate(axis, *pixels.T)
         return cls(observation.name, observation.points, observation.camera, pixels, projector)
 
     @property
@@ -89,27 +87,19 @@ class DisplacementField:
 
     def basis(self, pixels: Floats) -> sp.csr_array:
         """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
-        (i, wu), (j, wv) = (
-            cubic_basis(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
+        across, down = (
+            basis_matrix(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
             for k, (size, cells) in enumerate(zip(self.size, self.cells, strict=True))
         )
-        columns = (j[:, None] + np.arange(4))[:, :, None] * (self.cells[0] + 3) + (
-            i[:, None] + np.arange(4)
-        )[:, None]
-        values = wv[:, :, None] * wu[:, None]
-        rows = np.repeat(np.arange(len(pixels)), 16)
-        return sp.csr_array((values.ravel(), (rows, columns.ravel())), (len(pixels), self.unknowns))
+        return sp.csr_array((down[:, :, None] * across[:, None]).reshape(-1, self.unknowns))
 
     @cached_property
     def roughness(self) -> sp.csr_array:
         """Quadratic form (unknowns, unknowns) of the squared second differences of one component's
         coefficients."""
         across, down = (n + 3 for n in self.cells)
-
-        u, v = (
-            sp.kron(sp.eye(down), second_differences(across)),
-            sp.kron(second_differences(down), sp.eye(across)),
-        )
+        u = sp.kron(sp.eye(down), second_differences(across))
+        v = sp.kron(second_differences(down), sp.eye(across))
         return sp.csr_array(u.T @ u + v.T @ v)
 
 
@@ -118,26 +108,24 @@ class LinearView:
     """A view's linear equations ``residuals = pose a + change b + shared c``, one row per observed
     coordinate (px).
 
-    ``kinds`` (k,): index into KINDS of each row. Derivatives: ``pose`` (k, 6) by the board's pose;
-    ``change`` (k, 6) by the projector's rotation about its own centre and axes (rad) and its
-    translation (mm); ``scale`` (k,) by the board's relative growth; ``shared`` (k, unknowns) by the
-    lens errors: u and v components of the camera's field, then of the projector's. ``across`` (k,):
-    weight of each projector coordinate in the offset across the epipolar lines.
+    ``kinds`` (k,): index into KINDS of each row; ``usable`` (k,) bool: the rows that were measured.
+    Derivatives: ``pose`` (k, 6) by the board's pose; ``change`` (k, 6) by the projector's rotation
+    about its own centre and axes (rad) and its translation (mm); ``scale`` (k,) by the board's
+    relative growth; ``shared`` (k, unknowns) by what all views share: the change again, as the
+    calibration's own error, then the lens errors, u and v components of the camera's field, then of
+    the projector's. ``across`` (k,): weight of each projector coordinate in the offset across the
+    epipolar lines.
     """
 
     name: str
     kinds: np.ndarray
     residuals: Floats
+    usable: Mask
     pose: Floats
     change: Floats
     scale: Floats
     shared: sp.csr_array
     across: Floats
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """(k,) bool: the rows that were measured."""
-        return np.isfinite(self.residuals) & np.isfinite(self.change).all(1)
 
 
 def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
@@ -145,79 +133,70 @@ def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
 
     Raises InputError where that pose cannot be solved.
     """
-    T = _solve_pose(rig, view)
-    middle = view.points.mean(0)
-
-    def model(at: np.ndarray, moved: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose,
-        projector, scale."""
-        R = cv2.Rodrigues(at[:3])[0] @ T[:3, :3]
-        t = T[:3, 3] + at[3:6]
-        rays = np.concatenate(
-            [rig.camera.undistort(view.pixels + moved), np.ones((len(view.pixels), 1))], 1
-        )
-        on_board = rays * ((R[:, 2] @ t) / (rays @ R[:, 2]))[:, None]
-        in_projector = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
-        points = middle + (view.points - middle) * (1 + at[12])
-        return rig.camera.project(points @ R.T + t), rig.projector.project(in_projector)
-
-    steps = np.diag(np.r_[STEPS, STEPS, 1e-4])
-    columns = [
-        _flatten(*(a - b for a, b in zip(model(s), model(-s), strict=True))) / (2 * s.sum())
-        for s in steps
-    ]
-    features, samples = model(np.zeros(13))
-    # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
-    J = np.stack(
-        [
-            (model(np.zeros(13), 0.1 * e)[1] - model(np.zeros(13), -0.1 * e)[1]) / 0.2
-            for e in np.eye(2)
-        ],
-        2,
-    )
-    camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
-    on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
-    on_samples = projector.basis(np.nan_to_num(samples))
-    n, m = len(view.camera), len(view.pixels)
-
-    def moved_by(row: int) -> list[sp.csr_array]:
-        """Return the derivatives of a projector coordinate by the camera's field, u and v
-        components."""
-        return [-sp.csr_array(sp.diags(np.nan_to_num(J[:, row, k])) @ at_pixels) for k in (0, 1)]
-
-    interleaved = [sp.csr_array(sp.kron(on_features, np.eye(2)[:, k : k + 1])) for k in (0, 1)]
-    rows = (
-        [*interleaved, None, None],
-        [*moved_by(0), on_samples, None],
-        [*moved_by(1), None, on_samples],
-    )
-    shared = sp.block_array(rows, format="csr")
-    by_shift = np.stack([column[2 * n :].reshape(2, m).T for column in columns[3:6]], 2)
-    towards = unit_vectors(by_shift @ T[:3, 2])  # along the normal
-    return LinearView(
-        view.name,
-        np.repeat([0, 1, 2], [2 * n, m, m]),
-        _flatten(view.camera - features, view.projector - samples),
-        np.stack(columns[:6], 1),
-        np.stack(columns[6:12], 1),
-        columns[12],
-        shared,
-        np.concatenate([np.zeros(2 * n), -towards[:, 1], towards[:, 0]]),
-    )
-
-
-def _flatten(camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
-    """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2
-    m,)."""
-    return np.concatenate([camera.ravel(), projector[:, 0], projector[:, 1]])
-
-
-def _solve_pose(rig: StereoRig, view: DriftView) -> np.ndarray:
-    """Solve T_camera_board (4, 4) mm from the features in the camera; raises InputError without a
-    solution."""
     T = solve_pose(view.points, rig.camera.undistort(view.camera), np.eye(3), np.zeros(5))
     if T is None:
         raise InputError(
             f"{view.name}: no pose of the board fits its features: is it the calibration's board?"
         )
-    return T
+    middle = view.points.mean(0)
+
+    def model(at: Floats, moved: Floats | float = 0.0) -> tuple[Floats, Floats]:
+        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose,
+        projector, scale."""
+        moved_T = rigid_transform(cv2.Rodrigues(at[:3])[0] @ T[:3, :3], T[:3, 3] + at[3:6])
+        on_board = intersect_board(moved_T, rig.camera.undistort(view.pixels + moved))
+        in_projector = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
+        points = middle + (view.points - middle) * (1 + at[12])
+        features = rig.camera.project(move_points(moved_T, points))
+        return features, rig.projector.project(in_projector)
+
+    derivatives = np.column_stack(
+        [
+            _flatten(*(a - b for a, b in zip(model(step), model(-step), strict=True)))
+            / (2 * step.sum())
+            for step in np.diag(np.r_[STEPS, STEPS, 1e-4])
+        ]
+    )
+    features, samples = model(np.zeros(13))
+    residuals = _flatten(view.camera - features, view.projector - samples)
+    usable = finite_rows(residuals[:, None], derivatives[:, 6:12])
+    derivatives = np.nan_to_num(derivatives)
+    pose, change, scale = derivatives[:, :6], derivatives[:, 6:12], derivatives[:, 12]
+    # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
+    moved = [
+        (model(np.zeros(13), 0.1 * unit)[1] - model(np.zeros(13), -0.1 * unit)[1]) / 0.2
+        for unit in np.eye(2)
+    ]
+    J = np.nan_to_num(np.stack(moved, axis=2))
+    camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
+    on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
+    on_samples = projector.basis(np.nan_to_num(samples))
+    interleaved = [sp.kron(on_features, unit[:, None]) for unit in np.eye(2)]
+    columns, rows = ([-sp.diags(J[:, row, k]) @ at_pixels for k in (0, 1)] for row in (0, 1))
+    lens_errors = sp.block_array(
+        [
+            [*interleaved, None, None],
+            [*columns, on_samples, None],
+            [*rows, None, on_samples],
+        ]
+    )
+    n, m = len(view.camera), len(view.pixels)
+    by_shift = (derivatives[2 * n :, 3:6] @ T[:3, 2]).reshape(2, m)  # along the board's normal
+    towards = unit_vectors(by_shift.T)
+    return LinearView(
+        view.name,
+        np.repeat([0, 1, 2], [2 * n, m, m]),
+        np.where(usable, residuals, 0.0),
+        usable,
+        pose,
+        change,
+        scale,
+        sp.csr_array(sp.hstack([sp.csr_array(change), lens_errors])),
+        np.concatenate([np.zeros(2 * n), -towards[:, 1], towards[:, 0]]),
+    )
+
+
+def _flatten(camera: Floats, projector: Floats) -> Floats:
+    """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2
+    m,)."""
+    return np.concatenate([camera.ravel(), *projector.T])

@@ -7,7 +7,6 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS, board_frame, offset_gauge
 from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE, Device, roughness
@@ -18,6 +17,7 @@ from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import (
     Floats,
+    Mask,
     move_points,
     nearest_rotation,
     rotation_angle,
@@ -59,7 +59,7 @@ class ExpectedNoise:
     sample: float = 1.5e-5
     strengths: tuple[float, float] = (4e8, 2e8)
 
-    def with_noise(self, samples: np.ndarray) -> "ExpectedNoise":
+    def with_noise(self, samples: Floats) -> "ExpectedNoise":
         """Return the expectation updated by the measured noise (n,) of some poses' samples, in
         widths of the image.
 
@@ -86,13 +86,14 @@ class GuidanceModel:
     @cached_property
     def rig(self) -> Arrangement:
         """Both devices without local distortion, on coarse knots."""
+        rig = self.stereo
         camera, projector = (
-            _coarse_device(lens) for lens in (self.stereo.camera, self.stereo.projector)
+            Device.from_lens(lens, COARSE_CELLS) for lens in (rig.camera, rig.projector)
         )
-        return Arrangement(camera, projector, np.array(self.stereo.R), np.array(self.stereo.t))
+        return Arrangement(camera, projector, np.array(rig.R), np.array(rig.t))
 
     @cached_property
-    def points(self) -> np.ndarray:
+    def points(self) -> Floats:
         """(f, 3) mm: features that represent all those of the board."""
         low, high = self.board.points.min(0), self.board.points.max(0)
         grid = grid_points(*(np.linspace(low[k], high[k], n) for k, n in enumerate(FEATURES)))
@@ -100,7 +101,7 @@ class GuidanceModel:
         return np.ascontiguousarray(self.board.points[np.unique(nearest)])
 
     @cached_property
-    def frame(self) -> np.ndarray:
+    def frame(self) -> Floats:
         """(4,) mm: the rectangle of the board's features, as ``board_frame`` returns it."""
         return board_frame(self.board.points)
 
@@ -127,24 +128,21 @@ class GuidanceModel:
         ``T_camera_board``: (k, 4, 4) mm.
         """
         outline = self.board.outline()
-        shares = [(np.arange(n) + 0.5) / n for n in SAMPLES]
-        grid = grid_points(
-            *(outline[0, k] + share * np.ptp(outline[:, k]) for k, share in enumerate(shares))
-        )
-        pixels, visible = self._project(T_camera_board, np.pad(grid, ((0, 0), (0, 1))), 0)
+        shares = grid_points(*((np.arange(n) + 0.5) / n for n in SAMPLES), np.zeros(1))
+        points = outline[0] + shares * np.ptp(outline, axis=0)
+        pixels, visible = self._project(T_camera_board, points, 0)
         return [p[v] for p, v in zip(pixels, visible, strict=True)]
 
-    def is_visible(self, T_camera_board: Floats) -> NDArray[np.bool_]:
+    def is_visible(self, T_camera_board: Floats) -> Mask:
         """(k,) bool: poses (k, 4, 4) mm at which both devices see every feature of the board, with
         a margin."""
         margin = 0.25 * self.board.pitch_mm if self.board.kind in ("circles", "acircles") else None
-        return np.asarray(
-            self._project(T_camera_board, self.board.outline(margin), MARGIN)[1].all(1)
-        )
+        _, visible = self._project(T_camera_board, self.board.outline(margin), MARGIN)
+        return np.asarray(visible.all(1))
 
     def _project(
         self, T_camera_board: Floats, points: Floats, margin: float
-    ) -> tuple[Floats, NDArray[np.bool_]]:
+    ) -> tuple[Floats, Mask]:
         """Project board points (n, 3) mm at each pose (k, 4, 4).
 
         Returns the camera's pixels (k, n, 2) and whether they are inside both images, (k, n) bool,
@@ -162,43 +160,36 @@ class GuidanceModel:
         at = self.layout
         A = np.zeros((at.size, at.size))
         cell_ratio = CELLS_ACROSS / COARSE_CELLS
-        forms, strengths = [], []
-        for device, strength in zip(self.rig[:2], self.expected.strengths, strict=True):
-            # the same curvature energy of a field, and the same ridge, as on the adjustment's knots
-            form = roughness(device.coefficients)
-            forms.append(form + RIDGE * (cell_ratio**4 - 1) * np.eye(len(form)))
-            strengths.append(strength / device.size[0] ** 2 / cell_ratio**2)
-        prior = Prior((forms[0], forms[1]), offset_gauge(self.points), self.features_per_point)
-        prior.add(A, np.zeros(at.size), self.state, strengths)
+        # the same curvature energy of a field, and the same ridge, as on the adjustment's knots
+        forms = [roughness(device.coefficients) for device in self.rig[:2]]
+        camera, projector = (
+            form + RIDGE * (cell_ratio**4 - 1) * np.eye(len(form)) for form in forms
+        )
+        of_camera, of_projector = (
+            strength / device.size[0] ** 2 / cell_ratio**2
+            for device, strength in zip(self.rig[:2], self.expected.strengths, strict=True)
+        )
+        prior = Prior(
+            (camera, projector),
+            offset_gauge(self.points),
+            (of_camera, of_projector),
+            self.features_per_point,
+        )
+        prior.add(A, np.zeros(at.size), self.state)
         rig = np.arange(at.rig, at.camera_field)
-        A[rig, rig] += self._weak_prior_sigmas() ** -2.0
-        return A
-
-    def _weak_prior_sigmas(self) -> Floats:
-        """(24,): wide prior standard deviations of both lenses, rotation (rad) and translation
-        (mm)."""
+        # wide prior standard deviations of both lenses, rotation (rad) and translation (mm)
         lens = [
-            np.concatenate(
-                [np.repeat(0.3 * K[[0, 1], [0, 1]].mean(), 4), [0.5, 0.5, 0.02, 0.02, 2.0]]
-            )
+            [0.3 * K[[0, 1], [0, 1]].mean()] * 4 + [0.5, 0.5, 0.02, 0.02, 2.0]
             for K in (self.stereo.camera.K, self.stereo.projector.K)
         ]
-        return np.concatenate([*lens, [0.3] * 3, [300.0] * 3])
-
-
-def _coarse_device(lens: Lens) -> Device:
-    """Return a device with the lens's parameters and a zero displacement field on coarse knots."""
-    width, height = lens.size
-    down = int(np.clip(round(COARSE_CELLS * height / width), 4, 2 * COARSE_CELLS))
-    return Device(
-        lens.parameters, np.zeros((2, down + 3, COARSE_CELLS + 3)), np.array(lens.size, float)
-    )
+        A[rig, rig] += np.concatenate([*lens, [0.3] * 3, [300.0] * 3]) ** -2.0
+        return A
 
 
 def estimate_rig(
-    points: Sequence[np.ndarray],
-    camera: Sequence[np.ndarray],
-    projector: Sequence[np.ndarray],
+    points: Sequence[Floats],
+    camera: Sequence[Floats],
+    projector: Sequence[Floats],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> tuple[StereoRig, list[Floats]] | None:
     """Estimate an approximate rig and T_camera_board (4, 4) mm of every pose; None where the poses
@@ -207,41 +198,35 @@ def estimate_rig(
     Of each pose: ``points`` (n, 3) mm on the board, and their ``camera`` and ``projector`` pixels
     (n, 2), NaN where unknown. ``sizes``: (width, height) px of camera and projector.
     """
-    features = [_select_features(*each) for each in zip(points, camera, projector, strict=True)]
+    features = []
+    for pose in zip(points, camera, projector, strict=True):
+        known = np.nonzero(finite_rows(*pose[1:]))[0]  # that both devices see
+        if len(known):
+            known = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
+        features.append([np.ascontiguousarray(each[known], np.float32) for each in pose])
     if len(features) < MIN_POSES or any(len(each[0]) < MIN_FEATURES for each in features):
         return None
     boards, *images = zip(*features, strict=True)
-    devices = [
+    devices = (
         _calibrate_device(boards, seen, size) for seen, size in zip(images, sizes, strict=True)
-    ]
-    if devices[0] is None or devices[1] is None:
+    )
+    (camera_lens, poses), (projector_lens, projector_poses) = devices
+    if camera_lens is None or projector_lens is None:
         return None
-    lenses, poses = zip(*devices, strict=True)
-    T = np.array(poses[1]) @ np.linalg.inv(poses[0])  # T_projector_camera by each pose
+    T = np.array(projector_poses) @ np.linalg.inv(poses)  # T_projector_camera by each pose
     t = np.median(T[:, :3, 3], axis=0)
     R = nearest_rotation(np.median(T[:, :3, :3], axis=0))
     rotation = np.median(rotation_angle(T[:, :3, :3] @ R.T))
     translation = np.median(lengths(T[:, :3, 3] - t)) / max(float(np.linalg.norm(t)), 1e-9)
-    is_behind = any(pose[2, 3] <= 0 for pose in poses[0])
+    is_behind = any(pose[2, 3] <= 0 for pose in poses)
     if rotation > MAX_DISAGREEMENT[0] or translation > MAX_DISAGREEMENT[1] or is_behind:
         return None
-    return StereoRig(lenses[0], lenses[1], R, t), poses[0]
-
-
-def _select_features(
-    points: np.ndarray, camera: np.ndarray, projector: np.ndarray
-) -> list[NDArray[np.float32]]:
-    """Return at most MAX_FEATURES of a pose's points and pixels (k, ...) float32, of those that
-    both devices see."""
-    known = np.nonzero(finite_rows(camera, projector))[0]
-    if len(known):
-        known = known[np.unique(np.linspace(0, len(known) - 1, MAX_FEATURES).astype(int))]
-    return [np.ascontiguousarray(each[known], np.float32) for each in (points, camera, projector)]
+    return StereoRig(camera_lens, projector_lens, R, t), poses
 
 
 def _calibrate_device(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
-) -> tuple[Lens, list[Floats]] | None:
+    points: Sequence[Floats], pixels: Sequence[np.ndarray], size: tuple[int, int]
+) -> tuple[Lens | None, list[Floats]]:
     """Estimate a lens and T_device_board (4, 4) mm of each pose; None without a plausible
     solution."""
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
@@ -252,12 +237,9 @@ def _calibrate_device(
             points, pixels, size, np.eye(3), np.zeros(5), flags=flags
         )
     except cv2.error:
-        return None
-    if not (
-        np.isfinite(K).all()
-        and all(_FOCALS[0] < f / size[0] < _FOCALS[1] for f in (K[0, 0], K[1, 1] / 2))
-    ):
-        return None
-    return Lens(K, np.ravel(D)[:5], size), [
-        transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)
-    ]
+        return None, []
+    focals = np.array([K[0, 0], K[1, 1] / 2]) / size[0]
+    if not (np.isfinite(K).all() and (_FOCALS[0] < focals).all() and (focals < _FOCALS[1]).all()):
+        return None, []
+    poses = [transform_from_rvec(r, t) for r, t in zip(rvecs, tvecs, strict=True)]
+    return Lens(K, np.ravel(D)[:5], size), poses

@@ -2,7 +2,6 @@
 estimated from data."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numba
 import numpy as np
@@ -19,7 +18,6 @@ from slviewer.calibration.splined.half_turns import (
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
-    PoseData,
     factorize,
     normal_equations,
     predict_observations,
@@ -32,9 +30,11 @@ from slviewer.calibration.splined.residual_noise import (
     pose_trust,
     robust_weights,
 )
+from slviewer.calibration.splined.residuals import PoseData
 from slviewer.calibration.splined.unknowns import State
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
+from slviewer.geometry.rigid import Floats
 
 MIN_POSES = 3
 MAX_STEPS = 30
@@ -43,8 +43,6 @@ LEAST_DAMPING, DAMPING_STEP, MOST_DAMPING = 1e-6, 10.0, 10.0
 limit."""
 CONVERGENCE_SIGMAS = 0.02
 """Largest RMS change of the predicted observations at convergence, in sigmas."""
-FIRST_STRENGTH = 10.0
-"""Initial strength of the fields' priors in 1/px^2: displacements of some tenths of a pixel."""
 STRENGTH_STEPS = 3
 """Number of updates of the priors' strengths, which converge after two."""
 MIN_SAMPLES = 3
@@ -56,50 +54,41 @@ others."""
 
 def gather_data(
     observations: Sequence[Observation], stereo: StereoModel
-) -> tuple[list[str], PoseData, np.ndarray]:
+) -> tuple[list[str], PoseData, Floats]:
     """Collect the observations of the poses that the stereo calibration used and that hold both
     axes.
 
     Returns their names, the observations, and the samples' predicted noise (m, 2) px. Raises
     InputError for fewer than MIN_POSES poses with both axes, and for observations without samples.
     """
-    both = _select_complete(observations, stereo)
-    every = np.concatenate([o.points for o in both])
-    points, feature = np.unique(np.round(every, 6), axis=0, return_inverse=True)
-    samples = [o.samples for o in both if o.samples is not None]
-    data = PoseData(
-        np.cumsum([0, *(len(o.points) for o in both)]),
-        feature.ravel().astype(np.int64),
-        np.ascontiguousarray(np.concatenate([o.camera for o in both])),
-        np.cumsum([0, *(len(s.camera) for s in samples)]),
-        np.concatenate([s.camera for s in samples]),
-        np.concatenate([s.projector for s in samples]),
-        points,
-        board_frame(points),
-    )
-    return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
-
-
-def _select_complete(observations: Sequence[Observation], stereo: StereoModel) -> list[Observation]:
-    """Select the observations of ``gather_data``; raises its errors."""
     both = [o for o in observations if o.name in stereo.poses and len(o.surfaces) == 2]
     if len(both) < MIN_POSES:
-        single = (
-            sorted({axis for o in observations for axis in o.surfaces})
-            if len(both) < len(observations)
-            else []
-        )
+        single = sorted({axis for o in observations if len(o.surfaces) < 2 for axis in o.surfaces})
         alone = f"; others hold axis {' or '.join(single)} alone" if single else ""
         raise InputError(
             f"{len(both)} target poses hold both projector coordinates{alone}: splined compares"
             f" both, so capture at least {MIN_POSES} poses with the patterns of x and of y"
         )
-    if any(o.samples is None for o in both):
+    samples = [o.samples for o in both if o.samples is not None]
+    if len(samples) < len(both):
         raise InputError(
             "these target poses were read without samples of their phase: calibrate from the frames"
             " again"
         )
-    return both
+    boards, pixels = [o.points for o in both], [s.camera for s in samples]
+    every = np.concatenate(boards)
+    points, feature = np.unique(np.round(every, 6), axis=0, return_inverse=True)
+    data = PoseData(
+        np.cumsum([0, *map(len, boards)]),
+        feature.ravel().astype(np.int64),
+        np.ascontiguousarray(np.concatenate([o.camera for o in both])),
+        np.cumsum([0, *map(len, pixels)]),
+        np.concatenate(pixels),
+        np.concatenate([s.projector for s in samples]),
+        points,
+        board_frame(points),
+    )
+    return [o.name for o in both], data, np.concatenate([s.sigma for s in samples])
 
 
 def adjust_bundle(
@@ -117,23 +106,9 @@ def adjust_bundle(
     where the adjustment does not converge, is undetermined, or where too few poses agree with each
     other.
     """
-    # for one large matrix, not for many small ones
-    with threadpool_limits(numba.get_num_threads(), user_api="blas"):
-        return _adjust(observations, stereo, progress, cells_across)
-
-
-def _adjust(
-    observations: Sequence[Observation],
-    stereo: StereoModel,
-    progress: Callable[[float], None] | None,
-    cells_across: int | None,
-) -> Bundle:
-    """Do what ``adjust_bundle`` does, with the present number of threads."""
     names, data, sample_sigma = gather_data(observations, stereo)
     state = State.from_stereo(stereo, names, len(data.points), cells_across)
-    layout = state.layout
-    prior = Prior.build(state, data)
-    strengths = [FIRST_STRENGTH, FIRST_STRENGTH]
+    layout, prior = state.layout, Prior.build(state, data)
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array(
@@ -141,73 +116,82 @@ def _adjust(
     )
     half_turned = np.zeros(len(names), bool)
     updates, count, damping = 0, 0, 0.0
-    residuals = _residuals(state, data)
-    for step in range(1, MAX_STEPS + 1):
-        if step == 3:  # before such poses seem to contradict the others
-            half_turned = detect_half_turns(state, data, residuals[0], certain)
-            state, data = renumber_poses(state, data, half_turned)
-            residuals = _residuals(state, data)
-        noise = estimate_noise(*residuals, sample_sigma)
-        sigmas = _sigmas(residuals, noise, sample_sigma, data)
-        weights = robust_weights(*residuals, sigmas)
-        if step > 2:
-            is_excluded |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
-        _zero_weights(weights, is_excluded, data)
-        A, b = normal_equations(state, data, residuals, weights)
-        prior.add(A, b, state, strengths)
-        factor = BlockFactor(A, layout)
-        count = int(sum(np.count_nonzero(w) for w in weights))
-        cost = partial(_cost, weights=weights, prior=prior, strengths=strengths)
-        state, residuals, move, damping = _take_step(
-            state, residuals, data, cost, (A, b, factor.solve(b)), damping
+    # for one large matrix, not for many small ones
+    with threadpool_limits(numba.get_num_threads(), user_api="blas"):
+        residuals = _residuals(state, data)
+        for step in range(1, MAX_STEPS + 1):
+            if step == 3:  # before such poses seem to contradict the others
+                half_turned = detect_half_turns(state, data, residuals[0], certain)
+                state, data = renumber_poses(state, data, half_turned)
+                residuals = _residuals(state, data)
+            noise = estimate_noise(*residuals, sample_sigma)
+            sigmas = _sigmas(residuals, noise, sample_sigma, data)
+            weights = robust_weights(*residuals, sigmas)
+            if step > 2:
+                is_excluded |= (pose_trust(weights, sigmas, data) < MIN_TRUST).any(axis=1)
+            for w, pose in zip(weights, data.poses, strict=True):
+                w[is_excluded[pose]] = 0.0
+            A, b = normal_equations(state, data, residuals, weights)
+            prior.add(A, b, state)
+            factor = BlockFactor(A, layout)
+            count = int(sum(np.count_nonzero(w) for w in weights))
+            system = A, b, factor.solve(b)
+            state, residuals, move, damping = _take_step(
+                state, residuals, data, weights, prior, system, damping
+            )
+            moved = float(np.sqrt(max(float(move @ b), 0.0) / count))
+            if progress:
+                progress(step / (step + 3))
+            if moved < 0.3 and updates < STRENGTH_STEPS:
+                prior = prior.update_strengths(state, factor.solve)
+                updates += 1
+            elif moved < CONVERGENCE_SIGMAS:
+                break
+        else:
+            raise CalibrationRejected(
+                f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps:"
+                " check the stereo calibration's residuals, exclude poses that stand out, and add"
+                " some that reach into the corners"
+            )
+        if np.count_nonzero(~is_excluded) < MIN_POSES:
+            raise CalibrationRejected(
+                f"{np.count_nonzero(is_excluded)} of {len(names)} poses contradict the others: "
+                "capture the board again without moving it"
+            )
+        fits = _fit_statistics(
+            names, residuals, _sigmas(residuals, noise, sample_sigma, data), data
         )
-        moved = float(np.sqrt(max(move @ b, 0.0) / count))
-        if progress:
-            progress(step / (step + 3))
-        if moved < 0.3 and updates < STRENGTH_STEPS:
-            strengths = prior.update_strengths(strengths, state, factor.solve)
-            updates += 1
-        elif moved < CONVERGENCE_SIGMAS:
-            break
-    else:
-        raise CalibrationRejected(
-            f"the joint adjustment still moves by {moved:.2f} sigma after {MAX_STEPS} steps: check"
-            " the stereo calibration's residuals, exclude poses that stand out, and add some that"
-            " reach into the corners"
+        excluded = {
+            name: (
+                f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera,"
+                f" {fits[name].projector_trust:.2f} in the projector): was the board moved during"
+                " the capture?"
+            )
+            for name, out in zip(names, is_excluded, strict=True)
+            if out
+        }
+        pose, _ = data.poses
+        z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
+        z = (z + state.t_board[pose, 2])[~is_excluded[pose]]
+        camera_poses, projector_poses = _count_poses(state, weights[1], data)
+        rig_factor = factorize(A)[layout.rig :, layout.rig :]
+        return Bundle(
+            state=state,
+            poses=tuple(names),
+            points=data.points,
+            noise=noise,
+            strengths=prior.strengths,
+            fits=fits,
+            excluded=excluded,
+            depth_range_mm=(float(z.min()), float(z.max())),
+            camera_poses=camera_poses,
+            projector_poses=projector_poses,
+            packed_factor=rig_factor[np.tri(len(rig_factor), dtype=bool)].astype(np.float32),
+            steps=step,
+            half_turned_poses=tuple(
+                name for name, flag in zip(names, half_turned, strict=True) if flag
+            ),
         )
-    if np.count_nonzero(~is_excluded) < MIN_POSES:
-        raise CalibrationRejected(
-            f"{np.count_nonzero(is_excluded)} of {len(names)} poses contradict the others: "
-            "capture the board again without moving it"
-        )
-    fits = _fit_statistics(names, residuals, _sigmas(residuals, noise, sample_sigma, data), data)
-    excluded = {
-        name: (
-            f"contradicts the other poses (trust {fits[name].camera_trust:.2f} in the camera,"
-            f" {fits[name].projector_trust:.2f} in the projector): was the board moved during the"
-            " capture?"
-        )
-        for name, out in zip(names, is_excluded, strict=True)
-        if out
-    }
-    camera_poses, projector_poses = _count_poses(state, weights, data)
-    return Bundle(
-        state=state,
-        poses=tuple(names),
-        points=data.points,
-        noise=noise,
-        strengths=(strengths[0], strengths[1]),
-        fits=fits,
-        excluded=excluded,
-        depth_range_mm=_depth_range(state, data, is_excluded),
-        camera_poses=camera_poses,
-        projector_poses=projector_poses,
-        packed_factor=_pack_factor(factorize(A)[layout.rig :, layout.rig :]),
-        steps=step,
-        half_turned_poses=tuple(
-            name for name, flag in zip(names, half_turned, strict=True) if flag
-        ),
-    )
 
 
 def _residuals(state: State, data: PoseData) -> ObservedValues:
@@ -216,30 +200,15 @@ def _residuals(state: State, data: PoseData) -> ObservedValues:
     return data.feature_px - features, data.projector_px - samples
 
 
-def _cost(
-    state: State,
-    residuals: ObservedValues,
-    weights: ObservedValues,
-    prior: Prior,
-    strengths: Sequence[float],
-) -> float:
-    """Return half the weighted sum of squared residuals plus the prior's cost; NaN for invisible
-    observations."""
-    total = 0.0
-    for r, w in zip(residuals, weights, strict=True):
-        used = w > 0
-        total += float(np.sum(w[used] * r[used] ** 2))  # NaN where a step left the view
-    return 0.5 * total + prior.cost(state, strengths)
-
-
 def _take_step(
     state: State,
     residuals: ObservedValues,
     data: PoseData,
-    cost: Callable[[State, ObservedValues], float],
-    system: tuple[np.ndarray, np.ndarray, np.ndarray],
+    weights: ObservedValues,
+    prior: Prior,
+    system: tuple[Floats, Floats, Floats],
     damping: float,
-) -> tuple[State, ObservedValues, np.ndarray, float]:
+) -> tuple[State, ObservedValues, Floats, float]:
     """Take a Gauss-Newton step; damp it where it does not lower the cost.
 
     ``system``: information matrix, right-hand side, and full step. Only lenses and relative pose
@@ -247,6 +216,15 @@ def _take_step(
     Returns the new state, its residuals, the step, and the damping; the unchanged state where no
     damping helps.
     """
+
+    def cost(state: State, residuals: ObservedValues) -> float:
+        """Return half the weighted sum of squares plus the prior's cost; NaN for invisible ones."""
+        total = 0.0
+        for r, w in zip(residuals, weights, strict=True):
+            used = w > 0
+            total += float(np.sum(w[used] * r[used] ** 2))  # NaN where a step left the view
+        return 0.5 * total + prior.cost(state)
+
     A, b, full = system
     before = cost(state, residuals)
     damping = damping / DAMPING_STEP if damping > LEAST_DAMPING else 0.0
@@ -260,81 +238,39 @@ def _take_step(
     return state, residuals, full, damping
 
 
-def _pack_factor(factor: np.ndarray) -> np.ndarray:
-    """Return the lower triangle of a factor as a flat float32 array."""
-    return np.asarray(factor[np.tri(len(factor), dtype=bool)], np.float32)
-
-
 def _sigmas(
-    residuals: ObservedValues, noise: Noise, sample_sigma: np.ndarray, data: PoseData
+    residuals: ObservedValues, noise: Noise, sample_sigma: Floats, data: PoseData
 ) -> ObservedValues:
     """Return the standard deviations of features (n, 2) and samples (m, 2), px."""
     return pose_sigmas(residuals[0], data.feature_from, noise), noise.sigmas(sample_sigma)
 
 
-def _zero_weights(weights: ObservedValues, is_excluded: np.ndarray, data: PoseData) -> None:
-    """Set the weights of the excluded poses (p,) bool to 0, in place."""
-    for w, start in zip(weights, (data.feature_from, data.sample_from), strict=True):
-        for i in np.nonzero(is_excluded)[0]:
-            w[start[i] : start[i + 1]] = 0.0
-
-
 def _fit_statistics(
-    names: Sequence[str],
-    residuals: ObservedValues,
-    sigmas: ObservedValues,
-    data: PoseData,
+    names: Sequence[str], residuals: ObservedValues, sigmas: ObservedValues, data: PoseData
 ) -> dict[str, PoseFit]:
     """Compute the RMS residuals and the trust of each pose, excluded ones included."""
     fresh = robust_weights(*residuals, sigmas)
-    trust = pose_trust(fresh, sigmas, data)
-    fits = {}
-    for i, name in enumerate(names):
-        rms = []
-        for r, w, start in zip(
-            residuals, fresh, (data.feature_from, data.sample_from), strict=True
-        ):
-            part = slice(start[i], start[i + 1])
-            good = np.where(w[part] > 0, r[part], np.nan)
-            rms.append(
-                float(np.sqrt(np.nanmean(np.nansum(good**2, axis=1))))
-                if (w[part] > 0).any()
-                else np.nan
-            )
-        fits[name] = PoseFit(rms[0], rms[1], float(trust[i, 0]), float(trust[i, 1]))
-    return fits
-
-
-def _depth_range(state: State, data: PoseData, is_excluded: np.ndarray) -> tuple[float, float]:
-    """Return the nearest and farthest depth in mm of a feature in the poses that are not
-    excluded."""
-    pose = np.repeat(np.arange(len(is_excluded)), np.diff(data.feature_from))
-    z = (
-        np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
-        + state.t_board[pose, 2]
+    features, samples = (
+        np.where(w > 0, r**2, 0.0).sum(axis=1) for r, w in zip(residuals, fresh, strict=True)
     )
-    z = z[~is_excluded[pose]]
-    return float(z.min()), float(z.max())
+    squares = data.means(features, samples)
+    rms = np.sqrt(np.where(squares > 0, squares, np.nan))
+    figures = np.hstack([rms, pose_trust(fresh, sigmas, data)])
+    return {name: PoseFit(*row) for name, row in zip(names, figures.tolist(), strict=True)}
 
 
 def _count_poses(
-    state: State, weights: ObservedValues, data: PoseData
+    state: State, sample_weights: Floats, data: PoseData
 ) -> tuple[np.ndarray, np.ndarray]:
     """Count the poses that illuminated each cell (rows, columns) uint16 of the camera's and the
     projector's field."""
+    used, count = (sample_weights > 0).all(axis=1), state.layout.poses
+    pose = data.poses[1][used]
     counts = []
-    for device, pixels in (
-        (state.rig.camera, data.sample_px),
-        (state.rig.projector, data.projector_px),
-    ):
+    for device, pixels in zip(state.rig[:2], (data.sample_px, data.projector_px), strict=True):
         rows, columns = (n - 3 for n in device.coefficients.shape[1:])
-        width, height = device.size
-        total = np.zeros((rows, columns), np.uint16)
-        for first, last in zip(data.sample_from[:-1], data.sample_from[1:], strict=True):
-            used = (weights[1][first:last] > 0).all(axis=1)
-            u, v = pixels[first:last][used].T
-            extent = [[-0.5, height - 0.5], [-0.5, width - 0.5]]
-            samples, _, _ = np.histogram2d(v, u, bins=(rows, columns), range=extent)
-            total += (samples >= MIN_SAMPLES).astype(np.uint16)
-        counts.append(total)
+        u, v = pixels[used].T
+        extent = [(-0.5, n - 0.5) for n in (count, *device.size[::-1])]
+        samples, _ = np.histogramdd((pose, v, u), bins=(count, rows, columns), range=extent)
+        counts.append((samples >= MIN_SAMPLES).sum(axis=0, dtype=np.uint16))
     return counts[0], counts[1]

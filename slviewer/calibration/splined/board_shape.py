@@ -8,6 +8,7 @@ the pose has them.
 import numpy as np
 
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import unit_vectors
 
 HEIGHT_DEGREES = np.array([(i, total - i) for total in (2, 3, 4) for i in range(total, -1, -1)])
@@ -22,13 +23,13 @@ GAUGE_MM = 1e-6
 pitch have those."""
 
 
-def board_frame(points: np.ndarray) -> np.ndarray:
+def board_frame(points: Floats) -> Floats:
     """(4,) mm: middle x, middle y, half width, half height of the features' rectangle."""
     low, high = points[:, :2].min(0), points[:, :2].max(0)
     return np.concatenate([(low + high) / 2, np.maximum((high - low) / 2, 1e-3)])
 
 
-def offset_gauge(points: np.ndarray) -> np.ndarray:
+def offset_gauge(points: Floats) -> Floats:
     """(4, 2n) unit rows: what offsets (x0, y0, x1, y1, ...) have of a shift in x and y, a turn and
     a growth."""
     x, y = (points[:, :2] - points[:, :2].mean(0)).T
@@ -81,7 +82,7 @@ def _heights(points, frame, heights, out):
         out[i], _, _ = height_at(points[i, 0], points[i, 1], frame, heights, terms)
 
 
-def board_heights(points: np.ndarray, frame: np.ndarray, heights: np.ndarray) -> np.ndarray:
+def board_heights(points: Floats, frame: Floats, heights: Floats) -> Floats:
     """(n,) mm: z of the board's surface at board points (n, 2); positive away from the camera."""
     out = np.empty(len(points))
     _heights(np.ascontiguousarray(points[:, :2], np.float64), frame, heights, out)

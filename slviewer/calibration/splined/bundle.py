@@ -1,4 +1,6 @@
-"""The result of the joint adjustment: the estimated unknowns and their information matrix."""
+"""The result of the joint adjustment: the estimated unknowns, their information matrix, and the
+derivatives of measured points by the rig's unknowns, which turn their covariance into the
+cloud's."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,15 +9,30 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.fields import Device
-from slviewer.calibration.splined.posterior import compute_point_jacobian
+from slviewer.calibration.splined.normal import (
+    dense_columns,
+    fill_sample_fields,
+    set_sample_columns,
+)
 from slviewer.calibration.splined.residual_noise import Noise
-from slviewer.calibration.splined.unknowns import Arrangement, State
+from slviewer.calibration.splined.residuals import (
+    CAMERA,
+    CAMERA_FIELD,
+    FIELD,
+    HEIGHT,
+    ROW,
+    allocate_workspace,
+    sample_row,
+)
+from slviewer.calibration.splined.unknowns import LENS, Arrangement, State
+from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.records.plain import from_plain, to_plain
 
 _STATE_ARRAYS = ("R_board", "t_board", "heights", "offsets")
@@ -56,12 +73,12 @@ class Bundle:
     depth_range_mm: tuple[float, float]
     camera_poses: np.ndarray
     projector_poses: np.ndarray
-    packed_factor: NDArray[np.float32]
+    packed_factor: Floats32
     steps: int
     half_turned_poses: tuple[str, ...] = ()
 
     @cached_property
-    def factor(self) -> NDArray[np.float32]:
+    def factor(self) -> Floats32:
         """(n, n) float32, lower triangular: factor @ factor.T is the information (inverse
         covariance) of the rig's n unknowns in the order of ``UnknownLayout`` from ``rig`` on, with
         poses and board marginalised out.
@@ -72,7 +89,13 @@ class Bundle:
         factor[np.tri(n, dtype=bool)] = self.packed_factor
         return factor
 
-    def point_jacobian(self, axis: Axis, pixels: np.ndarray, z: np.ndarray) -> sp.csr_matrix:
+    @property
+    def illuminated(self) -> tuple[Mask, Mask]:
+        """Cells (rows, columns) bool of the camera's and of the projector's field that target poses
+        illuminated."""
+        return self.camera_poses > 0, self.projector_poses > 0
+
+    def point_jacobian(self, axis: Axis, pixels: Floats, z: Floats) -> sp.csr_matrix:
         """Return the Jacobian (3 n, unknowns) of measured points, mm per unit of the rig's
         unknowns.
 
@@ -103,7 +126,7 @@ class Bundle:
         rig = self.state.rig
         arrays = {
             f"{name}_{key}": value
-            for name, device in (("camera", rig.camera), ("projector", rig.projector))
+            for name, device in zip(("camera", "projector"), rig[:2], strict=True)
             for key, value in device._asdict().items()
         }
         arrays |= {name: getattr(self.state, name) for name in _STATE_ARRAYS}
@@ -113,24 +136,77 @@ class Bundle:
     @classmethod
     def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
         """Return the bundle that ``to_dict`` and ``to_arrays`` saved."""
-        devices = [
-            Device(*(np.ascontiguousarray(arrays[f"{name}_{key}"]) for key in Device._fields))
-            for name in ("camera", "projector")
-        ]
         a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-        rig = Arrangement(devices[0], devices[1], a["R"], a["t"])
+        camera, projector = (
+            Device(*(a[f"{name}_{key}"] for key in Device._fields))
+            for name in ("camera", "projector")
+        )
+        rig = Arrangement(camera, projector, a["R"], a["t"])
         state = State(rig, *(a[name] for name in _STATE_ARRAYS))
-        strengths, depths = data["strengths"], data["depth_range_mm"]
         return cls(
             state=state,
             poses=tuple(data["poses"]),
             **{name: a[name] for name in _OWN_ARRAYS},
             noise=from_plain(data["noise"], Noise),
-            strengths=(strengths[0], strengths[1]),
+            strengths=tuple(data["strengths"]),
             fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
             excluded=data["left_out"],
-            depth_range_mm=(depths[0], depths[1]),
+            depth_range_mm=tuple(data["depth_range_mm"]),
             packed_factor=a["factor"],
             steps=data["steps"],
             half_turned_poses=tuple(data.get("turned", ())),
         )
+
+
+def compute_point_jacobian(state: State, axis: Axis, pixels: Floats, z: Floats) -> sp.csr_matrix:
+    """Compute the Jacobian (3 n, unknowns) described in ``Bundle.point_jacobian``."""
+    pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or z.shape != pixels.shape[:1]:
+        raise InputError(
+            f"pixels {pixels.shape} and depths {z.shape} were given: (n, 2) and (n,) are needed"
+        )
+    if axis not in ("x", "y"):
+        raise InputError(
+            f"the axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)"
+        )
+    at, entries = state.layout, ROW - CAMERA
+    values, columns = np.zeros((len(z), 3, entries)), np.zeros((len(z), entries), np.int64)
+    plane = State(state.rig, np.eye(3)[None], np.zeros((1, 3)), np.zeros(HEIGHT_TERMS), z[:0, None])
+    _fill_rows(plane, 0 if axis == "x" else 1, pixels, z, at.starts - at.rig, values, columns)
+    indices = np.repeat(columns, 3, axis=0).ravel()
+    pointers = np.arange(0, 3 * len(z) + 1) * entries
+    return sp.csr_matrix((values.ravel(), indices, pointers), (3 * len(z), at.size - at.rig))
+
+
+@kernel()
+def _fill_rows(plane, axis, pixels, depths, at, values, columns):
+    """Fill ``values`` (n, 3, entries) and ``columns`` (n, entries) of the points' sparse Jacobian.
+
+    Each point is seen on a ``plane`` that faces the camera. Its depth changes so that the
+    projector's coordinate stays what was measured.
+    """
+    work, frame, cells = allocate_workspace(), np.array([0.0, 0.0, 1.0, 1.0]), np.zeros(4, np.int64)
+    all_columns = dense_columns(at)
+    for n in range(depths.shape[0]):
+        z = plane.t_board[0, 2] = depths[n]
+        u, _, cells[0], cells[1], cells[2], cells[3] = sample_row(plane, 0, frame, pixels[n], work)
+        if not np.isfinite(u):
+            values[n] = np.nan
+            continue
+        fill_sample_fields(work)
+        set_sample_columns(all_columns, plane.rig, cells, at)
+        columns[n] = all_columns[CAMERA:]
+        x, y = work.local[0] / z, work.local[1] / z
+        row = work.row[axis]
+        dx, dy, dz = values[n]
+        for c in range(dz.size):
+            dz[c] = -row[CAMERA + c] / row[HEIGHT - 1]  # over the change by a shift along z
+            dx[c], dy[c] = x * dz[c], y * dz[c]
+        for c in range(LENS):  # the ray changes too
+            dx[c] += z * work.ray_by_lens[0, c]
+            dy[c] += z * work.ray_by_lens[1, c]
+        for k in range(2 * FIELD):
+            basis, component = work.camera_basis, k // FIELD
+            spline = z * basis[2, k % FIELD // 4] * basis[0, k % 4]
+            dx[CAMERA_FIELD - CAMERA + k] += spline * work.ray_by_field[0, component]
+            dy[CAMERA_FIELD - CAMERA + k] += spline * work.ray_by_field[1, component]

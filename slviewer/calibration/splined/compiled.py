@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from os import cpu_count
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from slviewer.calibration.splined.correction_grid import evaluate
-from slviewer.calibration.splined.fields import project_point, undistort_pixel
+from slviewer.calibration.splined.fields import project_point, undistort, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.polynomial import grid_points
+from slviewer.geometry.rigid import Floats, Floats32, Mask
 
 GRID_CELLS_ACROSS = 100
 """Number of grid cells across the image's width: 16 px each at a width of 1600."""
@@ -47,10 +47,10 @@ class CompiledAxis:
     ray, or where the coordinate hardly changes with depth.
     """
 
-    coefficients: NDArray[np.float32]
+    coefficients: Floats32
     centre: float
-    grid: NDArray[np.float32]
-    supported_grid: NDArray[np.float32]
+    grid: Floats32
+    supported_grid: Floats32
     step: int
     near: float
     far: float
@@ -70,15 +70,8 @@ class CompiledAxis:
             [px_per_rad, self.centre, self.near, (grid.shape[2] - 1) / (self.far - self.near)],
             np.float32,
         )
-        evaluate(
-            np.ascontiguousarray(phase, np.float32),
-            numbers,
-            self.coefficients,
-            rays,
-            grid,
-            self.step,
-            out,
-        )
+        phase = np.ascontiguousarray(phase, np.float32)
+        evaluate(phase, numbers, self.coefficients, rays, grid, self.step, out)
         return out
 
     def depth_per_px(self, phase: np.ndarray, px_per_rad: float) -> np.ndarray:
@@ -92,9 +85,8 @@ class CompiledAxis:
 def pixel_rays(rig: Arrangement) -> Floats:
     """Return the undistorted normalised coordinates (2, h, w) float64 of the camera pixels."""
     width, height = (int(n) for n in rig.camera.size)
-    rays = np.empty((2, height, width))
-    _split_rows(height, lambda rows: _fill_rays(rig.camera, rows, rays))
-    return rays
+    rays = undistort(rig.camera, grid_points(np.arange(width), np.arange(height)))
+    return np.ascontiguousarray(rays.T).reshape(2, height, width)
 
 
 def compile_axis(
@@ -102,7 +94,7 @@ def compile_axis(
     axis: Axis,
     rays: np.ndarray,
     depths: tuple[float, float],
-    illuminated: tuple[np.ndarray, np.ndarray],
+    illuminated: tuple[Mask, Mask],
 ) -> CompiledAxis:
     """Compile one axis for depths between the two ``depths`` mm.
 
@@ -136,16 +128,6 @@ def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
     lanes = max(1, min(cpu_count() or 1, rows))
     with ThreadPoolExecutor(lanes) as threads:
         list(threads.map(lambda lane: work(np.arange(lane, rows, lanes)), range(lanes)))
-
-
-@kernel()
-def _fill_rays(camera, rows, rays):
-    """Fill ``rays`` (2, h, w) with the undistorted normalised coordinates of the pixels in some
-    ``rows``."""
-    basis = np.zeros((4, 4))
-    for v in rows:
-        for u in range(rays.shape[2]):
-            rays[0, v, u], rays[1, v, u] = undistort_pixel(camera, float(u), float(v), basis)
 
 
 @kernel()
@@ -201,12 +183,13 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     """Return (c0, c1, c2, first depth, last depth) of the ray (x, y, 1); NaN without a rational
     function."""
     first, last = near, far
+    none = np.nan, np.nan, np.nan, np.nan, np.nan
     if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(
         _project_depth(rig, x, y, far, basis)[0]
     ):
         first, last = _depth_interval(rig, x, y, near, far, basis)
         if not last - first > 1e-3 * (far - near):
-            return np.nan, np.nan, np.nan, np.nan, np.nan
+            return none
     # nodes of Chebyshev's polynomial in 1/z, in which the coordinate is nearly linear
     middle, half = 0.5 * (1.0 / last + 1.0 / first), 0.433 * (1.0 / first - 1.0 / last)
     z0, z1, z2 = 1.0 / (middle - half), 1.0 / middle, 1.0 / (middle + half)
@@ -218,7 +201,7 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0
     determinant = m00 * m11 - m01 * m10
     if not (abs(determinant) > 0.0 and abs(s2 - s0) > MIN_SLOPE * abs(z2 - z0)):
-        return np.nan, np.nan, np.nan, np.nan, np.nan
+        return none
     c1 = (r0 * m11 - m01 * r1) / determinant
     c2 = (m00 * r1 - r0 * m10) / determinant
     return z0 - c1 * s0 + c2 * s0 * z0, c1, c2, first, last

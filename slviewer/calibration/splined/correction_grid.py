@@ -27,10 +27,7 @@ def _blend_rows(above, below, down, i, k):
     """Interpolate linearly between the rows ``above`` and ``below`` of the grid at column ``i`` and
     layer ``k``."""
     # an index with a sign would be tested for counting from the end
-    column, layer = (
-        np.uint64(i),
-        np.uint64(k),
-    )
+    column, layer = np.uint64(i), np.uint64(k)
     upper = above[column, layer]
     return fma(down, below[column, layer] - upper, upper)
 
@@ -59,18 +56,12 @@ def add_corrections(z, cell, rest, grid, step, row):
         if top < 0:
             continue
         if top <= k + 1:
-            a0, a1 = (
-                _blend_rows(above, below, down, i, k),
-                _blend_rows(above, below, down, i, k + 1),
-            )
-            b0, b1 = (
-                _blend_rows(above, below, down, i + 1, k),
-                _blend_rows(above, below, down, i + 1, k + 1),
-            )
-            a2, b2 = (
-                _blend_rows(above, below, down, i, top + 1),
-                _blend_rows(above, below, down, i + 1, top + 1),
-            )
+            a0 = _blend_rows(above, below, down, i, k)
+            a1 = _blend_rows(above, below, down, i, k + 1)
+            a2 = _blend_rows(above, below, down, i, top + 1)
+            b0 = _blend_rows(above, below, down, i + 1, k)
+            b1 = _blend_rows(above, below, down, i + 1, k + 1)
+            b2 = _blend_rows(above, below, down, i + 1, top + 1)
             for q in range(len(here)):
                 first, deep = cells[q] == k, part[q]
                 a = fma(deep, a1 - a0, a0) if first else fma(deep, a2 - a1, a1)
@@ -80,10 +71,8 @@ def add_corrections(z, cell, rest, grid, step, row):
             for q in range(len(here)):
                 n, deep = np.int64(cells[q]), part[q]
                 if n >= 0:
-                    a, b = (
-                        _blend_rows(above, below, down, i, n),
-                        _blend_rows(above, below, down, i + 1, n),
-                    )
+                    a = _blend_rows(above, below, down, i, n)
+                    b = _blend_rows(above, below, down, i + 1, n)
                     a = fma(deep, _blend_rows(above, below, down, i, n + 1) - a, a)
                     b = fma(deep, _blend_rows(above, below, down, i + 1, n + 1) - b, b)
                     here[q] += fma(np.float32(q) * per_px, b - a, a)
@@ -98,11 +87,8 @@ def evaluate(phase, numbers, c, rays, grid, step, out):
     one, none = np.float32(1.0), np.float32(np.nan)
     width, deepest = phase.shape[1], np.float32(grid.shape[2] - 1.0001)
     for v in prange(phase.shape[0]):
-        z, cell, rest = (
-            np.empty(width, np.float32),
-            np.empty(width, np.int32),
-            np.empty(width, np.float32),
-        )
+        z, rest = np.empty((2, width), np.float32)
+        cell = np.empty(width, np.int32)
         for u in range(width):
             s = fma(px_per_rad, phase[v, u], -centre)
             rational = np.divide(fma(c[1, v, u], s, c[0, v, u]), fma(c[2, v, u], s, one))

@@ -12,7 +12,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from slviewer.geometry.brown import distort_to_px, undistort_point
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.splines import bending_energy
 
 CELLS_ACROSS = 26
@@ -27,36 +29,31 @@ class Device(NamedTuple):
     """A camera or projector in the compiled kernels: a ``Lens``'s ten ``numbers``, its field's
     ``coefficients``, and the image's ``size`` (2,) float64 px."""
 
-    numbers: np.ndarray
-    coefficients: np.ndarray
-    size: np.ndarray
+    numbers: Floats
+    coefficients: Floats
+    size: Floats
+
+    @classmethod
+    def from_lens(cls, lens: Lens, cells_across: int | None = None) -> "Device":
+        """Return a lens's device with W = 0, on square cells, ``CELLS_ACROSS`` by default."""
+        across = CELLS_ACROSS if cells_across is None else cells_across
+        width, height = lens.size
+        down = int(np.clip(round(across * height / width), 6, 2 * across))
+        return cls(lens.parameters, np.zeros((2, down + 3, across + 3)), np.array(lens.size, float))
 
 
-def cells_for(size: tuple[int, int], cells_across: int | None = None) -> tuple[int, int]:
-    """Cells (across, down) of an image of ``size``: square ones where pixels are; ``CELLS_ACROSS``
-    by default."""
-    across = CELLS_ACROSS if cells_across is None else cells_across
-    return across, int(np.clip(round(across * size[1] / size[0]), 6, 2 * across))
-
-
-def no_displacement(size: tuple[int, int], cells_across: int | None = None) -> np.ndarray:
-    """Coefficients of W = 0, on the cells of ``cells_for``."""
-    across, down = cells_for(size, cells_across)
-    return np.zeros((2, down + 3, across + 3))
-
-
-def roughness(coefficients: np.ndarray) -> np.ndarray:
+def roughness(coefficients: Floats) -> Floats:
     """(n, n): the prior's quadratic form of one component's n coefficients, second differences and
     a small ridge."""
     rows, columns = coefficients.shape[1:]
     return (bending_energy(columns, rows) + RIDGE * sp.eye(rows * columns)).toarray()
 
 
-def undistort(device: Device, pixels: np.ndarray) -> np.ndarray:
+def undistort(device: Device, pixels: Floats) -> Floats:
     """Undistorted normalised coordinates (n, 2) of ``pixels`` (n, 2); NaN for NaN and where the
     inversion fails."""
     rays = np.empty((len(pixels), 2))
-    _undistort_all(device, np.ascontiguousarray(pixels, np.float64), rays)
+    run_rows(_undistort_all, len(pixels), device, np.ascontiguousarray(pixels, np.float64), rays)
     return rays
 
 
@@ -159,11 +156,11 @@ def undistort_pixel(device, u, v, basis):
 
 
 @kernel()
-def _undistort_all(device, pixels, rays):
-    """Fill ``rays`` (n, 2) with the undistorted normalised coordinates of pixels (n, 2); NaN where
-    not possible."""
+def _undistort_all(first, last, device, pixels, rays):
+    """Fill ``rays`` (n, 2) with the undistorted normalised coordinates of pixels ``first`` to
+    ``last``; NaN where not possible."""
     basis = np.zeros((4, 4))
-    for n in range(pixels.shape[0]):
+    for n in range(first, last):
         rays[n, 0], rays[n, 1] = np.nan, np.nan
         if np.isfinite(pixels[n, 0]) and np.isfinite(pixels[n, 1]):
             rays[n, 0], rays[n, 1] = undistort_pixel(device, pixels[n, 0], pixels[n, 1], basis)

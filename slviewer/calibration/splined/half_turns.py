@@ -7,14 +7,16 @@ may cause. That part agrees between poses of one numbering, and has the opposite
 numbered from the other end.
 """
 
-from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
-from slviewer.calibration.splined.normal import PoseData, predict_observations
+from slviewer.calibration.splined.normal import predict_observations
+from slviewer.calibration.splined.residuals import PoseData
 from slviewer.calibration.splined.unknowns import State
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials, scale_to_unit_square
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import box_middle, finite_rows, lengths, unit_vectors
 from slviewer.target.board import Board
 
@@ -35,23 +37,17 @@ def is_numbering_ambiguous(notation: str) -> bool:
         return False
 
 
-def opposite_features(points: np.ndarray) -> np.ndarray | None:
+def opposite_features(points: Floats) -> np.ndarray | None:
     """Return the index (f,) of the feature opposite to each of ``points`` (f, 3) mm; None without
     that symmetry."""
     middle = box_middle(points)
     away = lengths((2 * middle - points)[:, None, :2] - points[None, :, :2])
     partner = np.argmin(away, axis=1)
-    apart = away[np.arange(len(points)), partner].max()
-    return (
-        partner
-        if apart < 1e-3 and np.array_equal(partner[partner], np.arange(len(points)))
-        else None
-    )
+    is_symmetric = np.array_equal(partner[partner], np.arange(len(points)))
+    return partner if is_symmetric and away.min(axis=1).max() < 1e-3 else None
 
 
-def detect_half_turns(
-    state: State, data: PoseData, residuals: np.ndarray, certain: np.ndarray
-) -> np.ndarray:
+def detect_half_turns(state: State, data: PoseData, residuals: Floats, certain: Mask) -> Mask:
     """Detect the poses (p,) bool numbered from the other end than the ``certain`` (p,) bool ones,
     or than most.
 
@@ -62,7 +58,13 @@ def detect_half_turns(
     count = state.layout.poses
     if partner is None or count < 3 or certain.all():
         return np.zeros(count, bool)
-    reversed_part = _odd_part(_measure_offsets(state, data, residuals), partner, data.points)
+    places = _measure_offsets(state, data, residuals)
+    # the opposite circle's offset is reversed by the turn: the antisymmetric part is the mean of
+    # both
+    odd = (places + places[:, partner]) / 2
+    basis, _ = np.linalg.qr(monomials(scale_to_unit_square(data.points[:, :2]), SMOOTH_DEGREE))
+    odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
+    reversed_part = odd.reshape(count, -1)
     unit = unit_vectors(reversed_part)
     alike = unit @ unit.T
     np.fill_diagonal(alike, 0.0)
@@ -91,45 +93,28 @@ def renumber_poses(state: State, data: PoseData, poses: np.ndarray) -> tuple[Sta
         feature[part] = partner[feature[part]]
         t[i] += 2 * R[i] @ np.array([middle[0], middle[1], 0.0])
         R[i] = R[i] @ np.diag([-1.0, -1.0, 1.0])
-    return replace(state, R_board=R, t_board=t), data._replace(feature=feature)
+    return state._replace(R_board=R, t_board=t), data._replace(feature=feature)
 
 
-def _measure_offsets(state: State, data: PoseData, residuals: np.ndarray) -> np.ndarray:
+def _measure_offsets(state: State, data: PoseData, residuals: Floats) -> Floats:
     """Return the offset (p, f, 2) mm of each feature on the board by each pose; 0 where missing or
     an outlier."""
-    by_place = []
     # the samples' predictions are not needed
     data = data._replace(sample_from=np.zeros_like(data.sample_from))
-    here, _ = predict_observations(state, data)
-    for k in range(2):
-        step = np.zeros_like(state.offsets)
-        step[:, k] = _STEP_MM
-        by_place.append(
-            (predict_observations(replace(state, offsets=state.offsets + step), data)[0] - here)
-            / _STEP_MM
-        )
-    J = np.stack(by_place, axis=2)  # of px by mm
+    here, right, below = (
+        predict_observations(state._replace(offsets=state.offsets + step), data)[0]
+        for step in ((0.0, 0.0), (_STEP_MM, 0.0), (0.0, _STEP_MM))
+    )
+    J = np.stack([right - here, below - here], axis=2) / _STEP_MM  # of px by mm
     usable = finite_rows(J.reshape(len(J), -1), residuals)
     usable[usable] &= np.abs(np.linalg.det(J[usable])) > 1e-9
     deviations = np.zeros_like(residuals)
     deviations[usable] = np.linalg.solve(J[usable], residuals[usable][..., None])[..., 0]
     deviations[usable] += state.offsets[data.feature[usable]]
     places = np.zeros((state.layout.poses, len(data.points), 2))
-    for i, (first, last) in enumerate(
-        zip(data.feature_from[:-1], data.feature_from[1:], strict=True)
-    ):
+    for i, (first, last) in enumerate(pairwise(data.feature_from)):
         each = deviations[first:last]
-        outlying = (np.abs(each) > 6 * 1.4826 * np.median(np.abs(each), axis=0)).any(1)
-        places[i, data.feature[first:last]] = np.where(outlying[:, None], 0.0, each)
+        limit = 6 * 1.4826 * np.median(np.abs(each), axis=0)
+        is_inlier = (np.abs(each) <= limit).all(axis=1, keepdims=True)
+        places[i, data.feature[first:last]] = each * is_inlier
     return places
-
-
-def _odd_part(places: np.ndarray, partner: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the part (p, 2 f) of offsets (p, f, 2) that changes sign under a half turn, without
-    its smooth part."""
-    # the opposite circle's offset is reversed by the turn: the antisymmetric part is the mean of
-    # both
-    odd = (places + places[:, partner]) / 2
-    basis, _ = np.linalg.qr(monomials(scale_to_unit_square(points[:, :2]), SMOOTH_DEGREE))
-    odd = odd - np.einsum("fk,gk,pgc->pfc", basis, basis, odd, optimize=True)
-    return odd.reshape(len(places), -1)

@@ -30,10 +30,13 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import Mask
 from slviewer.geometry.triangulation import check_map
 from slviewer.geometry.vectors import rms
 from slviewer.records.calibration import SplinedFit, VolumeSigma
 
+_COMPILED_ARRAYS = ("coefficients", "grid", "supported_grid")
+_COMPILED_NUMBERS = ("centre", "step", "near", "far")
 NEAR, FAR = 0.7, 1.4
 """Of the nearest and the farthest calibrated depth: between them points are measured."""
 
@@ -69,9 +72,8 @@ class SplinedModel:
     @cached_property
     def pinholes(self) -> StereoRig:
         """Both lenses without their displacement fields, and their relative pose."""
-        return StereoRig(
-            pinhole_lens(self.rig.camera), pinhole_lens(self.rig.projector), self.rig.R, self.rig.t
-        )
+        camera, projector = map(pinhole_lens, self.rig[:2])
+        return StereoRig(camera, projector, self.rig.R, self.rig.t)
 
     def residuals_over_noise(self, axis: Axis) -> float:
         """Return the ratio of the residuals of an axis to their predicted noise; 1 where noise
@@ -92,11 +94,13 @@ class SplinedModel:
 
         NaN where no target pose illuminated the cell of one of them.
         """
-        rays = undistort(self.rig.camera, pixels), undistort(self.rig.projector, projector)
-        known = in_illuminated_cells(
-            self.rig.camera, pixels, self.bundle.camera_poses > 0
-        ) & in_illuminated_cells(self.rig.projector, projector, self.bundle.projector_poses > 0)
-        return np.where(known[:, None], rays[0], np.nan), np.where(known[:, None], rays[1], np.nan)
+        camera, device = self.rig[:2]
+        illuminated = self.bundle.illuminated
+        unknown = ~in_illuminated_cells(camera, pixels, illuminated[0])
+        unknown |= ~in_illuminated_cells(device, projector, illuminated[1])
+        rays = undistort(camera, pixels), undistort(device, projector)
+        rays[0][unknown] = rays[1][unknown] = np.nan
+        return rays
 
     @cached_property
     def rays(self) -> np.ndarray:
@@ -122,41 +126,25 @@ class SplinedModel:
         """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled`
         takes the result."""
         axis = select_depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
-        fast, sigma = self.fast_axis(axis), self.sigma_map(axis)
-        data = {
-            "axis": axis,
-            "centre": fast.centre,
-            "step": fast.step,
-            "near": fast.near,
-            "far": fast.far,
-        }
-        return data, {
-            "coefficients": fast.coefficients,
-            "grid": fast.grid,
-            "supported_grid": fast.supported_grid,
-            "sigma": sigma.nodes,
-            "rays": self.single_rays,
-        }
+        fast = self.fast_axis(axis)
+        arrays = {name: getattr(fast, name) for name in _COMPILED_ARRAYS}
+        data = {"axis": axis} | {name: getattr(fast, name) for name in _COMPILED_NUMBERS}
+        return data, arrays | {"sigma": self.sigma_map(axis).nodes, "rays": self.single_rays}
 
     def restore_compiled(self, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Take what `compile_depth` of the same calibration returned, which takes seconds to
         compute."""
-        axis, depths = data["axis"], (data["near"], data["far"])
-        coefficients, grid, supported_grid = (
-            arrays[name] for name in ("coefficients", "grid", "supported_grid")
-        )
-        self._compiled[axis] = CompiledAxis(
-            coefficients, data["centre"], grid, supported_grid, data["step"], *depths
-        )
-        self._sigma_maps[axis] = SigmaMap(arrays["sigma"], *depths)
+        axis, fields = data["axis"], {name: data[name] for name in _COMPILED_NUMBERS}
+        fields |= {name: arrays[name] for name in _COMPILED_ARRAYS}
+        self._compiled[axis] = CompiledAxis(**fields)
+        self._sigma_maps[axis] = SigmaMap(arrays["sigma"], data["near"], data["far"])
         vars(self)["single_rays"] = arrays["rays"]
 
     def fast_axis(self, axis: Axis) -> CompiledAxis:
         """Return the compiled form of one axis; cached."""
         if axis not in self._compiled:
-            illuminated = self.bundle.camera_poses > 0, self.bundle.projector_poses > 0
             self._compiled[axis] = compile_axis(
-                self.rig, axis, self.rays, self.depths_mm, illuminated
+                self.rig, axis, self.rays, self.depths_mm, self.bundle.illuminated
             )
         return self._compiled[axis]
 
@@ -172,23 +160,18 @@ class SplinedModel:
             phase.phase, px_per_rad, self.single_rays, supported
         )
 
-    def support(self, phase: PhaseMap) -> np.ndarray:
+    def support(self, phase: PhaseMap) -> Mask:
         """(h, w) bool: measured pixels in cells that target poses illuminated, in camera and
         projector."""
         return np.isfinite(self.points(phase)[..., 2])
 
-    def depth_per_rad(self, phase: PhaseMap) -> np.ndarray:
-        """(h, w) float32: |dz/dphi| mm/rad at the phases measured."""
-        check_map(self.rig.camera.size, phase.phase, "phases")
-        px_per_rad = phase.period_px / (2 * np.pi)
-        return self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad) * np.float32(
-            px_per_rad
-        )
-
     def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
         """(h, w) mm: depth noise predicted from the phase noise, ``|dz/dphi| sigma_phi``; NaN where
         points are."""
-        sigma = self.depth_per_rad(phase) * phase.sigma_phase
+        check_map(self.rig.camera.size, phase.phase, "phases")
+        px_per_rad = phase.period_px / (2 * np.pi)
+        mm_per_px = self.fast_axis(phase.axis).depth_per_px(phase.phase, px_per_rad)
+        sigma = mm_per_px * np.float32(px_per_rad) * phase.sigma_phase
         return np.where(np.isfinite(points[..., 2]), sigma, np.nan).astype(np.float32)
 
     def excess_px(self, axis: Axis) -> float:
@@ -226,23 +209,17 @@ class SplinedModel:
     def describe(self) -> SplinedFit:
         """Return the figures of the adjustment."""
         bundle, noise = self.bundle, self.bundle.noise
-        fields = {
-            device: rms(part.coefficients[:, 1:-1, 1:-1])
-            for device, part in (
-                ("camera", bundle.state.rig.camera),
-                ("projector", bundle.state.rig.projector),
-            )
-        }
+        camera, projector = (rms(device.coefficients[:, 1:-1, 1:-1]) for device in self.rig[:2])
+        lit = [float(np.mean(cells)) for cells in bundle.illuminated]
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
-        illuminated = {"camera": bundle.camera_poses > 0, "projector": bundle.projector_poses > 0}
         return SplinedFit(
             steps=bundle.steps,
             residuals_over_noise=dict(zip(AXES, noise.ratio, strict=True)),
             noise_px={"camera": noise.camera_px, **dict(zip(AXES, noise.sample_px, strict=True))},
-            local_distortion_rms_px=fields,
+            local_distortion_rms_px={"camera": camera, "projector": projector},
             board_height_mm=(float(height.min()), float(height.max())),
             board_offsets_rms_mm=rms(bundle.state.offsets),
-            cells_lit={device: float(np.mean(cells)) for device, cells in illuminated.items()},
+            cells_lit={"camera": lit[0], "projector": lit[1]},
             sigma_volume_mm=self.sigma_volume,
             weights={
                 name: (fit.camera_trust, fit.projector_trust) for name, fit in bundle.fits.items()

@@ -10,105 +10,64 @@ from scipy.linalg import blas, cho_solve, lapack, solve_triangular
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.residuals import (
     CAMERA,
-    DENSE,
+    CAMERA_FIELD,
+    FIELD,
     HEIGHT,
     OFFSET,
+    PROJECTOR_FIELD,
+    ROW,
+    PoseData,
+    allocate_workspace,
     feature_row,
     sample_row,
 )
 from slviewer.calibration.splined.unknowns import RIG, State, UnknownLayout
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 
 MAX_LANES = 4
 """Largest number of matrices that threads fill in parallel; each has the size of the whole."""
 _ROWS_ADDED = 128  # of two matrices at a time
-FIELD = 16
-CAMERA_FIELD, PROJECTOR_FIELD, ROW = DENSE, DENSE + 2 * FIELD, DENSE + 4 * FIELD
-"""Coefficients of one component of a field that reach a place; index of each field's first entry in
-a whole row, behind the dense part; and the row's length."""
 
 
-ObservedValues = tuple[np.ndarray, np.ndarray]
+ObservedValues = tuple[Floats, Floats]
 """A value of each coordinate of all features, (n, 2), and of all samples, (m, 2)."""
-
-
-class PoseData(NamedTuple):
-    """What was observed, all poses one after another.
-
-    Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) their indices on
-    the board, and ``feature_px`` (n, 2), their pixels; and samples ``sample_from[i] : ...``: camera
-    pixels ``sample_px`` (m, 2), and ``projector_px`` (m, 2), their projector coordinates, NaN for
-    an axis not captured. ``points`` (f, 3) mm and ``frame`` (4,) are the board's.
-    """
-
-    feature_from: np.ndarray
-    feature: np.ndarray
-    feature_px: np.ndarray
-    sample_from: np.ndarray
-    sample_px: np.ndarray
-    projector_px: np.ndarray
-    points: np.ndarray
-    frame: np.ndarray
-
-
-class Workspace(NamedTuple):
-    """Buffers of one thread for the kernels of ``residuals``."""
-
-    camera_basis: np.ndarray
-    projector_basis: np.ndarray
-    by_point: np.ndarray
-    by_lens: np.ndarray
-    ray_by_lens: np.ndarray
-    ray_by_field: np.ndarray
-    terms: np.ndarray
-    local: np.ndarray
-    point: np.ndarray
-    turned: np.ndarray
-    normal: np.ndarray
 
 
 class Sums(NamedTuple):
     """Sums of one thread over observations in the same cells, before they are added to the normal
-    equations.
+    equations A (N, N) and b (N,).
 
     ``rows`` (4, ROW), ``w`` and ``r`` (4,): those of two observations, added at once, their weights
     and residuals; ``S`` (ROW, ROW) and ``s`` (ROW,): their weighted products; ``columns`` (ROW,):
-    of a row's entries, in the order of the vector of unknowns.
+    of a row's entries, in the order of the vector of unknowns; ``at``: see ``dense_columns``.
     """
 
-    rows: np.ndarray
-    w: np.ndarray
-    r: np.ndarray
-    S: np.ndarray
-    s: np.ndarray
+    rows: Floats
+    w: Floats
+    r: Floats
+    S: Floats
+    s: Floats
     columns: np.ndarray
-
-
-@kernel()
-def allocate_workspace():
-    """Return a workspace of zeros."""
-    return Workspace(
-        np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)), np.zeros((2, 9)), np.zeros((2, 9)),
-        np.zeros((2, 2)),
-        np.zeros((3, HEIGHT_TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
-    )  # fmt: skip
+    at: np.ndarray
+    A: Floats
+    b: Floats
 
 
 def predict_observations(state: State, data: PoseData) -> ObservedValues:
     """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where
     not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
-    model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
     shares = _split_poses(state.layout.poses)
     with ThreadPoolExecutor(len(shares)) as threads:
-        list(threads.map(lambda poses: _predict(*model, data, poses, features, samples), shares))
+        list(threads.map(lambda poses: _predict(state, data, poses, features, samples), shares))
     return features, samples
 
 
 def normal_equations(
     state: State, data: PoseData, residuals: ObservedValues, weights: ObservedValues
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Floats, Floats]:
     """Return J'WJ (N, N), of which the upper triangle is filled, and J'W r (N,).
 
     ``residuals`` and ``weights``: of features (n, 2), and of samples (m, 2); what weighs 0 may be
@@ -118,15 +77,11 @@ def normal_equations(
     shares = _split_poses(layout.poses)
     matrices = [np.zeros((layout.size, layout.size)) for _ in shares]
     right = np.zeros((len(shares), layout.size))
-    at = layout.starts
-    model = state.rig, state.R_board, state.t_board, state.heights, state.offsets
-    order = _sort_by_cell(state, data)
+    observed = data, residuals, weights, _sort_by_cell(state, data)
     with ThreadPoolExecutor(len(shares)) as threads:
         list(
             threads.map(
-                lambda poses, A, b: _accumulate(
-                    *model, data, *residuals, *weights, at, order, poses, A, b
-                ),
+                lambda *share: _accumulate(state, *observed, layout.starts, *share),
                 shares, matrices, right,
             )
         )  # fmt: skip
@@ -146,9 +101,8 @@ class BlockFactor:
     increased. Raises CalibrationRejected as `factorize` does.
     """
 
-    def __init__(self, A: np.ndarray, layout: UnknownLayout, damping: float = 0.0) -> None:
+    def __init__(self, A: Floats, layout: UnknownLayout, damping: float = 0.0) -> None:
         """Factorise the matrix."""
-        self._blocks = layout.separable
         first, second = slice(0, layout.offsets), slice(layout.rig, layout.projector_field)
         self._rest = np.r_[first, second]
         rest = np.block(
@@ -156,38 +110,31 @@ class BlockFactor:
         )
         rig = layout.offsets + np.arange(RIG)
         rest[rig, rig] *= 1 + damping
-        self._factors, self._couplings = [], []
-        for block in self._blocks:
+        self._eliminated = []
+        for block in layout.separable:
             factor = factorize(A[block, block].copy())
             after = A[block, second].T if block.start < second.start else A[second, block]
             coupling = np.concatenate([A[first, block], after])
             coupling = blas.dtrsm(1.0, factor, coupling.T, lower=1, overwrite_b=1)
             rest = blas.dsyrk(-1.0, coupling, 1.0, rest.T, trans=1, lower=1, overwrite_c=1).T
-            self._factors.append(factor)
-            self._couplings.append(coupling)
+            self._eliminated.append((block, factor, coupling))
         self._rest_factor = factorize(rest)
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
+    def solve(self, right: Floats) -> Floats:
         """Return the solution for a right-hand side (N,) or several (N, k)."""
-        parts = [
-            solve_triangular(factor, right[block], lower=True, check_finite=False)
-            for factor, block in zip(self._factors, self._blocks, strict=True)
-        ]
-        rest = right[self._rest] - sum(
-            c.T @ part for c, part in zip(self._couplings, parts, strict=True)
-        )
         out = np.empty_like(right)
+        for block, factor, _ in self._eliminated:
+            out[block] = solve_triangular(factor, right[block], lower=True, check_finite=False)
+        rest = right[self._rest] - sum(c.T @ out[block] for block, _, c in self._eliminated)
         out[self._rest] = rest = cho_solve((self._rest_factor, True), rest, check_finite=False)
-        for block, factor, coupling, part in zip(
-            self._blocks, self._factors, self._couplings, parts, strict=True
-        ):
+        for block, factor, coupling in self._eliminated:
             out[block] = solve_triangular(
-                factor, part - coupling @ rest, lower=True, trans=1, check_finite=False
+                factor, out[block] - coupling @ rest, lower=True, trans=1, check_finite=False
             )
         return out
 
 
-def factorize(A: np.ndarray) -> np.ndarray:
+def factorize(A: Floats) -> Floats:
     """Return the lower Cholesky factor of a matrix given by its upper triangle in C order;
     overwrites A.
 
@@ -199,7 +146,7 @@ def factorize(A: np.ndarray) -> np.ndarray:
             "the poses leave the joint adjustment undetermined: capture the board in more positions"
             " and tilts"
         )
-    return np.asarray(factor)
+    return factor
 
 
 def _sort_by_cell(state: State, data: PoseData) -> np.ndarray:
@@ -212,9 +159,7 @@ def _sort_by_cell(state: State, data: PoseData) -> np.ndarray:
     ):
         cells = np.array(device.coefficients.shape[:0:-1]) - 3
         keys += list(np.nan_to_num((px + 0.5) * cells / device.size).astype(np.int64).T)
-    return np.lexsort(
-        [*keys, np.repeat(np.arange(len(data.sample_from) - 1), np.diff(data.sample_from))]
-    )
+    return np.lexsort([*keys, data.poses[1]])
 
 
 def _split_poses(poses: int) -> list[np.ndarray]:
@@ -224,123 +169,74 @@ def _split_poses(poses: int) -> list[np.ndarray]:
 
 
 @kernel()
-def _predict(rig, R, t, heights, offsets, data, poses, features, samples):
+def _predict(state, data, poses, features, samples):
     """Fill the predicted ``features`` (n, 2) and ``samples`` (m, 2) px of some poses."""
     work = allocate_workspace()
-    row, by_field = np.zeros((2, DENSE)), np.zeros((2, 2))
     for i in poses:
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
-            f = data.feature[n]
-            u, v, _, _ = feature_row(
-                rig, R[i], t[i], heights, data.frame, data.points[f], offsets[f], work, row
-            )
+            u, v, _, _ = feature_row(state, i, data.points, data.frame, data.feature[n], work)
             features[n, 0], features[n, 1] = u, v
         for n in range(data.sample_from[i], data.sample_from[i + 1]):
-            px = data.sample_px[n]
-            u, v, _, _, _, _ = sample_row(
-                rig, R[i], t[i], heights, data.frame, px[0], px[1], work, row, by_field
-            )
+            u, v, _, _, _, _ = sample_row(state, i, data.frame, data.sample_px[n], work)
             samples[n, 0], samples[n, 1] = u, v
 
 
 @kernel()
-def _accumulate(
-    rig,
-    R,
-    t,
-    heights,
-    offsets,
-    data,
-    feature_r,
-    sample_r,
-    feature_w,
-    sample_w,
-    at,
-    order,
-    poses,
-    A,
-    b,
-):
+def _accumulate(state, data, residuals, weights, order, at, poses, A, b):
     """Add the observations of some ``poses`` to the normal matrix A (upper triangle) and the
     right-hand side b.
 
-    Samples are taken in ``order`` (m,); those in the same cells of both fields are summed before
-    they are added to A.
+    ``residuals`` and ``weights``: of features (n, 2) and samples (m, 2). Samples are taken in
+    ``order`` (m,); those in the same cells of both fields are summed before they are added to A.
     """
-    work, row = allocate_workspace(), np.zeros((2, ROW))
+    work = allocate_workspace()
     sums = Sums(
         np.zeros((4, ROW)), np.zeros(4), np.zeros(4), np.zeros((ROW, ROW)), np.zeros(ROW),
-        dense_columns(at)
+        dense_columns(at), at, A, b
     )  # fmt: skip
     for i in poses:
         for c in range(HEIGHT):
             sums.columns[c] = 6 * i + c
-        _add_features(
-            rig,
-            R[i],
-            t[i],
-            heights,
-            offsets,
-            data,
-            i,
-            feature_r,
-            feature_w,
-            at,
-            work,
-            row,
-            sums,
-            A,
-            b,
-        )
+        _add_features(state, i, data, residuals[0], weights[0], work, sums)
         part = order[data.sample_from[i] : data.sample_from[i + 1]]
-        _add_samples(
-            rig, R[i], t[i], heights, data, part, sample_r, sample_w, at, work, row, sums, A, b
-        )
+        _add_samples(state, i, data, part, residuals[1], weights[1], work, sums)
 
 
 @kernel()
-def _add_features(
-    rig, R, t, heights, offsets, data, pose, residuals, weights, at, work, row, sums, A, b
-):
-    """Add the features of one ``pose``, whose ``residuals`` and ``weights`` are (n, 2), to A and
-    b."""
+def _add_features(state, pose, data, residuals, weights, work, sums):
+    """Add the features of one ``pose``, whose ``residuals`` and ``weights`` are (n, 2)."""
     for n in range(data.feature_from[pose], data.feature_from[pose + 1]):
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
             f = data.feature[n]
-            _, _, i, j = feature_row(
-                rig, R, t, heights, data.frame, data.points[f], offsets[f], work, row
-            )
-            set_feature_columns(sums.columns, rig, f, i, j, at)
-            fill_feature_fields(row, work)
-            _set_rows(sums, 0, row, weights[n], residuals[n])
+            _, _, i, j = feature_row(state, pose, data.points, data.frame, f, work)
+            set_feature_columns(sums.columns, state.rig, f, i, j, sums.at)
+            fill_feature_fields(work)
+            _set_rows(sums, 0, work.row, weights[n], residuals[n])
             _add_rows(sums, PROJECTOR_FIELD)
-            _move_sums(sums, PROJECTOR_FIELD, A, b)
+            _move_sums(sums, PROJECTOR_FIELD)
 
 
 @kernel()
-def _add_samples(rig, R, t, heights, data, part, residuals, weights, at, work, row, sums, A, b):
-    """Add the samples of one pose, whose indices are ``part`` (k,), to A and b."""
-    by_field, cells = np.zeros((2, 2)), np.full(4, -1)
+def _add_samples(state, pose, data, part, residuals, weights, work, sums):
+    """Add the samples of one ``pose``, whose indices are ``part`` (k,)."""
+    cells = np.full(4, -1)
     first = 0
     for n in part:
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
-            u, v = data.sample_px[n]
-            _, _, ci, cj, pi, pj = sample_row(
-                rig, R, t, heights, data.frame, u, v, work, row, by_field
-            )
+            _, _, ci, cj, pi, pj = sample_row(state, pose, data.frame, data.sample_px[n], work)
             if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
                 _add_rows(sums, ROW)
-                _move_sums(sums, ROW, A, b)
+                _move_sums(sums, ROW)
                 first = 0
                 cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
-                set_sample_columns(sums.columns, rig, cells, at)
-            fill_sample_fields(row, work, by_field)
-            _set_rows(sums, first, row, weights[n], residuals[n])
+                set_sample_columns(sums.columns, state.rig, cells, sums.at)
+            fill_sample_fields(work)
+            _set_rows(sums, first, work.row, weights[n], residuals[n])
             if first == 2:
                 _add_rows(sums, ROW)
             first = 2 - first
     _add_rows(sums, ROW)
-    _move_sums(sums, ROW, A, b)
+    _move_sums(sums, ROW)
 
 
 @kernel()
@@ -389,20 +285,19 @@ def _set_field_columns(columns, first, device, i, j, start):
 
 
 @kernel()
-def fill_feature_fields(row, work):
+def fill_feature_fields(work):
     """Fill in the derivatives of a feature by the camera's field; u's coefficients are in row u
     alone, v's in row v."""
     for k in range(2):
-        _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, 1.0 - k, float(k))
+        _fill_field(work.row, CAMERA_FIELD + k * FIELD, work.camera_basis, 1.0 - k, float(k))
 
 
 @kernel()
-def fill_sample_fields(row, work, by_field):
+def fill_sample_fields(work):
     """Fill in the derivatives of a sample by both fields; both rows look through the camera's."""
+    row, by = work.row, work.by_field
     for k in range(2):
-        _fill_field(
-            row, CAMERA_FIELD + k * FIELD, work.camera_basis, by_field[0, k], by_field[1, k]
-        )
+        _fill_field(row, CAMERA_FIELD + k * FIELD, work.camera_basis, by[0, k], by[1, k])
         _fill_field(row, PROJECTOR_FIELD + k * FIELD, work.projector_basis, 1.0 - k, float(k))
 
 
@@ -446,9 +341,9 @@ def _add_rows(sums, length):
 
 
 @kernel()
-def _move_sums(sums, length, A, b):
+def _move_sums(sums, length):
     """Add S (upper triangle) and s to A and b, each entry to its column, and set them to zero."""
-    S, s, columns = sums.S, sums.s, sums.columns
+    S, s, columns, A, b = sums.S, sums.s, sums.columns, sums.A, sums.b
     for a in range(length):
         target, source, column = A[columns[a]], S[a, a:length], columns[a:length]
         b[columns[a]] += s[a]

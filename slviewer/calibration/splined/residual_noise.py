@@ -1,12 +1,13 @@
 """Weights of observations and priors, estimated from the residuals."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from slviewer.calibration.splined.normal import ObservedValues, PoseData
+from slviewer.calibration.splined.normal import ObservedValues
+from slviewer.calibration.splined.residuals import PoseData
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.robust import tukey_weights
 
 MIN_SIGMA_PX = 1e-4
@@ -15,10 +16,6 @@ MAX_RATIO = 100.0
 MAX_POSE_NOISE_RATIO = 2.5
 """How many times the features' common noise one pose may have of its own: a tilted or blurred board
 is read less well. What exceeds that contradicts the other poses."""
-PROBES = 24
-"""Random vectors that estimate a trace: to a percent of it."""
-STRENGTH_BOUNDS = (1e-1, 1e6)
-"""Bounds of a prior's strength, 1/px^2: a field of px and no prior, or no field."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +41,13 @@ class Noise:
         x, y = (max(1.0, float(s / p)) for s, p in zip(self.sample_px, predicted, strict=True))
         return x, y
 
-    def sigmas(self, sample_sigma: np.ndarray) -> np.ndarray:
+    def sigmas(self, sample_sigma: Floats) -> Floats:
         """Return the total standard deviations (m, 2) px of samples with predicted noise (m, 2)
         px."""
         return np.sqrt(sample_sigma**2 + np.square(self.excess_px))
 
 
-def estimate_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.ndarray) -> Noise:
+def estimate_noise(features: Floats, samples: Floats, sample_sigma: Floats) -> Noise:
     """Estimate the noise robustly from residuals of features (n, 2) and samples (m, 2) px; NaN does
     not count."""
     camera = 1.4826 * float(np.nanmedian(np.abs(features)))
@@ -61,7 +58,7 @@ def estimate_noise(features: np.ndarray, samples: np.ndarray, sample_sigma: np.n
     )
 
 
-def _excess_sigma(residuals: np.ndarray, sigma: np.ndarray) -> float:
+def _excess_sigma(residuals: Floats, sigma: Floats) -> float:
     """Solve for the sigma that, added in quadrature to the predicted one (m,), normalises the
     residuals (m,) to 1."""
     known = np.isfinite(residuals) & np.isfinite(sigma)
@@ -74,7 +71,7 @@ def _excess_sigma(residuals: np.ndarray, sigma: np.ndarray) -> float:
     return float(np.clip(excess, MIN_SIGMA_PX, max(3.0 * float(np.median(r)), MIN_SIGMA_PX)))
 
 
-def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) -> np.ndarray:
+def pose_sigmas(features: Floats, feature_from: np.ndarray, noise: Noise) -> Floats:
     """Return the sigma (n, 2) px of each feature: that of its pose, limited to 1 to 2.5 times the
     common one."""
     sigma = np.full_like(features, noise.camera_px)
@@ -88,9 +85,7 @@ def pose_sigmas(features: np.ndarray, feature_from: np.ndarray, noise: Noise) ->
     return sigma
 
 
-def robust_weights(
-    features: np.ndarray, samples: np.ndarray, sigmas: ObservedValues
-) -> ObservedValues:
+def robust_weights(features: Floats, samples: Floats, sigmas: ObservedValues) -> ObservedValues:
     """Return the weights of features (n, 2) and samples (m, 2) in 1/px^2: inverse variance times
     Tukey's biweight.
 
@@ -104,38 +99,11 @@ def robust_weights(
     return weights[0], weights[1]
 
 
-def pose_trust(weights: ObservedValues, sigmas: ObservedValues, data: PoseData) -> np.ndarray:
+def pose_trust(weights: ObservedValues, sigmas: ObservedValues, data: PoseData) -> Floats:
     """Return the mean of Tukey's biweight over each pose's features and over its samples, (poses,
     2)."""
-    trust = []
-    for w, s, start in zip(weights, sigmas, (data.feature_from, data.sample_from), strict=True):
-        each = np.nanmax(np.where(np.isfinite(s), w * s**2, 0.0), axis=1)
-        total = np.concatenate([[0.0], np.cumsum(each)])
-        trust.append((total[start[1:]] - total[start[:-1]]) / np.maximum(np.diff(start), 1))
-    return np.stack(trust, axis=1)
-
-
-def update_strength(
-    strength: float,
-    form: np.ndarray,
-    field: np.ndarray,
-    first: int,
-    solve: Callable[[np.ndarray], np.ndarray],
-    size: int,
-) -> float:
-    """Update a prior's strength by MacKay's fixed point, which maximises the evidence.
-
-    The prior is exp(-strength/2 c'Fc) for each component c of ``field`` (2, n), F = ``form`` (n,
-    n); the coefficients start at ``first`` in the vector of ``size`` unknowns, and ``solve``
-    applies the inverse of its normal matrix.
-    """
-    components, n = field.shape
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (components, n, PROBES))
-    right = np.zeros((size, PROBES))
-    right[first : first + components * n] = signs.reshape(-1, PROBES)
-    spread = solve(right)[first : first + components * n].reshape(signs.shape)
-    pulled = form @ signs
-    trace = float(np.sum(spread * pulled)) / PROBES
-    determined = max(components * n - strength * trace, 1.0)
-    energy = float(np.sum(field * (field @ form)))
-    return float(np.clip(determined / max(energy, 1e-12), *STRENGTH_BOUNDS))
+    features, samples = (
+        np.nanmax(np.where(np.isfinite(s), w * s**2, 0.0), axis=1)
+        for w, s in zip(weights, sigmas, strict=True)
+    )
+    return data.means(features, samples)

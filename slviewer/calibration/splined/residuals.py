@@ -6,15 +6,89 @@ offset (2) and rig (24), and for each field the splines' values at one place, fr
 entries are products.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from slviewer.calibration.splined.board_shape import height_at
+from slviewer.calibration.splined.board_shape import HEIGHT_TERMS, height_at
 from slviewer.calibration.splined.fields import displacement, remove_displacement
 from slviewer.geometry.brown import distort_point, undistort_point
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.rigid import Floats
 
 POSE, HEIGHT, OFFSET, CAMERA, PROJECTOR, TURN, SHIFT, DENSE = 0, 6, 18, 20, 29, 38, 41, 44
 """Index of each group's first entry in a dense row, and the row's length."""
+FIELD = 16
+CAMERA_FIELD, PROJECTOR_FIELD, ROW = DENSE, DENSE + 2 * FIELD, DENSE + 4 * FIELD
+"""Coefficients of one component of a field that reach a place; index of each field's first entry in
+a whole row, behind the dense part; and the row's length."""
+
+
+class PoseData(NamedTuple):
+    """What was observed, all poses one after another.
+
+    Of pose i, features ``feature_from[i] : feature_from[i + 1]``: ``feature`` (n,) their indices on
+    the board, and ``feature_px`` (n, 2), their pixels; and samples ``sample_from[i] : ...``: camera
+    pixels ``sample_px`` (m, 2), and ``projector_px`` (m, 2), their projector coordinates, NaN for
+    an axis not captured. ``points`` (f, 3) mm and ``frame`` (4,) are the board's.
+    """
+
+    feature_from: np.ndarray
+    feature: np.ndarray
+    feature_px: Floats
+    sample_from: np.ndarray
+    sample_px: Floats
+    projector_px: Floats
+    points: Floats
+    frame: Floats
+
+    @property
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """The pose of each feature (n,) and of each sample (m,)."""
+        feature, sample = (
+            np.repeat(np.arange(len(start) - 1), np.diff(start))
+            for start in (self.feature_from, self.sample_from)
+        )
+        return feature, sample
+
+    def means(self, features: Floats, samples: Floats) -> Floats:
+        """Return the means (p, 2) over each pose of its features' values (n,) and its samples'
+        (m,)."""
+        means = []
+        for values, pose in zip((features, samples), self.poses, strict=True):
+            counts = np.bincount(pose, minlength=len(self.feature_from) - 1)
+            means.append(np.bincount(pose, values, len(counts)) / np.maximum(counts, 1))
+        return np.stack(means, axis=1)
+
+
+class Workspace(NamedTuple):
+    """Buffers of one thread for the kernels: ``row`` (2, ROW) holds the derivatives of an
+    observation, ``by_field`` (2, 2) those of a sample by the camera's displacement."""
+
+    row: Floats
+    by_field: Floats
+
+    camera_basis: Floats
+    projector_basis: Floats
+    by_point: Floats
+    by_lens: Floats
+    ray_by_lens: Floats
+    ray_by_field: Floats
+    terms: Floats
+    local: Floats
+    point: Floats
+    turned: Floats
+    normal: Floats
+
+
+@kernel()
+def allocate_workspace():
+    """Return a workspace of zeros."""
+    return Workspace(
+        np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)),
+        np.zeros((2, 9)), np.zeros((2, 9)), np.zeros((2, 2)),
+        np.zeros((3, HEIGHT_TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+    )  # fmt: skip
 
 
 @kernel()
@@ -60,12 +134,7 @@ def project_to_device(device, X, basis, by_point, by_lens):
     du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
     _fill_pixel_by_lens(x, y, xd, yd, k, by_lens)
     # d(u, v before displacement) by x, y
-    ux, uy, vx, vy = (
-        k[0] * dxx,
-        k[0] * dxy,
-        k[1] * dxy,
-        k[1] * dyy,
-    )
+    ux, uy, vx, vy = k[0] * dxx, k[0] * dxy, k[1] * dxy, k[1] * dyy
     by_point[0, 0], by_point[0, 1] = ux * inverse, uy * inverse
     by_point[1, 0], by_point[1, 1] = vx * inverse, vy * inverse
     by_point[0, 2] = -(ux * x + uy * y) * inverse
@@ -112,19 +181,21 @@ def undistort_ray(device, u, v, basis, by_lens, by_field):
 
 
 @kernel()
-def feature_row(rig, R, t, heights, frame, point, offset, work, row):
-    """(u, v, first column, first row): where the camera sees a feature of the board at pose (R, t).
+def feature_row(state, pose, points, frame, f, work):
+    """(u, v, first column, first row): where the camera sees feature ``f`` of the board at a pose.
 
-    Fills ``row`` (2, 44), and in ``work.camera_basis`` the splines.
+    Fills ``work.row`` but for the fields' part, and in ``work.camera_basis`` the splines.
     """
-    x, y = point[0] + offset[0], point[1] + offset[1]
-    z, zx, zy = height_at(x, y, frame, heights, work.terms)
-    L = work.local
-    X = work.point
+    R, t = state.R_board[pose], state.t_board[pose]
+    x, y = points[f, 0] + state.offsets[f, 0], points[f, 1] + state.offsets[f, 1]
+    z, zx, zy = height_at(x, y, frame, state.heights, work.terms)
+    L, X, row = work.local, work.point, work.row
     for a in range(3):
         L[a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
         X[a] = L[a] + t[a]
-    u, v, i, j = project_to_device(rig.camera, X, work.camera_basis, work.by_point, work.by_lens)
+    u, v, i, j = project_to_device(
+        state.rig.camera, X, work.camera_basis, work.by_point, work.by_lens
+    )
     row[:] = 0.0
     if not np.isfinite(u):
         return u, v, i, j
@@ -134,7 +205,7 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
         fill_cross(L, work.by_point[k], 1.0, row[k, POSE : POSE + 3])
         row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = m0, m1, m2
         along = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
-        for c in range(heights.shape[0]):
+        for c in range(HEIGHT_TERMS):
             row[k, HEIGHT + c] = along * work.terms[0, c]
         row[k, OFFSET] = m0 * R[0, 0] + m1 * R[1, 0] + m2 * R[2, 0] + along * zx
         row[k, OFFSET + 1] = m0 * R[0, 1] + m1 * R[1, 1] + m2 * R[2, 1] + along * zy
@@ -144,16 +215,17 @@ def feature_row(rig, R, t, heights, frame, point, offset, work, row):
 
 
 @kernel()
-def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
+def sample_row(state, pose, frame, pixel, work):
     """(u_p, v_p, then first column and row in the camera's field, and in the projector's): where
-    the projector lights what camera pixel (u, v) sees of the board at pose (R, t).
+    the projector lights what a camera ``pixel`` (2,) sees of the board at a pose.
 
-    Fills ``row`` (2, 44), ``by_field`` (2, 2) by the camera's displacement, and both bases of
-    ``work``.
+    Fills ``work.row`` but for the fields' part, ``work.by_field``, and both bases.
     """
+    rig, R, t = state.rig, state.R_board[pose], state.t_board[pose]
+    row, by_field = work.row, work.by_field
     row[:] = 0.0
     x, y, ci, cj = undistort_ray(
-        rig.camera, u, v, work.camera_basis, work.ray_by_lens, work.ray_by_field
+        rig.camera, pixel[0], pixel[1], work.camera_basis, work.ray_by_lens, work.ray_by_field
     )
     facing = R[0, 2] * x + R[1, 2] * y + R[2, 2]
     if not (np.isfinite(x) and facing != 0.0):
@@ -166,7 +238,7 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
         bx = R[0, 0] * Y[0] + R[1, 0] * Y[1] + R[2, 0] * Y[2]
         by = R[0, 1] * Y[0] + R[1, 1] * Y[1] + R[2, 1] * Y[2]
         bz = R[0, 2] * Y[0] + R[1, 2] * Y[1] + R[2, 2] * Y[2]
-        z, zx, zy = height_at(bx, by, frame, heights, work.terms)
+        z, zx, zy = height_at(bx, by, frame, state.heights, work.terms)
         for a in range(3):
             N[a] = R[a, 2] - R[a, 0] * zx - R[a, 1] * zy
         facing = N[0] * x + N[1] * y + N[2]
@@ -193,12 +265,9 @@ def sample_row(rig, R, t, heights, frame, u, v, work, row, by_field):
         m2 = p0 * rig.R[0, 2] + p1 * rig.R[1, 2] + p2 * rig.R[2, 2]
         along = (m0 * x + m1 * y + m2) / facing
         fill_cross(Y, N, along, row[k, POSE : POSE + 3])
-        row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = (
-            along * N[0],
-            along * N[1],
-            along * N[2],
-        )
-        for c in range(heights.shape[0]):
+        for a in range(3):
+            row[k, POSE + 3 + a] = along * N[a]
+        for c in range(HEIGHT_TERMS):
             row[k, HEIGHT + c] = along * work.terms[0, c]
         ex, ey = s * (m0 - along * N[0]), s * (m1 - along * N[1])
         for c in range(9):

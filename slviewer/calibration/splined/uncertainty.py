@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import prange
-from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, distance_transform_edt, uniform_filter
+from scipy.ndimage import binary_erosion, distance_transform_edt, minimum_filter, uniform_filter
 
 from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.fields import Device
@@ -30,7 +29,7 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, Floats32, Mask
 from slviewer.records.calibration import VolumeSigma
 
 NODES = (21, 16, 11)
@@ -46,11 +45,11 @@ class SigmaMap:
     """Standard deviation of z for one axis: ``nodes`` (nv, nu, nz) float32 mm, evenly spaced over
     the image and from ``near`` to ``far`` mm."""
 
-    nodes: NDArray[np.float32]
+    nodes: Floats32
     near: float
     far: float
 
-    def interpolate(self, points: np.ndarray) -> NDArray[np.float32]:
+    def interpolate(self, points: np.ndarray) -> Floats32:
         """Interpolate at the organised points (h, w, 3) mm of the whole image; returns (h, w)
         float32 mm, NaN at NaN.
 
@@ -58,13 +57,8 @@ class SigmaMap:
         ends.
         """
         out = np.empty(points.shape[:2], np.float32)
-        _interpolate(
-            np.ascontiguousarray(points[..., 2], np.float32),
-            np.log(self.nodes),
-            self.near,
-            self.far,
-            out,
-        )
+        z = np.ascontiguousarray(points[..., 2], np.float32)
+        _interpolate(z, np.log(self.nodes), self.near, self.far, out)
         return out
 
 
@@ -80,19 +74,14 @@ def compute_sigma_map(bundle: Bundle, axis: Axis, near: float, far: float) -> Si
     moved = bundle.whiten(jacobian) @ motion.weights.astype(np.float32)
     width, height = (int(n) for n in rig.camera.size)
     across, down, deep = NODES
-    v, u, z = np.meshgrid(
-        np.linspace(0, height - 1, down),
-        np.linspace(0, width - 1, across),
-        np.linspace(near, far, deep),
-        indexing="ij",
-    )
+    axes = [np.linspace(0, height - 1, down), np.linspace(0, width - 1, across)]
+    v, u, z = np.meshgrid(*axes, np.linspace(near, far, deep), indexing="ij")
     pixels, nodes = np.column_stack([u.ravel(), v.ravel()]), z.ravel()
     jacobian = bundle.point_jacobian(axis, pixels, nodes)[2::3]
     jacobian.data[~np.isfinite(jacobian.data)] = 0.0
     places = Volume(pixels, nodes, *view_pixels(rig, pixels, nodes))
-    depths = (
-        bundle.whiten(jacobian) - moved @ motion.displace(places.points)[2::3].astype(np.float32).T
-    )
+    by_motion = motion.displace(places.points)[2::3].astype(np.float32)
+    depths = bundle.whiten(jacobian) - moved @ by_motion.T
     sigma = np.sqrt(np.einsum("mn,mn->n", depths, depths)) * extrapolation_factor(bundle, places)
     unknown = np.isnan(sigma) | (abs(jacobian).sum(axis=1).A1 == 0)
     sigma, unknown = sigma.reshape(u.shape), unknown.reshape(u.shape)
@@ -119,43 +108,30 @@ def extrapolation_factor(bundle: Bundle, places: Volume) -> Floats:
     illuminated there, the larger one of two.
     """
     factor = np.ones(len(places.z))
-    rig = bundle.state.rig
-    for device, pixels, poses in (
-        (rig.camera, places.pixels, bundle.camera_poses),
-        (rig.projector, places.projector, bundle.projector_poses),
-    ):
-        supported = in_illuminated_cells(device, pixels, poses > 0)
-        factor = np.where(
-            supported, factor, np.maximum(factor, persistence_ratio(device, poses > 0))
-        )
+    pixels = places.pixels, places.projector
+    for device, px, cells in zip(bundle.state.rig[:2], pixels, bundle.illuminated, strict=True):
+        beyond = ~in_illuminated_cells(device, px, cells)
+        factor[beyond] = np.maximum(factor[beyond], persistence_ratio(device, cells))
     return factor
 
 
-def persistence_ratio(device: Device, illuminated: np.ndarray) -> float:
+def persistence_ratio(device: Device, illuminated: Mask) -> float:
     """Return the standard deviation of sums of a field's second differences, over that of
     independent ones; at least 1.
 
     The sums are over neighbouring cells that are all ``illuminated`` (rows, columns) bool.
     """
     c = device.coefficients
-    corners = np.pad(illuminated, 1, mode="edge")
-    known = corners[:-1, :-1] & corners[1:, :-1] & corners[:-1, 1:] & corners[1:, 1:]
+    known = minimum_filter(np.pad(illuminated, ((0, 1), (0, 1)), mode="edge"), 2, mode="nearest")
     whole = binary_erosion(known, np.ones((EXTRAPOLATED_CELLS, EXTRAPOLATED_CELLS), bool))
     if not whole.any():
         return 1.0
-    middle = 2 * c[:, 1:-1, 1:-1]
-    across, down = (
-        c[:, 1:-1, :-2] - middle + c[:, 1:-1, 2:],
-        c[:, :-2, 1:-1] - middle + c[:, 2:, 1:-1],
-    )
+    across, down = np.diff(c[:, 1:-1], 2, axis=2), np.diff(c[:, :, 1:-1], 2, axis=1)
     each, together = 0.0, 0.0
     for differences in (*across, *down):
         each += float(np.mean(differences[known] ** 2))
-        together += (
-            float(np.mean(uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2))
-            * EXTRAPOLATED_CELLS**2
-        )
-    return max(1.0, float(np.sqrt(together / max(each, 1e-300))))
+        together += float(np.mean(uniform_filter(differences, EXTRAPOLATED_CELLS)[whole] ** 2))
+    return max(1.0, EXTRAPOLATED_CELLS * float(np.sqrt(together / max(each, 1e-300))))
 
 
 def summarise_volume_sigma(bundle: Bundle) -> VolumeSigma:
@@ -166,31 +142,24 @@ def summarise_volume_sigma(bundle: Bundle) -> VolumeSigma:
     fitted = _select_fitted(bundle, volume)
     sigma = volume_sigmas(bundle, axis, volume)
     worst = int(np.argmax(sigma))
-    u, v = map(float, volume.pixels[worst])
+    u, v = volume.pixels[worst].tolist()
     return VolumeSigma(
         median=float(np.median(sigma[fitted])),
         p95=float(np.percentile(sigma[fitted], 95)),
         worst=float(sigma[worst]),
         worst_at=(u, v, float(volume.z[worst])),
-        supported=float(
-            np.mean(volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0))
-        ),
+        supported=float(np.mean(volume.supported(rig, *bundle.illuminated))),
         depths_mm=(float(volume.z.min()), float(volume.z.max())),
         axis=axis,
     )
 
 
-def _select_fitted(bundle: Bundle, volume: Volume) -> np.ndarray:
+def _select_fitted(bundle: Bundle, volume: Volume) -> Mask:
     """Select the points (n,) bool for the fit of the rigid motion: the supported ones, or all if
     these are too few."""
-    supported = volume.supported(
-        bundle.state.rig, bundle.camera_poses > 0, bundle.projector_poses > 0
-    )
-    return (
-        supported
-        if np.count_nonzero(supported) >= MIN_FITTED_POINTS
-        else np.ones(len(supported), bool)
-    )
+    supported = volume.supported(bundle.state.rig, *bundle.illuminated)
+    is_enough = np.count_nonzero(supported) >= MIN_FITTED_POINTS
+    return supported if is_enough else np.ones_like(supported)
 
 
 @kernel(parallel=True)

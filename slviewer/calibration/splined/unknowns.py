@@ -1,6 +1,5 @@
 """The unknowns of the adjustment, and their order in its vector."""
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
-from slviewer.calibration.splined.fields import Device, no_displacement
+from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.brown import fold_radius_squared
 from slviewer.geometry.lens import Lens
@@ -29,71 +28,41 @@ class Arrangement(NamedTuple):
     t: Floats
 
 
-@dataclass(frozen=True)
-class UnknownLayout:
-    """Order of the unknowns: poses (6 each), height, offsets (2 each), then the rig: both lenses (9
-    each), rotation and translation, the camera's field and the projector's (u's coefficients, then
-    v's).
+class UnknownLayout(NamedTuple):
+    """Order of the unknowns: number of ``poses`` (6 each), then the index of the first unknown of
+    ``height``, ``offsets`` (2 each), and the ``rig``: both lenses (9 each), rotation and
+    translation, ``camera_field`` and ``projector_field`` (u's coefficients, then v's); and the
+    number of unknowns.
 
     The rig's unknowns are last, so that the last block of a Cholesky factor is their information
     with all others marginalised out.
     """
 
     poses: int
-    features: int
-    camera_knots: int
-    projector_knots: int
-
-    @property
-    def height(self) -> int:
-        """Index of the first coefficient of the board's height."""
-        return 6 * self.poses
-
-    @property
-    def offsets(self) -> int:
-        """Index of the first feature's offset."""
-        return self.height + HEIGHT_TERMS
-
-    @property
-    def rig(self) -> int:
-        """Index of the first parameter of the camera's lens."""
-        return self.offsets + 2 * self.features
-
-    @property
-    def camera_field(self) -> int:
-        """Index of the first coefficient of the camera's field."""
-        return self.rig + RIG
-
-    @property
-    def projector_field(self) -> int:
-        """Index of the first coefficient of the projector's field."""
-        return self.camera_field + 2 * self.camera_knots
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.projector_field + 2 * self.projector_knots
+    height: int
+    offsets: int
+    rig: int
+    camera_field: int
+    projector_field: int
+    size: int
 
     @property
     def starts(self) -> NDArray[np.int64]:
         """(5,): the first unknown of height, offsets, rig, camera's field, and projector's field,
         for the kernels."""
-        return np.array(
-            [self.height, self.offsets, self.rig, self.camera_field, self.projector_field], np.int64
-        )
+        return np.array(self[1:-1], np.int64)
 
     @property
     def separable(self) -> tuple[slice, ...]:
         """Blocks of which no two share an observation or a prior: offsets, and u and v of the
         projector's field."""
-        v = self.projector_field + self.projector_knots
+        v = (self.projector_field + self.size) // 2
         return slice(self.offsets, self.rig), slice(self.projector_field, v), slice(v, self.size)
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """The unknowns' values. ``R_board`` (p, 3, 3), ``t_board`` (p, 3): board to camera; ``heights``
-    (12,) and ``offsets`` (f, 2) mm: the board's shape."""
+class State(NamedTuple):
+    """The unknowns' values, for the compiled kernels too. ``R_board`` (p, 3, 3), ``t_board``
+    (p, 3): board to camera; ``heights`` (12,) and ``offsets`` (f, 2) mm: the board's shape."""
 
     rig: Arrangement
     R_board: Floats
@@ -111,17 +80,12 @@ class State:
         ``fields.CELLS_ACROSS``.
         """
         rig = stereo.rig
-        devices = [
-            Device(
-                lens.parameters,
-                no_displacement(lens.size, cells_across),
-                np.array(lens.size, float),
-            )
-            for lens in (rig.camera, rig.projector)
-        ]
+        camera, projector = (
+            Device.from_lens(lens, cells_across) for lens in (rig.camera, rig.projector)
+        )
         T = np.array([stereo.poses[name] for name in poses])
         return cls(
-            Arrangement(devices[0], devices[1], rig.R.copy(), rig.t.copy()),
+            Arrangement(camera, projector, rig.R.copy(), rig.t.copy()),
             np.ascontiguousarray(T[:, :3, :3]),
             np.ascontiguousarray(T[:, :3, 3]),
             np.zeros(HEIGHT_TERMS),
@@ -131,8 +95,9 @@ class State:
     @property
     def layout(self) -> UnknownLayout:
         """Order of the unknowns."""
-        knots = [device.coefficients[0].size for device in (self.rig.camera, self.rig.projector)]
-        return UnknownLayout(len(self.t_board), len(self.offsets), knots[0], knots[1])
+        poses, fields = len(self.t_board), [device.coefficients.size for device in self.rig[:2]]
+        bounds = np.cumsum([6 * poses, HEIGHT_TERMS, 2 * len(self.offsets), RIG, *fields])
+        return UnknownLayout(poses, *bounds.tolist())
 
     def step(self, step: Floats) -> "State":
         """Return the state after a step (N,) in the order of ``layout``; rotation vectors apply
@@ -140,9 +105,8 @@ class State:
         at = self.layout
         pose = step[: at.height].reshape(-1, 6)
         rig, s = self.rig, step[at.rig :]
-        fields = np.split(step[at.camera_field :], [2 * at.camera_knots])
-        return replace(
-            self,
+        fields = step[at.camera_field : at.projector_field], step[at.projector_field :]
+        return self._replace(
             rig=Arrangement(
                 _step_device(rig.camera, s[:LENS], fields[0]),
                 _step_device(rig.projector, s[LENS : 2 * LENS], fields[1]),
@@ -169,7 +133,7 @@ def rotate_left(R: Floats, vector: Floats) -> Floats:
     return u @ v
 
 
-def _step_device(device: Device, numbers: np.ndarray, coefficients: np.ndarray) -> Device:
+def _step_device(device: Device, numbers: Floats, coefficients: Floats) -> Device:
     """Return a device with steps added to its nine lens parameters and its spline coefficients."""
     k = device.numbers[:LENS] + numbers
     return Device(

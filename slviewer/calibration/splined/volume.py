@@ -10,7 +10,7 @@ from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
-from slviewer.geometry.rigid import Floats, motion_jacobian
+from slviewer.geometry.rigid import Floats, Mask, motion_jacobian
 from slviewer.geometry.vectors import finite_rows, rms
 
 DEPTH_FACTORS = (0.87, 1.13)
@@ -31,9 +31,13 @@ class Volume:
     points: Floats
     projector: Floats
 
+    def select(self, which: np.ndarray) -> "Volume":
+        """Return some of the points."""
+        return Volume(*(values[which] for values in vars(self).values()))
+
     def supported(
-        self, rig: Arrangement, camera_illuminated: np.ndarray, projector_illuminated: np.ndarray
-    ) -> np.ndarray:
+        self, rig: Arrangement, camera_illuminated: Mask, projector_illuminated: Mask
+    ) -> Mask:
         """(n,) bool: points in cells (rows, columns) bool that target poses illuminated, in both
         devices."""
         return in_illuminated_cells(
@@ -59,13 +63,9 @@ def working_volume(
     if not 0 < near < far:
         raise InputError(f"calibrated depths {calibrated_mm} mm leave no volume")
     width, height = rig.camera.size
-    u, v, z = np.meshgrid(
-        np.linspace(0, width - 1, columns),
-        np.linspace(0, height - 1, rows),
-        np.linspace(near, far, depths),
-        indexing="ij",
-    )
-    volume = select_visible(rig, np.column_stack([u.ravel(), v.ravel()]), z.ravel())
+    u, v = np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows)
+    grid = np.stack(np.meshgrid(u, v, np.linspace(near, far, depths), indexing="ij"), axis=-1)
+    volume = select_visible(rig, grid[..., :2].reshape(-1, 2), grid[..., 2].ravel())
     if not len(volume.z):
         raise InputError(
             f"camera and projector share nothing they both see at {near:.0f}-{far:.0f} mm"
@@ -73,19 +73,17 @@ def working_volume(
     return volume
 
 
-def select_visible(rig: Arrangement, pixels: np.ndarray, z: np.ndarray) -> Volume:
+def select_visible(rig: Arrangement, pixels: Floats, z: Floats) -> Volume:
     """Select the camera ``pixels`` (n, 2) at depths ``z`` (n,) mm whose points project into the
     projector's image."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     points, projector = view_pixels(rig, pixels, z)
     # False for NaN
     in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)
-    return Volume(pixels[in_view], z[in_view], points[in_view], projector[in_view])
+    return Volume(pixels, z, points, projector).select(np.flatnonzero(in_view))
 
 
-def view_pixels(
-    rig: Arrangement, pixels: np.ndarray, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def view_pixels(rig: Arrangement, pixels: Floats, z: Floats) -> tuple[Floats, Floats]:
     """Return points (n, 3) mm of camera ``pixels`` (n, 2) at depths ``z`` (n,) mm, and their
     projector pixels (n, 2).
 
@@ -97,13 +95,13 @@ def view_pixels(
     return points, projector
 
 
-def in_illuminated_cells(device: Device, pixels: np.ndarray, illuminated: np.ndarray) -> np.ndarray:
+def in_illuminated_cells(device: Device, pixels: Floats, illuminated: Mask) -> Mask:
     """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses
     illuminated.
 
     Pixels outside the image count to the cell at its edge; False for NaN.
     """
-    shape = np.array([illuminated.shape[1], illuminated.shape[0]])
+    shape = np.array(illuminated.shape[::-1])
     known = finite_rows(pixels)
     place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
     cells = np.clip(place, 0, shape - 1).astype(int)
@@ -126,12 +124,12 @@ class BestMotion:
     ``centre`` (3,) mm times ``arm`` mm.
     """
 
-    weights: np.ndarray
-    centre: np.ndarray
+    weights: Floats
+    centre: Floats
     arm: float
 
     @classmethod
-    def fit(cls, points: np.ndarray, fitted: np.ndarray | None = None) -> "BestMotion":
+    def fit(cls, points: Floats, fitted: Mask | None = None) -> "BestMotion":
         """Build the estimator for ``points`` (n, 3) mm; only those in ``fitted`` (n,) bool have
         weights.
 
@@ -147,14 +145,14 @@ class BestMotion:
         held = _motion_basis(points, centre, arm) * np.repeat(chosen, 3)[:, None]
         return cls(np.linalg.lstsq(held.T @ held, held.T, rcond=None)[0].T, centre, arm)
 
-    def displace(self, points: np.ndarray) -> np.ndarray:
+    def displace(self, points: Floats) -> Floats:
         """Return the displacements (3 n, 6) of points (n, 3) mm by the six motions; x, y, z of each
         point in turn."""
         return _motion_basis(points, self.centre, self.arm)
 
 
 def remove_rigid_motion(
-    whitened: np.ndarray, points: np.ndarray, fitted: np.ndarray | None = None
+    whitened: np.ndarray, points: Floats, fitted: Mask | None = None
 ) -> np.ndarray:
     """Remove the common rigid motion, to which measurements of a shape are invariant, from
     ``whitened`` (m, 3 n).
@@ -166,20 +164,19 @@ def remove_rigid_motion(
     """
     motion = BestMotion.fit(points, fitted)
     weights, moved = (
-        motion.weights.astype(whitened.dtype),
-        motion.displace(points).astype(whitened.dtype),
+        each.astype(whitened.dtype) for each in (motion.weights, motion.displace(points))
     )
     return whitened - (whitened @ weights) @ moved.T
 
 
-def sigma_3d(whitened: np.ndarray) -> np.ndarray:
+def sigma_3d(whitened: np.ndarray) -> Floats:
     """Return the 3D standard deviation (n,) mm of each point from a factor (m, 3 n) of the points'
     covariance."""
     squares = np.einsum("mn,mn->n", whitened, whitened, dtype=np.float64)
     return np.sqrt(squares.reshape(-1, 3).sum(axis=1))
 
 
-def _motion_basis(points: np.ndarray, centre: np.ndarray, arm: float) -> np.ndarray:
+def _motion_basis(points: Floats, centre: Floats, arm: float) -> Floats:
     """Return the displacements (3 n, 6) of points (n, 3) by translations and by rotations about
     ``centre``."""
     J = motion_jacobian((points - centre) / arm)
