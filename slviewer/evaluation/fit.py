@@ -1,41 +1,74 @@
-"""One least-squares shape in one cloud: its residuals, and those that noise alone would cause."""
+"""Planes and spheres in one organised cloud: which pixels show them, their least-squares fits, the
+residuals, and those that noise alone would cause.
+
+RANSAC says where the shape is; the largest patch of connected pixels within a tolerance says how
+far it reaches. The tolerance is many times wider than any form error worth measuring, so that
+finding the shape never flatters it: what is wrong by less stays in, and what is wrong by more,
+inside the patch, stays in too, to be counted as set aside. Where a cloud is noisier than that (Gray
+code alone), the tolerances follow its expected noise.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.ransac import ransac_plane, ransac_sphere
 from slviewer.geometry.robust import robust_sigma
-from slviewer.geometry.shapes import Plane, Sphere
+from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
 from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
-from slviewer.records.verification import MAX_EXCLUDED
-
-Fitted = TypeVar("Fitted", Plane, Sphere)
+from slviewer.records.verification import MAX_EXCLUDED, Shape
 
 MAX_SIGMA = 5.0
 LEAST_POINTS = 100
+RANSAC_TOLERANCE_MM = 1.0  # or twice the noise
+PATCH_TOLERANCE_MM = 3.0  # or six times the noise
+SPHERE_TOLERANCE = 0.04  # of its radius, if that is less
+RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor what is behind it
+LEAST_PIXELS = 200
+_SAMPLE = 40_000
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeResult:
-    """Distances of a cloud from its own best plane or sphere.
+    """Distances of a cloud from its own best plane or sphere, the ``shape``.
 
     ``points`` pixels were evaluated; of these ``excluded`` lie beyond 5 robust sigma and count
     neither in the fit nor in ``rms_mm``, the root mean square of the perpendicular (radial)
     distances. ``noise_floor_mm`` is what that would be from the cloud's expected noise alone, over
     the same pixels; NaN where none is known. ``error_map`` ``(h, w)`` float32, mm, NaN where
     nothing was evaluated, holds every distance, those excluded too: positive towards the camera for
-    a plane, outwards for a sphere. ``inliers`` ``(h, w)`` bool says which pixels counted.
+    a plane (Letter eq. 12), outwards for a sphere, whose radius is free. ``inliers`` ``(h, w)``
+    bool says which pixels counted.
     """
 
+    shape: Plane | Sphere
     rms_mm: float
     noise_floor_mm: float
     points: int
     excluded: int
     error_map: np.ndarray
     inliers: np.ndarray
+
+    @property
+    def plane(self) -> Plane:
+        """The fitted plane."""
+        assert isinstance(self.shape, Plane)
+        return self.shape
+
+    @property
+    def sphere(self) -> Sphere:
+        """The fitted sphere."""
+        assert isinstance(self.shape, Sphere)
+        return self.shape
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the fitted sphere."""
+        return self.sphere.radius
 
     @property
     def excluded_share(self) -> float:
@@ -55,14 +88,14 @@ class ShapeResult:
         )
 
 
-class Shape(Protocol):
+class FittedShape(Protocol):
     """A surface with distances from it."""
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distances (n,) mm of points (n, 3)."""
 
 
-AnyShape = TypeVar("AnyShape", bound=Shape)
+AnyShape = TypeVar("AnyShape", bound=FittedShape)
 
 
 def fit_settled(
@@ -93,35 +126,97 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.abs(residuals - np.median(residuals)) <= reach
 
 
-def fit_shape(
+def evaluate_plane(
     points: np.ndarray,
-    mask: np.ndarray,
-    sigma_z: np.ndarray | None,
-    start: Fitted,
-    fit: Callable[[np.ndarray], Fitted],
-) -> tuple[Fitted, ShapeResult]:
-    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate
-    the residuals."""
+    mask: np.ndarray | None,
+    sigma_z: np.ndarray | None = None,
+    start: Plane | None = None,
+) -> ShapeResult:
+    """Fit a plane to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the distances from
+    it.
+
+    ``mask`` ``(h, w)``: the pixels that show the plane; None: the largest flat patch is found.
+    ``sigma_z`` ``(h, w)`` mm: the expected noise of z, for the noise floor. ``start``: about where
+    the plane lies, if that is known.
+    """
+    return evaluate_shape("plane", points, mask, sigma_z, start=start)
+
+
+def evaluate_sphere(
+    points: np.ndarray,
+    mask: np.ndarray | None,
+    sigma_z: np.ndarray | None = None,
+    radius: float | None = None,
+    start: Sphere | None = None,
+) -> ShapeResult:
+    """Fit a sphere to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the radial distances
+    from it.
+
+    ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found.
+    ``sigma_z`` ``(h, w)`` mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the
+    sphere; the fitted radius stays free, as in the Letter's Table 2. ``start``: about where the
+    sphere lies, if that is known.
+    """
+    return evaluate_shape("sphere", points, mask, sigma_z, radius, start)
+
+
+def evaluate_spheres(
+    points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
+) -> list[ShapeResult]:
+    """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise
+    as above."""
+    spheres = find_spheres(points, count, sigma_z, radius)
+    return [
+        evaluate_shape("sphere", points, region, sigma_z, radius, start)
+        for start, region in spheres
+    ]
+
+
+def evaluate_shape(
+    shape: Shape,
+    points: np.ndarray,
+    mask: np.ndarray | None,
+    sigma_z: np.ndarray | None = None,
+    radius: float | None = None,
+    start: Plane | Sphere | None = None,
+) -> ShapeResult:
+    """Fit the shape to the measured pixels under ``mask`` of a cloud, and evaluate the residuals;
+    as `evaluate_sphere`."""
+    if mask is None:
+        start, mask = find_shape(shape, points, None, sigma_z, radius)
+    elif start is None:
+        start = start_shape(shape, points, mask, sigma_z, radius)
     evaluated = mask & finite_rows(points)
     chosen = points[evaluated].astype(np.float64)
     if len(chosen) < LEAST_POINTS:
         raise InputError(
             f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed."
         )
-    shape, is_inlier = fit_settled(lambda some, _: fit(some), chosen, start)
-    residuals = shape.distance(chosen)
-
+    fitted, is_inlier = fit_settled(lambda some, _: _FITS[shape](some), chosen, start)
+    residuals = fitted.distance(chosen)
     error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
     error_map[evaluated] = residuals
     inliers = np.zeros(points.shape[:2], dtype=bool)
     inliers[evaluated] = is_inlier
-    floor = (
-        float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
+    return ShapeResult(
+        fitted,
+        rms(residuals[is_inlier]),
+        (
+            float("nan")
+            if sigma_z is None
+            else noise_floor(fitted, chosen[is_inlier], sigma_z[inliers])
+        ),
+        len(chosen),
+        int(np.count_nonzero(~is_inlier)),
+        error_map,
+        inliers,
     )
-    error = rms(residuals[is_inlier])
-    return shape, ShapeResult(
-        error, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers
-    )
+
+
+_FITS: dict[Shape, Callable[[np.ndarray], Plane | Sphere]] = {
+    "plane": fit_plane,
+    "sphere": fit_sphere,
+}
 
 
 def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:
@@ -141,3 +236,145 @@ def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) 
     else:
         along = np.sum(unit_vectors(points - shape.centre) * rays, axis=1)
     return rms(sigma_z * along)
+
+
+def find_shape(
+    shape: Shape,
+    points: np.ndarray,
+    mask: np.ndarray | None = None,
+    sigma_z: np.ndarray | None = None,
+    radius: float | None = None,
+    start: Plane | Sphere | None = None,
+) -> tuple[Plane | Sphere, np.ndarray]:
+    """Detect the shape with most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
+
+    ``sigma_z`` ``(h, w)`` mm is the expected noise; ``radius`` in mm narrows the search for a
+    sphere. The region is one patch without its outermost two pixels; isolated pixels and small
+    holes inside it belong to it, whether something was measured there or not. A roughly known shape
+    to ``start`` from spares the search. The shape that comes back is a start for fits, not a
+    result. Raises ``InputError`` where no such shape fills a patch.
+    """
+    measured = measured_pixels(points, mask)
+    noise = _typical_noise(sigma_z, measured)
+    fitted = start or start_shape(shape, points, measured, sigma_z, radius)
+    patch = np.zeros_like(measured)
+    for _ in range(20):
+        before, reach = patch, PATCH_TOLERANCE_MM
+        if isinstance(fitted, Sphere):
+            reach = min(reach, SPHERE_TOLERANCE * fitted.radius)
+        distances = fitted.distance(np.where(measured[..., None], points, 0.0))
+        agreeing = measured & (np.abs(distances) < max(reach, 6.0 * noise))
+        patch = _largest_patch(agreeing)
+        region = _remove_rim(patch)
+        shown = np.count_nonzero(region & agreeing)
+        if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
+            raise InputError(
+                f"The largest {'flat' if shape == 'plane' else 'round'} patch has {shown} of"
+                f" {np.count_nonzero(measured)} measured pixels: check that the shape fills a good"
+                " part of the view, and that the cloud is not mere noise."
+            )
+        if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
+            break
+        # alternately a patch of agreeing pixels and least squares over it
+        fitted = _FITS[shape](_sample_points(points, patch & agreeing))
+    return fitted, region
+
+
+def find_spheres(
+    points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
+) -> list[tuple[Plane | Sphere, np.ndarray]]:
+    """``count`` spheres of one cloud and their regions, from left to right in the image."""
+    free = measured_pixels(points, None)
+    spheres = []
+    for _ in range(count):
+        spheres.append(find_shape("sphere", points, free, sigma_z, radius))
+        free &= ~cv2.dilate(
+            spheres[-1][1].astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)
+        ).astype(bool)
+    return sorted(spheres, key=lambda each: float(np.nonzero(each[1])[1].mean()))
+
+
+def start_shape(
+    shape: Shape,
+    points: np.ndarray,
+    mask: np.ndarray,
+    sigma_z: np.ndarray | None = None,
+    radius: float | None = None,
+) -> Plane | Sphere:
+    """Estimate the shape that most points under ``mask`` agree with, by RANSAC."""
+    measured = measured_pixels(points, mask)
+    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
+    some = _sample_points(points, measured)
+    if shape == "plane":
+        return ransac_plane(some, tolerance)[0]
+    return ransac_sphere(some, tolerance, radius)[0]
+
+
+def _typical_noise(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
+    """Median noise of the measured pixels in mm; 0 where none is known."""
+    if sigma_z is None:
+        return 0.0
+    if sigma_z.shape != measured.shape:
+        raise InputError(
+            f"The noise map has shape {sigma_z.shape} and the cloud {measured.shape}: they must"
+            " agree."
+        )
+    known = sigma_z[measured & np.isfinite(sigma_z)]
+    return float(np.median(known)) if known.size else 0.0
+
+
+def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Return which pixels ``(h, w)`` of a cloud hold a point, under a mask if there is one;
+    ``InputError`` if too few do."""
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise InputError(
+            f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed."
+        )
+    if mask is not None and mask.shape != points.shape[:2]:
+        raise InputError(
+            f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree."
+        )
+    measured = finite_rows(points)
+    measured = measured if mask is None else measured & mask
+    if np.count_nonzero(measured) < LEAST_PIXELS:
+        raise InputError(
+            f"{np.count_nonzero(measured)} points were measured where the shape is looked for: at"
+            f" least {LEAST_PIXELS} are needed; check that it is in view and illuminated."
+        )
+    return measured
+
+
+def _sample_points(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return some 40,000 of the measured points, (n, 3) float64."""
+    chosen = points[measured]
+    return chosen[:: -(-len(chosen) // _SAMPLE)].astype(np.float64)
+
+
+def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
+    """Return the largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and
+    small holes are filled."""
+    closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
+    if count < 2:
+        return np.zeros_like(agreeing)
+    patch = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        (~patch).astype(np.uint8), connectivity=8
+    )
+    small = stats[:, cv2.CC_STAT_AREA] < 0.005 * np.count_nonzero(patch)
+    h, w = patch.shape
+    inside = (
+        (stats[:, 0] > 0)
+        & (stats[:, 1] > 0)
+        & (stats[:, 0] + stats[:, 2] < w)
+        & (stats[:, 1] + stats[:, 3] < h)
+    )
+    holes = small & inside
+    holes[0] = False  # label 0 is the patch itself
+    return patch | holes[labels]
+
+
+def _remove_rim(patch: np.ndarray) -> np.ndarray:
+    """Return the patch without its outermost pixels, where it ends inside the image."""
+    kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+    return cv2.erode(patch.astype(np.uint8), kernel, borderValue=1).astype(bool)

@@ -13,9 +13,9 @@ from slviewer.evaluation.letter import (
     TABLE_2,
     TABLE_2_MEAN_MM,
     TABLE_2_RADIUS_MM,
+    SpherePose,
 )
 from slviewer.evaluation.render import Row
-from slviewer.evaluation.sphere import SphereResult
 
 
 def letter_rows(comparisons: Mapping[str, Comparison]) -> list[Row]:
@@ -46,7 +46,7 @@ def _make_row(name: str, comparison: Comparison) -> Row:
         row[f"{model} floor"] = (
             result.noise_floor_mm if np.isfinite(result.noise_floor_mm) else None
         )
-        if isinstance(result, SphereResult):
+        if comparison.shape == "sphere":
             row[f"{model} radius"] = result.radius_mm
         if np.isfinite(comparison.coverage[model]):
             row[f"{model} coverage %"] = 100.0 * comparison.coverage[model]
@@ -71,19 +71,14 @@ def _letter_figures(capture: str, shape: str) -> Row:
     """Return the Letter's figures of the pose whose number the capture's name ends with; {} without
     one."""
     number = re.search(r"(\d+)$", capture)
-    pose = int(number[1]) if number else 0
-    if shape == "plane":
-        return next(
-            (_letter_row(p.stereo_mm, p.pixelwise_mm) for p in TABLE_1 if p.pose == pose), {}
-        )
-    return next(
-        (
-            _letter_row(p.stereo_mm, p.pixelwise_mm, (p.stereo_radius_mm, p.pixelwise_radius_mm))
-            for p in TABLE_2
-            if p.pose == pose
-        ),
-        {},
-    )
+    table = TABLE_1 if shape == "plane" else TABLE_2
+    for theirs in table:
+        if number and theirs.pose == int(number[1]):
+            radii = None
+            if isinstance(theirs, SpherePose):
+                radii = theirs.stereo_radius_mm, theirs.pixelwise_radius_mm
+            return _letter_row(theirs.stereo_mm, theirs.pixelwise_mm, radii)
+    return {}
 
 
 def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | None = None) -> Row:

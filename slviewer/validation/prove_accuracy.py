@@ -7,7 +7,7 @@ it happens in memory, one capture after another: a full-size session of so many 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 from statistics import fmean
 from time import perf_counter
@@ -19,28 +19,22 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import calibrate_pixelwise
 from slviewer.errors import InputError
 from slviewer.evaluation.compare import Comparison, fit_clouds
+from slviewer.evaluation.fit import ShapeResult, evaluate_shape
 from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
-from slviewer.evaluation.plane import evaluate_plane
 from slviewer.evaluation.render import Row
-from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.fringe.phase import PhaseMap
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
-from slviewer.simulation.boards import BoardShape
+from slviewer.records.verification import Shape
+from slviewer.simulation.boards import FLAT, BoardShape
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import PerfectModel
-from slviewer.target.board import Board
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.rendered_calibration import (
-    DEFAULT_SETTINGS,
-    CalibrationSettings,
-    calibrate_rendered,
-    render_phase,
-)
+from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
 COVERED = 6
@@ -73,7 +67,7 @@ class RigCase:
     seed: int = 0
     texture: Literal["coarse", "fine"] = "coarse"
     local_distortion_px: float | None = None
-    shape: BoardShape = field(default_factory=BoardShape)
+    shape: BoardShape = FLAT
 
     def rig(self, scale: float) -> SimulatedRig:
         """The rig, its camera at ``scale`` times the Letter's resolution."""
@@ -154,25 +148,10 @@ class RigFigures:
         return radius, spacing
 
 
-def prove_accuracy(
-    scale: float = 1.0,
-    *,
-    rigs: Sequence[RigCase] | None = None,
-    poses: int = POSES,
-    shapes: Sequence[str] = (),
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
-    seed: int = 0,
-    progress: Progress = ignore_progress,
-) -> Proof:
-    """Calibrate and measure one rig after another; by default the six of ``rig_cases``.
-
-    ``shapes``: those of the Letter's planes and spheres that are measured; by default all.
-    """
-    cases = {case.name: case for case in (rig_cases(seed) if rigs is None else rigs)}
-    figures = [
-        measure_rig(case, scale, poses, report, shapes, settings)
-        for _, case, report in track(progress, cases)
-    ]
+def prove_accuracy(scale: float, seed: int, progress: Progress) -> Proof:
+    """Calibrate and measure the six of ``rig_cases``, one rig after another."""
+    cases = {case.name: case for case in rig_cases(seed)}
+    figures = [measure_rig(case, scale, report) for _, case, report in track(progress, cases)]
     return judge_accuracy(figures, scale)
 
 
@@ -235,29 +214,14 @@ def _make_row(rig: RigFigures) -> Row:
     }
 
 
-def measure_rig(
-    case: RigCase,
-    scale: float,
-    poses: int,
-    progress: Progress = ignore_progress,
-    shapes: Sequence[str] = (),
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
-) -> RigFigures:
-    """Calibrate a rig from ``poses`` rendered captures of its board, and measure shapes with it.
-
-    ``shapes``: names among the Letter's ten planes and six spheres; by default all.
-    """
+def measure_rig(case: RigCase, scale: float, progress: Progress) -> RigFigures:
+    """Calibrate a rig from ``POSES`` rendered captures of its board, and measure the Letter's ten
+    planes and six spheres with it."""
     start = perf_counter()
     rig = case.rig(scale)
-    plan = letter_plan(rig, Board.parse(settings.target), poses, case.shape)
-    measured_shapes = {
-        name: scene
-        for name, scene in plan.items()
-        if name.startswith(("plane_", "sphere_")) and (not shapes or name in shapes)
-    }
-    stereo, splined, observations = calibrate_rendered(
-        rig, plan, part(progress, 0.0, 0.6), settings
-    )
+    plan = letter_plan(rig, poses=POSES, shape=case.shape)
+    shapes = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
+    stereo, splined, observations = calibrate_rendered(rig, plan, part(progress, 0.0, 0.6))
     models: dict[str, Model] = {
         "stereo": stereo,
         "pixelwise": calibrate_pixelwise(observations, stereo),
@@ -267,17 +231,15 @@ def measure_rig(
     covered = covered_pixels(observations)
     planes: dict[str, PlaneFigures] = {}
     spheres: dict[str, Spheres] = {}
-    fits: dict[str, dict[str, SphereResult]] = {}
-    for name, scene, _ in track(progress, measured_shapes, 0.6, 1.0):
-        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name), settings)
-        comparison, measured = compare_fits(models, phase, covered, isinstance(scene, Spheres))
+    fits: dict[str, dict[str, ShapeResult]] = {}
+    for name, scene, _ in track(progress, shapes, 0.6, 1.0):
+        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name))
         if isinstance(scene, Spheres):
             spheres[name] = scene
-            for model, result in comparison.results.items():
-                assert isinstance(result, SphereResult)
+            for model, result in compare_fits(models, phase, covered, "sphere")[0].results.items():
                 fits.setdefault(model, {})[name] = result
         else:
-            planes[name] = _make_plane_figures(comparison, measured)
+            planes[name] = _make_plane_figures(*compare_fits(models, phase, covered, "plane"))
     return RigFigures(
         case.name,
         case.seed,
@@ -312,7 +274,7 @@ def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:
 
 
 def compare_fits(
-    models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, is_sphere: bool
+    models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, shape: Shape
 ) -> tuple[Comparison, float]:
     """Every model's fit to one capture over the covered pixels, and the share of these that splined
     measures."""
@@ -324,20 +286,18 @@ def compare_fits(
             np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma
         )
     comparison = fit_clouds(
-        "sphere" if is_sphere else "plane",
+        shape,
         {name: clouds[name] for name in JUDGED},
         phase.illuminated,
         depth_range=DEPTH_RANGE_MM,
-        radius=SPHERE_RADIUS_MM if is_sphere else None,
+        radius=SPHERE_RADIUS_MM,
     )
-    splined = comparison.results["splined"]
+    start = comparison.results["splined"].shape
     for name in clouds.keys() - set(JUDGED):
         points, sigma = clouds[name].points, clouds[name].sigma_z
         try:
-            comparison.results[name] = (
-                evaluate_sphere(points, comparison.common, sigma, SPHERE_RADIUS_MM, splined.sphere)
-                if isinstance(splined, SphereResult)
-                else evaluate_plane(points, comparison.common, sigma, splined.plane)
+            comparison.results[name] = evaluate_shape(
+                shape, points, comparison.common, sigma, start=start
             )
         except InputError:
             continue  # it measures nothing there

@@ -12,9 +12,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
-from slviewer.evaluation.plane import PlaneResult
 from slviewer.evaluation.render import render
-from slviewer.evaluation.sphere import SphereResult
 from slviewer.evaluation.tables import letter_rows
 from slviewer.pipeline.merge import MergedScans
 from slviewer.pipeline.report import curve_at
@@ -241,9 +239,7 @@ def _make_sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePos
         true_radius_mm=letter.SPHERE_RADIUS_MM,
         rms_mm=_get_rms(comparison),
         noise_floor_mm=_get_noise_floor(comparison),
-        radius_mm={
-            m: r.radius_mm for m, r in comparison.results.items() if isinstance(r, SphereResult)
-        },
+        radius_mm={m: r.radius_mm for m, r in comparison.results.items()},
         letter_rms_mm={"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
         letter_radius_mm={
             "stereo": theirs.stereo_radius_mm,
@@ -262,7 +258,6 @@ def error_maps(title: str, comparison: Comparison) -> ErrorMaps:
 def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
     """Points (n, 3) mm of the stereo model's plane on the rays of the evaluated pixels."""
     result = comparison.results["stereo"]
-    assert isinstance(result, PlaneResult)
     v, u = np.nonzero(result.inliers)
     chosen = np.arange(0, len(u), max(1, len(u) // 5000))
     d = np.column_stack([rays[v[chosen], u[chosen]], np.ones(len(chosen))])

@@ -16,7 +16,7 @@ from trimesh.creation import box
 
 import slviewer as sl
 from slviewer.errors import InputError, SessionError, UsageError
-from slviewer.evaluation.region import find_spheres
+from slviewer.evaluation.fit import find_spheres
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region

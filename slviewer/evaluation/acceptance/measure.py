@@ -6,9 +6,8 @@ import numpy as np
 
 from slviewer.evaluation.acceptance.artefact import Artefact
 from slviewer.evaluation.acceptance.figures import make_form_error, make_length_error
+from slviewer.evaluation.fit import ShapeResult, evaluate_plane, evaluate_spheres
 from slviewer.evaluation.incidence import incidence
-from slviewer.evaluation.plane import PlaneResult, evaluate_plane
-from slviewer.evaluation.sphere import SphereResult, evaluate_spheres
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import PositionErrors, PropertyError
@@ -34,7 +33,6 @@ def measure_artefact(
 
     Raises InputError where the artefact is not found in the cloud.
     """
-    shown: list[PlaneResult] | list[SphereResult]
     noise = 0.0
     if artefact.kind == "plane":
         shown = [evaluate_plane(cloud.points, plate, cloud.sigma_z)]
@@ -60,7 +58,7 @@ def measure_artefact(
 
 
 def _measure_balls(
-    artefact: Artefact, cloud: Cloud, balls: list[SphereResult], position: str
+    artefact: Artefact, cloud: Cloud, balls: list[ShapeResult], position: str
 ) -> tuple[list[PropertyError], float]:
     """The figures of one ball or two, and the noise of a length between their centres (of a
     diameter, for one)."""
@@ -90,7 +88,7 @@ def _measure_balls(
     return figures, noise
 
 
-def _fit_covariance(points: np.ndarray, ball: SphereResult) -> np.ndarray:
+def _fit_covariance(points: np.ndarray, ball: ShapeResult) -> np.ndarray:
     """(4, 4) mm^2 of centre and radius, from the scatter of the points about the sphere."""
     offsets = points[ball.inliers].astype(np.float64) - ball.sphere.centre
     J = np.column_stack([unit_vectors(offsets), np.ones(len(offsets))])
