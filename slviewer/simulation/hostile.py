@@ -128,32 +128,31 @@ def hostile_light(
 
 
 def expose_frames(
-    rig: SimulatedRig,
+    renderer: Renderer,
     light: np.ndarray,
     sequence: PatternSequence,
-    room_light: np.ndarray,
     number: int = 0,
     fault: Fault | None = None,
     severity: Severity = "mild",
     seed: int = 0,
 ) -> np.ndarray:
-    """(n, h, w) uint8: frames that the camera records of the ``light`` (n, h, w), with the fault
-    applied.
+    """(n, h, w) uint8: frames that the renderer's camera records of the ``light`` (n, h, w), with
+    the fault applied.
 
-    ``room_light`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the
-    same noise, fault or not.
+    The same ``number`` and ``seed`` give the same noise, fault or not.
     """
     level = fault.level(severity) if fault else 0.0
     name = zlib.crc32(repr(fault.words).encode()) if fault else 0
-    shot = Shot(number, sequence, np.random.default_rng([rig.seed, seed, number, name]), room_light)
+    sensor, noise_seed = renderer.rig.sensor, [renderer.rig.seed, seed, number]
+    rng = np.random.default_rng([*noise_seed, name])
+    shot = Shot(sequence, rng, renderer.room_light())
     if fault and fault.light:
         light = fault.light(light, level, shot)
-    sensor = rig.sensor
     noise = (
         np.array([sensor.dark_level, sensor.read_variance * _SUBLEVELS, sensor.shot_variance])
         * _SUBLEVELS
     )
-    keys = np.random.default_rng([rig.seed, seed, number, 0xF0]).integers(
+    keys = np.random.default_rng([*noise_seed, 0xF0]).integers(
         0, 2**32, (len(light), 2), dtype=np.uint32
     )
     signal = np.empty(light.shape, np.uint16)

@@ -12,12 +12,10 @@ from slviewer.fringe.sequence import Kind, PatternSequence
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """The capture that a fault acts on: its number among its kind, its sequence, and a generator of
-    its own. ``room_light``: (h, w) float32, even light as strong as the projector's white, in grey
-    levels.
+    """The capture that a fault acts on: its sequence, and a generator of its own. ``room_light``:
+    (h, w) float32, even light as strong as the projector's white, in grey levels.
     """
 
-    number: int
     sequence: PatternSequence
     rng: np.random.Generator
     room_light: np.ndarray
@@ -31,26 +29,16 @@ def scale_frames(light: np.ndarray, gains: np.ndarray) -> np.ndarray:
     return light * np.asarray(gains, np.float32)[:, None, None]
 
 
-def drifting_gains(n: int, rms: float, rng: np.random.Generator) -> np.ndarray:
-    """(n,) gains around 1 with exactly this relative rms, independent from frame to frame."""
-    gains = rng.standard_normal(n)
-    gains = (gains - gains.mean()) / gains.std()
-    return 1 + rms * np.clip(gains, -2.5, 2.5) / np.clip(gains, -2.5, 2.5).std()
-
-
 def vary_exposure(light: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
-    """Automatic exposure: each frame has a gain of its own, of this relative rms."""
-    return scale_frames(light, drifting_gains(len(light), rms, shot.rng))
+    """Automatic exposure: each frame has a gain of its own, of exactly this relative rms."""
+    gains = shot.rng.standard_normal(len(light))
+    clipped = np.clip((gains - gains.mean()) / gains.std(), -2.5, 2.5)
+    return scale_frames(light, 1 + rms * clipped / clipped.std())
 
 
 def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
-    """Simulate an exposure control that starts too bright by ``off``; see `exposure_loop_gains`."""
-    return scale_frames(light, exposure_loop_gains(light, off))
-
-
-def exposure_loop_gains(light: np.ndarray, off: float) -> np.ndarray:
-    """(n,) gains of an exposure control that starts too bright by ``off`` and follows the mean
-    level of the last frame.
+    """Simulate an exposure control that starts too bright by ``off`` and follows the mean level of
+    the last frame.
 
     Its target is the mean level of all frames; each frame it takes 15 % of the way that is left.
     """
@@ -60,7 +48,7 @@ def exposure_loop_gains(light: np.ndarray, off: float) -> np.ndarray:
     for mean in means:
         gains.append(gain)
         gain *= (target / (gain * max(float(mean), 1e-3))) ** 0.15
-    return np.array(gains)
+    return scale_frames(light, np.array(gains))
 
 
 def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
@@ -103,7 +91,7 @@ def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
     return dark + (light - dark) * bands.astype(np.float32)[:, :, None]
 
 
-def add_crosstalk(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+def add_crosstalk(light: np.ndarray, share: float, shot: Shot | None = None) -> np.ndarray:
     """Mix a share of the previous image into each, as a display with a slow response does."""
     before = np.concatenate([light[:1], light[:-1]])
     return np.float32(1 - share) * light + np.float32(share) * before

@@ -3,7 +3,9 @@ of the scene."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
+from typing import TypeVar
 from zlib import crc32
 
 import numpy as np
@@ -22,6 +24,7 @@ from slviewer.validation.simulated_capture import (
 )
 
 Rng = np.random.Generator
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,14 @@ class FaultyCapture:
     frames: tuple[int, ...] = ()
 
 
+Strike = Callable[[CaptureSetup, Rng], FaultyCapture]
+
+
 @dataclass(frozen=True)
 class CaptureFault:
     """``strike`` puts the fault into a sound capture; ``kinds``: captures that can have it."""
 
-    strike: Callable[[CaptureSetup, Rng], FaultyCapture]
+    strike: Strike
     kinds: tuple[CaptureKind, ...]
 
 
@@ -65,6 +71,16 @@ def _faulty(
     """The capture with ``changes`` of its setup."""
     changed = replace(sound, **changes)  # type: ignore[arg-type]
     return FaultyCapture(changed, sound, frozenset(causes), tuple(frames))
+
+
+def _change(*causes: str, is_linear: bool = False, **changes: object) -> Strike:
+    """What only changes some fields of the setup, of a linear projector if that matters."""
+
+    def strike(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+        """The capture with the changes."""
+        return _faulty(replace(setup, gamma=1.0) if is_linear else setup, causes, (), **changes)
+
+    return strike
 
 
 def _count(setup: CaptureSetup) -> int:
@@ -113,21 +129,15 @@ def _draw_axes(rng: Rng) -> tuple[Axis, ...]:
     return choices[rng.integers(3)]
 
 
-def _set_axes(values: Mapping[Axis, float], default: float) -> PerAxis[float]:
-    """A pair of values, ``default`` for an axis that is missing."""
-    return PerAxis(*(values.get(axis, default) for axis in AXES))
+def _set_axes(axes: Sequence[Axis], value: T, otherwise: T) -> PerAxis[T]:
+    """A pair of values: one for some of the axes, and another for the others."""
+    return PerAxis(*(value if axis in axes else otherwise for axis in AXES))
 
 
 def _cover(setup: CaptureSetup) -> CaptureSetup:
     """The capture of a plane that reaches beyond the projector's field on all sides, so that all
     coordinates occur."""
-    view = replace(setup.view, scene="plane", field=0.85)
-    return replace(setup, view=view)
-
-
-def _linear(setup: CaptureSetup) -> CaptureSetup:
-    """The capture with a linear projector."""
-    return replace(setup, gamma=1.0)
+    return replace(setup, view=replace(setup.view, scene="plane", field=0.85))
 
 
 # The order of the frames
@@ -156,18 +166,13 @@ def _missing_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     return _faulty(setup, ["missing-frame"], _same_run(setup, k), order=order)
 
 
-def _is_same_shift(setup: CaptureSetup, a: int, b: int) -> bool:
-    """Whether two frames are steps of one period."""
-    return any(a in steps and b in steps for steps in _steps(setup.shown))
-
-
 def _exchange(setup: CaptureSetup, a: int, b: int) -> FaultyCapture:
     """Two frames have changed places."""
     order = list(range(_count(setup)))
     order[a], order[b] = b, a
     causes = ["frame-order"]
     first, second = setup.shown.frames[a], setup.shown.frames[b]
-    if _is_same_shift(setup, a, b):
+    if any(a in steps and b in steps for steps in _steps(setup.shown)):
         causes.append("step-order")
     elif first.kind == second.kind == "gray" and first.axis == second.axis:
         causes.append("bit-order")  # the same images
@@ -260,8 +265,7 @@ def _flip_sign(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     # phase steps alone, reversed along both axes, are those of a projector upside down
     axes = _draw_axes(rng) if setup.kind in CODED else (AXES[rng.integers(2)],)
     causes = ["step-order"] if setup.kind in CODED else ["step-order", "axis-reversed"]
-    sign = PerAxis(*(-1 if axis in axes else 1 for axis in AXES))
-    return _describe(setup, causes, phase_sign=sign)
+    return _describe(setup, causes, phase_sign=_set_axes(axes, -1, 1))
 
 
 def _omit_offset(setup: CaptureSetup, rng: Rng, offset: float) -> FaultyCapture:
@@ -269,14 +273,13 @@ def _omit_offset(setup: CaptureSetup, rng: Rng, offset: float) -> FaultyCapture:
     causes = ["phase-offset"]
     if setup.kind in CODED and abs(offset) > 3:
         causes.append("gray-origin")  # half a period: the same images
-    values = _set_axes({axis: offset for axis in _draw_axes(rng)}, 0.0)
+    values = _set_axes(_draw_axes(rng), offset, 0.0)
     return _faulty(setup, causes, shown=replace(setup.shown, phase_offset_rad=values))
 
 
 def _move_origin(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """The Gray code begins half a period earlier than described."""
-    half = setup.shown.period_px("x") / 2
-    values = _set_axes({axis: -0.5 - half for axis in _draw_axes(rng)}, -0.5)
+    values = _set_axes(_draw_axes(rng), -0.5 - setup.shown.period_px("x") / 2, -0.5)
     shown = replace(setup.shown, gray_origin_px=values)
     return _faulty(setup, ["gray-origin", "phase-offset"], shown=shown)
 
@@ -377,35 +380,10 @@ def _vary_exposure(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
 
 
-def _flicker(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The light of the projector and of the room varies by 10 % along the rows."""
-    return _faulty(setup, ["flicker"], flicker=0.1)
-
-
 def _switch_lamp(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """A lamp is switched on in the middle, of 30 % of the mean grey level."""
     k = _draw_middle(setup, rng, 0.35, 0.65)
     return _faulty(setup, ["room-light"], room_step=(k, 0.3))
-
-
-def _saturate(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """White saturates 30 % of the illuminated pixels."""
-    return _faulty(setup, ["saturation"], clipped_share=0.3)
-
-
-def _darken(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The brightest pixels reach 2.5 % of full scale."""
-    return _faulty(setup, ["dark"], exposure=0.025)
-
-
-def _bend_response(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The projector has a gamma of 2.2, which few steps do not average out."""
-    return _faulty(_linear(setup), ["gamma"], gamma=2.2)
-
-
-def _clip_sine(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The cosines are 40 + 200 cos, clipped to 0 ... 255."""
-    return _faulty(_linear(setup), ["gamma", "saturation"], wave=(40.0, 200.0))
 
 
 # The scene
@@ -424,11 +402,6 @@ def _move(setup: CaptureSetup, rng: Rng, steadily: bool) -> FaultyCapture:
     k = int(rng.choice(shifts[-1][1][1:])) if shifts else _draw_middle(setup, rng, 0.35, 0.65)
     motion = 0.15 * np.arange(n) if steadily else 1.5 * (np.arange(n) >= k)
     return _faulty(setup, ["moved"], motion_px=tuple(float(s) for s in motion), direction=direction)
-
-
-def _ghost(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """Each image holds 15 % of the one before."""
-    return _faulty(setup, ["ghosting"], ghost=0.15)
 
 
 def _narrow_stripes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -453,38 +426,39 @@ CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
     "neighbours exchanged": CaptureFault(_exchange_neighbours, ANY),
     "distant frames exchanged": CaptureFault(_exchange_distant, ANY),
     "frame repeated": CaptureFault(_repeat_frame, ANY),
-    "foreign frame": CaptureFault(lambda s, rng: _replace_frame(s, rng, FOREIGN), ANY),
-    "black frame": CaptureFault(lambda s, rng: _replace_frame(s, rng, BLACK), ANY),
+    "foreign frame": CaptureFault(partial(_replace_frame, pattern=FOREIGN), ANY),
+    "black frame": CaptureFault(partial(_replace_frame, pattern=BLACK), ANY),
     "steps reversed": CaptureFault(_reverse_steps, PHASE),
     # each order of three steps is a shift or a reversal
     "steps permuted": CaptureFault(_permute_steps, (*CODED, "micro")),
     "phase sign flipped": CaptureFault(_flip_sign, PHASE),
-    "offset of a quarter period": CaptureFault(
-        lambda s, rng: _omit_offset(s, rng, np.pi / 2), PHASE
-    ),
-    "offset of half a period": CaptureFault(lambda s, rng: _omit_offset(s, rng, np.pi), PHASE),
+    "offset of a quarter period": CaptureFault(partial(_omit_offset, offset=np.pi / 2), PHASE),
+    "offset of half a period": CaptureFault(partial(_omit_offset, offset=np.pi), PHASE),
     "Gray origin moved": CaptureFault(_move_origin, CODED),
-    "Gray cell halved": CaptureFault(lambda s, rng: _scale_cell(s, rng, 0.5), BITS),
-    "Gray cell doubled": CaptureFault(lambda s, rng: _scale_cell(s, rng, 2.0), BITS),
+    "Gray cell halved": CaptureFault(partial(_scale_cell, factor=0.5), BITS),
+    "Gray cell doubled": CaptureFault(partial(_scale_cell, factor=2.0), BITS),
     "bits reversed": CaptureFault(_reverse_bits, BITS),
     "two bits exchanged": CaptureFault(_exchange_bits, BITS),
     "period 12 % too long": CaptureFault(_scale_period, PHASE),
     "axes exchanged": CaptureFault(_exchange_axes, ANY),
     "axis mirrored": CaptureFault(_mirror_projector, ANY),
-    "projector too small": CaptureFault(lambda s, rng: _scale_projector(s, rng, 0.7), ANY),
-    "projector too large": CaptureFault(lambda s, rng: _scale_projector(s, rng, 1.5), ANY),
-    "drift of 8 %": CaptureFault(lambda s, rng: _drift(s, rng, 0.08), ANY),
-    "drift of 30 %": CaptureFault(lambda s, rng: _drift(s, rng, 0.3), ANY),
+    "projector too small": CaptureFault(partial(_scale_projector, factor=0.7), ANY),
+    "projector too large": CaptureFault(partial(_scale_projector, factor=1.5), ANY),
+    "drift of 8 %": CaptureFault(partial(_drift, share=0.08), ANY),
+    "drift of 30 %": CaptureFault(partial(_drift, share=0.3), ANY),
     "random exposure": CaptureFault(_vary_exposure, ANY),
-    "flicker": CaptureFault(_flicker, ANY),
+    "flicker": CaptureFault(_change("flicker", flicker=0.1), ANY),
     "lamp switched on": CaptureFault(_switch_lamp, ANY),
-    "saturated": CaptureFault(_saturate, ANY),
-    "dark": CaptureFault(_darken, ANY),
-    "gamma 2.2": CaptureFault(_bend_response, FEW),
-    "clipped cosine": CaptureFault(_clip_sine, PHASE),
-    "moved": CaptureFault(lambda s, rng: _move(s, rng, False), ANY),
-    "moving": CaptureFault(lambda s, rng: _move(s, rng, True), ANY),
-    "ghosting": CaptureFault(_ghost, ANY),
+    "saturated": CaptureFault(_change("saturation", clipped_share=0.3), ANY),
+    "dark": CaptureFault(_change("dark", exposure=0.025), ANY),
+    # few steps do not average it out
+    "gamma 2.2": CaptureFault(_change("gamma", is_linear=True, gamma=2.2), FEW),
+    "clipped cosine": CaptureFault(
+        _change("gamma", "saturation", is_linear=True, wave=(40.0, 200.0)), PHASE
+    ),
+    "moved": CaptureFault(partial(_move, steadily=False), ANY),
+    "moving": CaptureFault(partial(_move, steadily=True), ANY),
+    "ghosting": CaptureFault(_change("ghosting", ghost=0.15), ANY),
     "narrow stripes": CaptureFault(_narrow_stripes, ("gray",)),
 }
 

@@ -32,9 +32,7 @@ def rendered():
 def exposed(fault=None, severity="mild"):
     """The frames of a capture with a fault."""
     light, renderer = rendered()
-    return expose_frames(
-        RIG, light, SEQUENCE, renderer.room_light(), 0, FAULTS[fault] if fault else None, severity
-    )
+    return expose_frames(renderer, light, SEQUENCE, 0, FAULTS[fault] if fault else None, severity)
 
 
 def evaluated(fault=None, severity="mild"):

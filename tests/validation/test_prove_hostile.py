@@ -8,9 +8,10 @@ from facts import raises
 
 from slviewer.errors import InputError, UsageError
 from slviewer.simulation.hostile import FAULTS
-from slviewer.validation.hostile_captures import CaseReport, MeasuredScan
 from slviewer.validation.prove_hostile import (
+    CaseReport,
     Figures,
+    MeasuredScan,
     choose_cases,
     fit_gauge,
     judge_case,
