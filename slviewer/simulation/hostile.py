@@ -20,7 +20,7 @@ from slviewer.simulation import hostile_scenes as scene_faults
 from slviewer.simulation.assets import asset
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise
 from slviewer.simulation.hostile_frames import Shot
-from slviewer.simulation.hostile_scenes import MirrorTable, Pattern
+from slviewer.simulation.hostile_scenes import CleanScene, MirrorTable, Pattern
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
@@ -59,8 +59,8 @@ class Fault:
     struck: tuple[int, int, int] = (ALL, ALL, ALL)
     directions: tuple[Direction, ...] = ("scan", "calibration")
     rig: Callable[[SimulatedRig, float, int], SimulatedRig] | None = None
-    scene: Callable[[Scene, float, int], Scene] | None = None
-    moving: Callable[[Scene, float], Sequence[Scene]] | None = None
+    scene: Callable[[CleanScene, float, int], Scene] | None = None
+    moving: Callable[[CleanScene, float], Sequence[Scene]] | None = None
     pattern: Callable[[Pattern, float], Pattern] | None = None
     light: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
     signal: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
@@ -100,7 +100,7 @@ def hostile_light(
     fault: Fault,
     severity: Severity,
     rig: SimulatedRig,
-    scene: Scene,
+    scene: CleanScene,
     sequence: PatternSequence,
     number: int,
 ) -> tuple[np.ndarray, Renderer]:
@@ -111,9 +111,10 @@ def hostile_light(
     """
     level = fault.level(severity)
     rig = fault.rig(rig, level, number) if fault.rig else rig
-    scene = fault.scene(scene, level, number) if fault.scene else scene
+    places: Sequence[Scene] = [fault.scene(scene, level, number) if fault.scene else scene]
+    if fault.moving:
+        places = fault.moving(scene, level)
     change = fault.pattern or (lambda pattern, level: pattern)
-    places = fault.moving(scene, level) if fault.moving else [scene]
     parts = np.array_split(np.arange(len(sequence.frames)), len(places))
     rendered = [
         render_light(rig, place, sequence, lambda pattern: change(pattern, level))
@@ -169,7 +170,7 @@ def expose_frames(
 def _load_fault(row: dict[str, Any]) -> Fault:
     """The fault of a table of ``faults.toml``, in which a stage is the name of a function of this
     package."""
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
+    values = dict(row)
     for stage in _STAGES & row.keys():
         values[stage] = getattr(scene_faults, row[stage], None) or getattr(frame_faults, row[stage])
     return Fault(**values | {"causes": frozenset(row["causes"])})

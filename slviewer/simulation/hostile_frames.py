@@ -20,6 +20,10 @@ class Shot:
     rng: np.random.Generator
     room_light: np.ndarray
 
+    def indices(self, kind: str, axis: str) -> list[int]:
+        """Indices of the sequence's frames of a kind and an axis."""
+        return [i for i, f in enumerate(self.sequence.frames) if (f.kind, f.axis) == (kind, axis)]
+
 
 # Light before the sensor
 
@@ -72,7 +76,7 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
 def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
     """Switch a lamp on half way through the phase steps of x: even light, ``share`` of the
     projector's."""
-    steps = _select_indices(shot, "phase", "x")
+    steps = shot.indices("phase", "x")
     illuminated = light.copy()
     illuminated[steps[len(steps) // 2] :] += np.float32(share) * shot.room_light
     return illuminated
@@ -195,15 +199,13 @@ def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[in
     return out
 
 
-def _select_indices(shot: Shot, kind: str, axis: str) -> list[int]:
-    """Indices of the sequence's frames of a kind and an axis."""
-    return [i for i, f in enumerate(shot.sequence.frames) if (f.kind, f.axis) == (kind, axis)]
-
-
 def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move
     forward."""
-    phase_x, gray_y = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "y")
+    phase_x, gray_y = (
+        shot.indices("phase", "x"),
+        shot.indices("gray", "y"),
+    )
     if level != 0:
         frames = drop_frame(frames, phase_x[3])
     return frames if level == 1 else drop_frame(frames, gray_y[2])
@@ -212,7 +214,10 @@ def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Repeat the previous frame in place of a Gray frame of x (level 0), a phase step (1), or three
     of them (2)."""
-    phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
+    phase, gray = (
+        shot.indices("phase", "x"),
+        shot.indices("gray", "x"),
+    )
     places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
     return show_instead(frames, places, [place - 1 for place in places])
 
@@ -220,7 +225,10 @@ def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
 def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the
     first Gray frame (2)."""
-    phase, gray = _select_indices(shot, "phase", "x"), _select_indices(shot, "gray", "x")
+    phase, gray = (
+        shot.indices("phase", "x"),
+        shot.indices("gray", "x"),
+    )
     first = {0: gray[-2], 1: phase[1], 2: phase[-1]}[int(level)]
     return show_instead(frames, [first, first + 1], [first + 1, first])
 
@@ -229,7 +237,7 @@ def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.nda
     """Exchange all frames of x and y (level 0), the phase steps alone (1), or the Gray frames alone
     (2)."""
     kinds = {0: get_args(Kind), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
-    x, y = ([i for kind in kinds for i in _select_indices(shot, kind, axis)] for axis in ("x", "y"))
+    x, y = ([i for kind in kinds for i in shot.indices(kind, axis)] for axis in ("x", "y"))
     return show_instead(frames, x + y, y + x)
 
 
@@ -237,9 +245,9 @@ def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary
     one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
-        places = _select_indices(shot, "gray", axis)
+        places = shot.indices("gray", axis)
         if level == 2:
-            places += _select_indices(shot, "complementary", axis)
+            places += shot.indices("complementary", axis)
         frames = show_instead(frames, places, places[::-1])
     return frames
 
@@ -248,7 +256,7 @@ def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Reorder phase steps: begin a quarter period late (level 0), run backwards (1), or 0 2 4 ... 1
     3 5 (2)."""
     for axis in ("x", "y"):
-        places = _select_indices(shot, "phase", axis)
+        places = shot.indices("phase", axis)
         n = len(places)
         orders = (
             [(k + n // 4) % n for k in range(n)],

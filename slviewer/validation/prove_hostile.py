@@ -49,11 +49,10 @@ from slviewer.simulation.hostile import (
     hostile_light,
     render_light,
 )
-from slviewer.simulation.hostile_scenes import MirrorTable
+from slviewer.simulation.hostile_scenes import CleanScene, MirrorTable
 from slviewer.simulation.plans import planes, spheres, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
-from slviewer.simulation.scenes import Scene
 from slviewer.target.board import Board
 from slviewer.validation.proof import Proof, root_mean_square
 
@@ -207,14 +206,14 @@ class HostileBench:
         return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
 
     @cached_property
-    def scenes(self) -> dict[str, Scene]:
+    def scenes(self) -> dict[str, CleanScene]:
         """Target poses and scans by name, in the order of their numbers."""
-        scenes: dict[str, Scene] = {
+        scenes: dict[str, CleanScene] = {
             f"pose_{i:02d}": printed_board(BOARD, pose, seed=self.rig.seed)
             for i, pose in enumerate(target_poses(self.rig, BOARD, self.poses), 1)
         }
-        shapes: dict[str, Scene] = {**planes(), **spheres()}
-        return {**scenes, **{name: shapes[name] for name in SCANS}}
+        plane, ball = SCANS
+        return {**scenes, plane: planes()[plane], ball: spheres()[ball]}
 
     @property
     def targets(self) -> tuple[str, ...]:
