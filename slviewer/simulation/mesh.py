@@ -30,11 +30,6 @@ class MeshScene:
     pose: Pose
     albedo: float = 0.8
 
-    def __post_init__(self) -> None:
-        for name, values in (("vertices", self.vertices), ("triangles", self.triangles)):
-            if values.ndim != 2 or values.shape[1] != 3 or not len(values):
-                raise InputError(f"a mesh needs {name} (n, 3), got the shape {values.shape}")
-
     @cached_property
     def placed(self) -> np.ndarray:
         """Vertices (n, 3) float64 in the camera frame."""
@@ -42,7 +37,6 @@ class MeshScene:
 
     def trace(self, rays: np.ndarray) -> Surface:
         """Return the first triangle that each ray meets; back faces are ignored."""
-        shape = rays.shape[:2]
         index, uvs = self.cast(rays)
         hit = index >= 0
         corners = self.triangles[index[hit]]
@@ -57,24 +51,17 @@ class MeshScene:
         smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         front = facing < 0
         hit[hit] = front
-        surface = Surface(
-            np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan), np.zeros(shape, np.float32)
-        )
-        surface.points[hit], surface.normals[hit], surface.albedo[hit] = (
-            points[front],
-            smooth[front],
-            self.albedo,
-        )
+        surface = Surface.empty(rays.shape[:2])
+        surface.points[hit], surface.normals[hit] = points[front], smooth[front]
+        surface.albedo[hit] = self.albedo
         return surface
 
     def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w,
         2): where on it."""
         directions = directions_of(rays)
-        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(
-            np.float32
-        )
-        cast = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
+        lines = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
+        cast = self._caster.cast_rays(open3d().core.Tensor(lines))
         distance, index, uv = (
             cast[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")
         )

@@ -120,12 +120,6 @@ class Renderer:
         replaces the renderer's own, and `gain` multiplies the signal and its noise before they
         become 8 bits.
         """
-        width, height = self.rig.camera.size
-        if out.shape != (height, width) or out.dtype != np.uint8:
-            raise InputError(
-                f"a frame needs an array of shape {(height, width)} uint8, got {out.shape}"
-                f" {out.dtype}"
-            )
         light = self.light(
             pattern, lamp=lamp, exposure=(self.exposure if exposure is None else exposure) * gain
         )

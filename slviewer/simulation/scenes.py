@@ -10,8 +10,6 @@ from typing import Protocol
 
 import numpy as np
 
-from slviewer.errors import InputError
-
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -23,6 +21,12 @@ class Surface:
     points: np.ndarray
     normals: np.ndarray
     albedo: np.ndarray
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> "Surface":
+        """The surface where none of (h, w) pixels meets anything."""
+        nowhere = np.full((*shape, 3), np.nan)
+        return cls(nowhere, nowhere.copy(), np.zeros(shape, np.float32))
 
     def overlay(self, other: "Surface", where: np.ndarray) -> "Surface":
         """Return the surface with the pixels ``where`` (h, w) bool of another one."""
@@ -56,19 +60,12 @@ class Spheres:
     radius_mm: float
     albedo: float = 0.85
 
-    def __post_init__(self) -> None:
-        if self.centres.ndim != 2 or self.centres.shape[1] != 3 or self.radius_mm <= 0:
-            raise InputError(
-                "spheres need centres (n, 3) and a radius above 0, got the shape"
-                f" {self.centres.shape}"
-            )
-
     def trace(self, rays: np.ndarray) -> Surface:
         """The nearer intersection with the nearest sphere."""
         directions = directions_of(rays)
         squared = (directions**2).sum(-1)
         depth = np.full(rays.shape[:2], np.inf)
-        normals = np.full(directions.shape, np.nan)
+        surface = Surface.empty(rays.shape[:2])
         for centre in self.centres:
             along = directions @ centre / squared
             root = along**2 - (centre @ centre - self.radius_mm**2) / squared
@@ -76,11 +73,10 @@ class Spheres:
                 z = along - np.sqrt(root)
             nearer = (z > 0) & (z < depth)
             depth[nearer] = z[nearer]
-            normals[nearer] = (directions[nearer] * z[nearer, None] - centre) / self.radius_mm
-        points = directions * np.where(np.isfinite(depth), depth, np.nan)[..., None]
-        return Surface(
-            points, normals, np.where(np.isfinite(depth), self.albedo, 0).astype(np.float32)
-        )
+            surface.points[nearer] = directions[nearer] * z[nearer, None]
+            surface.normals[nearer] = (surface.points[nearer] - centre) / self.radius_mm
+            surface.albedo[nearer] = self.albedo
+        return surface
 
     def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
         """Return whether another part of the spheres is between the points and `source`."""
