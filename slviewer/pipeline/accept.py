@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.measure import SIZE, SPACING, measure_artefact
-from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
+from slviewer.evaluation.acceptance import (
+    SIZE,
+    SPACING,
+    Acceptance,
+    Artefact,
+    conclude_test,
+    measure_artefact,
+)
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
