@@ -6,7 +6,6 @@ what is assumed of devices is blur, noise and light. Errors of a calibration are
 prediction.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,18 +139,15 @@ def predict_rig(
     projector: PlannedProjector,
     distance: float,
     baseline: float,
-    light: PlannedLight | None = None,
+    light: PlannedLight,
     period_px: float | None = None,
-    depth_factors: Sequence[float] | np.ndarray = _DEPTHS,
 ) -> RigPlan:
     """Predict what a rig measures at a distance, mm.
 
-    ``period_px``: of the fringes, by default the best. ``depth_factors``, ascending: the depths, as
-    multiples of the distance, among which the usable range is found.
+    ``period_px``: of the fringes, by default the best.
 
     Raises InputError where the projector does not illuminate what the camera sees there.
     """
-    light = light or PlannedLight()
     rig = place(camera, projector, distance, baseline)
     view = replace(rig, camera=_thin(rig.camera))
     is_lit = _is_illuminated(view, distance)
@@ -169,7 +165,7 @@ def predict_rig(
     )
     sigmas, modulation = optics.predict_sigma(distance, period, is_lit)
     middle, corner = _middle_and_corner(sigmas)
-    depths = distance * np.asarray(depth_factors, float)
+    depths = distance * _DEPTHS
     is_usable = np.array([_is_usable(optics, z, period, coverage, middle) for z in depths])
     columns, rows = projector.size
     return RigPlan(

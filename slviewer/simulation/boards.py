@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.simulation.board_kernels import average_albedo, intersect
 from slviewer.simulation.scenes import Surface
 from slviewer.target.board import Board
-from slviewer.target.mark import Mark, mark_geometry
+from slviewer.target.mark import Mark
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +97,12 @@ class BoardScene:
         xy, points, normals = intersect(
             np.ascontiguousarray(rays), origin, axes, self.pose.R, bounds, shape
         )
-        if self.board is None:
-            kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
-        elif self.board.kind == "chessboard":
-            kind, pitch, cells = (
-                2,
-                self.board.pitch_mm,
-                np.array([[self.board.columns, self.board.rows]], np.int32),
-            )
-        else:
-            kind, pitch, cells = 1, self.board.pitch_mm, self._cells
+        board = self.board
+        kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
+        if board is not None:
+            kind, pitch, cells = 1, board.pitch_mm, self._cells
+            if board.kind == "chessboard":
+                kind, cells = 2, np.array([[board.columns, board.rows]], np.int32)
         mark = np.array([self.mark.x, self.mark.y, self.mark.radius]) if self.mark else np.zeros(3)
         circles = self.features[:, :2].copy()
         sheet = kind, pitch, cells, circles, self.diameter_mm / 2, mark, self.white, self.dark
@@ -130,42 +126,27 @@ class BoardScene:
         return cKDTree(self.features[:, :2]).query(middle)[1].astype(np.int32)
 
 
-def printed_board(
-    board: Board,
-    pose: Pose,
-    shape: BoardShape = FLAT,
-    seed: int = 0,
-    margin_mm: float | None = None,
-    marked: bool = False,
-) -> BoardScene:
-    """Return the scene of `board` printed on a plate, `margin_mm` around its outer features
-    (default 1.5 pitches).
+def printed_board(board: Board, pose: Pose, shape: BoardShape = FLAT, seed: int = 0) -> BoardScene:
+    """Return the scene of `board` printed on a plate, 1.5 pitches around its outer features.
 
     `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a
-    pitch wide; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco
-    boards, which the simulation does not print.
+    pitch wide. Raises `InputError` for ChArUco boards, which the simulation does not print.
     """
     if board.kind not in ("circles", "acircles", "chessboard"):
         kind = "ChArUco" if board.kind == "charuco" else board.kind
         raise InputError(
             f"the simulation does not print {kind} boards: use circles, acircles or a chessboard"
         )
-    diameter = 0.0 if board.kind == "chessboard" else board.pitch_mm / 2
-    margin = 1.5 * board.pitch_mm if margin_mm is None else margin_mm
+    margin = 1.5 * board.pitch_mm
     low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin
     corner, plate = ((float(x), float(y)) for x, y in (low, high - low))
-    misplacement = (
-        np.random.default_rng([seed, 0xB0A]).normal(0, 1, (len(board.points), 2))
-        * shape.misplaced_mm
-    )
-    if board.kind == "chessboard":
-        misplacement *= 0  # its corners share edges, so that they cannot move one by one
-    mark = mark_geometry(board) if marked else None
-    return BoardScene(pose, board, corner, plate, shape, misplacement, diameter, mark=mark)
+    misplacement, diameter = np.zeros((len(board.points), 2)), 0.0
+    if board.kind != "chessboard":  # its corners share edges, so that they cannot move one by one
+        draws = np.random.default_rng([seed, 0xB0A]).normal(0, 1, misplacement.shape)
+        misplacement, diameter = draws * shape.misplaced_mm, board.pitch_mm / 2
+    return BoardScene(pose, board, corner, plate, shape, misplacement, diameter)
 
 
-def blank_board(
-    pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: BoardShape = FLAT
-) -> BoardScene:
+def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0)) -> BoardScene:
     """A white plate of `size` mm whose middle is the origin of its frame."""
-    return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, shape, np.zeros((0, 2)))
+    return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, FLAT, np.zeros((0, 2)))

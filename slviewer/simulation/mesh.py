@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.registration.open3d_loader import open3d
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
@@ -48,11 +49,10 @@ class MeshScene:
         s, t = uvs[hit].T[..., None]
         n = self.vertex_normals
         smooth = (1 - s - t) * n[corners[:, 0]] + s * n[corners[:, 1]] + t * n[corners[:, 2]]
-        smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         front = facing < 0
         hit[hit] = front
         surface = Surface.empty(rays.shape[:2])
-        surface.points[hit], surface.normals[hit] = points[front], smooth[front]
+        surface.points[hit], surface.normals[hit] = points[front], unit_vectors(smooth)[front]
         surface.albedo[hit] = self.albedo
         return surface
 
@@ -84,7 +84,7 @@ class MeshScene:
         normals = np.zeros_like(self.placed)
         for k in range(3):
             np.add.at(normals, self.triangles[:, k], flat)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return unit_vectors(normals)
 
     @cached_property
     def _caster(self) -> Any:

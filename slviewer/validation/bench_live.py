@@ -87,18 +87,12 @@ class LiveFigures:
         )
 
 
-def live_rate(
-    scale: float = 0.5,
-    seconds: float = 30.0,
-    progress: Progress = ignore_progress,
-    *,
-    warm_s: float = _WARM_S,
-) -> LiveFigures:
+def live_rate(scale: float, seconds: float, progress: Progress = ignore_progress) -> LiveFigures:
     """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled
     at once.
 
-    Clouds are reconstructed by the stereo model of the true lenses; the figures begin `warm_s`
-    after the first one. Raises SlviewerError where live scanning fails.
+    Clouds are reconstructed by the stereo model of the true lenses; the figures begin a
+    second after the first one. Raises SlviewerError where live scanning fails.
     """
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
@@ -115,7 +109,7 @@ def live_rate(
                 _wait_until(lambda: len(app.server.viser.get_clients()) == 1, operator)
                 operator.start_live()
                 _wait_until(lambda: _get_shown_rate(operator) > 0, operator)
-                time.sleep(warm_s)
+                time.sleep(_WARM_S)
                 return _measure(operator, app.server, seconds, progress)
 
 

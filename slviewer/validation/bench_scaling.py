@@ -104,9 +104,7 @@ def _describe_growth(sizes: tuple[float, ...], seconds: list[float]) -> str:
     return f"grows with the power {exponent:.2f}: {verdict}"
 
 
-def _time_pixels(
-    rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = MEGAPIXELS
-) -> list[Row]:
+def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
     """Rows of decoding 25 frames of several sizes, which are resized from rendered ones."""
     sequence = one_axis(p18(rig.projector.size), "x")
     frames = Renderer(rig, scene).capture(sequence)
@@ -117,12 +115,10 @@ def _time_pixels(
         large = np.stack([cv2.resize(frame, None, fx=scale, fy=scale) for frame in frames])
         return lambda: decode(sequence, large, "x")
 
-    return _measure_growth("decode 25 frames, MP", megapixels, decode_size)
+    return _measure_growth("decode 25 frames, MP", MEGAPIXELS, decode_size)
 
 
-def _time_captures(
-    rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CAPTURES
-) -> list[Row]:
+def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
     """Rows of the wizard's snapshot of a session with so many captures."""
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
         sequence = one_axis(p18(rig.projector.size), "x")
@@ -140,16 +136,16 @@ def _time_captures(
                 reader = SessionReader(session, planner)
                 return lambda: reader.read(RigView(), None)
 
-            rows = _measure_growth("snapshot of a session, captures", counts, read_session)
+            rows = _measure_growth("snapshot of a session, captures", CAPTURES, read_session)
             planner.close()
     return rows
 
 
-def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]:
+def _time_scans(rig: SimulatedRig) -> list[Row]:
     """Rows of registering scans of an object on a turntable that makes `STEPS` or more, with
     made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    steps = max(STEPS, *counts)
+    steps = max(STEPS, *SCANS)
     for name, scene in turning(steps).items():
         points = Renderer(rig, scene).truth().points
         points[..., 2] += rng.normal(0, NOISE_MM, points.shape[:2])
@@ -162,7 +158,7 @@ def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]
         angles = {name: 360.0 / steps * k for k, name in enumerate(chosen)}
         return lambda: register_all(chosen, names[0], Starts(table_deg=angles))
 
-    return _measure_growth("register scans of a turn", counts, register)
+    return _measure_growth("register scans of a turn", SCANS, register)
 
 
 def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:

@@ -7,7 +7,7 @@ simulation; how the faults are made does not depend on how they are searched for
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Literal
@@ -74,9 +74,6 @@ class Named:
     frames: tuple[int, ...]
     severity: Severity
     message: str = ""
-
-
-Examine = Callable[[PatternSequence, np.ndarray], list[Named]]
 
 
 def examine_capture(sequence: PatternSequence, stack: np.ndarray) -> list[Named]:
@@ -167,9 +164,7 @@ def plan_cases(scale: float, seed: int) -> Iterator[tuple[str, CaptureKind, int]
             yield fault, kind, 1000 * seed + i // len(kinds)
 
 
-def examine_case(
-    fault: str, kind: CaptureKind, seed: int, examiner: Examine = examine_capture
-) -> CaptureCase:
+def examine_case(fault: str, kind: CaptureKind, seed: int) -> CaptureCase:
     """Render one capture, sound where ``fault`` is "none", examine it, and judge the result."""
     if fault == NO_FAULT:
         setup = draw_setup(kind, seed)
@@ -180,7 +175,7 @@ def examine_case(
     capture = render_capture(setup)
     start = perf_counter()
     try:
-        named: list[Named] | None = examiner(setup.described, capture.stack)
+        named: list[Named] | None = examine_capture(setup.described, capture.stack)
     except Exception as error:  # the other cases still have to run
         named, crash = None, f"{type(error).__name__}: {error}"
     seconds, errors = perf_counter() - start, ""

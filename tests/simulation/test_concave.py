@@ -70,7 +70,7 @@ def test_indirect_light_adds_up_and_needs_bounces():
 
 @pytest.mark.slow
 def test_scattered_light_keeps_its_amount_away_from_the_border():
-    scene = wax(POSE, indirect=Indirect(0, scattered=0.6, reach_mm=3.0))
+    scene = wax(POSE)
     inner = np.abs(scene.vertices[:, :2]).max(axis=1) < 25
     assert scene._scattering.sum(axis=1)[inner] == pytest.approx(1.0, abs=0.1)
 

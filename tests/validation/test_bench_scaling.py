@@ -38,11 +38,13 @@ def test_the_exponent_of_the_growth_is_stated_beside_the_last_size(
 
 @pytest.mark.computes
 @pytest.mark.slow
-def test_pixels_captures_and_scans_are_measured() -> None:
+def test_pixels_captures_and_scans_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = letter(0.15)
     scene = letter_plan(rig, poses=1)["pose_01"]
-    rows = bench_scaling._time_pixels(rig, scene, (0.05, 0.1))
-    rows += bench_scaling._time_captures(rig, scene, (2, 4))
-    rows += bench_scaling._time_scans(rig, (2, 3))
+    monkeypatch.setattr(bench_scaling, "MEGAPIXELS", (0.05, 0.1))
+    monkeypatch.setattr(bench_scaling, "CAPTURES", (2, 4))
+    monkeypatch.setattr(bench_scaling, "SCANS", (2, 3))
+    rows = bench_scaling._time_pixels(rig, scene) + bench_scaling._time_captures(rig, scene)
+    rows += bench_scaling._time_scans(rig)
     assert len(rows) == 6 and all(row["ms"] > 0.01 and row["MB"] > 0 for row in rows)
     assert all(missing_facts(row["note"], "linear") == [] for row in rows[1::2])

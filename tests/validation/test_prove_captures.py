@@ -12,6 +12,7 @@ from facts import missing_facts
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_progress
+from slviewer.validation import prove_captures as captures
 from slviewer.validation.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
 from slviewer.validation.prove_captures import (
     NO_FAULT,
@@ -148,9 +149,10 @@ def test_few_wrong_pixels_are_harmful() -> None:
 
 
 @pytest.mark.computes
-def test_each_case_is_examined_and_judged() -> None:
+def test_each_case_is_examined_and_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(*found: Named) -> CaptureCase:
-        return examine_case("late from the start", "multifrequency", 0, lambda *_: list(found))
+        monkeypatch.setattr(captures, "examine_capture", lambda *_: list(found))
+        return examine_case("late from the start", "multifrequency", 0)
 
     assert find(Named("frame-lag", (), "bad")).outcome == "right"
     assert find(Named("gamma-ray", (), "bad")).outcome == "wrong"
@@ -159,15 +161,17 @@ def test_each_case_is_examined_and_judged() -> None:
     def crash(sequence: PatternSequence, stack: np.ndarray) -> list[Named]:
         raise ZeroDivisionError("a fault of the program")
 
-    case = examine_case(NO_FAULT, "gray", 0, crash)
+    monkeypatch.setattr(captures, "examine_capture", crash)
+    case = examine_case(NO_FAULT, "gray", 0)
     assert case.outcome == "CRASH" and missing_facts(case.text(), "ZeroDivisionError") == []
 
 
 @pytest.mark.computes
-def test_a_fault_that_changes_nothing_is_harmless() -> None:
-    case = examine_case("steps reversed", "p18", 0, lambda *_: [])
+def test_a_fault_that_changes_nothing_is_harmless(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(captures, "examine_capture", lambda *_: [])
+    case = examine_case("steps reversed", "p18", 0)
     assert case.outcome == "HARMFUL"
-    case = examine_case("drift of 8 %", "gray", 0, lambda *_: [])
+    case = examine_case("drift of 8 %", "gray", 0)
     assert case.outcome == "harmless", "the inverse of each bit follows it at once"
 
 
