@@ -7,9 +7,9 @@ it.
 
 import tomllib
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
+T = TypeVar("T")
 Severity = Literal["mild", "medium", "severe"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 Direction = Literal["scan", "calibration"]
@@ -33,7 +34,8 @@ calibration."""
 
 ALL = 1000
 """More poses than any session has."""
-_STAGES = {"rig", "scene", "moving", "pattern", "light", "signal", "frames"}
+_OPTICAL = {"rig", "scene", "moving", "pattern"}
+_STAGES = _OPTICAL | {"light", "signal", "frames"}
 _SUBLEVELS = 256  # a 16-bit signal holds so many steps a grey level
 
 
@@ -42,11 +44,12 @@ class Fault:
     """One fault: what each severity is in ``words``, and the ``causes`` of which one must be named
     where it does harm.
 
-    Each of the functions takes and gives one stage of a capture, at ``levels[severity]``.
-    ``rig(rig, level, number)`` and ``scene(scene, level, number)`` of the capture of this number;
-    ``moving(scene, level)``: the scene in each of so many equal parts of the capture; ``pattern``:
-    what the projector makes of one; ``light`` and ``signal``: float32 grey levels (n, h, w), above
-    dark and with dark; ``frames``: uint8 (n, h, w), as they are recorded.
+    Each of the functions in ``stages`` takes and gives one stage of a capture, at
+    ``levels[severity]``. ``rig(rig, level, number)`` and ``scene(scene, level, number)`` of the
+    capture of this number; ``moving([scene], level)``: the scene in each of so many equal parts of
+    the capture; ``pattern(pattern, level)``: what the projector makes of one; ``light(light, level,
+    shot)`` and ``signal(levels, level, shot)``: float32 grey levels (n, h, w), above dark and with
+    dark; ``frames(frames, level, shot)``: uint8 (n, h, w), as they are recorded.
 
     ``must_measure``: at mild severity the program has to reach the floor. ``struck``: how many of
     the target poses it strikes, at each severity. ``directions``: where it can strike.
@@ -55,25 +58,26 @@ class Fault:
     words: tuple[str, str, str]
     levels: tuple[float, float, float]
     causes: frozenset[str]
+    stages: Mapping[str, Callable[..., Any]]
     must_measure: bool = False
     struck: tuple[int, int, int] = (ALL, ALL, ALL)
     directions: tuple[Direction, ...] = ("scan", "calibration")
-    rig: Callable[[SimulatedRig, float, int], SimulatedRig] | None = None
-    scene: Callable[[CleanScene, float, int], Scene] | None = None
-    moving: Callable[[CleanScene, float], Sequence[Scene]] | None = None
-    pattern: Callable[[Pattern, float], Pattern] | None = None
-    light: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
-    signal: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
-    frames: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
 
-    def level(self, severity: Severity) -> float:
-        """Return the strength of the fault at a severity."""
-        return self.levels[SEVERITIES.index(severity)]
+    def apply(self, stage: str, value: T, severity: Severity, *context: object) -> T:
+        """A stage of a capture with the fault; as it is where the fault is of other stages."""
+        if stage in self.stages:
+            level = self.levels[SEVERITIES.index(severity)]
+            value = self.stages[stage](value, level, *context)
+        return value
 
     @property
     def is_optical(self) -> bool:
         """Whether the fault changes the light, which has to be rendered again."""
-        return any((self.rig, self.scene, self.moving, self.pattern))
+        return not self.stages.keys().isdisjoint(_OPTICAL)
+
+
+SOUND = Fault(("", "", ""), (0.0, 0.0, 0.0), frozenset(), {})
+"""No fault."""
 
 
 def render_light(
@@ -109,15 +113,13 @@ def hostile_light(
     Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth
     comes from.
     """
-    level = fault.level(severity)
-    rig = fault.rig(rig, level, number) if fault.rig else rig
-    places: Sequence[Scene] = [fault.scene(scene, level, number) if fault.scene else scene]
-    if fault.moving:
-        places = fault.moving(scene, level)
-    change = fault.pattern or (lambda pattern, level: pattern)
+    rig = fault.apply("rig", rig, severity, number)
+    places = fault.apply("moving", [fault.apply("scene", scene, severity, number)], severity)
     parts = np.array_split(np.arange(len(sequence.frames)), len(places))
     rendered = [
-        render_light(rig, place, sequence, lambda pattern: change(pattern, level))
+        render_light(
+            rig, place, sequence, lambda pattern: fault.apply("pattern", pattern, severity)
+        )
         for place in places
     ]
     light = [light[part] for (light, _), part in zip(rendered, parts, strict=True)]
@@ -133,7 +135,7 @@ def expose_frames(
     light: np.ndarray,
     sequence: PatternSequence,
     number: int = 0,
-    fault: Fault | None = None,
+    fault: Fault = SOUND,
     severity: Severity = "mild",
     seed: int = 0,
 ) -> np.ndarray:
@@ -142,13 +144,11 @@ def expose_frames(
 
     The same ``number`` and ``seed`` give the same noise, fault or not.
     """
-    level = fault.level(severity) if fault else 0.0
-    name = zlib.crc32(repr(fault.words).encode()) if fault else 0
+    name = 0 if fault is SOUND else zlib.crc32(repr(fault.words).encode())
     sensor, noise_seed = renderer.rig.sensor, [renderer.rig.seed, seed, number]
     rng = np.random.default_rng([*noise_seed, name])
     shot = Shot(sequence, rng, renderer.room_light())
-    if fault and fault.light:
-        light = fault.light(light, level, shot)
+    light = fault.apply("light", light, severity, shot)
     noise = (
         np.array([sensor.dark_level, sensor.read_variance * _SUBLEVELS, sensor.shot_variance])
         * _SUBLEVELS
@@ -161,19 +161,21 @@ def expose_frames(
         frame = frame * np.float32(_SUBLEVELS)
         digitise(frame, noise, 255.0 * _SUBLEVELS, NORMAL_QUANTILES, keys[k], signal[k])
     levels = signal.astype(np.float32) / np.float32(_SUBLEVELS)
-    if fault and fault.signal:
-        levels = fault.signal(levels, level, shot)
+    levels = fault.apply("signal", levels, severity, shot)
     frames = np.rint(np.clip(levels, 0, 255)).astype(np.uint8)
-    return fault.frames(frames, level, shot) if fault and fault.frames else frames
+    return fault.apply("frames", frames, severity, shot)
 
 
 def _load_fault(row: dict[str, Any]) -> Fault:
     """The fault of a table of ``faults.toml``, in which a stage is the name of a function of this
     package."""
-    values = dict(row)
-    for stage in _STAGES & row.keys():
-        values[stage] = getattr(scene_faults, row[stage], None) or getattr(frame_faults, row[stage])
-    return Fault(**values | {"causes": frozenset(row["causes"])})
+    names = {stage: row.pop(stage) for stage in _STAGES & row.keys()}
+    stages = {
+        stage: getattr(scene_faults, name, None) or getattr(frame_faults, name)
+        for stage, name in names.items()
+    }
+    values = {"words": tuple(row["words"]), "causes": frozenset(row["causes"]), "stages": stages}
+    return Fault(**row | values)
 
 
 _TABLE = tomllib.loads(asset("simulation/faults.toml").read_text(encoding="utf-8"))

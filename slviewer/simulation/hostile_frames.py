@@ -218,7 +218,7 @@ def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
         shot.indices("phase", "x"),
         shot.indices("gray", "x"),
     )
-    places = {0: [gray[-2]], 1: [phase[2]], 2: [phase[1], phase[-2], gray[-1]]}[int(level)]
+    places = ([gray[-2]], [phase[2]], [phase[1], phase[-2], gray[-1]])[int(level)]
     return show_instead(frames, places, [place - 1 for place in places])
 
 
@@ -229,14 +229,14 @@ def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
         shot.indices("phase", "x"),
         shot.indices("gray", "x"),
     )
-    first = {0: gray[-2], 1: phase[1], 2: phase[-1]}[int(level)]
+    first = (gray[-2], phase[1], phase[-1])[int(level)]
     return show_instead(frames, [first, first + 1], [first + 1, first])
 
 
 def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     """Exchange all frames of x and y (level 0), the phase steps alone (1), or the Gray frames alone
     (2)."""
-    kinds = {0: get_args(Kind), 1: ("phase",), 2: ("gray", "complementary")}[int(level)]
+    kinds = (get_args(Kind), ("phase",), ("gray", "complementary"))[int(level)]
     x, y = ([i for kind in kinds for i in shot.indices(kind, axis)] for axis in ("x", "y"))
     return show_instead(frames, x + y, y + x)
 

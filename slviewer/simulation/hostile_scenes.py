@@ -216,10 +216,10 @@ def flex_board(scene: CleanScene, bow_mm: float, number: int) -> Scene:
     return replace(scene, shape=BoardShape(*bow.tolist()))
 
 
-def moving_scenes(scene: CleanScene, by_mm: float) -> list[Scene]:
-    """Return eleven copies of a scene that moves by `by_mm` mm and turns slightly about its own
-    origin, as if held by hand."""
-    moved: list[Scene] = []
+def moving_scenes(scenes: Sequence[CleanScene], by_mm: float) -> list[Scene]:
+    """Return eleven copies of the one scene, which moves by `by_mm` mm and turns slightly about its
+    own origin, as if held by hand."""
+    (scene,), moved = scenes, list[Scene]()
     for share in np.linspace(0, 1, 11):
         way = share * by_mm * np.array([0.7, 0.5, 0.5])
         turn = share * by_mm * (np.array([0.3, -0.5, 0.2]) / 100)

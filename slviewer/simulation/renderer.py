@@ -67,6 +67,7 @@ class Renderer:
     def __init__(self, rig: SimulatedRig, scene: Scene) -> None:
         self.rig = rig
         self.scene = scene
+        self._concave = scene if isinstance(scene, ConcaveScene) else None
         self._indirect: dict[Axis, np.ndarray] = {}
         self._lights: dict[float, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -152,7 +153,7 @@ class Renderer:
             np.float32(lamp) * light.table, light.offset,
             self._taps, stray, out,
         )  # fmt: skip
-        if isinstance(self.scene, ConcaveScene):
+        if self._concave:
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)
             out += np.float32(lamp * exposure) * indirect
         return out
@@ -163,20 +164,18 @@ class Renderer:
 
         The camera's PSF is neglected: this light varies slowly.
         """
+        assert self._concave is not None
         if axis not in self._indirect:
-            assert isinstance(self.scene, ConcaveScene)
-            self._indirect[axis] = self.scene.light_matrix(self.rig, axis)
+            self._indirect[axis] = self._concave.light_matrix(self.rig, axis)
         values = self._indirect[axis] @ profile_light.astype(np.float32)
-        width, height = self.rig.camera.size
-        weights, reflected = self._pixel_weights
-        return (weights @ values).reshape(height, width) * reflected
+        reflected = self._maps.even[self._frame]
+        return (self._pixel_weights @ values).reshape(reflected.shape) * reflected
 
     @cached_property
-    def _pixel_weights(self) -> tuple[csr_matrix, np.ndarray]:
-        """Weights of vertices (h w, n) at each pixel, and the light reflected of what it receives,
-        (h, w) float32."""
-        assert isinstance(self.scene, ConcaveScene)
-        return self.scene.pixel_weights(self.rig.camera.rays(0)), self._maps.even[self._frame]
+    def _pixel_weights(self) -> csr_matrix:
+        """Weights of the vertices (h w, n) of a concave scene at each pixel."""
+        assert self._concave is not None
+        return self._concave.pixel_weights(self.rig.camera.rays(0))
 
     def room_light(self) -> np.ndarray:
         """(h, w) float32: grey levels of even room light as strong as full white light from the
@@ -208,7 +207,7 @@ class Renderer:
         focus."""
         maps, sensor = self._maps, self.rig.sensor
         light = (maps.gain + self.rig.light.ambient * maps.even)[self._frame]
-        if isinstance(self.scene, ConcaveScene):
+        if self._concave:
             light = light + self._indirect_light("x", np.ones(self.rig.projector.size[0]))
         illuminated = light[maps.truth.mask]
         if not illuminated.size:
@@ -263,9 +262,7 @@ class Renderer:
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)
-        surface_share = (
-            1 - self.scene.indirect.scattered if isinstance(self.scene, ConcaveScene) else 1.0
-        )
+        surface_share = 1 - self._concave.indirect.scattered if self._concave else 1.0
         return _Maps(
             gain=(surface_share * reflected * shade * reached * illuminated).astype(np.float32),
             even=(reflected * hit).astype(np.float32),

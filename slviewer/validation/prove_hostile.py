@@ -42,6 +42,7 @@ from slviewer.simulation.boards import printed_board
 from slviewer.simulation.hostile import (
     FAULTS,
     SEVERITIES,
+    SOUND,
     Direction,
     Fault,
     Severity,
@@ -221,7 +222,7 @@ class HostileBench:
         return tuple(name for name in self.scenes if name.startswith("pose_"))
 
     def capture(
-        self, name: str, fault: Fault | None = None, severity: Severity = "mild"
+        self, name: str, fault: Fault = SOUND, severity: Severity = "mild"
     ) -> tuple[np.ndarray, Renderer, Renderer]:
         """(n, h, w) uint8, and the renderers of the scene as it was and of the clean one."""
         scene, number = self.scenes[name], list(self.scenes).index(name)
@@ -229,7 +230,7 @@ class HostileBench:
             self._light[name] = render_light(self.rig, scene, self.sequence)
         light, clean = self._light[name]
         renderer = clean
-        if fault is not None and fault.is_optical:
+        if fault.is_optical:
             light, renderer = hostile_light(fault, severity, self.rig, scene, self.sequence, number)
         frames = expose_frames(renderer, light, self.sequence, number, fault, severity, self.seed)
         return frames, renderer, clean
@@ -238,15 +239,15 @@ class HostileBench:
         self,
         session: Path,
         report: CaseReport,
-        fault: Fault | None = None,
+        fault: Fault = SOUND,
         severity: Severity = "mild",
     ) -> list[MeasuredScan]:
         """Calibrate from target poses, of which some have the fault if there is one, and measure
         the clean scans; the report gets the causes of the calibration's verdict too."""
         shutil.rmtree(session, ignore_errors=True)
-        struck = fault.struck[SEVERITIES.index(severity)] if fault else 0
+        struck = fault.struck[SEVERITIES.index(severity)]
         frames = {
-            name: self.capture(name, fault if i < struck else None, severity)[0]
+            name: self.capture(name, fault if i < struck else SOUND, severity)[0]
             for i, name in enumerate(self.targets)
         }
         self._store(session, "calibration", frames, report)
@@ -264,7 +265,7 @@ class HostileBench:
         self,
         session: Path,
         report: CaseReport,
-        fault: Fault | None = None,
+        fault: Fault = SOUND,
         severity: Severity = "mild",
     ) -> list[MeasuredScan]:
         """Measure all scans, captured with the fault if there is one, with the calibration of a
