@@ -22,6 +22,7 @@ from slviewer.fringe.decode import texture
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import Axis, PatternSequence
+from slviewer.geometry.vectors import box_middle
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.pose_evidence import DecodedPose
@@ -217,12 +218,12 @@ def _tilt_boards_alike(
 ) -> DiagnosedCalibration:
     """The diagnosed calibration from boards that are all tilted alike, within ``spread_deg``."""
     rng = np.random.default_rng(5)
-    middle = (bench.board.points.min(0) + bench.board.points.max(0)) / 2
+    middle = box_middle(bench.board.points)
     captures = []
     for i in range(FEW_POSES):  # fewer would be a fault of its own
         pose = bench.poses[i]
         R = rotation(np.radians([tilt_deg, 0, 0]) + np.radians(spread_deg) * rng.uniform(-1, 1, 3))
-        place = 0.7 * (pose.to_camera(middle) * [1, 1, 0]) + [0, 0, pose.to_camera(middle)[2]]
+        place = pose.to_camera(middle) * [0.7, 0.7, 1]
         captures.append(bench.examine(i, bench.render(Pose(R, place - R @ middle), i)))
     return bench.attempt(captures)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
+from slviewer.geometry.vectors import box_middle
 from slviewer.pipeline.feedback import Progress
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
@@ -74,8 +75,8 @@ def measure_ridges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
     and corrected."""
     board = Board.parse(PRINT)
     R = rotation(TILT)
-    middle = (board.points.min(axis=0) + board.points.max(axis=0)) / 2
-    scene = printed_board(board, Pose(R, np.array([0.0, 0.0, DEPTH_MM]) - R @ middle))
+    place = np.array([0.0, 0.0, DEPTH_MM]) - R @ box_middle(board.points)
+    scene = printed_board(board, Pose(R, place))
     renderer = Renderer(rig, scene)
     phase = render_phase(renderer, "print", seed)
     before, after = _measure_depth_errors(rig, phase, renderer.truth().points[..., 2])
