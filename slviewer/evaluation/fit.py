@@ -31,6 +31,11 @@ RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor wh
 LEAST_PIXELS = 200
 _SAMPLE = 40_000
 
+Points = np.ndarray
+"""Of an organised cloud (h, w, 3), or some of its points (n, 3), mm."""
+Map = np.ndarray
+"""(h, w): a value for each pixel of an organised cloud."""
+
 
 @dataclass(frozen=True, eq=False)
 class ShapeResult:
@@ -50,8 +55,8 @@ class ShapeResult:
     noise_floor_mm: float
     points: int
     excluded: int
-    error_map: np.ndarray
-    inliers: np.ndarray
+    error_map: Map
+    inliers: Map
 
     @property
     def plane(self) -> Plane:
@@ -91,7 +96,7 @@ class ShapeResult:
 class FittedShape(Protocol):
     """A surface with distances from it."""
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
+    def distance(self, points: Points) -> np.ndarray:
         """Signed distances (n,) mm of points (n, 3)."""
 
 
@@ -99,7 +104,7 @@ AnyShape = TypeVar("AnyShape", bound=FittedShape)
 
 
 def fit_settled(
-    fit: Callable[[np.ndarray, AnyShape], AnyShape], points: np.ndarray, start: AnyShape
+    fit: Callable[[np.ndarray, AnyShape], AnyShape], points: Points, start: AnyShape
 ) -> tuple[AnyShape, np.ndarray]:
     """Fit a shape to points (n, 3) mm, those beyond 5 robust sigma excluded, repeated until the set
     is stable.
@@ -116,7 +121,7 @@ def fit_settled(
     return shape, inliers
 
 
-def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
+def within_sigmas(residuals: np.ndarray, points: Points) -> np.ndarray:
     """(n,) bool: the residuals (n,) mm within 5 robust sigma of their median.
 
     Sigma is that of *all* residuals, so that it does not shrink from round to round until only the
@@ -127,9 +132,9 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def evaluate_plane(
-    points: np.ndarray,
-    mask: np.ndarray | None,
-    sigma_z: np.ndarray | None = None,
+    points: Points,
+    mask: Map | None,
+    sigma_z: Map | None = None,
     start: Plane | None = None,
 ) -> ShapeResult:
     """Fit a plane to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the distances from
@@ -143,9 +148,9 @@ def evaluate_plane(
 
 
 def evaluate_sphere(
-    points: np.ndarray,
-    mask: np.ndarray | None,
-    sigma_z: np.ndarray | None = None,
+    points: Points,
+    mask: Map | None,
+    sigma_z: Map | None = None,
     radius: float | None = None,
     start: Sphere | None = None,
 ) -> ShapeResult:
@@ -161,7 +166,7 @@ def evaluate_sphere(
 
 
 def evaluate_spheres(
-    points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
+    points: Points, count: int, sigma_z: Map | None = None, radius: float | None = None
 ) -> list[ShapeResult]:
     """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise
     as above."""
@@ -174,9 +179,9 @@ def evaluate_spheres(
 
 def evaluate_shape(
     shape: Shape,
-    points: np.ndarray,
-    mask: np.ndarray | None,
-    sigma_z: np.ndarray | None = None,
+    points: Points,
+    mask: Map | None,
+    sigma_z: Map | None = None,
     radius: float | None = None,
     start: Plane | Sphere | None = None,
 ) -> ShapeResult:
@@ -219,7 +224,7 @@ _FITS: dict[Shape, Callable[[np.ndarray], Plane | Sphere]] = {
 }
 
 
-def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:
+def noise_floor(shape: Plane | Sphere, points: Points, sigma_z: Map) -> float:
     """Root mean square of ``sigma_z |n . r|`` over points (n, 3), r = (x/z, y/z, 1), n the shape's
     normal there; mm.
 
@@ -240,12 +245,12 @@ def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) 
 
 def find_shape(
     shape: Shape,
-    points: np.ndarray,
-    mask: np.ndarray | None = None,
-    sigma_z: np.ndarray | None = None,
+    points: Points,
+    mask: Map | None = None,
+    sigma_z: Map | None = None,
     radius: float | None = None,
     start: Plane | Sphere | None = None,
-) -> tuple[Plane | Sphere, np.ndarray]:
+) -> tuple[Plane | Sphere, Map]:
     """Detect the shape with most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
 
     ``sigma_z`` ``(h, w)`` mm is the expected noise; ``radius`` in mm narrows the search for a
@@ -281,8 +286,8 @@ def find_shape(
 
 
 def find_spheres(
-    points: np.ndarray, count: int, sigma_z: np.ndarray | None = None, radius: float | None = None
-) -> list[tuple[Plane | Sphere, np.ndarray]]:
+    points: Points, count: int, sigma_z: Map | None = None, radius: float | None = None
+) -> list[tuple[Plane | Sphere, Map]]:
     """``count`` spheres of one cloud and their regions, from left to right in the image."""
     free = measured_pixels(points, None)
     spheres = []
@@ -296,9 +301,9 @@ def find_spheres(
 
 def start_shape(
     shape: Shape,
-    points: np.ndarray,
-    mask: np.ndarray,
-    sigma_z: np.ndarray | None = None,
+    points: Points,
+    mask: Map,
+    sigma_z: Map | None = None,
     radius: float | None = None,
 ) -> Plane | Sphere:
     """Estimate the shape that most points under ``mask`` agree with, by RANSAC."""
@@ -310,7 +315,7 @@ def start_shape(
     return ransac_sphere(some, tolerance, radius)[0]
 
 
-def _typical_noise(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
+def _typical_noise(sigma_z: Map | None, measured: Map) -> float:
     """Median noise of the measured pixels in mm; 0 where none is known."""
     if sigma_z is None:
         return 0.0
@@ -323,7 +328,7 @@ def _typical_noise(sigma_z: np.ndarray | None, measured: np.ndarray) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+def measured_pixels(points: Points, mask: Map | None) -> Map:
     """Return which pixels ``(h, w)`` of a cloud hold a point, under a mask if there is one;
     ``InputError`` if too few do."""
     if points.ndim != 3 or points.shape[2] != 3:
@@ -344,13 +349,13 @@ def measured_pixels(points: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     return measured
 
 
-def _sample_points(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
+def _sample_points(points: Points, measured: Map) -> np.ndarray:
     """Return some 40,000 of the measured points, (n, 3) float64."""
     chosen = points[measured]
     return chosen[:: -(-len(chosen) // _SAMPLE)].astype(np.float64)
 
 
-def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
+def _largest_patch(agreeing: Map) -> Map:
     """Return the largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and
     small holes are filled."""
     closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
@@ -374,7 +379,7 @@ def _largest_patch(agreeing: np.ndarray) -> np.ndarray:
     return patch | holes[labels]
 
 
-def _remove_rim(patch: np.ndarray) -> np.ndarray:
+def _remove_rim(patch: Map) -> Map:
     """Return the patch without its outermost pixels, where it ends inside the image."""
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     return cv2.erode(patch.astype(np.uint8), kernel, borderValue=1).astype(bool)

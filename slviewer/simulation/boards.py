@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.simulation.board_kernels import average_albedo, intersect
-from slviewer.simulation.scenes import Surface
+from slviewer.simulation.scenes import Points, Rays, Surface
 from slviewer.target.board import Board
 from slviewer.target.mark import Mark
 
@@ -18,7 +18,7 @@ class Pose:
     """T_camera_board: X_camera = R X_board + t, mm."""
 
     R: np.ndarray
-    t: np.ndarray
+    t: Points
 
     def __post_init__(self) -> None:
         if self.R.shape != (3, 3) or self.t.shape != (3,):
@@ -32,7 +32,7 @@ class Pose:
         """T_camera_board (4, 4), mm."""
         return np.block([[self.R, self.t[:, None]], [np.zeros(3), 1.0]])
 
-    def to_camera(self, points: np.ndarray) -> np.ndarray:
+    def to_camera(self, points: Points) -> np.ndarray:
         """Board-frame points (..., 3) in the camera frame."""
         return points @ self.R.T + self.t
 
@@ -89,7 +89,7 @@ class BoardScene:
         shape = self.shape
         return shape.bow_x_mm * (1 - X * X) + shape.bow_y_mm * (1 - Y * Y) + shape.twist_mm * X * Y
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Where the rays meet the plate; albedo averaged over each pixel."""
         bounds = np.array([*self.corner, *self.plate])
         shape = np.array([self.shape.bow_x_mm, self.shape.bow_y_mm, self.shape.twist_mm])
@@ -111,7 +111,7 @@ class BoardScene:
         points[outside], normals[outside] = np.nan, np.nan
         return Surface(points, normals, albedo)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return all False: a nearly flat plate shades no part of itself."""
         return np.zeros(len(points), bool)
 

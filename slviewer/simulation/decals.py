@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.mesh import MeshScene
-from slviewer.simulation.scenes import Scene, Surface, sphere
+from slviewer.simulation.scenes import Points, Rays, Scene, Surface, sphere
 from slviewer.target.coded import marker_modules
 
 WHITE, BLACK = 0.85, 0.09
@@ -48,7 +48,7 @@ class MarkedScene:
     pose: Pose
     decals: Sequence[Decal]
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """What the scene's rays meet, with the decals' albedo, averaged over each pixel's area."""
         surface = self.scene.trace(rays)
         with np.errstate(invalid="ignore"):
@@ -74,7 +74,7 @@ class MarkedScene:
             albedo[near] = total / _SAMPLES**2
         return Surface(surface.points, surface.normals, albedo)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """As the scene itself: paper shades nothing."""
         return self.scene.occluded(points, source)
 

@@ -19,7 +19,7 @@ from slviewer.simulation import hostile_frames as frame_faults
 from slviewer.simulation import hostile_scenes as scene_faults
 from slviewer.simulation.assets import asset
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise
-from slviewer.simulation.hostile_frames import Shot
+from slviewer.simulation.hostile_frames import Frames, Shot
 from slviewer.simulation.hostile_scenes import CleanScene, MirrorTable, Pattern
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
@@ -85,7 +85,7 @@ def render_light(
     scene: Scene,
     sequence: PatternSequence,
     change: Callable[[Pattern], Pattern] = lambda p: p,
-) -> tuple[np.ndarray, Renderer]:
+) -> tuple[Frames, Renderer]:
     """(n, h, w) float32: the light of every frame in grey levels above dark, before any noise; and
     its renderer."""
     renderer = Renderer(rig, scene)
@@ -107,7 +107,7 @@ def hostile_light(
     scene: CleanScene,
     sequence: PatternSequence,
     number: int,
-) -> tuple[np.ndarray, Renderer]:
+) -> tuple[Frames, Renderer]:
     """Render the light as ``render_light``, with the fault's effects on rig, scene and patterns.
 
     Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth
@@ -132,13 +132,13 @@ def hostile_light(
 
 def expose_frames(
     renderer: Renderer,
-    light: np.ndarray,
+    light: Frames,
     sequence: PatternSequence,
     number: int = 0,
     fault: Fault = SOUND,
     severity: Severity = "mild",
     seed: int = 0,
-) -> np.ndarray:
+) -> Frames:
     """(n, h, w) uint8: frames that the renderer's camera records of the ``light`` (n, h, w), with
     the fault applied.
 

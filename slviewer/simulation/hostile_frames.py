@@ -9,6 +9,9 @@ import numpy as np
 
 from slviewer.fringe.sequence import Kind, PatternSequence
 
+Frames = np.ndarray
+"""(n, h, w): light or a signal, float32 grey levels, or recorded images, uint8."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shot:
@@ -28,19 +31,19 @@ class Shot:
 # Light before the sensor
 
 
-def scale_frames(light: np.ndarray, gains: np.ndarray) -> np.ndarray:
+def scale_frames(light: Frames, gains: np.ndarray) -> Frames:
     """Each of the frames (n, h, w) times its gain (n,)."""
     return light * np.asarray(gains, np.float32)[:, None, None]
 
 
-def vary_exposure(light: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
+def vary_exposure(light: Frames, rms: float, shot: Shot) -> Frames:
     """Automatic exposure: each frame has a gain of its own, of exactly this relative rms."""
     gains = shot.rng.standard_normal(len(light))
     clipped = np.clip((gains - gains.mean()) / gains.std(), -2.5, 2.5)
     return scale_frames(light, 1 + rms * clipped / clipped.std())
 
 
-def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
+def follow_exposure(light: Frames, off: float, shot: Shot) -> Frames:
     """Simulate an exposure control that starts too bright by ``off`` and follows the mean level of
     the last frame.
 
@@ -55,7 +58,7 @@ def follow_exposure(light: np.ndarray, off: float, shot: Shot) -> np.ndarray:
     return scale_frames(light, np.array(gains))
 
 
-def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
+def add_flicker(light: Frames, depth: float, shot: Shot) -> Frames:
     """Add mains flicker under a rolling shutter: bands 1 + depth sin, at another phase in each
     frame."""
     n, height, _ = light.shape
@@ -64,7 +67,7 @@ def add_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
     return light * (1 + depth * np.sin(2 * np.pi * (rows + phase))).astype(np.float32)[:, :, None]
 
 
-def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
+def add_room_flicker(light: Frames, depth: float, shot: Shot) -> Frames:
     """Add ambient light, a fifth as strong as the projector's, that flickers by ``depth`` of its
     light."""
     n, height, _ = light.shape
@@ -73,7 +76,7 @@ def add_room_flicker(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
     return 0.8 * light + bands.astype(np.float32)[:, :, None] * shot.room_light
 
 
-def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+def switch_lamp_on(light: Frames, share: float, shot: Shot) -> Frames:
     """Switch a lamp on half way through the phase steps of x: even light, ``share`` of the
     projector's."""
     steps = shot.indices("phase", "x")
@@ -82,7 +85,7 @@ def switch_lamp_on(light: np.ndarray, share: float, shot: Shot) -> np.ndarray:
     return illuminated
 
 
-def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
+def add_colour_wheel(light: Frames, depth: float, shot: Shot) -> Frames:
     """Simulate a short exposure that sees part of the colour wheel's turn: fast bands of the
     projector's light."""
     n, height, _ = light.shape
@@ -95,19 +98,19 @@ def add_colour_wheel(light: np.ndarray, depth: float, shot: Shot) -> np.ndarray:
     return dark + (light - dark) * bands.astype(np.float32)[:, :, None]
 
 
-def add_crosstalk(light: np.ndarray, share: float, shot: Shot | None = None) -> np.ndarray:
+def add_crosstalk(light: Frames, share: float, shot: Shot | None = None) -> Frames:
     """Mix a share of the previous image into each, as a display with a slow response does."""
     before = np.concatenate([light[:1], light[:-1]])
     return np.float32(1 - share) * light + np.float32(share) * before
 
 
-def add_vignetting(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
+def add_vignetting(light: Frames, loss: float, shot: Shot) -> Frames:
     """Light that falls off to the image's corners by ``loss``."""
     y, x = (np.linspace(-1, 1, size) for size in light.shape[1:])
     return light * (1 - loss * (x[None] ** 2 + y[:, None] ** 2) / 2).astype(np.float32)
 
 
-def add_lens_dust(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
+def add_lens_dust(light: Frames, loss: float, shot: Shot) -> Frames:
     """Blurred spots and scratches on the camera's lens, the same in every frame and every
     capture."""
     _, height, width = light.shape
@@ -125,7 +128,7 @@ def add_lens_dust(light: np.ndarray, loss: float, shot: Shot) -> np.ndarray:
     return np.asarray(light * (1 - np.float32(loss) * blurred), np.float32)
 
 
-def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.ndarray:
+def add_defocus_gradient(light: Frames, sigma_px: float, shot: Shot) -> Frames:
     """Blur as a tilted lens does: sharp at the left edge, up to ``sigma_px`` (of 400 px of width)
     at the right."""
     width = light.shape[2]
@@ -145,21 +148,21 @@ def add_defocus_gradient(light: np.ndarray, sigma_px: float, shot: Shot) -> np.n
 # The sensor's signal, and what is recorded of it
 
 
-def encode_srgb(signal: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+def encode_srgb(signal: Frames, share: float, shot: Shot) -> Frames:
     """Encode grey levels by this ``share`` of the sRGB curve, 0 for linear light."""
     x = np.clip(signal / 255, 0, 1)
     curve = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
     return np.asarray(255 * ((1 - share) * x + share * curve), np.float32)
 
 
-def shift_white_balance(signal: np.ndarray, rms: float, shot: Shot) -> np.ndarray:
+def shift_white_balance(signal: Frames, rms: float, shot: Shot) -> Frames:
     """Apply a digital gain that varies from frame to frame as a random walk of relative ``rms``."""
     walk = np.cumsum(shot.rng.standard_normal(len(signal)))
     walk -= walk.mean()
     return scale_frames(signal, 1 + rms * walk / walk.std())
 
 
-def compress_jpeg(frames: np.ndarray, quality: float, shot: Shot | None = None) -> np.ndarray:
+def compress_jpeg(frames: Frames, quality: float, shot: Shot | None = None) -> Frames:
     """Compress each frame (n, h, w) uint8 as JPEG, and decode it."""
     out = np.empty_like(frames)
     for k, frame in enumerate(frames):
@@ -169,7 +172,7 @@ def compress_jpeg(frames: np.ndarray, quality: float, shot: Shot | None = None) 
     return out
 
 
-def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
+def add_hot_pixels(frames: Frames, share: float, shot: Shot) -> Frames:
     """Set this share of the pixels hot or dead, the same ones in every capture."""
     kind = np.random.default_rng(0x407).random(frames.shape[1:])
     return np.where(
@@ -180,18 +183,18 @@ def add_hot_pixels(frames: np.ndarray, share: float, shot: Shot) -> np.ndarray:
 # Frames in another order than described
 
 
-def delay_frames(frames: np.ndarray, by: float = 1, shot: Shot | None = None) -> np.ndarray:
+def delay_frames(frames: Frames, by: float = 1, shot: Shot | None = None) -> Frames:
     """The frames (n, h, w) delayed: each shows the pattern projected ``by`` frames before."""
     return np.roll(frames, int(by), axis=0)
 
 
-def drop_frame(frames: np.ndarray, index: int) -> np.ndarray:
+def drop_frame(frames: Frames, index: int) -> Frames:
     """The frames (n, h, w) with one dropped: later ones move forward by one, and the last is
     repeated."""
     return np.concatenate([np.delete(frames, index, axis=0), frames[-1:]])
 
 
-def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[int]) -> np.ndarray:
+def show_instead(frames: Frames, places: Sequence[int], sources: Sequence[int]) -> Frames:
     """The frames (n, h, w) with those at the indices ``places`` replaced by those at
     ``sources``."""
     out = frames.copy()
@@ -199,7 +202,7 @@ def show_instead(frames: np.ndarray, places: Sequence[int], sources: Sequence[in
     return out
 
 
-def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+def lose_frames(frames: Frames, level: float, shot: Shot) -> Frames:
     """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move
     forward."""
     phase_x, gray_y = (
@@ -211,7 +214,7 @@ def lose_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     return frames if level == 1 else drop_frame(frames, gray_y[2])
 
 
-def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+def repeat_frames(frames: Frames, level: float, shot: Shot) -> Frames:
     """Repeat the previous frame in place of a Gray frame of x (level 0), a phase step (1), or three
     of them (2)."""
     phase, gray = (
@@ -222,7 +225,7 @@ def repeat_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     return show_instead(frames, places, [place - 1 for place in places])
 
 
-def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+def swap_neighbours(frames: Frames, level: float, shot: Shot) -> Frames:
     """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the
     first Gray frame (2)."""
     phase, gray = (
@@ -233,7 +236,7 @@ def swap_neighbours(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     return show_instead(frames, [first, first + 1], [first + 1, first])
 
 
-def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+def exchange_axis_frames(frames: Frames, level: float, shot: Shot) -> Frames:
     """Exchange all frames of x and y (level 0), the phase steps alone (1), or the Gray frames alone
     (2)."""
     kinds = (get_args(Kind), ("phase",), ("gray", "complementary"))[int(level)]
@@ -241,7 +244,7 @@ def exchange_axis_frames(frames: np.ndarray, level: float, shot: Shot) -> np.nda
     return show_instead(frames, x + y, y + x)
 
 
-def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+def reverse_bits(frames: Frames, level: float, shot: Shot) -> Frames:
     """Gray bits in reverse order: of x (level 0), of both axes (1), of both with the complementary
     one (2)."""
     for axis in ("x",) if level == 0 else ("x", "y"):
@@ -252,7 +255,7 @@ def reverse_bits(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
     return frames
 
 
-def reorder_steps(frames: np.ndarray, level: float, shot: Shot) -> np.ndarray:
+def reorder_steps(frames: Frames, level: float, shot: Shot) -> Frames:
     """Reorder phase steps: begin a quarter period late (level 0), run backwards (1), or 0 2 4 ... 1
     3 5 (2)."""
     for axis in ("x", "y"):

@@ -9,7 +9,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.simulation.scenes import Scene, Spheres, Surface
+from slviewer.simulation.scenes import Points, Rays, Scene, Spheres, Surface
 
 Pattern = tuple[Axis | None, np.ndarray]
 """What `fringe.profile` gives: the axis and the grey levels along it."""
@@ -29,7 +29,7 @@ class SceneGroup:
 
     scenes: Sequence[Scene]
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Return the nearest surface of all scenes along each ray."""
         nearest, *others = (scene.trace(rays) for scene in self.scenes)
         for surface in others:
@@ -39,7 +39,7 @@ class SceneGroup:
             nearest = nearest.overlay(surface, is_nearer)
         return nearest
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Whether any of the scenes blocks the way from a point to the source."""
         blocked = [scene.occluded(points, source) for scene in self.scenes]
         blocked += [
@@ -63,7 +63,7 @@ class DirtyBoard:
     left: float = 0.35
     seed: int = 0
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """The board's surface, with reduced albedo at dirt."""
         surface = self.scene.trace(rays)
         hit = surface.albedo > 0
@@ -81,7 +81,7 @@ class DirtyBoard:
         albedo[hit] *= np.where(dirty[tuple(np.clip(cells, 0, shape - 1).T)], self.left, 1.0)
         return Surface(surface.points, surface.normals, albedo)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return whether points are shaded, as for the clean board."""
         return self.scene.occluded(points, source)
 
@@ -107,7 +107,7 @@ class MirrorTable:
         n = self.normal
         return np.eye(3) - 2 * np.outer(n, n), 2 * self.offset_mm * n
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Trace rays to the object, and below it to its mirror image."""
         surface, scene, (M, shift) = self.scene.trace(rays), self.scene, self.reflection
         if isinstance(scene, Spheres):
@@ -125,11 +125,11 @@ class MirrorTable:
             Surface(image.points @ M.T + shift, image.normals @ M.T, albedo), visible
         )
 
-    def is_direct(self, rays: np.ndarray) -> np.ndarray:
+    def is_direct(self, rays: Rays) -> np.ndarray:
         """Return the pixels (h, w) bool that see the object itself, and not its mirror image."""
         return np.isfinite(self.scene.trace(rays).points[..., 2])
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return whether points are shaded by the object; the table is below and shades nothing."""
         return self.scene.occluded(points, source)
 
@@ -157,7 +157,7 @@ def with_hand(scene: CleanScene, reach_mm: float, number: int = 0) -> Scene:
     return SceneGroup((scene, Spheres(fingers, _FINGER_RADIUS_MM, albedo=0.55)))
 
 
-def _is_behind_plate(board: BoardScene, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+def _is_behind_plate(board: BoardScene, points: Points, source: Points) -> np.ndarray:
     """(n,) bool: the way from `points` (n, 3) to `source` (3,) crosses the plate; points on it are
     not behind it."""
     start, end = (points - board.pose.t) @ board.pose.R, (source - board.pose.t) @ board.pose.R

@@ -11,7 +11,7 @@ from slviewer.geometry.vectors import unit_vectors
 from slviewer.registration.open3d_loader import open3d
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
-from slviewer.simulation.scenes import Surface, directions_of
+from slviewer.simulation.scenes import Points, Rays, Surface, directions_of
 
 # shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
 _LIFT_MM = 0.02
@@ -26,7 +26,7 @@ class MeshScene:
     the vertices.
     """
 
-    vertices: np.ndarray
+    vertices: Points
     triangles: np.ndarray
     pose: Pose
     albedo: float = 0.8
@@ -36,7 +36,7 @@ class MeshScene:
         """Vertices (n, 3) float64 in the camera frame."""
         return self.pose.to_camera(self.vertices.astype(np.float64))
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Return the first triangle that each ray meets; back faces are ignored."""
         index, uvs = self.cast(rays)
         hit = index >= 0
@@ -56,7 +56,7 @@ class MeshScene:
         surface.albedo[hit] = self.albedo
         return surface
 
-    def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def cast(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
         """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w,
         2): where on it."""
         directions = directions_of(rays)
@@ -67,7 +67,7 @@ class MeshScene:
         )
         return np.where(np.isfinite(distance), index.astype(np.int64), -1), uv.astype(float)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return whether the mesh is between `points` and `source`."""
         way = source - points
         lift = _LIFT_MM / np.linalg.norm(way, axis=-1, keepdims=True)

@@ -10,6 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
+Points = np.ndarray
+"""(..., 3) mm: places, directions or normals, in the camera's frame where no other is named."""
+Rays = np.ndarray
+"""(h, w, 2): x / z and y / z of each pixel's ray."""
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -18,8 +23,8 @@ class Surface:
     pixel's area, 0 where nothing is met.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
+    points: Points
+    normals: Points
     albedo: np.ndarray
 
     @classmethod
@@ -40,14 +45,14 @@ class Surface:
 class Scene(Protocol):
     """Protocol of scenes that can be rendered."""
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """What the camera rays (h, w, 2) = (x/z, y/z) meet."""
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """(n,) bool: the way from `points` (n, 3) on the surface to `source` (3,) is blocked."""
 
 
-def directions_of(rays: np.ndarray) -> np.ndarray:
+def directions_of(rays: Rays) -> np.ndarray:
     """(h, w, 3): the directions (x/z, y/z, 1) of rays (h, w, 2)."""
     return np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
 
@@ -56,11 +61,11 @@ def directions_of(rays: np.ndarray) -> np.ndarray:
 class Spheres:
     """One or several diffuse spheres: centres (n, 3), one radius, nothing behind them."""
 
-    centres: np.ndarray
+    centres: Points
     radius_mm: float
     albedo: float = 0.85
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """The nearer intersection with the nearest sphere."""
         directions = directions_of(rays)
         squared = (directions**2).sum(-1)
@@ -78,7 +83,7 @@ class Spheres:
             surface.albedo[nearer] = self.albedo
         return surface
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return whether another part of the spheres is between the points and `source`."""
         way = source - points
         blocked = np.zeros(len(points), bool)

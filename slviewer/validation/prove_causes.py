@@ -29,7 +29,7 @@ from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.records.verdict import Cause
 from slviewer.simulation.boards import FLAT, BoardShape, Pose, printed_board
-from slviewer.simulation.hostile_frames import delay_frames, drop_frame, show_instead
+from slviewer.simulation.hostile_frames import Frames, delay_frames, drop_frame, show_instead
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
@@ -50,7 +50,7 @@ EVERY = 5
 """Poses that a fault of every one of them is put into; more would show the same."""
 MANY = 18
 """Poses from which those that reach a corner are taken away."""
-FrameChange = Callable[[np.ndarray], np.ndarray]
+FrameChange = Callable[[Frames], Frames]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class FaultBench:
     count: int = POSES
     shape: BoardShape = FLAT
     steps: int = 18
-    _frames: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    _frames: dict[int, Frames] = field(default_factory=dict, init=False, repr=False)
     _examined: dict[int, Judged] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
@@ -75,7 +75,7 @@ class FaultBench:
         """Target poses that reach the image's corners."""
         return target_poses(self.rig, self.board, self.count)
 
-    def frames(self, i: int) -> np.ndarray:
+    def frames(self, i: int) -> Frames:
         """Return the frames (n, h, w) uint8 of the i-th pose without a fault, cached."""
         if i not in self._frames:
             self._frames[i] = self.render(self.poses[i], i)
@@ -83,7 +83,7 @@ class FaultBench:
 
     def render(
         self, pose: Pose, seed: int, exposure: float = 1.0, reverse: Axis | None = None
-    ) -> np.ndarray:
+    ) -> Frames:
         """(n, h, w) uint8: a capture of the board at a pose, in so many times the usual light, with
         the patterns of one axis reversed.
         """
@@ -101,7 +101,7 @@ class FaultBench:
     def examine(
         self,
         i: int,
-        frames: np.ndarray,
+        frames: Frames,
         sequence: PatternSequence | None = None,
         board: Board | None = None,
     ) -> Judged:
@@ -157,7 +157,7 @@ class FaultBench:
         ]
         return self.attempt(captures, board)
 
-    def attempt_with(self, i: int, frames: np.ndarray) -> DiagnosedCalibration:
+    def attempt_with(self, i: int, frames: Frames) -> DiagnosedCalibration:
         """Calibrate from all captures, with the frames (n, h, w) of the i-th replaced."""
         captures = self.examine_clean()
         captures[i] = self.examine(i, frames)
@@ -240,7 +240,7 @@ def _avoid_corner(bench: FaultBench) -> DiagnosedCalibration:
     return wide.attempt(captures)
 
 
-def _exchange_halves(frames: np.ndarray) -> np.ndarray:
+def _exchange_halves(frames: Frames) -> Frames:
     """Frames (n, h, w) with the first and the second half exchanged."""
     half = len(frames) // 2  # as many frames of one axis as of the other
     return show_instead(frames, range(2 * half), [*range(half, 2 * half), *range(half)])

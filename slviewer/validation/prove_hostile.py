@@ -50,6 +50,7 @@ from slviewer.simulation.hostile import (
     hostile_light,
     render_light,
 )
+from slviewer.simulation.hostile_frames import Frames
 from slviewer.simulation.hostile_scenes import CleanScene, MirrorTable
 from slviewer.simulation.plans import planes, spheres, target_poses
 from slviewer.simulation.renderer import Renderer
@@ -187,9 +188,7 @@ class HostileBench:
     poses: int = 7
     models: tuple[ModelName, ...] = ("stereo",)
     seed: int = 0
-    _light: dict[str, tuple[np.ndarray, Renderer]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    _light: dict[str, tuple[Frames, Renderer]] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def sequence(self) -> PatternSequence:
@@ -223,7 +222,7 @@ class HostileBench:
 
     def capture(
         self, name: str, fault: Fault = SOUND, severity: Severity = "mild"
-    ) -> tuple[np.ndarray, Renderer, Renderer]:
+    ) -> tuple[Frames, Renderer, Renderer]:
         """(n, h, w) uint8, and the renderers of the scene as it was and of the clean one."""
         scene, number = self.scenes[name], list(self.scenes).index(name)
         if name not in self._light:
@@ -278,7 +277,7 @@ class HostileBench:
         self,
         session: Path,
         role: Literal["calibration", "scan"],
-        captures: Mapping[str, np.ndarray],
+        captures: Mapping[str, Frames],
         report: CaseReport,
     ) -> None:
         """Write frames as images with a TOML, and import them as anyone would."""
@@ -342,7 +341,7 @@ def _match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> Meas
     )
 
 
-def write_images(folder: Path, frames: np.ndarray) -> list[str]:
+def write_images(folder: Path, frames: Frames) -> list[str]:
     """Write frames (n, h, w) uint8 as numbered image files, and return their names."""
     folder.mkdir(parents=True)
     names = [f"{k:02d}.bmp" for k in range(len(frames))]
@@ -352,7 +351,7 @@ def write_images(folder: Path, frames: np.ndarray) -> list[str]:
 
 
 def _named_causes(
-    sequence: PatternSequence, captures: Mapping[str, np.ndarray], messages: Sequence[str]
+    sequence: PatternSequence, captures: Mapping[str, Frames], messages: Sequence[str]
 ) -> list[frozenset[str]]:
     """The causes that messages about captures name: those of the program's own findings whose
     sentence is part of a message."""
