@@ -130,7 +130,19 @@ class Artefact:
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
         """Return an artefact from the table of its file. Raises InputError for what is missing,
         unknown or impossible."""
-        _check_keys(given)
+        for table, known in _KEYS.items():
+            part = given if not table else given.get(table, {})
+            if not isinstance(part, Mapping):
+                raise InputError(
+                    f"the artefact's [{table}] must be a table: write [{table}] and its values"
+                    " below it"
+                )
+            if unknown := set(part) - known:
+                place = f" in [{table}]" if table else ""
+                raise InputError(
+                    f"the artefact's file says {min(unknown)!r}{place}, which is unknown: use"
+                    f" {', '.join(sorted(known))}"
+                )
         kind = given.get("kind")
         if kind not in tuple(BALLS):  # it may be of any type
             raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
@@ -163,23 +175,6 @@ class Artefact:
             positions=_read_positions(measured.get("captures")),
             limits=Limits(**{key: _number(limits, key) for key in limits}),
         )
-
-
-def _check_keys(given: Mapping[str, Any]) -> None:
-    """Raise InputError for a table of the artefact's file that is none, and for a key that is not
-    in `_KEYS`."""
-    for table, known in _KEYS.items():
-        part = given if not table else given.get(table, {})
-        if not isinstance(part, Mapping):
-            raise InputError(
-                f"the artefact's [{table}] must be a table: write [{table}] and its values below it"
-            )
-        if unknown := set(part) - known:
-            raise InputError(
-                "the artefact's file says"
-                f" {min(unknown)!r}{f' in [{table}]' if table else ''}, which is unknown: use"
-                f" {', '.join(sorted(known))}"
-            )
 
 
 def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[Length, ...]:

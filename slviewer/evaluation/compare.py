@@ -159,6 +159,8 @@ def fit_clouds(
         start, region = find_shape(shape, every, None, sigma_z, radius, start)
     measured_pixels(every, region)  # says so if there is too little
     common = region & shared
+    lit = np.zeros_like(region) if illuminated is None else region & illuminated
+    lit_pixels = np.count_nonzero(lit) or np.nan
     results: dict[str, ShapeResult] = {}
     for model, cloud in clouds.items():
         try:
@@ -173,7 +175,8 @@ def fit_clouds(
         region=region,
         common=common,
         coverage={
-            model: _coverage_share(cloud, region, illuminated) for model, cloud in clouds.items()
+            model: np.count_nonzero(lit & cloud.mask) / lit_pixels
+            for model, cloud in clouds.items()
         },
         incidence=None if depth_range is None else incidence(every, region, depth_range),
         share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
@@ -196,15 +199,6 @@ def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
         missing = ~np.isfinite(points).all(axis=2)
         points[missing], sigma_z[missing] = cloud.points[missing], cloud.sigma_z[missing]
     return points, sigma_z
-
-
-def _coverage_share(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
-    """Return the share of the region's illuminated pixels that the cloud measures; NaN where
-    unknown."""
-    measurable = 0 if illuminated is None else np.count_nonzero(region & illuminated)
-    if illuminated is None or measurable == 0:
-        return float("nan")
-    return np.count_nonzero(region & illuminated & cloud.mask) / measurable
 
 
 def _known(value: float) -> float | None:

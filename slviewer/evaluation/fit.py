@@ -262,7 +262,7 @@ def find_shape(
     measured = measured_pixels(points, mask)
     noise = _typical_noise(sigma_z, measured)
     fitted = start or start_shape(shape, points, measured, sigma_z, radius)
-    patch = np.zeros_like(measured)
+    patch, rim = np.zeros_like(measured), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     for _ in range(20):
         before, reach = patch, PATCH_TOLERANCE_MM
         if isinstance(fitted, Sphere):
@@ -270,7 +270,8 @@ def find_shape(
         distances = fitted.distance(np.where(measured[..., None], points, 0.0))
         agreeing = measured & (np.abs(distances) < max(reach, 6.0 * noise))
         patch = _largest_patch(agreeing)
-        region = _remove_rim(patch)
+        # without the outermost pixels, where the patch ends inside the image
+        region = cv2.erode(patch.astype(np.uint8), rim, borderValue=1).astype(bool)
         shown = np.count_nonzero(region & agreeing)
         if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
             raise InputError(
@@ -377,9 +378,3 @@ def _largest_patch(agreeing: Map) -> Map:
     holes = small & inside
     holes[0] = False  # label 0 is the patch itself
     return patch | holes[labels]
-
-
-def _remove_rim(patch: Map) -> Map:
-    """Return the patch without its outermost pixels, where it ends inside the image."""
-    kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    return cv2.erode(patch.astype(np.uint8), kernel, borderValue=1).astype(bool)

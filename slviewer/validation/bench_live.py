@@ -108,7 +108,10 @@ def live_rate(scale: float, seconds: float, progress: Progress = ignore_progress
             with _viewing(app.server, draws=True):
                 _wait_until(lambda: len(app.server.viser.get_clients()) == 1, operator)
                 operator.start_live()
-                _wait_until(lambda: _get_shown_rate(operator) > 0, operator)
+                _wait_until(
+                    lambda: (live := operator.snapshot().live) is not None and live.shown_per_s > 0,
+                    operator,
+                )
                 time.sleep(_WARM_S)
                 return _measure(operator, app.server, seconds, progress)
 
@@ -240,12 +243,6 @@ def _wait_until(condition: Callable[[], bool], operator: Operator) -> None:
                 f" {_get_last_notice(operator)}"
             )
         time.sleep(0.02)
-
-
-def _get_shown_rate(operator: Operator) -> float:
-    """Frames per s that the live scan shows at present; 0 without one."""
-    live = operator.snapshot().live
-    return 0.0 if live is None else live.shown_per_s
 
 
 def _get_last_notice(operator: Operator) -> str:

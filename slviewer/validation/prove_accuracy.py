@@ -239,7 +239,15 @@ def measure_rig(case: RigCase, scale: float, progress: Progress) -> RigFigures:
             for model, result in compare_fits(models, phase, covered, "sphere")[0].results.items():
                 fits.setdefault(model, {})[name] = result
         else:
-            planes[name] = _make_plane_figures(*compare_fits(models, phase, covered, "plane"))
+            comparison, measured = compare_fits(models, phase, covered, "plane")
+            shares, own = comparison.incidence or {}, comparison.results["splined"]
+            planes[name] = PlaneFigures(
+                max(shares, key=lambda region: shares[region]),
+                {model: result.rms_mm for model, result in comparison.results.items()},
+                own.noise_floor_mm,
+                own.points,
+                measured,
+            )
     return RigFigures(
         case.name,
         case.seed,
@@ -303,17 +311,3 @@ def compare_fits(
             continue  # it measures nothing there
     to_score = comparison.region & clouds["stereo"].mask & clouds[FLOOR].mask
     return comparison, float(comparison.common.sum() / max(to_score.sum(), 1))
-
-
-def _make_plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:
-    """The figures of one plane from its comparison and the share of its pixels that were
-    measured."""
-    shares = comparison.incidence or {}
-    splined = comparison.results["splined"]
-    return PlaneFigures(
-        max(shares, key=lambda region: shares[region]),
-        {name: result.rms_mm for name, result in comparison.results.items()},
-        splined.noise_floor_mm,
-        splined.points,
-        measured,
-    )

@@ -29,7 +29,8 @@ from slviewer.pipeline.pose_evidence import DecodedPose
 from slviewer.pipeline.poses import Judged, read_pose
 from slviewer.records.verdict import Cause
 from slviewer.simulation.boards import FLAT, BoardShape, Pose, printed_board
-from slviewer.simulation.hostile_frames import Frames, delay_frames, drop_frame, show_instead
+from slviewer.simulation.hostile_frames import Frames, delay_frames, drop_frame
+from slviewer.simulation.hostile_scenes import set_gamma
 from slviewer.simulation.plans import rotation, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
@@ -207,12 +208,6 @@ def _move_board(bench: FaultBench, by_mm: Sequence[float], share: float) -> Diag
     return bench.attempt_with(2, frames)
 
 
-def _apply_gamma(bench: FaultBench, gamma: float) -> DiagnosedCalibration:
-    """The diagnosed calibration from captures of a projector with this gamma."""
-    light = replace(bench.rig.light, gamma=gamma)
-    return replace(bench, rig=replace(bench.rig, light=light)).attempt_disturbed()
-
-
 def _tilt_boards_alike(
     bench: FaultBench, tilt_deg: float, spread_deg: float
 ) -> DiagnosedCalibration:
@@ -240,16 +235,11 @@ def _avoid_corner(bench: FaultBench) -> DiagnosedCalibration:
     return wide.attempt(captures)
 
 
-def _exchange_halves(frames: Frames) -> Frames:
-    """Frames (n, h, w) with the first and the second half exchanged."""
-    half = len(frames) // 2  # as many frames of one axis as of the other
-    return show_instead(frames, range(2 * half), [*range(half, 2 * half), *range(half)])
-
-
 FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]] = {
     "x and y frames exchanged": (
         "axes-swapped",
-        lambda bench: bench.attempt_disturbed(_exchange_halves),
+        # as many frames of one axis as of the other
+        lambda bench: bench.attempt_disturbed(lambda frames: delay_frames(frames, len(frames) / 2)),
     ),
     "columns from right to left": (
         "axis-reversed",
@@ -302,7 +292,10 @@ FAULTS: Mapping[str, tuple[Cause, Callable[[FaultBench], DiagnosedCalibration]]]
     ),
     "overexposed": ("saturation", lambda bench: bench.attempt_disturbed(exposure=1.8)),
     "much overexposed": ("saturation", lambda bench: bench.attempt_disturbed(exposure=4.0)),
-    "gamma 2.2": ("gamma", lambda bench: _apply_gamma(bench, 2.2)),
+    "gamma 2.2": (
+        "gamma",
+        lambda bench: replace(bench, rig=set_gamma(bench.rig, 2.2, 0)).attempt_disturbed(),
+    ),
     "boards facing the camera": (
         "parallel-poses",
         lambda bench: _tilt_boards_alike(bench, 0.0, 0.7),

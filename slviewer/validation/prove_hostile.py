@@ -301,7 +301,14 @@ class HostileBench:
             messages = [*messages, str(error)]
             raise
         finally:
-            report.named += _named_causes(self.sequence, captures, messages)
+            # the causes of the program's own findings whose sentence is part of a message
+            report.named += [
+                frozenset({finding.cause})
+                for name, frames in captures.items()
+                if (about := [message for message in messages if name in message])
+                for finding in examine(self.sequence, frames).findings
+                if any(finding.sentence in message for message in about)
+            ]
 
     def _measure(
         self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport
@@ -348,20 +355,6 @@ def write_images(folder: Path, frames: Frames) -> list[str]:
     for name, frame in zip(names, frames, strict=True):
         cv2.imwrite(str(folder / name), frame)  # written ten times as fast as PNG
     return names
-
-
-def _named_causes(
-    sequence: PatternSequence, captures: Mapping[str, Frames], messages: Sequence[str]
-) -> list[frozenset[str]]:
-    """The causes that messages about captures name: those of the program's own findings whose
-    sentence is part of a message."""
-    return [
-        frozenset({finding.cause})
-        for name, frames in captures.items()
-        if (about := [message for message in messages if name in message])
-        for finding in examine(sequence, frames).findings
-        if any(finding.sentence in message for message in about)
-    ]
 
 
 def prove_hostile(

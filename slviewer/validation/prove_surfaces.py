@@ -107,7 +107,19 @@ def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
             preset: measure_errors(renderer, preset, model, seed)
             for preset in ("p18", "complementary", "multifrequency", "micro")
         }
-        rows += [_make_row(name, preset, each) for preset, each in errors.items()]
+        rows += [
+            {
+                "surface": name,
+                "patterns": preset,
+                "RMS mm": each.rms_mm,
+                "with mask": each.masked_rms_mm,
+                ">5 sigma %": round(100 * each.wrong, 2),
+                "of these masked %": 100 * each.caught,
+                "gross masked %": 100 * each.gross_caught,
+                "good masked %": round(100 * each.lost, 2),
+            }
+            for preset, each in errors.items()
+        ]
         gain = errors["p18"].rms_mm / errors["micro"].rms_mm
         gains.append(f"{name} {gain:.1f}")
         if not is_indirect:
@@ -151,17 +163,3 @@ def measure_errors(
         gross_caught,
         lost,
     )
-
-
-def _make_row(name: str, preset: str, errors: SequenceErrors) -> Row:
-    """Return a row of the table."""
-    return {
-        "surface": name,
-        "patterns": preset,
-        "RMS mm": errors.rms_mm,
-        "with mask": errors.masked_rms_mm,
-        ">5 sigma %": round(100 * errors.wrong, 2),
-        "of these masked %": 100 * errors.caught,
-        "gross masked %": 100 * errors.gross_caught,
-        "good masked %": round(100 * errors.lost, 2),
-    }

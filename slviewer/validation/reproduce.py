@@ -297,8 +297,17 @@ def _make_report_data(
         fit_rms_mm=pixelwise.median_rms_mm(pixelwise.depth_axis),
         planes=result.plane_rows(),
         spheres=[
-            _make_sphere_row(name, c, row)
-            for (name, c), row in zip(result.spheres.items(), letter.TABLE_2, strict=True)
+            SphereRow(
+                name,
+                theirs.region,
+                letter.SPHERE_RADIUS_MM,
+                _get_rms(c),
+                _get_noise_floor(c),
+                {m: r.radius_mm for m, r in c.results.items()},
+                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
+                {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
+            )
+            for (name, c), theirs in zip(result.spheres.items(), letter.TABLE_2, strict=True)
         ],
         spacings=[
             SpacingRow(name, known, measured)
@@ -329,20 +338,6 @@ def _make_report_data(
         ),
         poses_left_out=stereo.excluded,
         letter_points=letter.EXPERIMENT_3_POINTS,
-    )
-
-
-def _make_sphere_row(name: str, comparison: Comparison, theirs: letter.SpherePose) -> SphereRow:
-    """The report's row of one sphere, beside the Letter's values."""
-    return SphereRow(
-        name,
-        theirs.region,
-        letter.SPHERE_RADIUS_MM,
-        _get_rms(comparison),
-        _get_noise_floor(comparison),
-        {m: r.radius_mm for m, r in comparison.results.items()},
-        {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-        {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
     )
 
 

@@ -129,13 +129,16 @@ class SimulatedCapture:
 
 
 def build_sequence(kind: CaptureKind, view: View, blur_px: float) -> PatternSequence:
-    """The patterns of one kind for the projector of a view, x before y."""
+    """The patterns of one kind for the projector of a view, x before y; of Gray cells, two of which
+    are a stripe, those that the camera resolves."""
+    least = LEAST_STRIPE * max(1.0, blur_px) / (2 * view.pixels_per_column)
+    cell = min(cell for cell in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0) if cell >= least)
     builders: dict[CaptureKind, Callable[[Size], PatternSequence]] = {
         "p18": p18,
         "complementary": partial(complementary, steps=4),
         "multifrequency": partial(_three_periods, periods_of=_covering_periods),
         "heterodyne": partial(_three_periods, periods_of=_close_periods),
-        "gray": partial(gray_code, cell_px=_choose_cell(view, blur_px)),
+        "gray": partial(gray_code, cell_px=cell),
         "micro": micro,
     }
     return builders[kind](view.projector)
@@ -174,12 +177,6 @@ def gray_code(size: Size, cell_px: float) -> PatternSequence:
     return PatternSequence(
         size, (*frames, Frame("white"), Frame("black")), gray_origin_px=-0.5, gray_cell_px=cell_px
     )
-
-
-def _choose_cell(view: View, blur_px: float) -> float:
-    """Width px of Gray cells, of which the camera resolves the stripes, two cells wide."""
-    least = LEAST_STRIPE * max(1.0, blur_px) / (2 * view.pixels_per_column)
-    return min(cell for cell in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0) if cell >= least)
 
 
 def draw_setup(kind: CaptureKind, seed: int) -> CaptureSetup:
