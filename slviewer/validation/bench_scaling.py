@@ -21,7 +21,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Starts, register_all
@@ -56,7 +56,7 @@ LINEAR = 1.1
 """Largest exponent that counts as linear."""
 
 
-def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
+def time_scaling(progress: Progress) -> list[Row]:
     """Rows of each size, with the largest memory of its arrays, and of each kind the exponent of
     its growth."""
     rig = letter(SCALE)

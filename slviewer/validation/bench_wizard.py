@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.records.verification import Verification
 from slviewer.validation.bench_rows import Row, median, row, run_python
@@ -153,7 +153,7 @@ _WAITING = ("threading.py", "selectors.py", "socket.py", "queue.py", "subprocess
 """Files of the standard library in which a thread waits."""
 
 
-def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> list[Row]:
+def time_wizard(scale: float, progress: Progress) -> list[Row]:
     """Rows of what an operator waits for, with the seconds of the slowest acts of the Autopilot and
     of the functions that the slowest one spent them in.
 

@@ -19,10 +19,8 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.feedback import Progress
-from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.target.board import Board
 from slviewer.validation.proof import Proof, root_mean_square, track
 from slviewer.validation.prove_accuracy import rig_cases
 from slviewer.validation.rendered_calibration import calibrate_rendered
@@ -46,9 +44,10 @@ class PredictedErrors:
     def row(self, rig: str) -> dict[str, Any]:
         """The figures in mm; NaN where target poses support everything."""
         inside, elsewhere = self.supported, ~self.supported
-        predicted, true = (
-            root_mean_square(self.predicted[inside]),
-            root_mean_square(self.true[inside]),
+        predicted, true, predicted_elsewhere, true_elsewhere = (
+            root_mean_square(errors[places])
+            for places in (inside, elsewhere)
+            for errors in (self.predicted, self.true)
         )
         return {
             "rig": rig,
@@ -57,9 +56,7 @@ class PredictedErrors:
             "true": true,
             "ratio": predicted / true,
             "below_2_sigma": float(np.mean((self.true < 2 * self.predicted)[inside])),
-            "ratio_elsewhere": (
-                root_mean_square(self.predicted[elsewhere]) / root_mean_square(self.true[elsewhere])
-            ),
+            "ratio_elsewhere": predicted_elsewhere / true_elsewhere,
         }
 
 
@@ -73,7 +70,7 @@ def prove_uncertainty(scale: float, seed: int, progress: Progress) -> Proof:
     rigs = {}
     for name, case, report in track(progress, {case.name: case for case in rig_cases(seed)}):
         rig = case.rig(scale)
-        plan = letter_plan(rig, Board.parse(TARGET), POSES, case.shape)
+        plan = letter_plan(rig, poses=POSES, shape=case.shape)
         rigs[name] = compare_with_truth(calibrate_rendered(rig, plan, report)[1], rig)
     return judge_uncertainty(rigs, scale, POSES)
 

@@ -17,7 +17,6 @@ from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
 from slviewer.evaluation.render import Row, render
-from slviewer.evaluation.tables import letter_rows
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
@@ -272,7 +271,7 @@ def _render_table(comparisons: Mapping[str, Comparison]) -> str:
     the report has."""
     rows: list[Row] = [
         {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
-        for row in letter_rows(comparisons)
+        for row in letter.letter_rows(comparisons)
     ]
     return render(rows)
 

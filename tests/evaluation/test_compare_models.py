@@ -11,8 +11,8 @@ from slviewer.errors import InputError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.evaluation.incidence import incidence
+from slviewer.evaluation.letter import letter_rows
 from slviewer.evaluation.render import render
-from slviewer.evaluation.tables import letter_rows
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text
