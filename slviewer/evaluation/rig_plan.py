@@ -9,6 +9,7 @@ prediction.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import label
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.errors import InputError
@@ -160,13 +161,19 @@ def predict_rig(
     away = float(np.hypot(distance, baseline))
     camera_px, projector_px = distance / camera.focal_px, away / projector.focal_px[0]
     optics = _Optics(view, camera, projector, light, distance)
-    period = period_px or _best_period(
-        float(np.median(optics.blur_px(distance)[is_lit])), camera_px / projector_px
-    )
+    # the noise, period / modulation, is least at 2 pi blur: the modulation falls as
+    # exp(-2 pi² blur² / period²)
+    least_noise = 2 * np.pi * float(np.median(optics.blur_px(distance)[is_lit]))
+    shortest = max(_MIN_PERIOD_PX, _MIN_CAMERA_PX * (camera_px / projector_px))
+    period = period_px or float(np.ceil(max(least_noise, shortest)))
     sigmas, modulation = optics.predict_sigma(distance, period, is_lit)
     middle, corner = _middle_and_corner(sigmas)
     depths = distance * _DEPTHS
     is_usable = np.array([_is_usable(optics, z, period, coverage, middle) for z in depths])
+    at = int(np.argmin(np.abs(depths - distance)))
+    is_usable[at] = True
+    runs = label(is_usable)[0]
+    usable = depths[runs == runs[at]]
     columns, rows = projector.size
     return RigPlan(
         rig=rig,
@@ -178,7 +185,7 @@ def predict_rig(
         camera_px=camera_px,
         projector_px=projector_px,
         coverage=coverage,
-        depth_range=_range_around(depths, is_usable, distance),
+        depth_range=(float(usable[0]), float(usable[-1])),
         period_px=period,
         modulation=modulation,
         sigma_middle=middle,
@@ -192,11 +199,8 @@ def _thin(lens: Lens) -> Lens:
     width, height = lens.size
     share = _GRID / width
     rows = max(2, round(height * share))
-    K = lens.K.copy()
-    K[0] *= share
-    K[1] *= rows / height
-    K[0, 2], K[1, 2] = (_GRID - 1) / 2, (rows - 1) / 2
-    return Lens(K, np.zeros(5), (_GRID, rows))
+    focal_px = lens.K[0, 0] * share, lens.K[1, 1] * (rows / height)
+    return Lens.from_parameters((*focal_px, (_GRID - 1) / 2, (rows - 1) / 2), (_GRID, rows))
 
 
 def _plane_points(rig: StereoRig, z: float) -> np.ndarray:
@@ -279,12 +283,6 @@ class _Optics:
         return np.where(is_lit, sigmas, np.nan), float(np.median(modulation[is_lit]))
 
 
-def _best_period(blur: float, columns_per_px: float) -> float:
-    """Return the period, in whole projector columns, with the least noise: period / modulation is
-    least at 2 pi blur (the modulation falls as exp(-2 pi² blur² / period²))."""
-    return float(np.ceil(max(2 * np.pi * blur, _MIN_PERIOD_PX, _MIN_CAMERA_PX * columns_per_px)))
-
-
 def _middle_and_corner(sigmas: np.ndarray) -> tuple[float, float]:
     """Return the median of a map (h, w) in its middle, and that of the outermost tenth of what is
     not NaN."""
@@ -303,14 +301,3 @@ def _is_usable(optics: _Optics, z: float, period: float, coverage: float, sigma:
     if is_lit.mean() < _USABLE_COVERAGE * coverage:
         return False
     return bool(np.nanmedian(optics.predict_sigma(z, period, is_lit)[0]) <= _USABLE_SIGMA * sigma)
-
-
-def _range_around(depths: np.ndarray, usable: np.ndarray, distance: float) -> tuple[float, float]:
-    """Return the ends of the run of usable depths around the distance."""
-    at = int(np.argmin(np.abs(depths - distance)))
-    low = high = at
-    while low > 0 and usable[low - 1]:
-        low -= 1
-    while high < len(depths) - 1 and usable[high + 1]:
-        high += 1
-    return float(depths[low]), float(depths[high])
