@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
+from slviewer.fringe.sequence import Axis, Frame, PerAxis
 from slviewer.validation.simulated_capture import (
     AXES,
     BLACK,
@@ -93,15 +93,21 @@ def _coded(setup: CaptureSetup) -> list[int]:
     return [i for i, frame in enumerate(setup.shown.frames) if frame.kind != "texture"]
 
 
-def _steps(sequence: PatternSequence) -> list[tuple[int, ...]]:
+def _steps(setup: CaptureSetup) -> list[tuple[int, ...]]:
     """Indices of the phase steps of each period and axis."""
-    return [indices for axis in sequence.axes for _, indices in sequence.phase_shifts(axis)]
+    shown = setup.shown
+    return [indices for axis in shown.axes for _, indices in shown.phase_shifts(axis)]
+
+
+def _show(setup: CaptureSetup, instead: Mapping[int, int]) -> tuple[int, ...]:
+    """The order of the patterns, with others at some places."""
+    return tuple(instead.get(i, i) for i in range(_count(setup)))
 
 
 def _is_same_pattern(setup: CaptureSetup, a: int, b: int) -> bool:
     """Whether two frames show the same, as two bits that are black all over the projector."""
     first, second = setup.shown.frames[a], setup.shown.frames[b]
-    shown = [pattern_levels(setup.shown, f, setup.wave) for f in (first, second)]
+    shown = [pattern_levels(setup.shown, f) for f in (first, second)]
     if first.axis == second.axis:
         return bool(np.array_equal(shown[0], shown[1]))
     return all(np.ptp(levels) == 0 for levels in shown) and shown[0][0] == shown[1][0]
@@ -168,15 +174,13 @@ def _missing_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
 
 def _exchange(setup: CaptureSetup, a: int, b: int) -> FaultyCapture:
     """Two frames have changed places."""
-    order = list(range(_count(setup)))
-    order[a], order[b] = b, a
     causes = ["frame-order"]
     first, second = setup.shown.frames[a], setup.shown.frames[b]
-    if any(a in steps and b in steps for steps in _steps(setup.shown)):
+    if any(a in steps and b in steps for steps in _steps(setup)):
         causes.append("step-order")
     elif first.kind == second.kind == "gray" and first.axis == second.axis:
         causes.append("bit-order")  # the same images
-    return _faulty(setup, causes, [a, b], order=tuple(order))
+    return _faulty(setup, causes, [a, b], order=_show(setup, {a: b, b: a}))
 
 
 def _exchange_neighbours(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -186,14 +190,14 @@ def _exchange_neighbours(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
         for a, b in pairwise(_coded(setup))
         if b == a + 1 and not _is_same_pattern(setup, a, b)
     ]
-    return _exchange(setup, *(int(k) for k in rng.choice(pairs)))
+    return _exchange(setup, *rng.choice(pairs).tolist())
 
 
 def _exchange_distant(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """Two frames have changed places, with several between them."""
     coded = _coded(setup)
     while True:
-        a, b = sorted(int(k) for k in rng.choice(coded, 2, replace=False))
+        a, b = sorted(rng.choice(coded, 2, replace=False).tolist())
         if b - a >= 4 and not _is_same_pattern(setup, a, b):
             return _exchange(setup, a, b)
 
@@ -203,33 +207,31 @@ def _repeat_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     k = int(rng.choice([k for k in _coded(setup)[1:] if not _is_same_pattern(setup, k, k - 1)]))
     if rng.random() < 0.5:
         return _faulty(setup, ["duplicate-frame"], [k], copies=((k, k - 1),))
-    order = list(range(_count(setup)))
-    order[k] = k - 1
-    return _faulty(setup, ["duplicate-frame"], [k], order=tuple(order))
+    return _faulty(setup, ["duplicate-frame"], [k], order=_show(setup, {k: k - 1}))
 
 
 def _replace_frame(setup: CaptureSetup, rng: Rng, pattern: int) -> FaultyCapture:
     """One frame shows something else."""
-    frames, wave = setup.shown.frames, setup.wave
-    usable = [k for k in _coded(setup) if pattern_levels(setup.shown, frames[k], wave).any()]
+    frames = setup.shown.frames
+    usable = [k for k in _coded(setup) if pattern_levels(setup.shown, frames[k]).any()]
     k = int(rng.choice(usable))
-    order = list(range(_count(setup)))
-    order[k] = pattern
-    return _faulty(setup, ["duplicate-frame", "frame-order"], [k], order=tuple(order))
+    order = _show(setup, {k: pattern})
+    return _faulty(setup, ["duplicate-frame", "frame-order"], [k], order=order)
 
 
 def _order_steps(setup: CaptureSetup, permute: Callable[[int], Sequence[int]]) -> FaultyCapture:
     """The steps of every period are shown in the order ``permute(steps)``."""
-    order = list(range(_count(setup)))
-    counts = {len(steps) for steps in _steps(setup.shown)}
+    counts = {len(steps) for steps in _steps(setup)}
     orders = {n: permute(n) for n in sorted(counts)}
-    for steps in _steps(setup.shown):
-        for place, step in zip(steps, orders[len(steps)], strict=True):
-            order[place] = steps[step]
+    instead = {
+        place: steps[step]
+        for steps in _steps(setup)
+        for place, step in zip(steps, orders[len(steps)], strict=True)
+    }
     causes = ["step-order"]
-    if all(sum(k != step for k, step in enumerate(orders[n])) == 2 for n in counts):
+    if all(sum(k != step for k, step in enumerate(order)) == 2 for order in orders.values()):
         causes.append("frame-order")  # two steps of each period have changed places
-    return _faulty(setup, causes, order=tuple(order))
+    return _faulty(setup, causes, order=_show(setup, instead))
 
 
 def _reverse_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -246,7 +248,7 @@ def _permute_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
             order = rng.permutation(n)
             differences = {int(d) for d in np.diff(order, append=order[0]) % n}
             if differences not in ({1}, {n - 1}):
-                return [int(k) for k in order]
+                return order.tolist()
 
     return _order_steps(setup, permute)
 
@@ -293,17 +295,20 @@ def _scale_cell(setup: CaptureSetup, rng: Rng, factor: float) -> FaultyCapture:
     return _describe(_cover(setup), causes, gray_cell_px=cell)
 
 
-def _renumber_bits(frames: Sequence[Frame], renumber: Callable[[Frame], int]) -> tuple[Frame, ...]:
-    """The frames with other numbers of bits."""
-    return tuple(
-        replace(f, bit=renumber(f)) if f.kind in ("gray", "inverse") else f for f in frames
+def _renumber_bits(
+    setup: CaptureSetup, causes: Sequence[str], renumber: Callable[[Frame], int]
+) -> FaultyCapture:
+    """The capture whose description has other numbers of bits."""
+    frames = tuple(
+        replace(f, bit=renumber(f)) if f.kind in ("gray", "inverse") else f
+        for f in setup.described.frames
     )
+    return _describe(setup, causes, frames=frames)
 
 
 def _reverse_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """The bits are numbered from the least significant one."""
-    frames = _renumber_bits(setup.described.frames, lambda f: f.bits - 1 - f.bit)
-    return _describe(setup, ["bit-order"], frames=frames)
+    return _renumber_bits(setup, ["bit-order"], lambda f: f.bits - 1 - f.bit)
 
 
 def _exchange_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -319,8 +324,7 @@ def _exchange_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
         shift = bits[frame.axis] - fewest
         return number.get(frame.bit - shift, frame.bit - shift) + shift
 
-    frames = _renumber_bits(setup.described.frames, renumber)
-    return _describe(setup, ["bit-order", "frame-order"], frames=frames)
+    return _renumber_bits(setup, ["bit-order", "frame-order"], renumber)
 
 
 def _scale_period(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -371,13 +375,13 @@ def _drift(setup: CaptureSetup, rng: Rng, share: float) -> FaultyCapture:
     n = _count(setup)
     gains = np.linspace(1, 1 - share, n)
     gains = gains[::-1] if rng.random() < 0.5 else gains
-    return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
+    return _faulty(setup, ["exposure-drift"], gains=tuple(gains.tolist()))
 
 
 def _vary_exposure(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """The exposure of each image differs at random by 5 %."""
     gains = 1 + 0.05 * np.clip(rng.standard_normal(_count(setup)), -2.5, 2.5)
-    return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
+    return _faulty(setup, ["exposure-drift"], gains=tuple(gains.tolist()))
 
 
 def _switch_lamp(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -401,7 +405,8 @@ def _move(setup: CaptureSetup, rng: Rng, steadily: bool) -> FaultyCapture:
     shifts = setup.shown.phase_shifts("x" if beside else "y")
     k = int(rng.choice(shifts[-1][1][1:])) if shifts else _draw_middle(setup, rng, 0.35, 0.65)
     motion = 0.15 * np.arange(n) if steadily else 1.5 * (np.arange(n) >= k)
-    return _faulty(setup, ["moved"], motion_px=tuple(float(s) for s in motion), direction=direction)
+    motion_px = tuple(motion.tolist())
+    return _faulty(setup, ["moved"], motion_px=motion_px, direction=direction)
 
 
 def _narrow_stripes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
