@@ -55,27 +55,12 @@ OUTSIDE = 50.0
 
 
 @dataclass(frozen=True)
-class Length:
-    """A calibrated length, mm, with its expanded uncertainty ``U_mm`` (k = 2)."""
+class CertifiedValue:
+    """A value of a certificate with its expanded uncertainty ``U`` (k = 2): a length in mm, the
+    thermal expansion in ppm/K, the temperature in degrees Celsius (and K)."""
 
-    mm: float
-    U_mm: float
-
-
-@dataclass(frozen=True)
-class Expansion:
-    """Relative thermal expansion of the artefact, with its expanded uncertainty (k = 2)."""
-
-    ppm_per_kelvin: float
-    U_ppm_per_kelvin: float
-
-
-@dataclass(frozen=True)
-class Temperature:
-    """The artefact's temperature while it was measured, with its expanded uncertainty (k = 2)."""
-
-    celsius: float
-    U_kelvin: float
+    value: float
+    U: float
 
 
 @dataclass(frozen=True)
@@ -100,31 +85,31 @@ class Artefact:
     kind: Kind
     name: str
     certificate: str
-    spacing: Length | None
-    diameters: tuple[Length, ...]
-    form: Length
+    spacing: CertifiedValue | None
+    diameters: tuple[CertifiedValue, ...]
+    form: CertifiedValue
     reference_celsius: float
-    expansion: Expansion
-    temperature: Temperature
+    expansion: CertifiedValue
+    temperature: CertifiedValue
     positions: Mapping[str, str]
     limits: Limits
 
-    def at_measurement(self, length: Length) -> tuple[float, float]:
+    def at_measurement(self, length: CertifiedValue) -> tuple[float, float]:
         """(mm, its standard uncertainty in mm) of a calibrated length at the temperature of the
         measurement."""
-        warmer, ppm = self.temperature.celsius - self.reference_celsius, 1e-6 * length.mm
+        warmer, ppm = self.temperature.value - self.reference_celsius, 1e-6 * length.value
         parts = (
-            length.U_mm / 2,
-            ppm * self.expansion.U_ppm_per_kelvin / 2 * warmer,
-            ppm * self.expansion.ppm_per_kelvin * self.temperature.U_kelvin / 2,
+            length.U / 2,
+            ppm * self.expansion.U / 2 * warmer,
+            ppm * self.expansion.value * self.temperature.U / 2,
         )
-        return length.mm + ppm * self.expansion.ppm_per_kelvin * warmer, hypot(*parts)
+        return length.value + ppm * self.expansion.value * warmer, hypot(*parts)
 
     @property
     def form_U_mm(self) -> float:
         """Expanded uncertainty (k = 2) that the artefact's own form brings into a range: 2
         sqrt((F/2)^2 + u(F)^2)."""
-        return 2 * hypot(self.form.mm / 2, self.form.U_mm / 2)
+        return 2 * hypot(self.form.value / 2, self.form.U / 2)
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
@@ -149,26 +134,16 @@ class Artefact:
         calibrated, measured, limits = (
             given.get(table, {}) for table in ("calibrated", "measured", "limits")
         )
-        spacing = None
-        if kind == "ball-bar":
-            spacing = Length(
-                _number(calibrated, "spacing_mm"), _number(calibrated, "spacing_U_mm", least=0)
-            )
         return cls(
             kind=kind,
             name=str(given.get("name", kind)),
             certificate=str(given.get("certificate", "none given")),
-            spacing=spacing,
+            spacing=_read_value(calibrated, "spacing") if kind == "ball-bar" else None,
             diameters=_read_diameters(calibrated, BALLS[kind]),
-            form=Length(
-                _number(calibrated, "form_mm", 0.0, 0), _number(calibrated, "form_U_mm", 0.0, 0)
-            ),
+            form=_read_value(calibrated, "form", least=0, otherwise=0.0),
             reference_celsius=_number(calibrated, "temperature_C", 20.0, -50),
-            expansion=Expansion(
-                _number(calibrated, "expansion_ppm_K", least=-10),
-                _number(calibrated, "expansion_U_ppm_K", least=0),
-            ),
-            temperature=Temperature(
+            expansion=_read_value(calibrated, "expansion", "ppm_K", least=-10),
+            temperature=CertifiedValue(
                 _number(measured, "temperature_C", least=-50),
                 _number(measured, "temperature_U_K", least=0),
             ),
@@ -177,7 +152,21 @@ class Artefact:
         )
 
 
-def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[Length, ...]:
+def _read_value(
+    table: Mapping[str, Any],
+    name: str,
+    unit: str = "mm",
+    least: float | None = None,
+    otherwise: float | None = None,
+) -> CertifiedValue:
+    """The value ``name`` in a unit, above 0 or at least ``least``, and its uncertainty."""
+    return CertifiedValue(
+        _number(table, f"{name}_{unit}", otherwise, least),
+        _number(table, f"{name}_U_{unit}", otherwise, 0),
+    )
+
+
+def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[CertifiedValue, ...]:
     """Return the diameter of each of so many balls, from one number or a list."""
     if not balls:
         return ()
@@ -186,7 +175,7 @@ def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[Length, 
     listed = each if isinstance(each, list) else [each] * balls
     if len(listed) != balls:
         raise InputError(f"{len(listed)} diameters are given for {balls}: give one a ball")
-    return tuple(Length(_number({"diameter_mm": d}, "diameter_mm"), U) for d in listed)
+    return tuple(CertifiedValue(_number({"diameter_mm": d}, "diameter_mm"), U) for d in listed)
 
 
 def _read_positions(captures: object) -> dict[str, str]:
@@ -280,7 +269,7 @@ def measure_artefact(
         figures = [make_form_error(FLATNESS, position, shown[0].error_map, artefact.form_U_mm)]
         noise = 0.0
     else:
-        nominal = float(np.mean([diameter.mm for diameter in artefact.diameters])) / 2
+        nominal = float(np.mean([diameter.value for diameter in artefact.diameters])) / 2
         shown = evaluate_spheres(cloud.points, len(artefact.diameters), cloud.sigma_z, nominal)
         figures, noise = _measure_balls(artefact, cloud, shown, position)
     region = np.logical_or.reduce([np.isfinite(result.error_map) for result in shown])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.mesh import MeshScene
-from slviewer.simulation.scenes import Points, Rays, Scene, Surface, sphere
+from slviewer.simulation.scenes import AlteredScene, Rays, Surface, sphere
 from slviewer.target.coded import marker_modules
 
 WHITE, BLACK = 0.85, 0.09
@@ -40,11 +40,10 @@ class Decal:
 
 
 @dataclass(frozen=True, eq=False)
-class MarkedScene:
+class MarkedScene(AlteredScene):
     """An object's scene at ``pose`` with decals on it, which follow its surface and do not change
     its shape."""
 
-    scene: Scene
     pose: Pose
     decals: Sequence[Decal]
 
@@ -73,10 +72,6 @@ class MarkedScene:
                 total += np.where(np.isnan(there), own, there).astype(np.float32)
             albedo[near] = total / _SAMPLES**2
         return Surface(surface.points, surface.normals, albedo)
-
-    def occluded(self, points: Points, source: Points) -> np.ndarray:
-        """As the scene itself: paper shades nothing."""
-        return self.scene.occluded(points, source)
 
 
 def marked_plate(pose: Pose) -> MarkedScene:

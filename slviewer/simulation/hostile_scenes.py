@@ -9,7 +9,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.simulation.scenes import Points, Rays, Scene, Spheres, Surface
+from slviewer.simulation.scenes import AlteredScene, Points, Rays, Scene, Spheres, Surface
 
 Pattern = tuple[Axis | None, np.ndarray]
 """What `fringe.profile` gives: the axis and the grey levels along it."""
@@ -51,7 +51,7 @@ class SceneGroup:
 
 
 @dataclass(frozen=True, eq=False)
-class DirtyBoard:
+class DirtyBoard(AlteredScene):
     """A board with specks of dust and scratches: of the cells of its surface, `share` reflect only
     `left` of the light.
 
@@ -81,13 +81,9 @@ class DirtyBoard:
         albedo[hit] *= np.where(dirty[tuple(np.clip(cells, 0, shape - 1).T)], self.left, 1.0)
         return Surface(surface.points, surface.normals, albedo)
 
-    def occluded(self, points: Points, source: Points) -> np.ndarray:
-        """Return whether points are shaded, as for the clean board."""
-        return self.scene.occluded(points, source)
-
 
 @dataclass(frozen=True, eq=False)
-class MirrorTable:
+class MirrorTable(AlteredScene):
     """A polished table below an object: rays that miss the object and meet the table see the object
     mirrored.
 
@@ -128,10 +124,6 @@ class MirrorTable:
     def is_direct(self, rays: Rays) -> np.ndarray:
         """Return the pixels (h, w) bool that see the object itself, and not its mirror image."""
         return np.isfinite(self.scene.trace(rays).points[..., 2])
-
-    def occluded(self, points: Points, source: Points) -> np.ndarray:
-        """Return whether points are shaded by the object; the table is below and shades nothing."""
-        return self.scene.occluded(points, source)
 
     def second_projector(self, rig: SimulatedRig) -> SimulatedRig:
         """The rig with the projector's mirror image in the table: its light is `reflectivity` as

@@ -58,6 +58,17 @@ def directions_of(rays: Rays) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
+class AlteredScene:
+    """A scene of which something changes what is seen, and not what is shaded."""
+
+    scene: Scene
+
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
+        """As of the scene itself."""
+        return self.scene.occluded(points, source)
+
+
+@dataclass(frozen=True, eq=False)
 class Spheres:
     """One or several diffuse spheres: centres (n, 3), one radius, nothing behind them."""
 
