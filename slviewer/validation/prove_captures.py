@@ -50,18 +50,18 @@ of sound captures with an alarm."""
 Severity = Literal["bad", "warning", "note"]
 _SEVERITIES: dict[str, Severity] = {"rejected": "bad", "doubtful": "warning", "note": "note"}
 """Of the findings of an examination; the worst first."""
-_REFUSALS = (
-    (r"are saturated", "saturation"),
-    (r"light from other surfaces", "indirect-light"),
-    (r"outside the projector", "projector-size"),
-    (r"which the projector spans", "fringe-period|projector-size"),
-    (r"which a Gray cell spans", "gray-cell|fringe-period"),
-    (r"Gray bits number", "fringe-period|gray-cell|projector-size"),
-    (r"modulation is", "dark"),
-    (r"rows and between the frames", "flicker"),
-    (r"light of the room", "room-light"),
-    (r"brightness varies", "exposure-drift"),
-)
+_REFUSALS = {
+    r"are saturated": "saturation",
+    r"light from other surfaces": "indirect-light",
+    r"outside the projector": "projector-size",
+    r"which the projector spans": "fringe-period|projector-size",
+    r"which a Gray cell spans": "gray-cell|fringe-period",
+    r"Gray bits number": "fringe-period|gray-cell|projector-size",
+    r"modulation is": "dark",
+    r"rows and between the frames": "flicker",
+    r"light of the room": "room-light",
+    r"brightness varies": "exposure-drift",
+}
 """Causes that messages of refusals state in words."""
 
 
@@ -88,7 +88,7 @@ def examine_capture(sequence: PatternSequence, stack: np.ndarray) -> list[Named]
         phases = decode_frames("capture", sequence, stack)
         check_capture("capture", sequence, stack, phases, examination)
     except InputError as error:
-        causes = (cause for words, cause in _REFUSALS if re.search(words, str(error)))
+        causes = (cause for words, cause in _REFUSALS.items() if re.search(words, str(error)))
         return [Named(next(causes, "unreadable"), (), "bad", str(error)), *found]
     exposure = check_capture_exposure(sequence, stack, phases)
     if exposure.verdict in ("bad", "warning"):

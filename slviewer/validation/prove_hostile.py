@@ -81,24 +81,24 @@ Outcome = Literal[
 ]  # fmt: skip
 PASSED: tuple[Outcome, ...] = ("measured", "degraded, warned", "noisier as predicted", "refused")
 
-_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
-    (r"outside the projector", frozenset({"projector-size"})),
-    (r"no pixel carries a readable", frozenset({"unreadable"})),
-    (r"[Cc]ircles were|[Cc]ircles detected|board's columns", frozenset({"board"})),
-    (r"% of the image before", frozenset({"crosstalk"})),
-    (r"are saturated and masked", frozenset({"saturation"})),
-    (r"fringes are weak", frozenset({"dark"})),
-    (r"lamps or a projector that flicker", frozenset({"flicker"})),
-    (r"images were compressed", frozenset({"jpeg"})),
-    (r"x and y are exchanged", frozenset({"axes-swapped"})),
-    (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
-    (r"calibration is of another rig", frozenset({"other-rig", "moved"})),
-)
-"""What messages without a structured cause name, by their facts."""
-_OPEN: tuple[tuple[str, frozenset[str]], ...] = (
-    (r"uncertainty of the points", frozenset({"other-rig", "moved", "motion"})),
-    (r"neighbouring pixels scatter", frozenset({"noise"})),
-)
+_WORDS = {
+    r"outside the projector": "projector-size",
+    r"no pixel carries a readable": "unreadable",
+    r"[Cc]ircles were|[Cc]ircles detected|board's columns": "board",
+    r"% of the image before": "crosstalk",
+    r"are saturated and masked": "saturation",
+    r"fringes are weak": "dark",
+    r"lamps or a projector that flicker": "flicker",
+    r"images were compressed": "jpeg",
+    r"x and y are exchanged": "axes-swapped",
+    r"axis is reversed|turned by 180": "axis-reversed",
+    r"calibration is of another rig": "other-rig|moved",
+}
+"""What messages without a structured cause name, by their facts; several causes joined by "|"."""
+_OPEN = {
+    r"uncertainty of the points": "other-rig|moved|motion",
+    r"neighbouring pixels scatter": "noise",
+}
 """What messages name that leave the cause open: right where it is among them, and never wrong."""
 
 
@@ -476,11 +476,13 @@ def judge_case(
     return _judge_figures(figures, floor, is_right, must_measure), words
 
 
-def _match_causes(
-    facts: Sequence[tuple[str, frozenset[str]]], texts: Sequence[str]
-) -> list[frozenset[str]]:
+def _match_causes(facts: Mapping[str, str], texts: Sequence[str]) -> list[frozenset[str]]:
     """The causes whose pattern is in one of the texts."""
-    return [causes for pattern, causes in facts if any(re.search(pattern, text) for text in texts)]
+    return [
+        frozenset(causes.split("|"))
+        for pattern, causes in facts.items()
+        if any(re.search(pattern, text) for text in texts)
+    ]
 
 
 def _judge_figures(figures: Figures, floor: Figures, is_right: bool, must_measure: bool) -> Outcome:
