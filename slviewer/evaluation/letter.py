@@ -19,9 +19,8 @@ SPHERE_RADIUS_MM = 98.0  # nominal; "a sphere of 196 mm diameter"
 
 @dataclass(frozen=True)
 class PlanePose:
-    """A row of Table 1: shares of the board in R1, R2, R3 in percent; RMS in mm."""
+    """A row of Table 1, in the order of the poses: shares of the board in R1, R2, R3 in percent; RMS in mm."""
 
-    pose: int
     incidence: tuple[float, float, float]
     stereo_mm: float
     pixelwise_mm: float
@@ -29,9 +28,8 @@ class PlanePose:
 
 @dataclass(frozen=True)
 class SpherePose:
-    """A row of Table 2: position of the sphere; RMS and fitted radius in mm."""
+    """A row of Table 2, in the order of the poses: position of the sphere; RMS and fitted radius in mm."""
 
-    pose: int
     region: str
     stereo_mm: float
     pixelwise_mm: float
@@ -40,27 +38,27 @@ class SpherePose:
 
 
 TABLE_1 = (
-    PlanePose(1, (100.0, 0.0, 0.0), 0.188, 0.068),
-    PlanePose(2, (91.2, 8.8, 0.0), 0.237, 0.066),
-    PlanePose(3, (0.0, 100.0, 0.0), 0.144, 0.070),
-    PlanePose(4, (0.0, 100.0, 0.0), 0.127, 0.056),
-    PlanePose(5, (0.0, 47.6, 52.4), 0.172, 0.091),
-    PlanePose(6, (0.0, 0.7, 99.3), 0.205, 0.104),
-    PlanePose(7, (0.0, 0.0, 100.0), 0.270, 0.163),
-    PlanePose(8, (0.0, 0.0, 100.0), 0.214, 0.118),
-    PlanePose(9, (2.1, 97.9, 0.0), 0.138, 0.053),
-    PlanePose(10, (0.0, 87.0, 13.0), 0.146, 0.076),
+    PlanePose((100.0, 0.0, 0.0), 0.188, 0.068),
+    PlanePose((91.2, 8.8, 0.0), 0.237, 0.066),
+    PlanePose((0.0, 100.0, 0.0), 0.144, 0.070),
+    PlanePose((0.0, 100.0, 0.0), 0.127, 0.056),
+    PlanePose((0.0, 47.6, 52.4), 0.172, 0.091),
+    PlanePose((0.0, 0.7, 99.3), 0.205, 0.104),
+    PlanePose((0.0, 0.0, 100.0), 0.270, 0.163),
+    PlanePose((0.0, 0.0, 100.0), 0.214, 0.118),
+    PlanePose((2.1, 97.9, 0.0), 0.138, 0.053),
+    PlanePose((0.0, 87.0, 13.0), 0.146, 0.076),
 )
 TABLE_1_MEAN_MM = (0.184, 0.087)  # stereo, pixelwise
 TABLE_1_RATIO_OF_MEANS = 2.13  # before rounding; the best row is 3.59, the Letter's "3.6 times"
 
 TABLE_2 = (
-    SpherePose(1, "R1", 0.109, 0.080, 98.44, 98.01),
-    SpherePose(2, "R1", 0.096, 0.074, 98.28, 98.00),
-    SpherePose(3, "R2", 0.086, 0.062, 98.27, 98.08),
-    SpherePose(4, "R2", 0.076, 0.056, 98.20, 98.06),
-    SpherePose(5, "R3", 0.092, 0.076, 98.25, 98.15),
-    SpherePose(6, "R3", 0.085, 0.085, 98.10, 98.06),
+    SpherePose("R1", 0.109, 0.080, 98.44, 98.01),
+    SpherePose("R1", 0.096, 0.074, 98.28, 98.00),
+    SpherePose("R2", 0.086, 0.062, 98.27, 98.08),
+    SpherePose("R2", 0.076, 0.056, 98.20, 98.06),
+    SpherePose("R3", 0.092, 0.076, 98.25, 98.15),
+    SpherePose("R3", 0.085, 0.085, 98.10, 98.06),
 )
 TABLE_2_MEAN_MM = (0.091, 0.072)
 # mean and standard deviation: stereo, pixelwise
@@ -129,13 +127,13 @@ def _letter_figures(capture: str, shape: str) -> Row:
     one."""
     number = re.search(r"(\d+)$", capture)
     table = TABLE_1 if shape == "plane" else TABLE_2
-    for theirs in table:
-        if number and theirs.pose == int(number[1]):
-            radii = None
-            if isinstance(theirs, SpherePose):
-                radii = theirs.stereo_radius_mm, theirs.pixelwise_radius_mm
-            return _letter_row(theirs.stereo_mm, theirs.pixelwise_mm, radii)
-    return {}
+    if not number or not 0 < int(number[1]) <= len(table):
+        return {}
+    theirs = table[int(number[1]) - 1]
+    radii = None
+    if isinstance(theirs, SpherePose):
+        radii = theirs.stereo_radius_mm, theirs.pixelwise_radius_mm
+    return _letter_row(theirs.stereo_mm, theirs.pixelwise_mm, radii)
 
 
 def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | None = None) -> Row:

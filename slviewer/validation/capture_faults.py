@@ -41,6 +41,7 @@ class FaultyCapture:
     frames: tuple[int, ...] = ()
 
 
+Kinds = tuple[CaptureKind, ...]
 Strike = Callable[[CaptureSetup, Rng], FaultyCapture]
 
 
@@ -49,16 +50,14 @@ class CaptureFault:
     """``strike`` puts the fault into a sound capture; ``kinds``: captures that can have it."""
 
     strike: Strike
-    kinds: tuple[CaptureKind, ...]
+    kinds: Kinds = KINDS
 
 
-ANY = KINDS
-PHASE: tuple[CaptureKind, ...] = tuple(k for k in KINDS if k != "gray")
-CODED: tuple[CaptureKind, ...] = ("p18", "complementary")
+PHASE: Kinds = tuple(k for k in KINDS if k != "gray")
+CODED: Kinds = ("p18", "complementary")
 """With phase steps and Gray bits."""
-BITS: tuple[CaptureKind, ...] = (*CODED, "gray")
-LEVELS: tuple[CaptureKind, ...] = ("multifrequency", "heterodyne", "micro")
-FEW: tuple[CaptureKind, ...] = ("complementary", *LEVELS)
+BITS: Kinds = (*CODED, "gray")
+FEW: Kinds = ("complementary", "multifrequency", "heterodyne", "micro")
 """With three or four phase steps."""
 
 
@@ -425,14 +424,14 @@ def _narrow_stripes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
 
 
 CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
-    "late from the start": CaptureFault(_late_from_start, ANY),
-    "late from one frame on": CaptureFault(_late_from_frame, ANY),
-    "frame missing": CaptureFault(_missing_frame, ANY),
-    "neighbours exchanged": CaptureFault(_exchange_neighbours, ANY),
-    "distant frames exchanged": CaptureFault(_exchange_distant, ANY),
-    "frame repeated": CaptureFault(_repeat_frame, ANY),
-    "foreign frame": CaptureFault(partial(_replace_frame, pattern=FOREIGN), ANY),
-    "black frame": CaptureFault(partial(_replace_frame, pattern=BLACK), ANY),
+    "late from the start": CaptureFault(_late_from_start),
+    "late from one frame on": CaptureFault(_late_from_frame),
+    "frame missing": CaptureFault(_missing_frame),
+    "neighbours exchanged": CaptureFault(_exchange_neighbours),
+    "distant frames exchanged": CaptureFault(_exchange_distant),
+    "frame repeated": CaptureFault(_repeat_frame),
+    "foreign frame": CaptureFault(partial(_replace_frame, pattern=FOREIGN)),
+    "black frame": CaptureFault(partial(_replace_frame, pattern=BLACK)),
     "steps reversed": CaptureFault(_reverse_steps, PHASE),
     # each order of three steps is a shift or a reversal
     "steps permuted": CaptureFault(_permute_steps, (*CODED, "micro")),
@@ -445,25 +444,25 @@ CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
     "bits reversed": CaptureFault(_reverse_bits, BITS),
     "two bits exchanged": CaptureFault(_exchange_bits, BITS),
     "period 12 % too long": CaptureFault(_scale_period, PHASE),
-    "axes exchanged": CaptureFault(_exchange_axes, ANY),
-    "axis mirrored": CaptureFault(_mirror_projector, ANY),
-    "projector too small": CaptureFault(partial(_scale_projector, factor=0.7), ANY),
-    "projector too large": CaptureFault(partial(_scale_projector, factor=1.5), ANY),
-    "drift of 8 %": CaptureFault(partial(_drift, share=0.08), ANY),
-    "drift of 30 %": CaptureFault(partial(_drift, share=0.3), ANY),
-    "random exposure": CaptureFault(_vary_exposure, ANY),
-    "flicker": CaptureFault(_change("flicker", flicker=0.1), ANY),
-    "lamp switched on": CaptureFault(_switch_lamp, ANY),
-    "saturated": CaptureFault(_change("saturation", clipped_share=0.3), ANY),
-    "dark": CaptureFault(_change("dark", exposure=0.025), ANY),
+    "axes exchanged": CaptureFault(_exchange_axes),
+    "axis mirrored": CaptureFault(_mirror_projector),
+    "projector too small": CaptureFault(partial(_scale_projector, factor=0.7)),
+    "projector too large": CaptureFault(partial(_scale_projector, factor=1.5)),
+    "drift of 8 %": CaptureFault(partial(_drift, share=0.08)),
+    "drift of 30 %": CaptureFault(partial(_drift, share=0.3)),
+    "random exposure": CaptureFault(_vary_exposure),
+    "flicker": CaptureFault(_change("flicker", flicker=0.1)),
+    "lamp switched on": CaptureFault(_switch_lamp),
+    "saturated": CaptureFault(_change("saturation", clipped_share=0.3)),
+    "dark": CaptureFault(_change("dark", exposure=0.025)),
     # few steps do not average it out
     "gamma 2.2": CaptureFault(_change("gamma", is_linear=True, gamma=2.2), FEW),
     "clipped cosine": CaptureFault(
         _change("gamma", "saturation", is_linear=True, wave=(40.0, 200.0)), PHASE
     ),
-    "moved": CaptureFault(partial(_move, steadily=False), ANY),
-    "moving": CaptureFault(partial(_move, steadily=True), ANY),
-    "ghosting": CaptureFault(_change("ghosting", ghost=0.15), ANY),
+    "moved": CaptureFault(partial(_move, steadily=False)),
+    "moving": CaptureFault(partial(_move, steadily=True)),
+    "ghosting": CaptureFault(_change("ghosting", ghost=0.15)),
     "narrow stripes": CaptureFault(_narrow_stripes, ("gray",)),
 }
 
