@@ -19,7 +19,8 @@ SPHERE_RADIUS_MM = 98.0  # nominal; "a sphere of 196 mm diameter"
 
 @dataclass(frozen=True)
 class PlanePose:
-    """A row of Table 1, in the order of the poses: shares of the board in R1, R2, R3 in percent; RMS in mm."""
+    """A row of Table 1, in the order of the poses: shares of the board in R1, R2, R3 in percent; RMS
+    in mm."""
 
     incidence: tuple[float, float, float]
     stereo_mm: float
@@ -28,7 +29,8 @@ class PlanePose:
 
 @dataclass(frozen=True)
 class SpherePose:
-    """A row of Table 2, in the order of the poses: position of the sphere; RMS and fitted radius in mm."""
+    """A row of Table 2, in the order of the poses: position of the sphere; RMS and fitted radius in
+    mm."""
 
     region: str
     stereo_mm: float
