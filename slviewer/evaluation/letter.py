@@ -19,8 +19,8 @@ SPHERE_RADIUS_MM = 98.0  # nominal; "a sphere of 196 mm diameter"
 
 @dataclass(frozen=True)
 class PlanePose:
-    """A row of Table 1, in the order of the poses: shares of the board in R1, R2, R3 in percent; RMS
-    in mm."""
+    """A row of Table 1, in the order of the poses: shares of the board in R1, R2, R3 in percent;
+    RMS in mm."""
 
     incidence: tuple[float, float, float]
     stereo_mm: float

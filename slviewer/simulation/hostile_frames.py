@@ -61,19 +61,17 @@ def follow_exposure(light: Frames, off: float, shot: Shot) -> Frames:
 def add_flicker(light: Frames, depth: float, shot: Shot) -> Frames:
     """Add mains flicker under a rolling shutter: bands 1 + depth sin, at another phase in each
     frame."""
-    n, height, _ = light.shape
-    rows = 1.6 * np.arange(height) / height
-    phase = 0.37 * np.arange(n)[:, None] + shot.rng.uniform(0, 1, (n, 1)) * 0.1
-    return light * (1 + depth * np.sin(2 * np.pi * (rows + phase))).astype(np.float32)[:, :, None]
+    n = len(light)
+    begin = 0.37 * np.arange(n)[:, None] + shot.rng.uniform(0, 1, (n, 1)) * 0.1
+    return light * (1 + depth * np.sin(_row_phase(light, 1.6, begin))).astype(np.float32)
 
 
 def add_room_flicker(light: Frames, depth: float, shot: Shot) -> Frames:
     """Add ambient light, a fifth as strong as the projector's, that flickers by ``depth`` of its
     light."""
-    n, height, _ = light.shape
-    rows = 1.6 * np.arange(height) / height
-    bands = 0.2 * (1 + depth * np.sin(2 * np.pi * (rows + 0.29 * np.arange(n)[:, None])))
-    return 0.8 * light + bands.astype(np.float32)[:, :, None] * shot.room_light
+    phase = _row_phase(light, 1.6, 0.29 * np.arange(len(light))[:, None])
+    bands = 0.2 * (1 + depth * np.sin(phase))
+    return 0.8 * light + bands.astype(np.float32) * shot.room_light
 
 
 def switch_lamp_on(light: Frames, share: float, shot: Shot) -> Frames:
@@ -88,14 +86,16 @@ def switch_lamp_on(light: Frames, share: float, shot: Shot) -> Frames:
 def add_colour_wheel(light: Frames, depth: float, shot: Shot) -> Frames:
     """Simulate a short exposure that sees part of the colour wheel's turn: fast bands of the
     projector's light."""
-    n, height, _ = light.shape
     dark = light.min(0, keepdims=True)
-    rows = 5.0 * np.arange(height) / height
-    phase = shot.rng.uniform(0, 1, (n, 1))
-    bands = 1 + depth * (
-        np.sin(2 * np.pi * (rows + phase)) + 0.5 * np.sin(4 * np.pi * (rows + phase))
-    )
-    return dark + (light - dark) * bands.astype(np.float32)[:, :, None]
+    phase = _row_phase(light, 5.0, shot.rng.uniform(0, 1, (len(light), 1)))
+    bands = 1 + depth * (np.sin(phase) + 0.5 * np.sin(2 * phase))
+    return dark + (light - dark) * bands.astype(np.float32)
+
+
+def _row_phase(light: Frames, turns: float, begin: np.ndarray) -> np.ndarray:
+    """Phase (n, h, 1), rad, of so many turns along the rows that begin at ``begin`` (n, 1)."""
+    height = light.shape[1]
+    return (2 * np.pi * (turns * np.arange(height) / height + begin))[..., None]
 
 
 def add_crosstalk(light: Frames, share: float, shot: Shot | None = None) -> Frames:
@@ -166,8 +166,7 @@ def compress_jpeg(frames: Frames, quality: float, shot: Shot | None = None) -> F
     """Compress each frame (n, h, w) uint8 as JPEG, and decode it."""
     out = np.empty_like(frames)
     for k, frame in enumerate(frames):
-        encoded, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
-        assert encoded
+        data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])[1]
         out[k] = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
     return out
 
@@ -205,22 +204,15 @@ def show_instead(frames: Frames, places: Sequence[int], sources: Sequence[int]) 
 def lose_frames(frames: Frames, level: float, shot: Shot) -> Frames:
     """Drop a Gray frame of y (level 0), a phase step of x (1), or both (2); later frames move
     forward."""
-    phase_x, gray_y = (
-        shot.indices("phase", "x"),
-        shot.indices("gray", "y"),
-    )
     if level != 0:
-        frames = drop_frame(frames, phase_x[3])
-    return frames if level == 1 else drop_frame(frames, gray_y[2])
+        frames = drop_frame(frames, shot.indices("phase", "x")[3])
+    return frames if level == 1 else drop_frame(frames, shot.indices("gray", "y")[2])
 
 
 def repeat_frames(frames: Frames, level: float, shot: Shot) -> Frames:
     """Repeat the previous frame in place of a Gray frame of x (level 0), a phase step (1), or three
     of them (2)."""
-    phase, gray = (
-        shot.indices("phase", "x"),
-        shot.indices("gray", "x"),
-    )
+    phase, gray = shot.indices("phase", "x"), shot.indices("gray", "x")
     places = ([gray[-2]], [phase[2]], [phase[1], phase[-2], gray[-1]])[int(level)]
     return show_instead(frames, places, [place - 1 for place in places])
 
@@ -228,10 +220,7 @@ def repeat_frames(frames: Frames, level: float, shot: Shot) -> Frames:
 def swap_neighbours(frames: Frames, level: float, shot: Shot) -> Frames:
     """Two Gray frames of x swapped (level 0), two phase steps (1), the last phase step and the
     first Gray frame (2)."""
-    phase, gray = (
-        shot.indices("phase", "x"),
-        shot.indices("gray", "x"),
-    )
+    phase, gray = shot.indices("phase", "x"), shot.indices("gray", "x")
     first = (gray[-2], phase[1], phase[-1])[int(level)]
     return show_instead(frames, [first, first + 1], [first + 1, first])
 
