@@ -34,6 +34,9 @@ _USABLE_COVERAGE, _USABLE_SIGMA = 0.6, 2.0
 """Of the depth range: share of the view that the projector must illuminate, and noise over that at
 the distance."""
 
+Map = np.ndarray
+"""(h, w): a value for each of a few camera pixels."""
+
 
 @dataclass(frozen=True)
 class PlannedCamera:
@@ -203,13 +206,13 @@ def _thin(lens: Lens) -> Lens:
     return Lens.from_parameters((*focal_px, (_GRID - 1) / 2, (rows - 1) / 2), (_GRID, rows))
 
 
-def _plane_points(rig: StereoRig, z: float) -> np.ndarray:
+def _plane_points(rig: StereoRig, z: float) -> Map:
     """Return the points (h, w, 3) mm where the camera's rays meet the plane at depth z."""
     rays = rig.camera.rays()
     return np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) * z
 
 
-def _is_illuminated(rig: StereoRig, z: float) -> np.ndarray:
+def _is_illuminated(rig: StereoRig, z: float) -> Map:
     """Return which camera pixels (h, w) see the projector's picture on the plane at depth z."""
     return rig.projector.contains(rig.project(_plane_points(rig, z)))
 
@@ -225,7 +228,7 @@ class _Optics:
     light: PlannedLight
     focus: float
 
-    def blur_px(self, z: float) -> np.ndarray:
+    def blur_px(self, z: float) -> Map:
         """Return the Gaussian sigma (h, w) of a fringe on the plane at depth z, in projector
         columns.
 
@@ -243,7 +246,7 @@ class _Optics:
         camera_sigma = np.sqrt(camera.blur_px**2 + of_camera**2 + 1 / 12) * columns_per_px
         return np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
 
-    def light_on(self, z: float, is_lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def light_on(self, z: float, is_lit: Map) -> tuple[Map, Map]:
         """Return the projector's light (h, w) that returns from a white plane at depth z, and the
         room's, as shares of the brightest white: cosine of the incidence, square of the distance,
         cos^4 of the camera's lens.
@@ -257,9 +260,7 @@ class _Optics:
         brightest = np.quantile((lit + self.light.ambient * even)[is_lit], _BRIGHT_QUANTILE)
         return lit / brightest, self.light.ambient * even / brightest
 
-    def predict_sigma(
-        self, z: float, period: float, is_lit: np.ndarray
-    ) -> tuple[np.ndarray, float]:
+    def predict_sigma(self, z: float, period: float, is_lit: Map) -> tuple[Map, float]:
         """Return the standard deviation (h, w) mm of depth on the plane at depth z, NaN where not
         ``is_lit`` (h, w), and the median modulation in grey levels. The exposure is chosen for a
         white surface at that depth.
@@ -283,7 +284,7 @@ class _Optics:
         return np.where(is_lit, sigmas, np.nan), float(np.median(modulation[is_lit]))
 
 
-def _middle_and_corner(sigmas: np.ndarray) -> tuple[float, float]:
+def _middle_and_corner(sigmas: Map) -> tuple[float, float]:
     """Return the median of a map (h, w) in its middle, and that of the outermost tenth of what is
     not NaN."""
     rows, columns = np.nonzero(np.isfinite(sigmas))

@@ -22,6 +22,9 @@ _EXPOSURE_QUANTILE = (
     0.995  # of the illuminated pixels; a few brighter ones do not decide an exposure
 )
 
+Map = np.ndarray
+"""(h, w), or (h, w, 2 or 3): a value, or some, for each pixel."""
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -33,9 +36,9 @@ class Truth:
     no shadow.
     """
 
-    points: np.ndarray
-    projector: np.ndarray
-    mask: np.ndarray
+    points: Map
+    projector: Map
+    mask: Map
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +49,11 @@ class _Maps:
     among the tabulated `sigmas`; coordinates: projector px along each axis.
     """
 
-    gain: np.ndarray
-    even: np.ndarray
-    level: np.ndarray
+    gain: Map
+    even: Map
+    level: Map
     sigmas: np.ndarray
-    coordinates: dict[Axis, np.ndarray]
+    coordinates: dict[Axis, Map]
     truth: Truth
 
 
@@ -69,7 +72,7 @@ class Renderer:
         self.scene = scene
         self._concave = scene if isinstance(scene, ConcaveScene) else None
         self._indirect: dict[Axis, np.ndarray] = {}
-        self._lights: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+        self._lights: dict[float, tuple[Map, Map]] = {}
 
     def truth(self) -> Truth:
         """What a perfect instrument would measure."""
@@ -108,7 +111,7 @@ class Renderer:
         self,
         pattern: tuple[Axis | None, np.ndarray],
         keys: np.ndarray,
-        out: np.ndarray,
+        out: Map,
         *,
         lamp: float = 1.0,
         exposure: float | None = None,
@@ -136,7 +139,7 @@ class Renderer:
         *,
         lamp: float = 1.0,
         exposure: float | None = None,
-    ) -> np.ndarray:
+    ) -> Map:
         """(h, w) float32: the light of one frame in grey levels above dark, before noise and
         clipping; as `frame`."""
         rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
@@ -158,7 +161,7 @@ class Renderer:
             out += np.float32(lamp * exposure) * indirect
         return out
 
-    def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> np.ndarray:
+    def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> Map:
         """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile
         (n,) in 0 ... 1.
 
@@ -177,18 +180,18 @@ class Renderer:
         assert self._concave is not None
         return self._concave.pixel_weights(self.rig.camera.rays(0))
 
-    def room_light(self) -> np.ndarray:
+    def room_light(self) -> Map:
         """(h, w) float32: grey levels of even room light as strong as full white light from the
         projector."""
         return self._blur(self._maps.even * np.float32(self.exposure))
 
-    def _blur(self, light: np.ndarray) -> np.ndarray:
+    def _blur(self, light: Map) -> Map:
         """Return light on the maps, blurred by the camera's PSF, within the frame (h, w)."""
         for direction in (0, 1):
             light = correlate1d(light, self._taps, axis=direction)
         return np.ascontiguousarray(light[self._frame])
 
-    def _light(self, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+    def _light(self, exposure: float) -> tuple[Map, Map]:
         """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes,
         blurred, (h, w)."""
         if exposure not in self._lights:
