@@ -44,27 +44,21 @@ def prove_plan(scale: float, seed: int, progress: Progress) -> Proof:
     rows, checks = [], []
     for k, (kind, measure, _) in enumerate(track(progress, CASES)):
         cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(REPEATS)]
-        truths, U = (
-            np.array([truth for truth, _ in cases]),
-            np.array([q.U or 0.0 for _, q in cases]),
-        )
-        errors = np.array([q.value for _, q in cases]) - truths
+        truths, values, U = np.array([(truth, q.value, q.U or 0.0) for truth, q in cases]).T
+        errors = values - truths
         covered = 100 * float(np.mean(np.abs(errors) <= U))
         chance = 100 * float(np.sqrt(0.95 * 0.05 / REPEATS))
         least, most = BAND[0] - chance, BAND[1] + chance
-        checks.append(
-            BandCheck(kind, f"% of {REPEATS} repeats covered by U (k = 2)", covered, least, most)
-        )
-        rows.append(
-            {
-                "characteristic": kind,
-                "mean true mm": round(float(truths.mean()), 4),
-                "mean error mm": round(float(errors.mean()), 4),
-                "std. dev. mm": round(float(errors.std()), 4),
-                "U / 2 mm": round(float(U.mean()) / 2, 4),
-                "covered %": round(covered, 1),
-            }
-        )
+        what = f"% of {REPEATS} repeats covered by U (k = 2)"
+        checks.append(BandCheck(kind, what, covered, least, most))
+        figures = {
+            "mean true mm": truths.mean(),
+            "mean error mm": errors.mean(),
+            "std. dev. mm": errors.std(),
+            "U / 2 mm": U.mean() / 2,
+        }
+        rounded = {title: round(float(value), 4) for title, value in figures.items()}
+        rows.append({"characteristic": kind, **rounded, "covered %": round(covered, 1)})
     record = {"noise_mm": NOISE_MM, "points": side**2, "repeats": REPEATS, "rows": rows}
     return prove_checks(checks, scale, rows, record)
 

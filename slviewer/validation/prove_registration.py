@@ -11,7 +11,6 @@ from itertools import pairwise
 from time import perf_counter
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter as the_letter
@@ -19,7 +18,7 @@ from slviewer.evaluation.render import Row
 from slviewer.fringe.decode import texture
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.geometry.rigid import fit_rigid, move_points, rotation_angle
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part
@@ -349,4 +348,4 @@ def _measure_marked(
 def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
     """How far a motion (4, 4) shifts a point (3,), mm, and its angle, degrees."""
     shift = np.linalg.norm(move_points(D, centre[None]) - centre)
-    return float(shift), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
+    return float(shift), float(np.degrees(rotation_angle(D[:3, :3])))
