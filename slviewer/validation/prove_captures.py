@@ -175,18 +175,14 @@ def examine_case(fault: str, kind: CaptureKind, seed: int) -> CaptureCase:
     capture = render_capture(setup)
     start = perf_counter()
     try:
-        named: list[Named] | None = examine_capture(setup.described, capture.stack)
+        named = examine_capture(setup.described, capture.stack)
+        outcome = judge_findings(named, faulty)
     except Exception as error:  # the other cases still have to run
-        named, crash = None, f"{type(error).__name__}: {error}"
+        named, outcome = [Named(f"{type(error).__name__}: {error}", (), "bad")], "CRASH"
     seconds, errors = perf_counter() - start, ""
     frames = " of frame " + " or ".join(map(str, faulty.frames)) if faulty.frames else ""
     expected = (" or ".join(sorted(faulty.causes)) or "nothing") + frames
-    if named is None:
-        outcome: Outcome = "CRASH"
-        named = [Named(crash, (), "bad")]
-    elif (judged := judge_findings(named, faulty)) is not None:
-        outcome = judged
-    else:
+    if outcome is None:
         outcome, errors = judge_errors(faulty, capture)
     return CaptureCase(
         fault, kind, seed, outcome, expected, tuple(named), errors, setup.text(), seconds
@@ -273,9 +269,8 @@ def summarize_cases(cases: Sequence[CaptureCase], scale: float) -> Proof:
         _list_row(fault, [c for c in cases if c.fault == fault])
         for fault in dict.fromkeys(c.fault for c in cases)
     ]
-    named = Counter(case.outcome for case in faulty)
-    passed = (named["right"] + named["harmless"]) / len(faulty)
-    harmful = (named["HARMFUL"] + named["LOST"] + named["CRASH"]) / len(faulty)
+    passed = sum(case.outcome in PASSED for case in faulty) / len(faulty)
+    harmful = sum(case.outcome in ("HARMFUL", "LOST", "CRASH") for case in faulty) / len(faulty)
     alarms = sum(case.outcome != "sound" for case in sound) / len(sound)
     checks = [
         BandCheck("faults", "share that is named or harmless", passed, LEAST_NAMED, 1.0),
@@ -294,10 +289,8 @@ def _list_row(fault: str, cases: Sequence[CaptureCase]) -> Row:
     for kind in KINDS:
         own = Counter(case.outcome for case in cases if case.kind == kind)
         row[kind] = " ".join(f"{own[o]} {o}" for o in outcomes if own[o]) or "-"
-    total = Counter(case.outcome for case in cases)
-    passed = sum(total[outcome] for outcome in PASSED)
-    row["right %"] = 100 * passed / len(cases)
-    row["harmful"] = total["HARMFUL"] + total["LOST"]
+    row["right %"] = 100 * sum(case.outcome in PASSED for case in cases) / len(cases)
+    row["harmful"] = sum(case.outcome in ("HARMFUL", "LOST") for case in cases)
     row["s"] = float(np.mean([case.seconds for case in cases]))
     return row
 
@@ -307,7 +300,7 @@ def _list_totals(faulty: Sequence[CaptureCase], sound: Sequence[CaptureCase]) ->
     for name, cases, outcomes in (("faults", faulty, OF_FAULTS), ("sound", sound, OF_SOUND)):
         total = Counter(case.outcome for case in cases)
         counts = ", ".join(f"{total[o]} {o}" for o in outcomes)
-        passed = 100 * sum(total[outcome] for outcome in PASSED) / len(cases)
+        passed = 100 * sum(case.outcome in PASSED for case in cases) / len(cases)
         seconds = np.quantile([case.seconds for case in cases], [0.5, 0.95])
         yield (
             f"{len(cases)} {name}: {counts}; {passed:.1f} % right; {seconds[0]:.2f} s to examine in"
