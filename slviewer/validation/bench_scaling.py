@@ -18,8 +18,6 @@ from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
@@ -32,7 +30,7 @@ from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.turning import STEPS, turning
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
-from slviewer.validation.rendered_calibration import observe_rendered
+from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
@@ -106,7 +104,7 @@ def _describe_growth(sizes: tuple[float, ...], seconds: list[float]) -> str:
 
 def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
     """Rows of decoding 25 frames of several sizes, which are resized from rendered ones."""
-    sequence = one_axis(p18(rig.projector.size), "x")
+    sequence = scan_sequence(rig)
     frames = Renderer(rig, scene).capture(sequence)
 
     def decode_size(size: float) -> Callable[[], object]:
@@ -121,7 +119,7 @@ def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
 def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
     """Rows of the wizard's snapshot of a session with so many captures."""
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
-        sequence = one_axis(p18(rig.projector.size), "x")
+        sequence = scan_sequence(rig)
         frames = Renderer(rig, scene).capture(sequence)
         with Session.open_or_create(Path(folder, "session")) as session:
             first = session.save_capture(
@@ -216,7 +214,7 @@ def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
     """Make a session with the rig's true calibration and so many equal scans."""
     rig = letter(scale)
     true_calibration(session, rig)
-    sequence = one_axis(p18(rig.projector.size), "x")
+    sequence = scan_sequence(rig)
     frames = Renderer(rig, scene).capture(sequence)
     with Session.open(session, write=True) as store:
         for number in range(1, count + 1):

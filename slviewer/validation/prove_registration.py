@@ -16,8 +16,6 @@ from slviewer.errors import InputError
 from slviewer.evaluation import letter as the_letter
 from slviewer.evaluation.render import Row
 from slviewer.fringe.decode import texture
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
 from slviewer.geometry.rigid import fit_rigid, move_points, rotation_angle
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
@@ -47,7 +45,7 @@ from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
+from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase, scan_sequence
 
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
@@ -333,7 +331,7 @@ def _measure_marked(
     first."""
     clouds = {}
     for k, (name, scene) in enumerate(zip("ab", pair, strict=True)):
-        sequence = one_axis(p18(rig.projector.size), "x")
+        sequence = scan_sequence(rig)
         frames = Renderer(rig, scene).capture(sequence, number + k)
         phases = decode_frames(name, sequence, frames)
         clouds[name] = reconstruct_cloud(model, phases, texture=texture(sequence, frames))

@@ -9,7 +9,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.fringe.decode import texture
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
+from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
@@ -65,5 +65,10 @@ def observe_rendered(rig: SimulatedRig, scene: Scene, name: str, number: int) ->
 
 def render_phase(renderer: Renderer, name: str, number: int) -> PhaseMap:
     """The phase of axis x of a rendered scan, whose noise ``number`` seeds."""
-    only_x = one_axis(p18(renderer.rig.projector.size), "x")
-    return decode_frames(name, only_x, renderer.capture(only_x, number))["x"]
+    sequence = scan_sequence(renderer.rig)
+    return decode_frames(name, sequence, renderer.capture(sequence, number))["x"]
+
+
+def scan_sequence(rig: SimulatedRig) -> PatternSequence:
+    """The patterns of axis x alone, with which scans are captured."""
+    return one_axis(p18(rig.projector.size), "x")
