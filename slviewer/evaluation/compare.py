@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.fit import (
-    LEAST_PIXELS,
-    ShapeResult,
-    evaluate_shape,
-    find_shape,
-    measured_pixels,
-    start_shape,
-)
+from slviewer.evaluation.fit import LEAST_PIXELS, ShapeResult, ShapeSearch, measured_pixels
 from slviewer.evaluation.incidence import incidence
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
@@ -153,10 +146,11 @@ def fit_clouds(
         )
     # A wall behind the shape may hold more pixels, in a model that measures everywhere.
     searched = region if region is not None else shared
-    start = start_shape(shape, every, searched, sigma_z, radius)
+    search = ShapeSearch(shape, every, sigma_z, radius)
+    start = search.start(searched)
     is_searched = region is None
     if region is None:
-        start, region = find_shape(shape, every, None, sigma_z, radius, start)
+        start, region = search.find(None, start)
     measured_pixels(every, region)  # says so if there is too little
     common = region & shared
     lit = np.zeros_like(region) if illuminated is None else region & illuminated
@@ -164,9 +158,8 @@ def fit_clouds(
     results: dict[str, ShapeResult] = {}
     for model, cloud in clouds.items():
         try:
-            results[model] = evaluate_shape(
-                shape, cloud.points, common, cloud.sigma_z, radius, start
-            )
+            search = ShapeSearch(shape, cloud.points, cloud.sigma_z)
+            results[model] = search.evaluate(common, start)
         except InputError as error:
             raise InputError(f"No {shape} could be fitted to the {model} cloud. {error}") from error
     return Comparison(

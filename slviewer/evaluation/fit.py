@@ -144,7 +144,7 @@ def evaluate_plane(
     ``sigma_z`` ``(h, w)`` mm: the expected noise of z, for the noise floor. ``start``: about where
     the plane lies, if that is known.
     """
-    return evaluate_shape("plane", points, mask, sigma_z, start=start)
+    return ShapeSearch("plane", points, sigma_z).evaluate(mask, start)
 
 
 def evaluate_sphere(
@@ -162,7 +162,7 @@ def evaluate_sphere(
     sphere; the fitted radius stays free, as in the Letter's Table 2. ``start``: about where the
     sphere lies, if that is known.
     """
-    return evaluate_shape("sphere", points, mask, sigma_z, radius, start)
+    return ShapeSearch("sphere", points, sigma_z, radius).evaluate(mask, start)
 
 
 def evaluate_spheres(
@@ -170,52 +170,118 @@ def evaluate_spheres(
 ) -> list[ShapeResult]:
     """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise
     as above."""
-    spheres = find_spheres(points, count, sigma_z, radius)
-    return [
-        evaluate_shape("sphere", points, region, sigma_z, radius, start)
-        for start, region in spheres
-    ]
+    search = ShapeSearch("sphere", points, sigma_z, radius)
+    return [search.evaluate(region, start) for start, region in search.find_several(count)]
 
 
-def evaluate_shape(
-    shape: Shape,
-    points: Points,
-    mask: Map | None,
-    sigma_z: Map | None = None,
-    radius: float | None = None,
-    start: Plane | Sphere | None = None,
-) -> ShapeResult:
-    """Fit the shape to the measured pixels under ``mask`` of a cloud, and evaluate the residuals;
-    as `evaluate_sphere`."""
-    if mask is None:
-        start, mask = find_shape(shape, points, None, sigma_z, radius)
-    elif start is None:
-        start = start_shape(shape, points, mask, sigma_z, radius)
-    evaluated = mask & finite_rows(points)
-    chosen = points[evaluated].astype(np.float64)
-    if len(chosen) < LEAST_POINTS:
-        raise InputError(
-            f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed."
-        )
-    fitted, is_inlier = fit_settled(lambda some, _: _FITS[shape](some), chosen, start)
-    residuals = fitted.distance(chosen)
-    error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
-    error_map[evaluated] = residuals
-    inliers = np.zeros(points.shape[:2], dtype=bool)
-    inliers[evaluated] = is_inlier
-    return ShapeResult(
-        fitted,
-        rms(residuals[is_inlier]),
-        (
-            float("nan")
-            if sigma_z is None
-            else noise_floor(fitted, chosen[is_inlier], sigma_z[inliers])
-        ),
-        len(chosen),
-        int(np.count_nonzero(~is_inlier)),
-        error_map,
-        inliers,
-    )
+@dataclass(frozen=True, eq=False)
+class ShapeSearch:
+    """A plane or a sphere that is looked for in a cloud ``points`` ``(h, w, 3)`` mm, NaN where
+    invalid.
+
+    ``sigma_z`` ``(h, w)`` mm is the expected noise; ``radius`` in mm, roughly, narrows the search
+    for a sphere.
+    """
+
+    shape: Shape
+    points: Points
+    sigma_z: Map | None = None
+    radius: float | None = None
+
+    def start(self, mask: Map) -> Plane | Sphere:
+        """Estimate the shape that most points under ``mask`` agree with, by RANSAC."""
+        measured = measured_pixels(self.points, mask)
+        tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * self._typical_noise(measured))
+        some = _sample_points(self.points, measured)
+        if self.shape == "plane":
+            return ransac_plane(some, tolerance)[0]
+        return ransac_sphere(some, tolerance, self.radius)[0]
+
+    def find(
+        self, mask: Map | None = None, start: Plane | Sphere | None = None
+    ) -> tuple[Plane | Sphere, Map]:
+        """Detect the shape with most pixels, and its region ``(h, w)`` bool.
+
+        The region is one patch without its outermost two pixels; isolated pixels and small holes
+        inside it belong to it, whether something was measured there or not. A roughly known shape
+        to ``start`` from spares the search. The shape that comes back is a start for fits, not a
+        result. Raises ``InputError`` where no such shape fills a patch.
+        """
+        points, measured = self.points, measured_pixels(self.points, mask)
+        noise = self._typical_noise(measured)
+        fitted = start or self.start(measured)
+        patch, rim = np.zeros_like(measured), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+        for _ in range(20):
+            before, reach = patch, PATCH_TOLERANCE_MM
+            if isinstance(fitted, Sphere):
+                reach = min(reach, SPHERE_TOLERANCE * fitted.radius)
+            distances = fitted.distance(np.where(measured[..., None], points, 0.0))
+            agreeing = measured & (np.abs(distances) < max(reach, 6.0 * noise))
+            patch = _largest_patch(agreeing)
+            # without the outermost pixels, where the patch ends inside the image
+            region = cv2.erode(patch.astype(np.uint8), rim, borderValue=1).astype(bool)
+            shown = np.count_nonzero(region & agreeing)
+            if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
+                raise InputError(
+                    f"The largest {'flat' if self.shape == 'plane' else 'round'} patch has"
+                    f" {shown} of {np.count_nonzero(measured)} measured pixels: check that the"
+                    " shape fills a good part of the view, and that the cloud is not mere noise."
+                )
+            if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
+                break
+            # alternately a patch of agreeing pixels and least squares over it
+            fitted = _FITS[self.shape](_sample_points(points, patch & agreeing))
+        return fitted, region
+
+    def find_several(self, count: int) -> list[tuple[Plane | Sphere, Map]]:
+        """``count`` shapes of one cloud and their regions, from left to right in the image."""
+        free = measured_pixels(self.points, None)
+        found = []
+        for _ in range(count):
+            found.append(self.find(free))
+            free &= ~cv2.dilate(
+                found[-1][1].astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)
+            ).astype(bool)
+        return sorted(found, key=lambda each: float(np.nonzero(each[1])[1].mean()))
+
+    def evaluate(self, mask: Map | None, start: Plane | Sphere | None = None) -> ShapeResult:
+        """Fit the shape to the measured pixels under ``mask``, and evaluate the residuals; as
+        `evaluate_sphere`."""
+        points, sigma_z = self.points, self.sigma_z
+        if mask is None:
+            start, mask = self.find()
+        start = start or self.start(mask)
+        evaluated = mask & finite_rows(points)
+        chosen = points[evaluated].astype(np.float64)
+        if len(chosen) < LEAST_POINTS:
+            raise InputError(
+                f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are"
+                " needed."
+            )
+        fitted, is_inlier = fit_settled(lambda some, _: _FITS[self.shape](some), chosen, start)
+        residuals = fitted.distance(chosen)
+        error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
+        error_map[evaluated] = residuals
+        inliers = np.zeros(points.shape[:2], dtype=bool)
+        inliers[evaluated] = is_inlier
+        floor = np.nan
+        if sigma_z is not None:
+            floor = noise_floor(fitted, chosen[is_inlier], sigma_z[inliers])
+        excluded = int(np.count_nonzero(~is_inlier))
+        error = rms(residuals[is_inlier])
+        return ShapeResult(fitted, error, floor, len(chosen), excluded, error_map, inliers)
+
+    def _typical_noise(self, measured: Map) -> float:
+        """Median noise of the measured pixels in mm; 0 where none is known."""
+        if self.sigma_z is None:
+            return 0.0
+        if self.sigma_z.shape != measured.shape:
+            raise InputError(
+                f"The noise map has shape {self.sigma_z.shape} and the cloud {measured.shape}: they"
+                " must agree."
+            )
+        known = self.sigma_z[measured & np.isfinite(self.sigma_z)]
+        return float(np.median(known)) if known.size else 0.0
 
 
 _FITS: dict[Shape, Callable[[np.ndarray], Plane | Sphere]] = {
@@ -241,92 +307,6 @@ def noise_floor(shape: Plane | Sphere, points: Points, sigma_z: Map) -> float:
     else:
         along = np.sum(unit_vectors(points - shape.centre) * rays, axis=1)
     return rms(sigma_z * along)
-
-
-def find_shape(
-    shape: Shape,
-    points: Points,
-    mask: Map | None = None,
-    sigma_z: Map | None = None,
-    radius: float | None = None,
-    start: Plane | Sphere | None = None,
-) -> tuple[Plane | Sphere, Map]:
-    """Detect the shape with most pixels of a cloud ``(h, w, 3)``, and its region ``(h, w)`` bool.
-
-    ``sigma_z`` ``(h, w)`` mm is the expected noise; ``radius`` in mm narrows the search for a
-    sphere. The region is one patch without its outermost two pixels; isolated pixels and small
-    holes inside it belong to it, whether something was measured there or not. A roughly known shape
-    to ``start`` from spares the search. The shape that comes back is a start for fits, not a
-    result. Raises ``InputError`` where no such shape fills a patch.
-    """
-    measured = measured_pixels(points, mask)
-    noise = _typical_noise(sigma_z, measured)
-    fitted = start or start_shape(shape, points, measured, sigma_z, radius)
-    patch, rim = np.zeros_like(measured), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
-    for _ in range(20):
-        before, reach = patch, PATCH_TOLERANCE_MM
-        if isinstance(fitted, Sphere):
-            reach = min(reach, SPHERE_TOLERANCE * fitted.radius)
-        distances = fitted.distance(np.where(measured[..., None], points, 0.0))
-        agreeing = measured & (np.abs(distances) < max(reach, 6.0 * noise))
-        patch = _largest_patch(agreeing)
-        # without the outermost pixels, where the patch ends inside the image
-        region = cv2.erode(patch.astype(np.uint8), rim, borderValue=1).astype(bool)
-        shown = np.count_nonzero(region & agreeing)
-        if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
-            raise InputError(
-                f"The largest {'flat' if shape == 'plane' else 'round'} patch has {shown} of"
-                f" {np.count_nonzero(measured)} measured pixels: check that the shape fills a good"
-                " part of the view, and that the cloud is not mere noise."
-            )
-        if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
-            break
-        # alternately a patch of agreeing pixels and least squares over it
-        fitted = _FITS[shape](_sample_points(points, patch & agreeing))
-    return fitted, region
-
-
-def find_spheres(
-    points: Points, count: int, sigma_z: Map | None = None, radius: float | None = None
-) -> list[tuple[Plane | Sphere, Map]]:
-    """``count`` spheres of one cloud and their regions, from left to right in the image."""
-    free = measured_pixels(points, None)
-    spheres = []
-    for _ in range(count):
-        spheres.append(find_shape("sphere", points, free, sigma_z, radius))
-        free &= ~cv2.dilate(
-            spheres[-1][1].astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)
-        ).astype(bool)
-    return sorted(spheres, key=lambda each: float(np.nonzero(each[1])[1].mean()))
-
-
-def start_shape(
-    shape: Shape,
-    points: Points,
-    mask: Map,
-    sigma_z: Map | None = None,
-    radius: float | None = None,
-) -> Plane | Sphere:
-    """Estimate the shape that most points under ``mask`` agree with, by RANSAC."""
-    measured = measured_pixels(points, mask)
-    tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * _typical_noise(sigma_z, measured))
-    some = _sample_points(points, measured)
-    if shape == "plane":
-        return ransac_plane(some, tolerance)[0]
-    return ransac_sphere(some, tolerance, radius)[0]
-
-
-def _typical_noise(sigma_z: Map | None, measured: Map) -> float:
-    """Median noise of the measured pixels in mm; 0 where none is known."""
-    if sigma_z is None:
-        return 0.0
-    if sigma_z.shape != measured.shape:
-        raise InputError(
-            f"The noise map has shape {sigma_z.shape} and the cloud {measured.shape}: they must"
-            " agree."
-        )
-    known = sigma_z[measured & np.isfinite(sigma_z)]
-    return float(np.median(known)) if known.size else 0.0
 
 
 def measured_pixels(points: Points, mask: Map | None) -> Map:

@@ -30,7 +30,7 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.errors import InputError
 from slviewer.evaluation.compare import Comparison, fit_clouds
-from slviewer.evaluation.fit import ShapeResult, evaluate_shape
+from slviewer.evaluation.fit import ShapeResult, ShapeSearch
 from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
@@ -320,9 +320,8 @@ def compare_fits(
     for name in clouds.keys() - set(JUDGED):
         points, sigma = clouds[name].points, clouds[name].sigma_z
         try:
-            comparison.results[name] = evaluate_shape(
-                shape, points, comparison.common, sigma, start=start
-            )
+            search = ShapeSearch(shape, points, sigma)
+            comparison.results[name] = search.evaluate(comparison.common, start)
         except InputError:
             continue  # it measures nothing there
     to_score = comparison.region & clouds["stereo"].mask & clouds[FLOOR].mask
