@@ -166,10 +166,13 @@ class MeasuredScan:
 
 
 @dataclass(eq=False)
-class CaseReport:
-    """The program's messages on a case: its warnings, the causes that it named, and the error that
-    ended it."""
+class CaseRun:
+    """A case in a ``session``, and the program's messages on it: its warnings, the causes that it
+    named, and the error that ended it."""
 
+    session: Path
+    fault: Fault = SOUND
+    severity: Severity = "mild"
     warnings: list[str] = field(default_factory=list)
     named: list[frozenset[str]] = field(default_factory=list)
     error: Exception | None = None
@@ -234,51 +237,34 @@ class HostileBench:
         frames = expose_frames(renderer, light, self.sequence, number, fault, severity, self.seed)
         return frames, renderer, clean
 
-    def measure_anew(
-        self,
-        session: Path,
-        report: CaseReport,
-        fault: Fault = SOUND,
-        severity: Severity = "mild",
-    ) -> list[MeasuredScan]:
-        """Calibrate from target poses, of which some have the fault if there is one, and measure
-        the clean scans; the report gets the causes of the calibration's verdict too."""
-        shutil.rmtree(session, ignore_errors=True)
-        struck = fault.struck[SEVERITIES.index(severity)]
+    def measure_anew(self, run: CaseRun) -> list[MeasuredScan]:
+        """Calibrate from target poses, of which some have the fault of the run, and measure the
+        clean scans; the run gets the causes of the calibration's verdict too."""
+        shutil.rmtree(run.session, ignore_errors=True)
+        struck = run.fault.struck[SEVERITIES.index(run.severity)]
         frames = {
-            name: self.capture(name, fault if i < struck else SOUND, severity)[0]
+            name: self.capture(name, run.fault if i < struck else SOUND, run.severity)[0]
             for i, name in enumerate(self.targets)
         }
-        self._store(session, "calibration", frames, report)
+        self._store(run, "calibration", frames)
         try:
-            calibrate.run(
-                session, CalibrateSettings(str(BOARD), self.models), warn=report.warnings.append
-            )
+            settings = CalibrateSettings(str(BOARD), self.models)
+            calibrate.run(run.session, settings, warn=run.warnings.append)
         finally:
-            with Session.open(session) as store:
+            with Session.open(run.session) as store:
                 verdict = load_last_verdict(store)
-            report.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
-        return self.measure_scans(session, report)
+            run.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
+        return self.measure_scans(run)
 
-    def measure_scans(
-        self,
-        session: Path,
-        report: CaseReport,
-        fault: Fault = SOUND,
-        severity: Severity = "mild",
-    ) -> list[MeasuredScan]:
-        """Measure all scans, captured with the fault if there is one, with the calibration of a
-        session."""
-        shots = {name: self.capture(name, fault, severity) for name in SCANS}
-        self._store(session, "scan", {name: shot[0] for name, shot in shots.items()}, report)
-        return [self._measure(session, name, shot[1:], report) for name, shot in shots.items()]
+    def measure_scans(self, run: CaseRun, fault: Fault = SOUND) -> list[MeasuredScan]:
+        """Measure all scans, captured with the fault if there is one, with the calibration of the
+        run's session."""
+        shots = {name: self.capture(name, fault, run.severity) for name in SCANS}
+        self._store(run, "scan", {name: shot[0] for name, shot in shots.items()})
+        return [self._measure(run, name, shot[1:]) for name, shot in shots.items()]
 
     def _store(
-        self,
-        session: Path,
-        role: Literal["calibration", "scan"],
-        captures: Mapping[str, Frames],
-        report: CaseReport,
+        self, run: CaseRun, role: Literal["calibration", "scan"], captures: Mapping[str, Frames]
     ) -> None:
         """Write frames as images with a TOML, and import them as anyone would."""
         source = self.folder / "images"
@@ -286,11 +272,11 @@ class HostileBench:
         files = [write_images(source / name, frames) for name, frames in captures.items()]
         toml = source / "sequence.toml"
         toml.write_text(describe_sequence(self.sequence, files[0]))
-        messages = report.warnings
+        messages = run.warnings
         try:
             import_captures(
                 source,
-                session,
+                run.session,
                 "frames",
                 sequence=toml,
                 role=role,
@@ -302,7 +288,7 @@ class HostileBench:
             raise
         finally:
             # the causes of the program's own findings whose sentence is part of a message
-            report.named += [
+            run.named += [
                 frozenset({finding.cause})
                 for name, frames in captures.items()
                 if (about := [message for message in messages if name in message])
@@ -310,21 +296,19 @@ class HostileBench:
                 if any(finding.sentence in message for message in about)
             ]
 
-    def _measure(
-        self, session: Path, name: str, truth: tuple[Renderer, Renderer], report: CaseReport
-    ) -> MeasuredScan:
+    def _measure(self, run: CaseRun, name: str, truth: tuple[Renderer, Renderer]) -> MeasuredScan:
         """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the
         renderers know."""
         shape: Shape = "plane" if name.startswith("plane") else "sphere"
-        with Session.open(session) as store:
-            job, out = Job(store, warn=report.warnings.append), self.folder / "cloud.ply"
+        with Session.open(run.session) as store:
+            job, out = Job(store, warn=run.warnings.append), self.folder / "cloud.ply"
             done = reconstruct_capture(job, ReconstructSettings(name, self.models[-1], out=out))
             try:
                 radius = SPHERE_RADIUS_MM if shape == "sphere" else None
                 settings = VerifySettings([name], shape, self.models, radius=radius)
                 verify.run(store, settings, warn=job.warn)
             except SlviewerError as error:
-                report.warnings.append(str(error))
+                run.warnings.append(str(error))
         return _match_with_truth(done.cloud, *truth)
 
 
@@ -379,7 +363,7 @@ def prove_hostile(
     with tempfile.TemporaryDirectory(prefix="slviewer-hostile-") as folder:
         progress(0.0, "the undisturbed rig")
         bench = HostileBench(rig, Path(folder), 8 if splined else 7, models, seed)
-        sound = bench.measure_anew(bench.folder / "sound", CaseReport())
+        sound = bench.measure_anew(CaseRun(bench.folder / "sound"))
         gauge = fit_gauge(sound)
         floor = score(sound, gauge)
         for i, (name, severity, direction) in enumerate(chosen):
@@ -427,22 +411,22 @@ def run_case(
     floor: Figures,
 ) -> HostileCase:
     """Run one case against the undisturbed session; an error, a crash too, is its result."""
-    start, report = perf_counter(), CaseReport()
-    name, severity, direction = case
-    fault, figures = FAULTS[name], None
+    start, (name, severity, direction), figures = perf_counter(), case, None
+    session = bench.folder / ("sound" if direction == "scan" else "hostile")
+    run = CaseRun(session, FAULTS[name], severity)
     try:
         if direction == "scan":
-            measured = bench.measure_scans(bench.folder / "sound", report, fault, severity)
+            measured = bench.measure_scans(run, run.fault)
         else:
-            measured = bench.measure_anew(bench.folder / "hostile", report, fault, severity)
+            measured = bench.measure_anew(run)
             gauge = fit_gauge(measured)
         figures = score(measured, gauge)
     except Exception as error:  # the other cases still have to run
-        report.error = error
-    outcome, named = judge_case(fault, severity, report, figures, floor)
-    messages = list(report.warnings)
-    if report.error:
-        messages.append(f"{type(report.error).__name__}: {report.error}")
+        run.error = error
+    outcome, named = judge_case(run, figures, floor)
+    messages = list(run.warnings)
+    if run.error:
+        messages.append(f"{type(run.error).__name__}: {run.error}")
     return HostileCase(
         *case,
         outcome,
@@ -456,18 +440,19 @@ def run_case(
 
 
 def judge_case(
-    fault: Fault, severity: Severity, report: CaseReport, figures: Figures | None, floor: Figures
+    run: CaseRun, figures: Figures | None, floor: Figures
 ) -> tuple[Outcome, tuple[str, ...]]:
     """The outcome of a case, and the causes that the program named."""
-    texts = [*report.warnings, *([str(report.error)] if report.error and not report.named else [])]
-    named = report.named + _match_causes(_WORDS, texts)
+    fault, error = run.fault, run.error
+    texts = [*run.warnings, *([str(error)] if error and not run.named else [])]
+    named = run.named + _match_causes(_WORDS, texts)
     named += [causes for causes in _match_causes(_OPEN, texts) if causes & fault.causes]
     words = tuple(dict.fromkeys("|".join(sorted(each)) for each in named))
-    if report.error is not None and not isinstance(report.error, SlviewerError):
+    if error is not None and not isinstance(error, SlviewerError):
         return "CRASH", words
     is_right = any(each & fault.causes for each in named)
-    must_measure = fault.must_measure and severity == "mild"
-    if figures is None or report.error is not None:
+    must_measure = fault.must_measure and run.severity == "mild"
+    if figures is None or error is not None:
         return (
             "WRONG REASON" if not is_right else "TURNED AWAY" if must_measure else "refused"
         ), words
