@@ -63,13 +63,13 @@ def add_flicker(light: Frames, depth: float, shot: Shot) -> Frames:
     frame."""
     n = len(light)
     begin = 0.37 * np.arange(n)[:, None] + shot.rng.uniform(0, 1, (n, 1)) * 0.1
-    return light * (1 + depth * np.sin(_row_phase(light, 1.6, begin))).astype(np.float32)
+    return light * (1 + depth * np.sin(row_phase(light, 1.6, begin))).astype(np.float32)
 
 
 def add_room_flicker(light: Frames, depth: float, shot: Shot) -> Frames:
     """Add ambient light, a fifth as strong as the projector's, that flickers by ``depth`` of its
     light."""
-    phase = _row_phase(light, 1.6, 0.29 * np.arange(len(light))[:, None])
+    phase = row_phase(light, 1.6, 0.29 * np.arange(len(light))[:, None])
     bands = 0.2 * (1 + depth * np.sin(phase))
     return 0.8 * light + bands.astype(np.float32) * shot.room_light
 
@@ -87,12 +87,12 @@ def add_colour_wheel(light: Frames, depth: float, shot: Shot) -> Frames:
     """Simulate a short exposure that sees part of the colour wheel's turn: fast bands of the
     projector's light."""
     dark = light.min(0, keepdims=True)
-    phase = _row_phase(light, 5.0, shot.rng.uniform(0, 1, (len(light), 1)))
+    phase = row_phase(light, 5.0, shot.rng.uniform(0, 1, (len(light), 1)))
     bands = 1 + depth * (np.sin(phase) + 0.5 * np.sin(2 * phase))
     return dark + (light - dark) * bands.astype(np.float32)
 
 
-def _row_phase(light: Frames, turns: float, begin: np.ndarray) -> np.ndarray:
+def row_phase(light: Frames, turns: float, begin: np.ndarray) -> np.ndarray:
     """Phase (n, h, 1), rad, of so many turns along the rows that begin at ``begin`` (n, 1)."""
     height = light.shape[1]
     return (2 * np.pi * (turns * np.arange(height) / height + begin))[..., None]

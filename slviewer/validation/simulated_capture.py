@@ -16,7 +16,7 @@ import numpy as np
 
 from slviewer.fringe.presets import bits_for, complementary, gray_bits, micro, p18, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, Size
-from slviewer.simulation.hostile_frames import add_crosstalk, compress_jpeg, scale_frames
+from slviewer.simulation.hostile_frames import add_crosstalk, compress_jpeg, row_phase, scale_frames
 from slviewer.validation.simulated_scene import (
     FOCAL,
     SCENES,
@@ -299,22 +299,20 @@ def _illuminate(
 
 def _photograph_another_scene(setup: CaptureSetup, image: int) -> np.ndarray:
     """A picture (h, w) that has nothing to do with the patterns, about as bright."""
-    width, height = setup.view.camera
     rng = np.random.default_rng([setup.seed, image, 7])
     coarse = rng.uniform(0, 1, (7, 9)).astype(np.float32)
-    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    return cv2.resize(coarse, setup.view.camera, interpolation=cv2.INTER_CUBIC).clip(0, 1)
 
 
 def _disturb(setup: CaptureSetup, light: np.ndarray) -> np.ndarray:
     """Light (n, h, w) with ghosts, gains, flicker and the lamp of the room."""
-    n, height, _ = light.shape
     if setup.ghost:
         light = add_crosstalk(light, setup.ghost)
     if setup.gains:
         light = scale_frames(light, np.array(setup.gains))
     if setup.flicker:
-        rows = 1.7 * np.arange(height)[None] / height + 0.37 * np.arange(n)[:, None]
-        light = light * (1 + setup.flicker * np.sin(2 * np.pi * rows)).astype(np.float32)[..., None]
+        phase = row_phase(light, 1.7, 0.37 * np.arange(len(light))[:, None])
+        light = light * (1 + setup.flicker * np.sin(phase)).astype(np.float32)
     first, share = setup.room_step
     if share:
         albedo = trace_view(setup.view).albedo.mean(axis=0)
@@ -330,10 +328,8 @@ def _record(setup: CaptureSetup, light: np.ndarray) -> np.ndarray:
     geometry = trace_view(setup.view, setup.displacements[0])
     white = geometry.shade.mean(axis=0) + setup.ambient * geometry.albedo.mean(axis=0)
     known = white[(geometry.shade > 0).all(axis=0)]
-    if setup.clipped_share:
-        gain = 1 / float(np.quantile(known, 1 - setup.clipped_share))
-    else:
-        gain = setup.exposure / float(np.quantile(known, 0.99))
+    share, level = (setup.clipped_share, 1.0) if setup.clipped_share else (0.01, setup.exposure)
+    gain = level / float(np.quantile(known, 1 - share))
     full = (1 << setup.bit_depth) - 1
     rng = np.random.default_rng([setup.seed, crc32(setup.kind.encode()), 3])
     dtype = np.uint8 if setup.bit_depth == 8 else np.uint16
