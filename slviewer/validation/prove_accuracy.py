@@ -95,7 +95,7 @@ class RigCase:
 BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
 
 
-def rig_cases(seed: int = 0) -> tuple[RigCase, ...]:
+def rig_cases(seed: int) -> tuple[RigCase, ...]:
     """The default rig and five others; another seed makes six others of the same kinds."""
     return (
         RigCase("coarse", seed),
