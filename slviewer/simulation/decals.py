@@ -107,9 +107,8 @@ def _stick_on_front(
     """The marker on a front at ``radius`` from the y axis, turned about y and then x, and moved
     along y."""
     R = Rotation.from_euler("yx", turn_deg, degrees=True).as_matrix()
-    return Decal(
-        number, side_mm, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0]))
-    )
+    place = R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0])
+    return Decal(number, side_mm, Pose(R, place))
 
 
 def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +118,6 @@ def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]
     angles = np.arange(around) * 2 * np.pi / around
     ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
     vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
-    i, j = np.arange(around), (np.arange(around) + 1) % around
-    return vertices, np.concatenate(
-        [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
-    )
+    i, j = np.arange(around), np.roll(np.arange(around), -1)
+    halves = [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
+    return vertices, np.concatenate(halves)

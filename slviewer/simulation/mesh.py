@@ -82,8 +82,7 @@ class MeshScene:
         # twice the area: a fair weight
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals = np.zeros_like(self.placed)
-        for k in range(3):
-            np.add.at(normals, self.triangles[:, k], flat)
+        np.add.at(normals, self.triangles.T, flat)
         return unit_vectors(normals)
 
     @cached_property
