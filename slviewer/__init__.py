@@ -45,8 +45,7 @@ if TYPE_CHECKING:
     from slviewer.devices.simulated import simulated_rig
     from slviewer.devices.world import SimulatedWorld
     from slviewer.errors import SlviewerError
-    from slviewer.evaluation.plane import evaluate_plane
-    from slviewer.evaluation.sphere import evaluate_sphere
+    from slviewer.evaluation.fit import evaluate_plane, evaluate_sphere
     from slviewer.examination.examine import examine
     from slviewer.fringe.decode import decode, texture
     from slviewer.fringe.phase import PhaseMap, Reason
@@ -130,8 +129,8 @@ _EXPORTS = {
     "decode": "fringe.decode",
     "detect_board": "target.detect:detect",
     "draw_error_maps": "report.maps",
-    "evaluate_plane": "evaluation.plane",
-    "evaluate_sphere": "evaluation.sphere",
+    "evaluate_plane": "evaluation.fit",
+    "evaluate_sphere": "evaluation.fit",
     "examine": "examination.examine",
     "export": "pipeline.export",
     "fuse_clouds": "surface.fuse:fuse",

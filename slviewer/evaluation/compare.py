@@ -8,17 +8,8 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.evaluation.fit import LEAST_PIXELS, ShapeResult, ShapeSearch, measured_pixels
 from slviewer.evaluation.incidence import incidence
-from slviewer.evaluation.plane import PlaneResult, evaluate_plane
-from slviewer.evaluation.region import (
-    LEAST_PIXELS,
-    find_plane,
-    find_sphere,
-    measured_pixels,
-    start_plane,
-    start_sphere,
-)
-from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.record import to_vector
@@ -44,7 +35,7 @@ class Comparison:
     """
 
     shape: Shape
-    results: dict[str, PlaneResult | SphereResult]
+    results: dict[str, ShapeResult]
     region: np.ndarray
     common: np.ndarray
     coverage: dict[str, float]
@@ -78,15 +69,14 @@ class Comparison:
         return messages
 
     def region_text(self) -> str:
-        """Describe the position of the measured region in the image; empty where its map is not
-        available."""
-        rows, columns = (
-            np.flatnonzero(self.region.any(axis=1)),
-            np.flatnonzero(self.region.any(axis=0)),
-        )
-        if not len(rows):
-            return ""
-        return f"columns {columns[0]}-{columns[-1]}, rows {rows[0]}-{rows[-1]}"
+        """Describe the position of the measured region in the image."""
+        left, right, top, bottom = self._region_px()
+        return f"columns {left}-{right}, rows {top}-{bottom}"
+
+    def _region_px(self) -> tuple[int, int, int, int]:
+        """First and last column, first and last row of the measured region."""
+        rows, columns = (np.flatnonzero(self.region.any(axis=axis)) for axis in (1, 0))
+        return int(columns[0]), int(columns[-1]), int(rows[0]), int(rows[-1])
 
     def record(
         self, masked: Mapping[str, float] = MappingProxyType({}), **origin: Any
@@ -96,10 +86,6 @@ class Comparison:
         ``masked``: {model: share that it masks}, of models that do; ``origin``: the record's inputs
         and scales.
         """
-        rows, columns = (
-            np.flatnonzero(self.region.any(axis=1)),
-            np.flatnonzero(self.region.any(axis=0)),
-        )
         return Verification(
             shape=self.shape,
             models={
@@ -109,27 +95,23 @@ class Comparison:
                     rms_mm=result.rms_mm,
                     noise_floor_mm=_known(result.noise_floor_mm),
                     coverage=_known(self.coverage[model]),
-                    radius_mm=result.radius_mm if isinstance(result, SphereResult) else None,
-                    centre_mm=(
-                        to_vector(result.sphere.centre)
-                        if isinstance(result, SphereResult)
-                        else None
-                    ),
-                    normal=(
-                        to_vector(result.plane.normal) if isinstance(result, PlaneResult) else None
-                    ),
-                    offset_mm=(
-                        float(result.plane.offset) if isinstance(result, PlaneResult) else None
-                    ),
                     masked=masked.get(model),
+                    **_shape_fields(result.shape),
                 )
                 for model, result in self.results.items()
             },
             incidence=self.incidence,
             share=_known(self.share),
-            region_px=(int(columns[0]), int(columns[-1]), int(rows[0]), int(rows[-1])),
+            region_px=self._region_px(),
             **origin,
         )
+
+
+def _shape_fields(shape: Plane | Sphere) -> dict[str, Any]:
+    """The fields of a record that describe a fitted shape."""
+    if isinstance(shape, Plane):
+        return {"normal": to_vector(shape.normal), "offset_mm": float(shape.offset)}
+    return {"centre_mm": to_vector(shape.centre), "radius_mm": shape.radius}
 
 
 def fit_clouds(
@@ -164,26 +146,20 @@ def fit_clouds(
         )
     # A wall behind the shape may hold more pixels, in a model that measures everywhere.
     searched = region if region is not None else shared
+    search = ShapeSearch(shape, every, sigma_z, radius)
+    start = search.start(searched)
     is_searched = region is None
-    start: Plane | Sphere
-    if shape == "plane":
-        start = start_plane(every, searched, sigma_z)
-        if region is None:
-            start, region = find_plane(every, sigma_z=sigma_z, start=start)
-    else:
-        start = start_sphere(every, searched, sigma_z, radius=radius)
-        if region is None:
-            start, region = find_sphere(every, sigma_z=sigma_z, radius=radius, start=start)
+    if region is None:
+        start, region = search.find(None, start)
     measured_pixels(every, region)  # says so if there is too little
     common = region & shared
-    results: dict[str, PlaneResult | SphereResult] = {}
+    lit = np.zeros_like(region) if illuminated is None else region & illuminated
+    lit_pixels = np.count_nonzero(lit) or np.nan
+    results: dict[str, ShapeResult] = {}
     for model, cloud in clouds.items():
         try:
-            results[model] = (
-                evaluate_plane(cloud.points, common, cloud.sigma_z, start)
-                if isinstance(start, Plane)
-                else evaluate_sphere(cloud.points, common, cloud.sigma_z, radius, start)
-            )
+            search = ShapeSearch(shape, cloud.points, cloud.sigma_z)
+            results[model] = search.evaluate(common, start)
         except InputError as error:
             raise InputError(f"No {shape} could be fitted to the {model} cloud. {error}") from error
     return Comparison(
@@ -192,7 +168,8 @@ def fit_clouds(
         region=region,
         common=common,
         coverage={
-            model: _coverage_share(cloud, region, illuminated) for model, cloud in clouds.items()
+            model: np.count_nonzero(lit & cloud.mask) / lit_pixels
+            for model, cloud in clouds.items()
         },
         incidence=None if depth_range is None else incidence(every, region, depth_range),
         share=int(np.count_nonzero(common)) / max(1, int(np.count_nonzero(shared))),
@@ -215,15 +192,6 @@ def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
         missing = ~np.isfinite(points).all(axis=2)
         points[missing], sigma_z[missing] = cloud.points[missing], cloud.sigma_z[missing]
     return points, sigma_z
-
-
-def _coverage_share(cloud: Cloud, region: np.ndarray, illuminated: np.ndarray | None) -> float:
-    """Return the share of the region's illuminated pixels that the cloud measures; NaN where
-    unknown."""
-    measurable = 0 if illuminated is None else np.count_nonzero(region & illuminated)
-    if illuminated is None or measurable == 0:
-        return float("nan")
-    return np.count_nonzero(region & illuminated & cloud.mask) / measurable
 
 
 def _known(value: float) -> float | None:

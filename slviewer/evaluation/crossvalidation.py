@@ -133,16 +133,17 @@ def gather_results(
         raise InputError(
             f"no model could be made without some of the poses ({why}): capture more poses"
         )
-    models = {model: _average_errors(list(of_poses.values())) for model, of_poses in poses.items()}
+    models = {
+        model: HeldOutError(
+            *(
+                rms([getattr(each, name) for each in of_poses.values()])
+                for name in HeldOutError.__struct_fields__
+            )
+        )
+        for model, of_poses in poses.items()
+    }
     return ModelComparison(
         recommended=_recommend(models), models=models, poses=poses, folds=folds, failed=dict(failed)
-    )
-
-
-def _average_errors(errors: Sequence[HeldOutPose]) -> HeldOutError:
-    """Return the root mean square of each figure over some poses."""
-    return HeldOutError(
-        *(rms([getattr(each, name) for each in errors]) for name in HeldOutError.__struct_fields__)
     )
 
 

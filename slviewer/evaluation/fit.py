@@ -1,41 +1,79 @@
-"""One least-squares shape in one cloud: its residuals, and those that noise alone would cause."""
+"""Planes and spheres in one organised cloud: which pixels show them, their least-squares fits, the
+residuals, and those that noise alone would cause.
+
+RANSAC says where the shape is; the largest patch of connected pixels within a tolerance says how
+far it reaches. The tolerance is many times wider than any form error worth measuring, so that
+finding the shape never flatters it: what is wrong by less stays in, and what is wrong by more,
+inside the patch, stays in too, to be counted as set aside. Where a cloud is noisier than that (Gray
+code alone), the tolerances follow its expected noise.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.ransac import ransac_plane, ransac_sphere
 from slviewer.geometry.robust import robust_sigma
-from slviewer.geometry.shapes import Plane, Sphere
+from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
 from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
-from slviewer.records.verification import MAX_EXCLUDED
-
-Fitted = TypeVar("Fitted", Plane, Sphere)
+from slviewer.records.verification import MAX_EXCLUDED, Shape
 
 MAX_SIGMA = 5.0
 LEAST_POINTS = 100
+RANSAC_TOLERANCE_MM = 1.0  # or twice the noise
+PATCH_TOLERANCE_MM = 3.0  # or six times the noise
+SPHERE_TOLERANCE = 0.04  # of its radius, if that is less
+RIM_PX = 2  # mixed pixels at an object's outline show neither the object nor what is behind it
+LEAST_PIXELS = 200
+_SAMPLE = 40_000
+
+Points = np.ndarray
+"""Of an organised cloud (h, w, 3), or some of its points (n, 3), mm."""
+Map = np.ndarray
+"""(h, w): a value for each pixel of an organised cloud."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeResult:
-    """Distances of a cloud from its own best plane or sphere.
+    """Distances of a cloud from its own best plane or sphere, the ``shape``.
 
     ``points`` pixels were evaluated; of these ``excluded`` lie beyond 5 robust sigma and count
     neither in the fit nor in ``rms_mm``, the root mean square of the perpendicular (radial)
     distances. ``noise_floor_mm`` is what that would be from the cloud's expected noise alone, over
     the same pixels; NaN where none is known. ``error_map`` ``(h, w)`` float32, mm, NaN where
     nothing was evaluated, holds every distance, those excluded too: positive towards the camera for
-    a plane, outwards for a sphere. ``inliers`` ``(h, w)`` bool says which pixels counted.
+    a plane (Letter eq. 12), outwards for a sphere, whose radius is free. ``inliers`` ``(h, w)``
+    bool says which pixels counted.
     """
 
+    shape: Plane | Sphere
     rms_mm: float
     noise_floor_mm: float
     points: int
     excluded: int
-    error_map: np.ndarray
-    inliers: np.ndarray
+    error_map: Map
+    inliers: Map
+
+    @property
+    def plane(self) -> Plane:
+        """The fitted plane."""
+        assert isinstance(self.shape, Plane)
+        return self.shape
+
+    @property
+    def sphere(self) -> Sphere:
+        """The fitted sphere."""
+        assert isinstance(self.shape, Sphere)
+        return self.shape
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of the fitted sphere."""
+        return self.sphere.radius
 
     @property
     def excluded_share(self) -> float:
@@ -55,18 +93,18 @@ class ShapeResult:
         )
 
 
-class Shape(Protocol):
+class FittedShape(Protocol):
     """A surface with distances from it."""
 
-    def distance(self, points: np.ndarray) -> np.ndarray:
+    def distance(self, points: Points) -> np.ndarray:
         """Signed distances (n,) mm of points (n, 3)."""
 
 
-AnyShape = TypeVar("AnyShape", bound=Shape)
+AnyShape = TypeVar("AnyShape", bound=FittedShape)
 
 
 def fit_settled(
-    fit: Callable[[np.ndarray, AnyShape], AnyShape], points: np.ndarray, start: AnyShape
+    fit: Callable[[np.ndarray, AnyShape], AnyShape], points: Points, start: AnyShape
 ) -> tuple[AnyShape, np.ndarray]:
     """Fit a shape to points (n, 3) mm, those beyond 5 robust sigma excluded, repeated until the set
     is stable.
@@ -83,7 +121,7 @@ def fit_settled(
     return shape, inliers
 
 
-def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
+def within_sigmas(residuals: np.ndarray, points: Points) -> np.ndarray:
     """(n,) bool: the residuals (n,) mm within 5 robust sigma of their median.
 
     Sigma is that of *all* residuals, so that it does not shrink from round to round until only the
@@ -93,38 +131,166 @@ def within_sigmas(residuals: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.abs(residuals - np.median(residuals)) <= reach
 
 
-def fit_shape(
-    points: np.ndarray,
-    mask: np.ndarray,
-    sigma_z: np.ndarray | None,
-    start: Fitted,
-    fit: Callable[[np.ndarray], Fitted],
-) -> tuple[Fitted, ShapeResult]:
-    """Fit the shape to the measured pixels under ``mask`` of a cloud ``(h, w, 3)``, and evaluate
-    the residuals."""
-    evaluated = mask & finite_rows(points)
-    chosen = points[evaluated].astype(np.float64)
-    if len(chosen) < LEAST_POINTS:
-        raise InputError(
-            f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are needed."
-        )
-    shape, is_inlier = fit_settled(lambda some, _: fit(some), chosen, start)
-    residuals = shape.distance(chosen)
+def evaluate_plane(
+    points: Points,
+    mask: Map | None,
+    sigma_z: Map | None = None,
+    start: Plane | None = None,
+) -> ShapeResult:
+    """Fit a plane to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the distances from
+    it.
 
-    error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
-    error_map[evaluated] = residuals
-    inliers = np.zeros(points.shape[:2], dtype=bool)
-    inliers[evaluated] = is_inlier
-    floor = (
-        float("nan") if sigma_z is None else noise_floor(shape, chosen[is_inlier], sigma_z[inliers])
-    )
-    error = rms(residuals[is_inlier])
-    return shape, ShapeResult(
-        error, floor, len(chosen), int(np.count_nonzero(~is_inlier)), error_map, inliers
-    )
+    ``mask`` ``(h, w)``: the pixels that show the plane; None: the largest flat patch is found.
+    ``sigma_z`` ``(h, w)`` mm: the expected noise of z, for the noise floor. ``start``: about where
+    the plane lies, if that is known.
+    """
+    return ShapeSearch("plane", points, sigma_z).evaluate(mask, start)
 
 
-def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) -> float:
+def evaluate_sphere(
+    points: Points,
+    mask: Map | None,
+    sigma_z: Map | None = None,
+    radius: float | None = None,
+    start: Sphere | None = None,
+) -> ShapeResult:
+    """Fit a sphere to a cloud ``(h, w, 3)`` mm, NaN where invalid, and measure the radial distances
+    from it.
+
+    ``mask`` ``(h, w)``: the pixels that show the sphere; None: the largest round patch is found.
+    ``sigma_z`` ``(h, w)`` mm: the expected noise of z. ``radius`` in mm, roughly, helps to find the
+    sphere; the fitted radius stays free, as in the Letter's Table 2. ``start``: about where the
+    sphere lies, if that is known.
+    """
+    return ShapeSearch("sphere", points, sigma_z, radius).evaluate(mask, start)
+
+
+def evaluate_spheres(
+    points: Points, count: int, sigma_z: Map | None = None, radius: float | None = None
+) -> list[ShapeResult]:
+    """The ``count`` spheres of one cloud, such as a ball bar's two, from left to right; otherwise
+    as above."""
+    search = ShapeSearch("sphere", points, sigma_z, radius)
+    return [search.evaluate(region, start) for start, region in search.find_several(count)]
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeSearch:
+    """A plane or a sphere that is looked for in a cloud ``points`` ``(h, w, 3)`` mm, NaN where
+    invalid.
+
+    ``sigma_z`` ``(h, w)`` mm is the expected noise; ``radius`` in mm, roughly, narrows the search
+    for a sphere.
+    """
+
+    shape: Shape
+    points: Points
+    sigma_z: Map | None = None
+    radius: float | None = None
+
+    def start(self, mask: Map) -> Plane | Sphere:
+        """Estimate the shape that most points under ``mask`` agree with, by RANSAC."""
+        measured = measured_pixels(self.points, mask)
+        tolerance = max(RANSAC_TOLERANCE_MM, 2.0 * self._typical_noise(measured))
+        some = _sample_points(self.points, measured)
+        if self.shape == "plane":
+            return ransac_plane(some, tolerance)[0]
+        return ransac_sphere(some, tolerance, self.radius)[0]
+
+    def find(
+        self, mask: Map | None = None, start: Plane | Sphere | None = None
+    ) -> tuple[Plane | Sphere, Map]:
+        """Detect the shape with most pixels, and its region ``(h, w)`` bool.
+
+        The region is one patch without its outermost two pixels; isolated pixels and small holes
+        inside it belong to it, whether something was measured there or not. A roughly known shape
+        to ``start`` from spares the search. The shape that comes back is a start for fits, not a
+        result. Raises ``InputError`` where no such shape fills a patch.
+        """
+        points, measured = self.points, measured_pixels(self.points, mask)
+        noise = self._typical_noise(measured)
+        fitted = start or self.start(measured)
+        patch, rim = np.zeros_like(measured), np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
+        for _ in range(20):
+            before, reach = patch, PATCH_TOLERANCE_MM
+            if isinstance(fitted, Sphere):
+                reach = min(reach, SPHERE_TOLERANCE * fitted.radius)
+            distances = fitted.distance(np.where(measured[..., None], points, 0.0))
+            agreeing = measured & (np.abs(distances) < max(reach, 6.0 * noise))
+            patch = _largest_patch(agreeing)
+            # without the outermost pixels, where the patch ends inside the image
+            region = cv2.erode(patch.astype(np.uint8), rim, borderValue=1).astype(bool)
+            shown = np.count_nonzero(region & agreeing)
+            if shown < LEAST_PIXELS or shown < 0.5 * np.count_nonzero(region & measured):
+                raise InputError(
+                    f"The largest {'flat' if self.shape == 'plane' else 'round'} patch has"
+                    f" {shown} of {np.count_nonzero(measured)} measured pixels: check that the"
+                    " shape fills a good part of the view, and that the cloud is not mere noise."
+                )
+            if np.count_nonzero(patch ^ before) <= 1e-4 * np.count_nonzero(patch):
+                break
+            # alternately a patch of agreeing pixels and least squares over it
+            fitted = _FITS[self.shape](_sample_points(points, patch & agreeing))
+        return fitted, region
+
+    def find_several(self, count: int) -> list[tuple[Plane | Sphere, Map]]:
+        """``count`` shapes of one cloud and their regions, from left to right in the image."""
+        free = measured_pixels(self.points, None)
+        found = []
+        for _ in range(count):
+            found.append(self.find(free))
+            free &= ~cv2.dilate(
+                found[-1][1].astype(np.uint8), np.ones((4 * RIM_PX + 1,) * 2, np.uint8)
+            ).astype(bool)
+        return sorted(found, key=lambda each: float(np.nonzero(each[1])[1].mean()))
+
+    def evaluate(self, mask: Map | None, start: Plane | Sphere | None = None) -> ShapeResult:
+        """Fit the shape to the measured pixels under ``mask``, and evaluate the residuals; as
+        `evaluate_sphere`."""
+        points, sigma_z = self.points, self.sigma_z
+        if mask is None:
+            start, mask = self.find()
+        start = start or self.start(mask)
+        evaluated = mask & finite_rows(points)
+        chosen = points[evaluated].astype(np.float64)
+        if len(chosen) < LEAST_POINTS:
+            raise InputError(
+                f"{len(chosen)} points were measured in the region: at least {LEAST_POINTS} are"
+                " needed."
+            )
+        fitted, is_inlier = fit_settled(lambda some, _: _FITS[self.shape](some), chosen, start)
+        residuals = fitted.distance(chosen)
+        error_map = np.full(points.shape[:2], np.nan, dtype=np.float32)
+        error_map[evaluated] = residuals
+        inliers = np.zeros(points.shape[:2], dtype=bool)
+        inliers[evaluated] = is_inlier
+        floor = np.nan
+        if sigma_z is not None:
+            floor = noise_floor(fitted, chosen[is_inlier], sigma_z[inliers])
+        excluded = int(np.count_nonzero(~is_inlier))
+        error = rms(residuals[is_inlier])
+        return ShapeResult(fitted, error, floor, len(chosen), excluded, error_map, inliers)
+
+    def _typical_noise(self, measured: Map) -> float:
+        """Median noise of the measured pixels in mm; 0 where none is known."""
+        if self.sigma_z is None:
+            return 0.0
+        if self.sigma_z.shape != measured.shape:
+            raise InputError(
+                f"The noise map has shape {self.sigma_z.shape} and the cloud {measured.shape}: they"
+                " must agree."
+            )
+        known = self.sigma_z[measured & np.isfinite(self.sigma_z)]
+        return float(np.median(known)) if known.size else 0.0
+
+
+_FITS: dict[Shape, Callable[[np.ndarray], Plane | Sphere]] = {
+    "plane": fit_plane,
+    "sphere": fit_sphere,
+}
+
+
+def noise_floor(shape: Plane | Sphere, points: Points, sigma_z: Map) -> float:
     """Root mean square of ``sigma_z |n . r|`` over points (n, 3), r = (x/z, y/z, 1), n the shape's
     normal there; mm.
 
@@ -141,3 +307,54 @@ def noise_floor(shape: Plane | Sphere, points: np.ndarray, sigma_z: np.ndarray) 
     else:
         along = np.sum(unit_vectors(points - shape.centre) * rays, axis=1)
     return rms(sigma_z * along)
+
+
+def measured_pixels(points: Points, mask: Map | None) -> Map:
+    """Return which pixels ``(h, w)`` of a cloud hold a point, under a mask if there is one;
+    ``InputError`` if too few do."""
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise InputError(
+            f"The cloud has shape {points.shape}: an organised cloud (h, w, 3) is needed."
+        )
+    if mask is not None and mask.shape != points.shape[:2]:
+        raise InputError(
+            f"The mask has shape {mask.shape} and the cloud {points.shape[:2]}: they must agree."
+        )
+    measured = finite_rows(points)
+    measured = measured if mask is None else measured & mask
+    if np.count_nonzero(measured) < LEAST_PIXELS:
+        raise InputError(
+            f"{np.count_nonzero(measured)} points were measured where the shape is looked for: at"
+            f" least {LEAST_PIXELS} are needed; check that it is in view and illuminated."
+        )
+    return measured
+
+
+def _sample_points(points: Points, measured: Map) -> np.ndarray:
+    """Return some 40,000 of the measured points, (n, 3) float64."""
+    chosen = points[measured]
+    return chosen[:: -(-len(chosen) // _SAMPLE)].astype(np.float64)
+
+
+def _largest_patch(agreeing: Map) -> Map:
+    """Return the largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and
+    small holes are filled."""
+    closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
+    if count < 2:
+        return np.zeros_like(agreeing)
+    patch = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        (~patch).astype(np.uint8), connectivity=8
+    )
+    small = stats[:, cv2.CC_STAT_AREA] < 0.005 * np.count_nonzero(patch)
+    h, w = patch.shape
+    inside = (
+        (stats[:, 0] > 0)
+        & (stats[:, 1] > 0)
+        & (stats[:, 0] + stats[:, 2] < w)
+        & (stats[:, 1] + stats[:, 3] < h)
+    )
+    holes = small & inside
+    holes[0] = False  # label 0 is the patch itself
+    return patch | holes[labels]

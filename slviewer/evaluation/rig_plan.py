@@ -6,10 +6,10 @@ what is assumed of devices is blur, noise and light. Errors of a calibration are
 prediction.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import label
 
 from slviewer.calibration.next_pose import nominal_lens
 from slviewer.errors import InputError
@@ -33,6 +33,9 @@ _DEPTHS = np.linspace(0.5, 2.0, 151)
 _USABLE_COVERAGE, _USABLE_SIGMA = 0.6, 2.0
 """Of the depth range: share of the view that the projector must illuminate, and noise over that at
 the distance."""
+
+Map = np.ndarray
+"""(h, w): a value for each of a few camera pixels."""
 
 
 @dataclass(frozen=True)
@@ -140,18 +143,15 @@ def predict_rig(
     projector: PlannedProjector,
     distance: float,
     baseline: float,
-    light: PlannedLight | None = None,
+    light: PlannedLight,
     period_px: float | None = None,
-    depth_factors: Sequence[float] | np.ndarray = _DEPTHS,
 ) -> RigPlan:
     """Predict what a rig measures at a distance, mm.
 
-    ``period_px``: of the fringes, by default the best. ``depth_factors``, ascending: the depths, as
-    multiples of the distance, among which the usable range is found.
+    ``period_px``: of the fringes, by default the best.
 
     Raises InputError where the projector does not illuminate what the camera sees there.
     """
-    light = light or PlannedLight()
     rig = place(camera, projector, distance, baseline)
     view = replace(rig, camera=_thin(rig.camera))
     is_lit = _is_illuminated(view, distance)
@@ -164,13 +164,19 @@ def predict_rig(
     away = float(np.hypot(distance, baseline))
     camera_px, projector_px = distance / camera.focal_px, away / projector.focal_px[0]
     optics = _Optics(view, camera, projector, light, distance)
-    period = period_px or _best_period(
-        float(np.median(optics.blur_px(distance)[is_lit])), camera_px / projector_px
-    )
+    # the noise, period / modulation, is least at 2 pi blur: the modulation falls as
+    # exp(-2 pi² blur² / period²)
+    least_noise = 2 * np.pi * float(np.median(optics.blur_px(distance)[is_lit]))
+    shortest = max(_MIN_PERIOD_PX, _MIN_CAMERA_PX * (camera_px / projector_px))
+    period = period_px or float(np.ceil(max(least_noise, shortest)))
     sigmas, modulation = optics.predict_sigma(distance, period, is_lit)
     middle, corner = _middle_and_corner(sigmas)
-    depths = distance * np.asarray(depth_factors, float)
+    depths = distance * _DEPTHS
     is_usable = np.array([_is_usable(optics, z, period, coverage, middle) for z in depths])
+    at = int(np.argmin(np.abs(depths - distance)))
+    is_usable[at] = True
+    runs = label(is_usable)[0]
+    usable = depths[runs == runs[at]]
     columns, rows = projector.size
     return RigPlan(
         rig=rig,
@@ -182,7 +188,7 @@ def predict_rig(
         camera_px=camera_px,
         projector_px=projector_px,
         coverage=coverage,
-        depth_range=_range_around(depths, is_usable, distance),
+        depth_range=(float(usable[0]), float(usable[-1])),
         period_px=period,
         modulation=modulation,
         sigma_middle=middle,
@@ -196,20 +202,17 @@ def _thin(lens: Lens) -> Lens:
     width, height = lens.size
     share = _GRID / width
     rows = max(2, round(height * share))
-    K = lens.K.copy()
-    K[0] *= share
-    K[1] *= rows / height
-    K[0, 2], K[1, 2] = (_GRID - 1) / 2, (rows - 1) / 2
-    return Lens(K, np.zeros(5), (_GRID, rows))
+    focal_px = lens.K[0, 0] * share, lens.K[1, 1] * (rows / height)
+    return Lens.from_parameters((*focal_px, (_GRID - 1) / 2, (rows - 1) / 2), (_GRID, rows))
 
 
-def _plane_points(rig: StereoRig, z: float) -> np.ndarray:
+def _plane_points(rig: StereoRig, z: float) -> Map:
     """Return the points (h, w, 3) mm where the camera's rays meet the plane at depth z."""
     rays = rig.camera.rays()
     return np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) * z
 
 
-def _is_illuminated(rig: StereoRig, z: float) -> np.ndarray:
+def _is_illuminated(rig: StereoRig, z: float) -> Map:
     """Return which camera pixels (h, w) see the projector's picture on the plane at depth z."""
     return rig.projector.contains(rig.project(_plane_points(rig, z)))
 
@@ -225,7 +228,7 @@ class _Optics:
     light: PlannedLight
     focus: float
 
-    def blur_px(self, z: float) -> np.ndarray:
+    def blur_px(self, z: float) -> Map:
         """Return the Gaussian sigma (h, w) of a fringe on the plane at depth z, in projector
         columns.
 
@@ -243,7 +246,7 @@ class _Optics:
         camera_sigma = np.sqrt(camera.blur_px**2 + of_camera**2 + 1 / 12) * columns_per_px
         return np.sqrt(projector.blur_px**2 + of_projector**2 + 1 / 12 + camera_sigma**2)
 
-    def light_on(self, z: float, is_lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def light_on(self, z: float, is_lit: Map) -> tuple[Map, Map]:
         """Return the projector's light (h, w) that returns from a white plane at depth z, and the
         room's, as shares of the brightest white: cosine of the incidence, square of the distance,
         cos^4 of the camera's lens.
@@ -257,9 +260,7 @@ class _Optics:
         brightest = np.quantile((lit + self.light.ambient * even)[is_lit], _BRIGHT_QUANTILE)
         return lit / brightest, self.light.ambient * even / brightest
 
-    def predict_sigma(
-        self, z: float, period: float, is_lit: np.ndarray
-    ) -> tuple[np.ndarray, float]:
+    def predict_sigma(self, z: float, period: float, is_lit: Map) -> tuple[Map, float]:
         """Return the standard deviation (h, w) mm of depth on the plane at depth z, NaN where not
         ``is_lit`` (h, w), and the median modulation in grey levels. The exposure is chosen for a
         white surface at that depth.
@@ -283,13 +284,7 @@ class _Optics:
         return np.where(is_lit, sigmas, np.nan), float(np.median(modulation[is_lit]))
 
 
-def _best_period(blur: float, columns_per_px: float) -> float:
-    """Return the period, in whole projector columns, with the least noise: period / modulation is
-    least at 2 pi blur (the modulation falls as exp(-2 pi² blur² / period²))."""
-    return float(np.ceil(max(2 * np.pi * blur, _MIN_PERIOD_PX, _MIN_CAMERA_PX * columns_per_px)))
-
-
-def _middle_and_corner(sigmas: np.ndarray) -> tuple[float, float]:
+def _middle_and_corner(sigmas: Map) -> tuple[float, float]:
     """Return the median of a map (h, w) in its middle, and that of the outermost tenth of what is
     not NaN."""
     rows, columns = np.nonzero(np.isfinite(sigmas))
@@ -307,14 +302,3 @@ def _is_usable(optics: _Optics, z: float, period: float, coverage: float, sigma:
     if is_lit.mean() < _USABLE_COVERAGE * coverage:
         return False
     return bool(np.nanmedian(optics.predict_sigma(z, period, is_lit)[0]) <= _USABLE_SIGMA * sigma)
-
-
-def _range_around(depths: np.ndarray, usable: np.ndarray, distance: float) -> tuple[float, float]:
-    """Return the ends of the run of usable depths around the distance."""
-    at = int(np.argmin(np.abs(depths - distance)))
-    low = high = at
-    while low > 0 and usable[low - 1]:
-        low -= 1
-    while high < len(depths) - 1 and usable[high + 1]:
-        high += 1
-    return float(depths[low]), float(depths[high])

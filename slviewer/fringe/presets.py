@@ -12,7 +12,7 @@ MICRO_PX = (12.0, 16.0)
 """Shortest period of micro phase shifting, and about the longest."""
 
 
-def p18(projector: Size) -> PatternSequence:
+def p18(projector: Size, steps: int = 18) -> PatternSequence:
     """Return 18 steps at a period of 18 px, seven Gray bits (more if the projector needs them),
     then white.
 
@@ -20,7 +20,7 @@ def p18(projector: Size) -> PatternSequence:
     """
     frames: list[Frame] = []
     for axis, extent in zip(AXES, projector, strict=True):
-        frames += phase_steps(axis, 18, 18.0) + gray_bits(axis, max(7, bits_for(extent / 18)))
+        frames += phase_steps(axis, steps, 18.0) + gray_bits(axis, max(7, bits_for(extent / 18)))
         frames.append(Frame("texture"))
     return PatternSequence(projector, tuple(frames))
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.optimize
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import narrowest_range
+from slviewer.evaluation.acceptance import narrowest_range
 from slviewer.evaluation.fit import MAX_SIGMA, fit_settled, within_sigmas
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.geometry.vectors import diagonal, finite_rows, rms

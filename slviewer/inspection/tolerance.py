@@ -3,7 +3,7 @@
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import judge_property, make_length_error
+from slviewer.evaluation.acceptance import judge_property, make_length_error
 from slviewer.inspection.deviation import Deviation
 from slviewer.records.acceptance import Decision
 from slviewer.records.measurement import ToleranceVerdict

@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.artefact import Artefact
-from slviewer.evaluation.acceptance.measure import SIZE, SPACING, measure_artefact
-from slviewer.evaluation.acceptance.result import Acceptance, conclude_test
+from slviewer.evaluation.acceptance import (
+    SIZE,
+    SPACING,
+    Acceptance,
+    Artefact,
+    conclude_test,
+    measure_artefact,
+)
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
@@ -175,7 +180,7 @@ def _length_budget(
     # known, not removed
     uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0
     board = mm * 1e-6 * float(np.hypot(scale.u_ppm, uncorrected_ppm))
-    warmth = mm * 1e-6 * artefact.expansion.ppm_per_kelvin * artefact.temperature.U_kelvin / 2
+    warmth = mm * 1e-6 * artefact.expansion.value * artefact.temperature.U / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
     if checks:
         last = checks[-1]
@@ -198,7 +203,7 @@ def _length_budget(
                 "temperature",
                 warmth,
                 "B",
-                f"{artefact.expansion.ppm_per_kelvin:g} ppm/K of the artefact",
+                f"{artefact.expansion.value:g} ppm/K of the artefact",
             ),
             Contribution("drift", drift, "B", since),
         ],

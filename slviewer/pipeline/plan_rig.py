@@ -10,7 +10,7 @@ import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.evaluation.plane import evaluate_plane
+from slviewer.evaluation.fit import evaluate_plane
 from slviewer.evaluation.rig_plan import (
     DARK_LEVEL,
     PEAK_LEVEL,

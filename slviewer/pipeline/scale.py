@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.result import Acceptance
+from slviewer.evaluation.acceptance import Acceptance
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.store import Session
 

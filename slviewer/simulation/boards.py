@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.simulation.board_kernels import average_albedo, intersect
-from slviewer.simulation.scenes import Surface
+from slviewer.simulation.scenes import Points, Rays, Surface
 from slviewer.target.board import Board
-from slviewer.target.mark import Mark, mark_geometry
+from slviewer.target.mark import Mark
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +18,7 @@ class Pose:
     """T_camera_board: X_camera = R X_board + t, mm."""
 
     R: np.ndarray
-    t: np.ndarray
+    t: Points
 
     def __post_init__(self) -> None:
         if self.R.shape != (3, 3) or self.t.shape != (3,):
@@ -32,7 +32,7 @@ class Pose:
         """T_camera_board (4, 4), mm."""
         return np.block([[self.R, self.t[:, None]], [np.zeros(3), 1.0]])
 
-    def to_camera(self, points: np.ndarray) -> np.ndarray:
+    def to_camera(self, points: Points) -> np.ndarray:
         """Board-frame points (..., 3) in the camera frame."""
         return points @ self.R.T + self.t
 
@@ -89,7 +89,7 @@ class BoardScene:
         shape = self.shape
         return shape.bow_x_mm * (1 - X * X) + shape.bow_y_mm * (1 - Y * Y) + shape.twist_mm * X * Y
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Where the rays meet the plate; albedo averaged over each pixel."""
         bounds = np.array([*self.corner, *self.plate])
         shape = np.array([self.shape.bow_x_mm, self.shape.bow_y_mm, self.shape.twist_mm])
@@ -97,16 +97,12 @@ class BoardScene:
         xy, points, normals = intersect(
             np.ascontiguousarray(rays), origin, axes, self.pose.R, bounds, shape
         )
-        if self.board is None:
-            kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
-        elif self.board.kind == "chessboard":
-            kind, pitch, cells = (
-                2,
-                self.board.pitch_mm,
-                np.array([[self.board.columns, self.board.rows]], np.int32),
-            )
-        else:
-            kind, pitch, cells = 1, self.board.pitch_mm, self._cells
+        board = self.board
+        kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
+        if board is not None:
+            kind, pitch, cells = 1, board.pitch_mm, self._cells
+            if board.kind == "chessboard":
+                kind, cells = 2, np.array([[board.columns, board.rows]], np.int32)
         mark = np.array([self.mark.x, self.mark.y, self.mark.radius]) if self.mark else np.zeros(3)
         circles = self.features[:, :2].copy()
         sheet = kind, pitch, cells, circles, self.diameter_mm / 2, mark, self.white, self.dark
@@ -115,7 +111,7 @@ class BoardScene:
         points[outside], normals[outside] = np.nan, np.nan
         return Surface(points, normals, albedo)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return all False: a nearly flat plate shades no part of itself."""
         return np.zeros(len(points), bool)
 
@@ -130,42 +126,27 @@ class BoardScene:
         return cKDTree(self.features[:, :2]).query(middle)[1].astype(np.int32)
 
 
-def printed_board(
-    board: Board,
-    pose: Pose,
-    shape: BoardShape = FLAT,
-    seed: int = 0,
-    margin_mm: float | None = None,
-    marked: bool = False,
-) -> BoardScene:
-    """Return the scene of `board` printed on a plate, `margin_mm` around its outer features
-    (default 1.5 pitches).
+def printed_board(board: Board, pose: Pose, shape: BoardShape = FLAT, seed: int = 0) -> BoardScene:
+    """Return the scene of `board` printed on a plate, 1.5 pitches around its outer features.
 
     `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a
-    pitch wide; `marked` adds the mark of the printed sheets. Raises `InputError` for ChArUco
-    boards, which the simulation does not print.
+    pitch wide. Raises `InputError` for ChArUco boards, which the simulation does not print.
     """
     if board.kind not in ("circles", "acircles", "chessboard"):
         kind = "ChArUco" if board.kind == "charuco" else board.kind
         raise InputError(
             f"the simulation does not print {kind} boards: use circles, acircles or a chessboard"
         )
-    diameter = 0.0 if board.kind == "chessboard" else board.pitch_mm / 2
-    margin = 1.5 * board.pitch_mm if margin_mm is None else margin_mm
+    margin = 1.5 * board.pitch_mm
     low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin
     corner, plate = ((float(x), float(y)) for x, y in (low, high - low))
-    misplacement = (
-        np.random.default_rng([seed, 0xB0A]).normal(0, 1, (len(board.points), 2))
-        * shape.misplaced_mm
-    )
-    if board.kind == "chessboard":
-        misplacement *= 0  # its corners share edges, so that they cannot move one by one
-    mark = mark_geometry(board) if marked else None
-    return BoardScene(pose, board, corner, plate, shape, misplacement, diameter, mark=mark)
+    misplacement, diameter = np.zeros((len(board.points), 2)), 0.0
+    if board.kind != "chessboard":  # its corners share edges, so that they cannot move one by one
+        draws = np.random.default_rng([seed, 0xB0A]).normal(0, 1, misplacement.shape)
+        misplacement, diameter = draws * shape.misplaced_mm, board.pitch_mm / 2
+    return BoardScene(pose, board, corner, plate, shape, misplacement, diameter)
 
 
-def blank_board(
-    pose: Pose, size: tuple[float, float] = (220.0, 176.0), shape: BoardShape = FLAT
-) -> BoardScene:
+def blank_board(pose: Pose, size: tuple[float, float] = (220.0, 176.0)) -> BoardScene:
     """A white plate of `size` mm whose middle is the origin of its frame."""
-    return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, shape, np.zeros((0, 2)))
+    return BoardScene(pose, None, (-size[0] / 2, -size[1] / 2), size, FLAT, np.zeros((0, 2)))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.mesh import MeshScene
-from slviewer.simulation.scenes import Scene, Surface, sphere
+from slviewer.simulation.scenes import AlteredScene, Rays, Surface, sphere
 from slviewer.target.coded import marker_modules
 
 WHITE, BLACK = 0.85, 0.09
@@ -40,15 +40,14 @@ class Decal:
 
 
 @dataclass(frozen=True, eq=False)
-class MarkedScene:
+class MarkedScene(AlteredScene):
     """An object's scene at ``pose`` with decals on it, which follow its surface and do not change
     its shape."""
 
-    scene: Scene
     pose: Pose
     decals: Sequence[Decal]
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """What the scene's rays meet, with the decals' albedo, averaged over each pixel's area."""
         surface = self.scene.trace(rays)
         with np.errstate(invalid="ignore"):
@@ -73,10 +72,6 @@ class MarkedScene:
                 total += np.where(np.isnan(there), own, there).astype(np.float32)
             albedo[near] = total / _SAMPLES**2
         return Surface(surface.points, surface.normals, albedo)
-
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """As the scene itself: paper shades nothing."""
-        return self.scene.occluded(points, source)
 
 
 def marked_plate(pose: Pose) -> MarkedScene:
@@ -112,9 +107,8 @@ def _stick_on_front(
     """The marker on a front at ``radius`` from the y axis, turned about y and then x, and moved
     along y."""
     R = Rotation.from_euler("yx", turn_deg, degrees=True).as_matrix()
-    return Decal(
-        number, side_mm, Pose(R, R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0]))
-    )
+    place = R @ np.array([0.0, 0.0, -radius]) + np.array([0.0, y, 0.0])
+    return Decal(number, side_mm, Pose(R, place))
 
 
 def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +118,6 @@ def cylinder_mesh(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]
     angles = np.arange(around) * 2 * np.pi / around
     ring = np.stack([radius * np.cos(angles), np.zeros(around), radius * np.sin(angles)], axis=1)
     vertices = np.concatenate([ring + np.array([0, y, 0]) for y in (-length / 2, length / 2)])
-    i, j = np.arange(around), (np.arange(around) + 1) % around
-    return vertices, np.concatenate(
-        [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
-    )
+    i, j = np.arange(around), np.roll(np.arange(around), -1)
+    halves = [np.stack([i, i + around, j], 1), np.stack([j, i + around, j + around], 1)]
+    return vertices, np.concatenate(halves)

@@ -7,9 +7,9 @@ it.
 
 import tomllib
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -19,12 +19,13 @@ from slviewer.simulation import hostile_frames as frame_faults
 from slviewer.simulation import hostile_scenes as scene_faults
 from slviewer.simulation.assets import asset
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise
-from slviewer.simulation.hostile_frames import Shot
-from slviewer.simulation.hostile_scenes import MirrorTable, Pattern
+from slviewer.simulation.hostile_frames import Frames, Shot
+from slviewer.simulation.hostile_scenes import CleanScene, MirrorTable, Pattern
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
+T = TypeVar("T")
 Severity = Literal["mild", "medium", "severe"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 Direction = Literal["scan", "calibration"]
@@ -33,7 +34,8 @@ calibration."""
 
 ALL = 1000
 """More poses than any session has."""
-_STAGES = {"rig", "scene", "moving", "pattern", "light", "signal", "frames"}
+_OPTICAL = {"rig", "scene", "moving", "pattern"}
+_STAGES = _OPTICAL | {"light", "signal", "frames"}
 _SUBLEVELS = 256  # a 16-bit signal holds so many steps a grey level
 
 
@@ -42,11 +44,12 @@ class Fault:
     """One fault: what each severity is in ``words``, and the ``causes`` of which one must be named
     where it does harm.
 
-    Each of the functions takes and gives one stage of a capture, at ``levels[severity]``.
-    ``rig(rig, level, number)`` and ``scene(scene, level, number)`` of the capture of this number;
-    ``moving(scene, level)``: the scene in each of so many equal parts of the capture; ``pattern``:
-    what the projector makes of one; ``light`` and ``signal``: float32 grey levels (n, h, w), above
-    dark and with dark; ``frames``: uint8 (n, h, w), as they are recorded.
+    Each of the functions in ``stages`` takes and gives one stage of a capture, at
+    ``levels[severity]``. ``rig(rig, level, number)`` and ``scene(scene, level, number)`` of the
+    capture of this number; ``moving([scene], level)``: the scene in each of so many equal parts of
+    the capture; ``pattern(pattern, level)``: what the projector makes of one; ``light(light, level,
+    shot)`` and ``signal(levels, level, shot)``: float32 grey levels (n, h, w), above dark and with
+    dark; ``frames(frames, level, shot)``: uint8 (n, h, w), as they are recorded.
 
     ``must_measure``: at mild severity the program has to reach the floor. ``struck``: how many of
     the target poses it strikes, at each severity. ``directions``: where it can strike.
@@ -55,25 +58,26 @@ class Fault:
     words: tuple[str, str, str]
     levels: tuple[float, float, float]
     causes: frozenset[str]
+    stages: Mapping[str, Callable[..., Any]]
     must_measure: bool = False
     struck: tuple[int, int, int] = (ALL, ALL, ALL)
     directions: tuple[Direction, ...] = ("scan", "calibration")
-    rig: Callable[[SimulatedRig, float, int], SimulatedRig] | None = None
-    scene: Callable[[Scene, float, int], Scene] | None = None
-    moving: Callable[[Scene, float], Sequence[Scene]] | None = None
-    pattern: Callable[[Pattern, float], Pattern] | None = None
-    light: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
-    signal: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
-    frames: Callable[[np.ndarray, float, Shot], np.ndarray] | None = None
 
-    def level(self, severity: Severity) -> float:
-        """Return the strength of the fault at a severity."""
-        return self.levels[SEVERITIES.index(severity)]
+    def apply(self, stage: str, value: T, severity: Severity, *context: object) -> T:
+        """A stage of a capture with the fault; as it is where the fault is of other stages."""
+        if stage in self.stages:
+            level = self.levels[SEVERITIES.index(severity)]
+            value = self.stages[stage](value, level, *context)
+        return value
 
     @property
     def is_optical(self) -> bool:
         """Whether the fault changes the light, which has to be rendered again."""
-        return any((self.rig, self.scene, self.moving, self.pattern))
+        return not self.stages.keys().isdisjoint(_OPTICAL)
+
+
+SOUND = Fault(("", "", ""), (0.0, 0.0, 0.0), frozenset(), {})
+"""No fault."""
 
 
 def render_light(
@@ -81,7 +85,7 @@ def render_light(
     scene: Scene,
     sequence: PatternSequence,
     change: Callable[[Pattern], Pattern] = lambda p: p,
-) -> tuple[np.ndarray, Renderer]:
+) -> tuple[Frames, Renderer]:
     """(n, h, w) float32: the light of every frame in grey levels above dark, before any noise; and
     its renderer."""
     renderer = Renderer(rig, scene)
@@ -100,23 +104,22 @@ def hostile_light(
     fault: Fault,
     severity: Severity,
     rig: SimulatedRig,
-    scene: Scene,
+    scene: CleanScene,
     sequence: PatternSequence,
     number: int,
-) -> tuple[np.ndarray, Renderer]:
+) -> tuple[Frames, Renderer]:
     """Render the light as ``render_light``, with the fault's effects on rig, scene and patterns.
 
     Where the scene moves, the renderer is that of the middle of the phase steps of x, which depth
     comes from.
     """
-    level = fault.level(severity)
-    rig = fault.rig(rig, level, number) if fault.rig else rig
-    scene = fault.scene(scene, level, number) if fault.scene else scene
-    change = fault.pattern or (lambda pattern, level: pattern)
-    places = fault.moving(scene, level) if fault.moving else [scene]
+    rig = fault.apply("rig", rig, severity, number)
+    places = fault.apply("moving", [fault.apply("scene", scene, severity, number)], severity)
     parts = np.array_split(np.arange(len(sequence.frames)), len(places))
     rendered = [
-        render_light(rig, place, sequence, lambda pattern: change(pattern, level))
+        render_light(
+            rig, place, sequence, lambda pattern: fault.apply("pattern", pattern, severity)
+        )
         for place in places
     ]
     light = [light[part] for (light, _), part in zip(rendered, parts, strict=True)]
@@ -128,32 +131,29 @@ def hostile_light(
 
 
 def expose_frames(
-    rig: SimulatedRig,
-    light: np.ndarray,
+    renderer: Renderer,
+    light: Frames,
     sequence: PatternSequence,
-    room_light: np.ndarray,
     number: int = 0,
-    fault: Fault | None = None,
+    fault: Fault = SOUND,
     severity: Severity = "mild",
     seed: int = 0,
-) -> np.ndarray:
-    """(n, h, w) uint8: frames that the camera records of the ``light`` (n, h, w), with the fault
-    applied.
+) -> Frames:
+    """(n, h, w) uint8: frames that the renderer's camera records of the ``light`` (n, h, w), with
+    the fault applied.
 
-    ``room_light`` as ``Renderer.room_light`` gives it. The same ``number`` and ``seed`` give the
-    same noise, fault or not.
+    The same ``number`` and ``seed`` give the same noise, fault or not.
     """
-    level = fault.level(severity) if fault else 0.0
-    name = zlib.crc32(repr(fault.words).encode()) if fault else 0
-    shot = Shot(number, sequence, np.random.default_rng([rig.seed, seed, number, name]), room_light)
-    if fault and fault.light:
-        light = fault.light(light, level, shot)
-    sensor = rig.sensor
+    name = 0 if fault is SOUND else zlib.crc32(repr(fault.words).encode())
+    sensor, noise_seed = renderer.rig.sensor, [renderer.rig.seed, seed, number]
+    rng = np.random.default_rng([*noise_seed, name])
+    shot = Shot(sequence, rng, renderer.room_light())
+    light = fault.apply("light", light, severity, shot)
     noise = (
         np.array([sensor.dark_level, sensor.read_variance * _SUBLEVELS, sensor.shot_variance])
         * _SUBLEVELS
     )
-    keys = np.random.default_rng([rig.seed, seed, number, 0xF0]).integers(
+    keys = np.random.default_rng([*noise_seed, 0xF0]).integers(
         0, 2**32, (len(light), 2), dtype=np.uint32
     )
     signal = np.empty(light.shape, np.uint16)
@@ -161,19 +161,21 @@ def expose_frames(
         frame = frame * np.float32(_SUBLEVELS)
         digitise(frame, noise, 255.0 * _SUBLEVELS, NORMAL_QUANTILES, keys[k], signal[k])
     levels = signal.astype(np.float32) / np.float32(_SUBLEVELS)
-    if fault and fault.signal:
-        levels = fault.signal(levels, level, shot)
+    levels = fault.apply("signal", levels, severity, shot)
     frames = np.rint(np.clip(levels, 0, 255)).astype(np.uint8)
-    return fault.frames(frames, level, shot) if fault and fault.frames else frames
+    return fault.apply("frames", frames, severity, shot)
 
 
 def _load_fault(row: dict[str, Any]) -> Fault:
     """The fault of a table of ``faults.toml``, in which a stage is the name of a function of this
     package."""
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in row.items()}
-    for stage in _STAGES & row.keys():
-        values[stage] = getattr(scene_faults, row[stage], None) or getattr(frame_faults, row[stage])
-    return Fault(**values | {"causes": frozenset(row["causes"])})
+    names = {stage: row.pop(stage) for stage in _STAGES & row.keys()}
+    stages = {
+        stage: getattr(scene_faults, name, None) or getattr(frame_faults, name)
+        for stage, name in names.items()
+    }
+    values = {"words": tuple(row["words"]), "causes": frozenset(row["causes"]), "stages": stages}
+    return Fault(**row | values)
 
 
 _TABLE = tomllib.loads(asset("simulation/faults.toml").read_text(encoding="utf-8"))

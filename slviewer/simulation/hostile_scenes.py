@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
-from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.simulation.scenes import Scene, Spheres, Surface
+from slviewer.simulation.scenes import AlteredScene, Points, Rays, Scene, Spheres, Surface
 
 Pattern = tuple[Axis | None, np.ndarray]
 """What `fringe.profile` gives: the axis and the grey levels along it."""
+CleanScene = BoardScene | Spheres
+"""Scenes that faults act on."""
 
 _FINGERS_MM = (-24.0, -8.0, 8.0, 24.0)
 _FINGER_RADIUS_MM = 11.0
@@ -29,7 +29,7 @@ class SceneGroup:
 
     scenes: Sequence[Scene]
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Return the nearest surface of all scenes along each ray."""
         nearest, *others = (scene.trace(rays) for scene in self.scenes)
         for surface in others:
@@ -39,7 +39,7 @@ class SceneGroup:
             nearest = nearest.overlay(surface, is_nearer)
         return nearest
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Whether any of the scenes blocks the way from a point to the source."""
         blocked = [scene.occluded(points, source) for scene in self.scenes]
         blocked += [
@@ -51,7 +51,7 @@ class SceneGroup:
 
 
 @dataclass(frozen=True, eq=False)
-class DirtyBoard:
+class DirtyBoard(AlteredScene):
     """A board with specks of dust and scratches: of the cells of its surface, `share` reflect only
     `left` of the light.
 
@@ -63,7 +63,7 @@ class DirtyBoard:
     left: float = 0.35
     seed: int = 0
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """The board's surface, with reduced albedo at dirt."""
         surface = self.scene.trace(rays)
         hit = surface.albedo > 0
@@ -81,13 +81,9 @@ class DirtyBoard:
         albedo[hit] *= np.where(dirty[tuple(np.clip(cells, 0, shape - 1).T)], self.left, 1.0)
         return Surface(surface.points, surface.normals, albedo)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """Return whether points are shaded, as for the clean board."""
-        return self.scene.occluded(points, source)
-
 
 @dataclass(frozen=True, eq=False)
-class MirrorTable:
+class MirrorTable(AlteredScene):
     """A polished table below an object: rays that miss the object and meet the table see the object
     mirrored.
 
@@ -96,44 +92,48 @@ class MirrorTable:
     `is_direct` says which pixels see it directly.
     """
 
-    scene: Scene
+    scene: CleanScene
     normal: np.ndarray
     offset_mm: float
     reflectivity: float
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    @property
+    def reflection(self) -> tuple[np.ndarray, np.ndarray]:
+        """M (3, 3) and shift (3,): X' = M X + shift is X mirrored in the table."""
+        n = self.normal
+        return np.eye(3) - 2 * np.outer(n, n), 2 * self.offset_mm * n
+
+    def trace(self, rays: Rays) -> Surface:
         """Trace rays to the object, and below it to its mirror image."""
-        surface = self.scene.trace(rays)
-        direct = np.isfinite(surface.points[..., 2])
-        image = _mirror_scene(self.scene, self.normal, self.offset_mm).trace(rays)
+        surface, scene, (M, shift) = self.scene.trace(rays), self.scene, self.reflection
+        if isinstance(scene, Spheres):
+            mirrored: Scene = replace(scene, centres=scene.centres @ M.T + shift)
+        else:
+            mirrored = replace(scene, pose=Pose(M @ scene.pose.R, M @ scene.pose.t + shift))
+        image = mirrored.trace(rays)
         # The table lies between camera and mirror image, so that the image's points are behind the
         # mirror.
         with np.errstate(invalid="ignore"):
             behind = image.points @ self.normal > self.offset_mm
-        visible = ~direct & behind & np.isfinite(image.points[..., 2])
-        M, shift = _compute_reflection(self.normal, self.offset_mm)
+        visible = ~np.isfinite(surface.points[..., 2]) & behind
         albedo = np.float32(self.reflectivity) * image.albedo
         return surface.overlay(
             Surface(image.points @ M.T + shift, image.normals @ M.T, albedo), visible
         )
 
-    def is_direct(self, rays: np.ndarray) -> np.ndarray:
+    def is_direct(self, rays: Rays) -> np.ndarray:
         """Return the pixels (h, w) bool that see the object itself, and not its mirror image."""
         return np.isfinite(self.scene.trace(rays).points[..., 2])
-
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
-        """Return whether points are shaded by the object; the table is below and shades nothing."""
-        return self.scene.occluded(points, source)
 
     def second_projector(self, rig: SimulatedRig) -> SimulatedRig:
         """The rig with the projector's mirror image in the table: its light is `reflectivity` as
         strong."""
-        M, shift = _compute_reflection(self.normal, self.offset_mm)
+        M, shift = self.reflection
         light = replace(rig.light, ambient=0.0)
         return replace(rig, R=rig.R @ M, t=rig.R @ shift + rig.t, light=light)
 
 
-def with_hand(scene: Scene, reach_mm: float, number: int = 0) -> Scene:
+def with_hand(scene: CleanScene, reach_mm: float, number: int = 0) -> Scene:
     """The scene with a hand that reaches `reach_mm` over it: over a board's right edge, or over a
     sphere's front."""
     lengths = np.arange(0.0, reach_mm + 20.0, 12.0)
@@ -143,20 +143,13 @@ def with_hand(scene: Scene, reach_mm: float, number: int = 0) -> Scene:
         fingers = scene.pose.to_camera(
             offsets + np.array([x + width - reach_mm, y + 0.5 * height, 0.0])
         )
-    elif isinstance(scene, Spheres):
-        fingers = (
-            offsets
-            + scene.centres[0]
-            + np.array([scene.radius_mm - reach_mm, 0.0, -scene.radius_mm])
-        )
     else:
-        raise InputError(
-            f"no hand holds a scene of type {type(scene).__name__}: use a board or spheres"
-        )
+        edge = np.array([scene.radius_mm - reach_mm, 0.0, -scene.radius_mm])
+        fingers = offsets + scene.centres[0] + edge
     return SceneGroup((scene, Spheres(fingers, _FINGER_RADIUS_MM, albedo=0.55)))
 
 
-def _is_behind_plate(board: BoardScene, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+def _is_behind_plate(board: BoardScene, points: Points, source: Points) -> np.ndarray:
     """(n,) bool: the way from `points` (n, 3) to `source` (3,) crosses the plate; points on it are
     not behind it."""
     start, end = (points - board.pose.t) @ board.pose.R, (source - board.pose.t) @ board.pose.R
@@ -165,36 +158,6 @@ def _is_behind_plate(board: BoardScene, points: np.ndarray, source: np.ndarray) 
     crossing = (start + share[:, None] * (end - start))[:, :2] - np.array(board.corner)
     inside = ((crossing > 0) & (crossing < np.array(board.plate))).all(1)
     return np.asarray(inside & (share > 0) & (share < 1) & (np.abs(start[:, 2]) > _THICKNESS_MM))
-
-
-def moved_scene(scene: Scene, by_mm: np.ndarray, turn_rad: np.ndarray) -> Scene:
-    """The scene moved by (3,) mm in the camera frame, and turned about its own origin."""
-    if isinstance(scene, Spheres):
-        return replace(scene, centres=scene.centres + by_mm)
-    if isinstance(scene, BoardScene | MeshScene):
-        return replace(scene, pose=Pose(rotation(turn_rad) @ scene.pose.R, scene.pose.t + by_mm))
-    raise InputError(
-        f"a scene of type {type(scene).__name__} cannot be moved: use a board, spheres or a mesh"
-    )
-
-
-def _compute_reflection(normal: np.ndarray, offset_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """M (3, 3) and shift (3,): X' = M X + shift is X mirrored in the plane n . X = offset."""
-    n = np.asarray(normal, float)
-    return np.eye(3) - 2 * np.outer(n, n), 2 * offset_mm * n
-
-
-def _mirror_scene(scene: Scene, normal: np.ndarray, offset_mm: float) -> Scene:
-    """The mirror image of a scene in the plane n . X = offset, mm; InputError for other than boards
-    and spheres."""
-    M, shift = _compute_reflection(normal, offset_mm)
-    if isinstance(scene, Spheres):
-        return replace(scene, centres=scene.centres @ M.T + shift)
-    if isinstance(scene, BoardScene):
-        return replace(scene, pose=Pose(M @ scene.pose.R, M @ scene.pose.t + shift))
-    raise InputError(
-        f"a scene of type {type(scene).__name__} has no mirror image: use a board or spheres"
-    )
 
 
 def set_gamma(rig: SimulatedRig, gamma: float, number: int) -> SimulatedRig:
@@ -206,12 +169,8 @@ def dim_projector(rig: SimulatedRig, amplitude: float, number: int) -> Simulated
     """Return the rig with fringes of this amplitude in grey levels on white; the camera's exposure
     is unchanged."""
     white = 2 * amplitude / (1 - rig.light.black)
-    return replace(
-        rig,
-        sensor=replace(
-            rig.sensor, peak_level=rig.sensor.dark_level + white * (1 + rig.light.ambient)
-        ),
-    )
+    peak = rig.sensor.dark_level + white * (1 + rig.light.ambient)
+    return replace(rig, sensor=replace(rig.sensor, peak_level=peak))
 
 
 def overexpose(rig: SimulatedRig, times: float, number: int) -> SimulatedRig:
@@ -240,7 +199,7 @@ def knock_projector(rig: SimulatedRig, mrad: float, number: int) -> SimulatedRig
     return replace(rig, R=turn @ rig.R, t=turn @ rig.t)
 
 
-def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
+def flex_board(scene: CleanScene, bow_mm: float, number: int) -> Scene:
     """Return the scene with a board bent anew for each ``number``; scenes without a board are
     unchanged."""
     if not isinstance(scene, BoardScene):
@@ -249,46 +208,47 @@ def flex_board(scene: Scene, bow_mm: float, number: int) -> Scene:
     return replace(scene, shape=BoardShape(*bow.tolist()))
 
 
-def moving_scenes(scene: Scene, by_mm: float) -> list[Scene]:
-    """Return eleven copies of a scene that moves by `by_mm` mm and turns slightly, as if held by
-    hand."""
-    way, turn = np.array([0.7, 0.5, 0.5]), np.array([0.3, -0.5, 0.2]) / 100
-    return [
-        moved_scene(scene, share * by_mm * way, share * by_mm * turn)
-        for share in np.linspace(0, 1, 11)
-    ]
+def moving_scenes(scenes: Sequence[CleanScene], by_mm: float) -> list[Scene]:
+    """Return eleven copies of the one scene, which moves by `by_mm` mm and turns slightly about its
+    own origin, as if held by hand."""
+    (scene,), moved = scenes, list[Scene]()
+    for share in np.linspace(0, 1, 11):
+        way = share * by_mm * np.array([0.7, 0.5, 0.5])
+        turn = share * by_mm * (np.array([0.3, -0.5, 0.2]) / 100)
+        if isinstance(scene, Spheres):
+            moved.append(replace(scene, centres=scene.centres + way))
+        else:
+            pose = Pose(rotation(turn) @ scene.pose.R, scene.pose.t + way)
+            moved.append(replace(scene, pose=pose))
+    return moved
 
 
-def dirty_scene(scene: Scene, share: float, number: int) -> Scene:
+def dirty_scene(scene: CleanScene, share: float, number: int) -> Scene:
     """The scene with dust and scratches on this share of its board; scenes without a board are
     unchanged."""
     return DirtyBoard(scene, share) if isinstance(scene, BoardScene) else scene
 
 
-def put_on_table(scene: Scene, reflectivity: float, number: int) -> Scene:
+def put_on_table(scene: CleanScene, reflectivity: float, number: int) -> Scene:
     """The scene on a polished table 3 mm below the object, which mirrors it."""
     if isinstance(scene, BoardScene):
         (x, y), (width, height) = scene.corner, scene.plate
         corners = [(x + a * width, y + b * height, 0.0) for a in (0, 1) for b in (0, 1)]
         lowest = scene.pose.to_camera(np.array(corners))[:, 1].max()
-    elif isinstance(scene, Spheres):
-        lowest = scene.centres[:, 1].max() + scene.radius_mm
     else:
-        return scene
+        lowest = scene.centres[:, 1].max() + scene.radius_mm
     return MirrorTable(scene, np.array([0.0, 1.0, 0.0]), float(lowest) + 3.0, reflectivity)
 
 
-def add_second_board(scene: Scene, size_mm: float, number: int) -> Scene:
+def add_second_board(scene: CleanScene, size_mm: float, number: int) -> Scene:
     """The scene with another white plate of this width 70 mm behind the object, to the left of
     it."""
     if isinstance(scene, BoardScene):
         middle = scene.pose.to_camera(
             np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0])
         )
-    elif isinstance(scene, Spheres):
-        middle = scene.centres[0]
     else:
-        return scene
+        middle = scene.centres[0]
     place = middle + np.array([-0.18 * middle[2], -0.09 * middle[2], 70.0])
     turn = rotation(np.radians([5.0, -12.0, 8.0]))
     return SceneGroup((scene, blank_board(Pose(turn, place), (size_mm, 0.8 * size_mm))))

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.registration.open3d_loader import open3d
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
-from slviewer.simulation.scenes import Surface, directions_of
+from slviewer.simulation.scenes import Points, Rays, Surface, directions_of
 
 # shadow rays start this far above the surface: Open3D casts in float32, 1e-4 mm at these depths
 _LIFT_MM = 0.02
@@ -25,24 +26,18 @@ class MeshScene:
     the vertices.
     """
 
-    vertices: np.ndarray
+    vertices: Points
     triangles: np.ndarray
     pose: Pose
     albedo: float = 0.8
-
-    def __post_init__(self) -> None:
-        for name, values in (("vertices", self.vertices), ("triangles", self.triangles)):
-            if values.ndim != 2 or values.shape[1] != 3 or not len(values):
-                raise InputError(f"a mesh needs {name} (n, 3), got the shape {values.shape}")
 
     @cached_property
     def placed(self) -> np.ndarray:
         """Vertices (n, 3) float64 in the camera frame."""
         return self.pose.to_camera(self.vertices.astype(np.float64))
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """Return the first triangle that each ray meets; back faces are ignored."""
-        shape = rays.shape[:2]
         index, uvs = self.cast(rays)
         hit = index >= 0
         corners = self.triangles[index[hit]]
@@ -54,33 +49,25 @@ class MeshScene:
         s, t = uvs[hit].T[..., None]
         n = self.vertex_normals
         smooth = (1 - s - t) * n[corners[:, 0]] + s * n[corners[:, 1]] + t * n[corners[:, 2]]
-        smooth /= np.linalg.norm(smooth, axis=-1, keepdims=True)
         front = facing < 0
         hit[hit] = front
-        surface = Surface(
-            np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan), np.zeros(shape, np.float32)
-        )
-        surface.points[hit], surface.normals[hit], surface.albedo[hit] = (
-            points[front],
-            smooth[front],
-            self.albedo,
-        )
+        surface = Surface.empty(rays.shape[:2])
+        surface.points[hit], surface.normals[hit] = points[front], unit_vectors(smooth)[front]
+        surface.albedo[hit] = self.albedo
         return surface
 
-    def cast(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def cast(self, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
         """Return (h, w) int: the triangle, of either side, that each ray meets, -1 for none; (h, w,
         2): where on it."""
         directions = directions_of(rays)
-        origin_and_way = np.concatenate([np.zeros_like(directions), directions], -1).astype(
-            np.float32
-        )
-        cast = self._caster.cast_rays(open3d().core.Tensor(origin_and_way))
+        lines = np.concatenate([np.zeros_like(directions), directions], -1).astype(np.float32)
+        cast = self._caster.cast_rays(open3d().core.Tensor(lines))
         distance, index, uv = (
             cast[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")
         )
         return np.where(np.isfinite(distance), index.astype(np.int64), -1), uv.astype(float)
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return whether the mesh is between `points` and `source`."""
         way = source - points
         lift = _LIFT_MM / np.linalg.norm(way, axis=-1, keepdims=True)
@@ -95,9 +82,8 @@ class MeshScene:
         # twice the area: a fair weight
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals = np.zeros_like(self.placed)
-        for k in range(3):
-            np.add.at(normals, self.triangles[:, k], flat)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        np.add.at(normals, self.triangles.T, flat)
+        return unit_vectors(normals)
 
     @cached_property
     def _caster(self) -> Any:

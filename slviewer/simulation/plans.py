@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import box_middle
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import (
     FLAT,
@@ -58,7 +59,7 @@ def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
     )
     rig = replace(rig, camera=camera, projector=projector)
     rng = np.random.default_rng([rig.seed, 0x705E])
-    middle = (board.points.min(0) + board.points.max(0)) / 2
+    middle = box_middle(board.points)
     # Spread evenly and without pattern: depths, tilts and directions are each shuffled strata.
     depths = 512 + 176 * (rng.permutation(n) + 0.5) / n
     tilts = np.radians(6 + 22 * (rng.permutation(n) + 0.5) / n)
@@ -110,18 +111,8 @@ def _list_directions(n: int) -> np.ndarray:
     """(n, 2) in -1 ... 1: position of each board in the field of view; corners most, then edges,
     then the middle."""
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
-    cycle = [
-        *corners,
-        (0, 0),
-        *corners,
-        (1, 0),
-        *corners,
-        (0, -1),
-        *corners,
-        (-1, 0),
-        *corners,
-        (0, 1),
-    ]
+    others = [(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1)]
+    cycle = [place for other in others for place in (*corners, other)]
     return np.array([cycle[i % len(cycle)] for i in range(n)], float)
 
 

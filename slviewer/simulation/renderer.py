@@ -22,6 +22,9 @@ _EXPOSURE_QUANTILE = (
     0.995  # of the illuminated pixels; a few brighter ones do not decide an exposure
 )
 
+Map = np.ndarray
+"""(h, w), or (h, w, 2 or 3): a value, or some, for each pixel."""
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -33,9 +36,9 @@ class Truth:
     no shadow.
     """
 
-    points: np.ndarray
-    projector: np.ndarray
-    mask: np.ndarray
+    points: Map
+    projector: Map
+    mask: Map
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +49,11 @@ class _Maps:
     among the tabulated `sigmas`; coordinates: projector px along each axis.
     """
 
-    gain: np.ndarray
-    even: np.ndarray
-    level: np.ndarray
+    gain: Map
+    even: Map
+    level: Map
     sigmas: np.ndarray
-    coordinates: dict[Axis, np.ndarray]
+    coordinates: dict[Axis, Map]
     truth: Truth
 
 
@@ -67,8 +70,9 @@ class Renderer:
     def __init__(self, rig: SimulatedRig, scene: Scene) -> None:
         self.rig = rig
         self.scene = scene
+        self._concave = scene if isinstance(scene, ConcaveScene) else None
         self._indirect: dict[Axis, np.ndarray] = {}
-        self._lights: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+        self._lights: dict[float, tuple[Map, Map]] = {}
 
     def truth(self) -> Truth:
         """What a perfect instrument would measure."""
@@ -107,7 +111,7 @@ class Renderer:
         self,
         pattern: tuple[Axis | None, np.ndarray],
         keys: np.ndarray,
-        out: np.ndarray,
+        out: Map,
         *,
         lamp: float = 1.0,
         exposure: float | None = None,
@@ -120,12 +124,6 @@ class Renderer:
         replaces the renderer's own, and `gain` multiplies the signal and its noise before they
         become 8 bits.
         """
-        width, height = self.rig.camera.size
-        if out.shape != (height, width) or out.dtype != np.uint8:
-            raise InputError(
-                f"a frame needs an array of shape {(height, width)} uint8, got {out.shape}"
-                f" {out.dtype}"
-            )
         light = self.light(
             pattern, lamp=lamp, exposure=(self.exposure if exposure is None else exposure) * gain
         )
@@ -141,7 +139,7 @@ class Renderer:
         *,
         lamp: float = 1.0,
         exposure: float | None = None,
-    ) -> np.ndarray:
+    ) -> Map:
         """(h, w) float32: the light of one frame in grey levels above dark, before noise and
         clipping; as `frame`."""
         rig, maps, (varies, grey_levels) = self.rig, self._maps, pattern
@@ -158,44 +156,42 @@ class Renderer:
             np.float32(lamp) * light.table, light.offset,
             self._taps, stray, out,
         )  # fmt: skip
-        if isinstance(self.scene, ConcaveScene):
+        if self._concave:
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)
             out += np.float32(lamp * exposure) * indirect
         return out
 
-    def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> np.ndarray:
+    def _indirect_light(self, axis: Axis, profile_light: np.ndarray) -> Map:
         """Light at unit exposure, (h, w) float32, that the surface throws on itself under a profile
         (n,) in 0 ... 1.
 
         The camera's PSF is neglected: this light varies slowly.
         """
+        assert self._concave is not None
         if axis not in self._indirect:
-            assert isinstance(self.scene, ConcaveScene)
-            self._indirect[axis] = self.scene.light_matrix(self.rig, axis)
+            self._indirect[axis] = self._concave.light_matrix(self.rig, axis)
         values = self._indirect[axis] @ profile_light.astype(np.float32)
-        width, height = self.rig.camera.size
-        weights, reflected = self._pixel_weights
-        return (weights @ values).reshape(height, width) * reflected
+        reflected = self._maps.even[self._frame]
+        return (self._pixel_weights @ values).reshape(reflected.shape) * reflected
 
     @cached_property
-    def _pixel_weights(self) -> tuple[csr_matrix, np.ndarray]:
-        """Weights of vertices (h w, n) at each pixel, and the light reflected of what it receives,
-        (h, w) float32."""
-        assert isinstance(self.scene, ConcaveScene)
-        return self.scene.pixel_weights(self.rig.camera.rays(0)), self._maps.even[self._frame]
+    def _pixel_weights(self) -> csr_matrix:
+        """Weights of the vertices (h w, n) of a concave scene at each pixel."""
+        assert self._concave is not None
+        return self._concave.pixel_weights(self.rig.camera.rays(0))
 
-    def room_light(self) -> np.ndarray:
+    def room_light(self) -> Map:
         """(h, w) float32: grey levels of even room light as strong as full white light from the
         projector."""
         return self._blur(self._maps.even * np.float32(self.exposure))
 
-    def _blur(self, light: np.ndarray) -> np.ndarray:
+    def _blur(self, light: Map) -> Map:
         """Return light on the maps, blurred by the camera's PSF, within the frame (h, w)."""
         for direction in (0, 1):
             light = correlate1d(light, self._taps, axis=direction)
         return np.ascontiguousarray(light[self._frame])
 
-    def _light(self, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+    def _light(self, exposure: float) -> tuple[Map, Map]:
         """Grey levels: of full white light as `_Maps.gain`, and of all that no pattern changes,
         blurred, (h, w)."""
         if exposure not in self._lights:
@@ -214,7 +210,7 @@ class Renderer:
         focus."""
         maps, sensor = self._maps, self.rig.sensor
         light = (maps.gain + self.rig.light.ambient * maps.even)[self._frame]
-        if isinstance(self.scene, ConcaveScene):
+        if self._concave:
             light = light + self._indirect_light("x", np.ones(self.rig.projector.size[0]))
         illuminated = light[maps.truth.mask]
         if not illuminated.size:
@@ -269,9 +265,7 @@ class Renderer:
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)
-        surface_share = (
-            1 - self.scene.indirect.scattered if isinstance(self.scene, ConcaveScene) else 1.0
-        )
+        surface_share = 1 - self._concave.indirect.scattered if self._concave else 1.0
         return _Maps(
             gain=(surface_share * reflected * shade * reached * illuminated).astype(np.float32),
             even=(reflected * hit).astype(np.float32),

@@ -10,7 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
-from slviewer.errors import InputError
+Points = np.ndarray
+"""(..., 3) mm: places, directions or normals, in the camera's frame where no other is named."""
+Rays = np.ndarray
+"""(h, w, 2): x / z and y / z of each pixel's ray."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +23,15 @@ class Surface:
     pixel's area, 0 where nothing is met.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
+    points: Points
+    normals: Points
     albedo: np.ndarray
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> "Surface":
+        """The surface where none of (h, w) pixels meets anything."""
+        nowhere = np.full((*shape, 3), np.nan)
+        return cls(nowhere, nowhere.copy(), np.zeros(shape, np.float32))
 
     def overlay(self, other: "Surface", where: np.ndarray) -> "Surface":
         """Return the surface with the pixels ``where`` (h, w) bool of another one."""
@@ -36,39 +45,43 @@ class Surface:
 class Scene(Protocol):
     """Protocol of scenes that can be rendered."""
 
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """What the camera rays (h, w, 2) = (x/z, y/z) meet."""
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """(n,) bool: the way from `points` (n, 3) on the surface to `source` (3,) is blocked."""
 
 
-def directions_of(rays: np.ndarray) -> np.ndarray:
+def directions_of(rays: Rays) -> np.ndarray:
     """(h, w, 3): the directions (x/z, y/z, 1) of rays (h, w, 2)."""
     return np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class AlteredScene:
+    """A scene of which something changes what is seen, and not what is shaded."""
+
+    scene: Scene
+
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
+        """As of the scene itself."""
+        return self.scene.occluded(points, source)
 
 
 @dataclass(frozen=True, eq=False)
 class Spheres:
     """One or several diffuse spheres: centres (n, 3), one radius, nothing behind them."""
 
-    centres: np.ndarray
+    centres: Points
     radius_mm: float
     albedo: float = 0.85
 
-    def __post_init__(self) -> None:
-        if self.centres.ndim != 2 or self.centres.shape[1] != 3 or self.radius_mm <= 0:
-            raise InputError(
-                "spheres need centres (n, 3) and a radius above 0, got the shape"
-                f" {self.centres.shape}"
-            )
-
-    def trace(self, rays: np.ndarray) -> Surface:
+    def trace(self, rays: Rays) -> Surface:
         """The nearer intersection with the nearest sphere."""
         directions = directions_of(rays)
         squared = (directions**2).sum(-1)
         depth = np.full(rays.shape[:2], np.inf)
-        normals = np.full(directions.shape, np.nan)
+        surface = Surface.empty(rays.shape[:2])
         for centre in self.centres:
             along = directions @ centre / squared
             root = along**2 - (centre @ centre - self.radius_mm**2) / squared
@@ -76,13 +89,12 @@ class Spheres:
                 z = along - np.sqrt(root)
             nearer = (z > 0) & (z < depth)
             depth[nearer] = z[nearer]
-            normals[nearer] = (directions[nearer] * z[nearer, None] - centre) / self.radius_mm
-        points = directions * np.where(np.isfinite(depth), depth, np.nan)[..., None]
-        return Surface(
-            points, normals, np.where(np.isfinite(depth), self.albedo, 0).astype(np.float32)
-        )
+            surface.points[nearer] = directions[nearer] * z[nearer, None]
+            surface.normals[nearer] = (surface.points[nearer] - centre) / self.radius_mm
+            surface.albedo[nearer] = self.albedo
+        return surface
 
-    def occluded(self, points: np.ndarray, source: np.ndarray) -> np.ndarray:
+    def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Return whether another part of the spheres is between the points and `source`."""
         way = source - points
         blocked = np.zeros(len(points), bool)

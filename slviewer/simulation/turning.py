@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 import trimesh
 
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import rotation
@@ -73,8 +74,7 @@ def stone() -> tuple[np.ndarray, np.ndarray]:
     for _ in range(6):  # the lopsided whole
         wave = rng.normal(size=3) * rng.uniform(0.8, 2.0)
         radius += 1.2 * np.cos(directions @ wave + rng.uniform(0, 2 * np.pi))
-    middles = rng.normal(size=(90, 3))
-    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    middles = unit_vectors(rng.normal(size=(90, 3)))
     widths = np.radians(rng.uniform(5.0, 12.0, len(middles)))
     heights = (
         rng.uniform(0.15, 0.35, len(middles))

@@ -169,25 +169,17 @@ def _time_decoding(
 
     ``definition``: seconds of the NumPy definition, where it is compared.
     """
-    coded = frames[:-1]  # without the texture
-    kernel, moved, least = _time_with_floor(
-        _time_kernel_alone(sequence, frames), coded, 0, (1, 4, 0)
-    )
+    alone = _time_with_floor(_decode_alone(sequence, frames), frames[:-1], 0, (1, 4, 0))
     whole = median(lambda: decode(sequence, frames, "x"), 5)
-    target = None if definition is None else (1.7 * kernel, "1.7 kernels")
+    target = None if definition is None else (1.7 * alone[0], "1.7 kernels")
+    remark = "with the noise, spikes and new arrays"
     return [
-        row(f"{stage}, kernel", kernel, moved, least, note=note),
-        row(
-            stage,
-            whole,
-            definition=definition,
-            note="with the noise, spikes and new arrays",
-            target=target,
-        ),
-    ], kernel
+        row(f"{stage}, kernel", *alone, note=note),
+        row(stage, whole, definition=definition, note=remark, target=target),
+    ], alone[0]
 
 
-def _time_kernel_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
+def _decode_alone(sequence: PatternSequence, frames: np.ndarray) -> Callable[[], object]:
     """The decoding of axis x into arrays made before, with the noise known, and without a look at
     neighbours."""
     layout = axis_layout(sequence, "x")
@@ -212,29 +204,24 @@ def _time_measuring(sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
         "splined": (6, lambda: compiled.depth(phase.phase, PERIOD_PX / (2 * np.pi), rays, True)),
     }
     for name, (numbers, work) in fast.items():
-        seconds, moved, least = _time_with_floor(work, frames[:0], numbers, (0, 0, 1))
-        rows.append(row(f"reconstruct from phases, {name}", seconds, moved, least))
+        timed = _time_with_floor(work, frames[:0], numbers, (0, 0, 1))
+        rows.append(row(f"reconstruct from phases, {name}", *timed))
     one = OnePass(sequence, pixelwise, "x")
-    light = one.light(frames)
-    scan = one.run(frames, light)
-    rows.append(_time_one_pass(one, frames, 7))
-    rows.append(_time_one_pass(OnePass(sequence, _make_splined(compiled, rays), "x"), frames, 5))
-    rows += gpu_rows(sequence, pixelwise, frames)
-    rows.append(
-        row(
-            "second pass, over spikes",
-            median(lambda: one.repair_spikes(scan), 9),
-            megabytes(scan.phase),
-        )
-    )
-    rows.append(
-        row(
-            "noise and fringe mean of a capture, sampled",
-            median(lambda: one.light(frames), 5),
-            target=1e-3,
-        )
-    )
-    return [*rows, *_time_files(scan.cloud(), sequence, frames)]
+    scan = one.run(frames, one.light(frames))
+    # a splined model with made-up values, of which only the arrays that one pass reads are filled
+    splined = object.__new__(SplinedModel)
+    vars(splined).update(rays=rays, _compiled={"x": compiled})
+    repairing = median(lambda: one.repair_spikes(scan), 9)
+    sampling = median(lambda: one.light(frames), 5)
+    return [
+        *rows,
+        _time_one_pass(one, frames, 7),
+        _time_one_pass(OnePass(sequence, splined, "x"), frames, 5),
+        *gpu_rows(sequence, pixelwise, frames),
+        row("second pass, over spikes", repairing, megabytes(scan.phase)),
+        row("noise and fringe mean of a capture, sampled", sampling, target=1e-3),
+        *_time_files(scan.cloud(), sequence, frames),
+    ]
 
 
 def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
@@ -242,12 +229,10 @@ def _time_one_pass(one: OnePass, frames: np.ndarray, numbers: int) -> Row:
     allocates nothing."""
     light = one.light(frames)
     scan = one.run(frames, light)
-    seconds, moved, least = _time_with_floor(
-        lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1)
-    )
+    timed = _time_with_floor(lambda: one.sweep(frames, light, scan), frames, numbers, (2, 3, 1))
     note = "frames to phase, points, depth noise, modulation and texture; spikes not repaired"
     stage = f"one pass over {len(frames)} frames, {one.model.name}"
-    return row(stage, seconds, moved, least, note=note, target=(1.3 * least, "1.3 floors"))
+    return row(stage, *timed, note=note, target=(1.3 * timed[2], "1.3 floors"))
 
 
 def _time_with_floor(
@@ -255,15 +240,16 @@ def _time_with_floor(
 ) -> tuple[float, float, float]:
     """Seconds of some work, MB that it moves, and seconds of only moving them; ``written`` as
     `move_bytes` has them."""
-    shape = frames.shape[1:]
-    values = np.zeros((numbers, *shape), np.float32)
-    grey = np.zeros((written[0], *shape), frames.dtype)
-    single, triple = (
-        np.zeros((written[1], *shape), np.float32),
-        np.zeros((written[2], *shape, 3), np.float32),
+    shape, (greys, singles, triples) = frames.shape[1:], written
+    arrays = (
+        frames,
+        np.zeros((numbers, *shape), np.float32),
+        np.zeros((greys, *shape), frames.dtype),
+        np.zeros((singles, *shape), np.float32),
+        np.zeros((triples, *shape, 3), np.float32),
     )
-    seconds, least = time_beside(work, lambda: move_bytes(frames, values, grey, single, triple), 25)
-    return seconds, megabytes(frames, values, grey, single, triple), least
+    seconds, least = time_beside(work, lambda: move_bytes(*arrays), 25)
+    return seconds, megabytes(*arrays), least
 
 
 def _time_live(rig: SimulatedRig, renderer: Renderer) -> Row:
@@ -275,13 +261,8 @@ def _time_live(rig: SimulatedRig, renderer: Renderer) -> Row:
     one = OnePass(sequence, pixelwise, "x")
     scan = one.run(frames)
     seconds = median(lambda: one.run(frames, scan.light, scan), 15)
-    note = f"{1 / seconds:.0f} clouds/s"
-    return row(
-        f"live: {len(frames) - 1} recorded frames to arrays",
-        seconds,
-        note=note,
-        target=(1 / 60, "60 clouds/s"),
-    )
+    stage, target = f"live: {len(frames) - 1} recorded frames to arrays", (1 / 60, "60 clouds/s")
+    return row(stage, seconds, note=f"{1 / seconds:.0f} clouds/s", target=target)
 
 
 def _time_peers(
@@ -366,59 +347,36 @@ def _time_fit(observations: list[Observation], stereo: StereoModel) -> tuple[flo
     return seconds, held
 
 
-def _make_splined(compiled: CompiledAxis, rays: np.ndarray) -> SplinedModel:
-    """A splined model with made-up values, of which only the arrays that one pass reads are
-    filled."""
-    model = object.__new__(SplinedModel)
-    vars(model).update(rays=rays, _compiled={"x": compiled})
-    return model
-
-
 def _time_files(cloud: Cloud, sequence: PatternSequence, frames: np.ndarray) -> list[Row]:
     """Rows of saving a capture, and of writing a cloud with texture and noise as PLY, against
     writing as many bytes."""
     mask = cloud.mask
-    with tempfile.TemporaryDirectory() as folder:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Session.create(Path(folder, "session")) as session,
+    ):
         path, plain = Path(folder, "cloud.ply"), Path(folder, "plain")
-        exported = median(
-            lambda: write_ply(
-                path, cloud.measured, colours=cloud.colours(), scalars=cloud.sigmas(mask)
-            ),
-            3,
-        )
-        content = path.read_bytes()
-        with Session.create(Path(folder, "session")) as session:
-            save = partial(
-                session.save_capture,
-                "scan_01",
-                "scan",
-                sequence,
-                frames,
-                source="simulated",
-                force=True,
+
+        def export() -> None:
+            """Write the cloud."""
+            write_ply(path, cloud.measured, colours=cloud.colours(), scalars=cloud.sigmas(mask))
+
+        def save() -> None:
+            """Save the capture."""
+            session.save_capture(
+                "scan_01", "scan", sequence, frames, source="simulated", force=True
             )
-            saved = median(save, 3)
-        copies = [
-            median(partial(atomic.replace_file, plain, data), 3)
-            for data in (content, frames.tobytes())
-        ]
-    points = f"{np.count_nonzero(mask) / 1e6:.2f} M points"
-    return [
-        row(
-            f"write {points} as PLY",
-            exported,
-            len(content) / 1e6,
-            copies[0],
-            target=(1.5 * copies[0], "1.5 floors"),
-        ),
-        row(
-            f"save a capture of {len(frames)} frames",
-            saved,
-            megabytes(frames),
-            copies[1],
-            target=(1.5 * copies[1], "1.5 floors"),
-        ),
-    ]
+
+        rows = []
+        for stage, work, read in (
+            (f"write {np.count_nonzero(mask) / 1e6:.2f} M points as PLY", export, path.read_bytes),
+            (f"save a capture of {len(frames)} frames", save, frames.tobytes),
+        ):
+            seconds, content = median(work, 3), read()
+            copying = median(partial(atomic.replace_file, plain, content), 3)
+            target = 1.5 * copying, "1.5 floors"
+            rows.append(row(stage, seconds, len(content) / 1e6, copying, target=target))
+    return rows
 
 
 def _make_calibrations(shape: tuple[int, ...]) -> tuple[PixelwiseModel, CompiledAxis, np.ndarray]:

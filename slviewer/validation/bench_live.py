@@ -87,18 +87,12 @@ class LiveFigures:
         )
 
 
-def live_rate(
-    scale: float = 0.5,
-    seconds: float = 30.0,
-    progress: Progress = ignore_progress,
-    *,
-    warm_s: float = _WARM_S,
-) -> LiveFigures:
+def live_rate(scale: float, seconds: float, progress: Progress = ignore_progress) -> LiveFigures:
     """Scan the demo object live on the simulated rig, its camera 1600x1200 times `scale`, settled
     at once.
 
-    Clouds are reconstructed by the stereo model of the true lenses; the figures begin `warm_s`
-    after the first one. Raises SlviewerError where live scanning fails.
+    Clouds are reconstructed by the stereo model of the true lenses; the figures begin a
+    second after the first one. Raises SlviewerError where live scanning fails.
     """
     progress(0.0, "preparing the rig")
     with tempfile.TemporaryDirectory() as folder:
@@ -106,34 +100,37 @@ def live_rate(
         true_calibration(session, letter(scale))
         with (
             Operator(session, {"driver": "simulated", "scale": scale}) as operator,
-            _serve_wizard(operator) as server,
+            contextlib.closing(App(operator, Serving(port=0))) as app,
         ):
+            app.shell.go("scan")
             _wait_until(lambda: operator.snapshot().rig.state == "open", operator)
             operator.place("object")
-            with _Viewer(server, draws=True):
-                _wait_until(lambda: len(server.viser.get_clients()) == 1, operator)
+            with _viewing(app.server, draws=True):
+                _wait_until(lambda: len(app.server.viser.get_clients()) == 1, operator)
                 operator.start_live()
-                _wait_until(lambda: _get_shown_rate(operator) > 0, operator)
-                return _measure(operator, server, seconds, progress, warm_s)
+                _wait_until(
+                    lambda: (live := operator.snapshot().live) is not None and live.shown_per_s > 0,
+                    operator,
+                )
+                time.sleep(_WARM_S)
+                return _measure(operator, app.server, seconds, progress)
 
 
 def _measure(
-    operator: Operator, server: SafeServer, seconds: float, progress: Progress, warm_s: float
+    operator: Operator, server: SafeServer, seconds: float, progress: Progress
 ) -> LiveFigures:
     """Figures of the running live scan over so many seconds, with a second viewer that stops
     reading."""
-    time.sleep(warm_s)
     begun, first = time.monotonic(), operator.live_captures
     used: list[tuple[float, tuple[float, ...]]] = []
     made, shown, behind, points = [], [], [], 0
     alone = min(seconds / 3, _STALLED_AFTER_S)
     with contextlib.ExitStack() as stack:
-        stalled: _Viewer | None = None
         halfway, then = 0.0, 0
-        while (passed := time.monotonic() - begun) < seconds or stalled is None:
-            if stalled is None and passed > alone:
+        while (passed := time.monotonic() - begun) < seconds or not halfway:
+            if not halfway and passed > alone:
                 halfway, then = passed, operator.live_captures
-                stalled = stack.enter_context(_Viewer(server, draws=False))
+                stack.enter_context(_viewing(server, draws=False))
             time.sleep(min(0.25, seconds / 20))
             live = operator.snapshot().live
             if live is None:
@@ -167,80 +164,66 @@ def _measure(
     )
 
 
-class _Viewer:
+@contextlib.contextmanager
+def _viewing(server: SafeServer, draws: bool) -> Iterator[None]:
     """A browser's connection: with `draws` it receives and acknowledges everything, otherwise it
     reads nothing."""
-
-    def __init__(self, server: SafeServer, draws: bool) -> None:
-        self._server, self._draws = server, draws
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run_client, name="viewer", daemon=True)
-
-    def __enter__(self) -> "_Viewer":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._closing.set()
-        self._thread.join(5.0)
-
-    def _run_client(self) -> None:
-        """Connect again and again until closed, and draw or stall according to ``draws``."""
-        while not self._closing.is_set():
-            with contextlib.suppress(WebSocketException, OSError), self._connect() as connection:
-                connection.send(
-                    msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_VIEWPOINT})
-                )
-                if self._draws:
-                    self._answer_requests(connection)
-                else:  # until the server gives it up, and once more then
-                    while not self._closing.wait(0.1) and connection.state.name == "OPEN":
-                        pass
-
-    def _answer_requests(self, connection: Connection) -> None:
-        """Receive messages until closed, and answer the server's requests for acknowledgement."""
-        unpack = zstandard.ZstdDecompressor()
-        while not self._closing.is_set():
-            try:
-                raw = connection.recv(timeout=0.2)
-            except TimeoutError:
-                continue
-            assert isinstance(raw, bytes)
-            whole, packed = (int.from_bytes(raw[at : at + 8], "little") for at in (0, 8))
-            for message in msgspec.msgpack.decode(unpack.decompress(raw[16 : 16 + packed], whole))[
-                "messages"
-            ]:
-                if message["type"] == "LocalStorageGetItemRequestMessage":
-                    answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
-                    kind = "LocalStorageGetItemResponseMessage"
-                    connection.send(msgspec.msgpack.encode({"type": kind, **answer}))
-
-    def _connect(self) -> ClientConnection:
-        """Open a WebSocket to the server with the view token, as viser's page does."""
-        port, grant = self._server.port, self._server.access.grants["watch"]
-        host = f"127.0.0.1:{port}"
-        return connect(
-            f"ws://{host}{grant.path}/",
-            sock=socket.create_connection(("127.0.0.1", port), timeout=5),
-            additional_headers=[
-                ("Cookie", f"{grant.cookie_name}={grant.value}"),
-                ("Origin", f"http://{host}"),
-            ],
-            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
-            max_size=2**26,
-            ping_interval=None,  # who stalls does not give up by itself
-        )
-
-
-@contextlib.contextmanager
-def _serve_wizard(operator: Operator) -> Iterator[SafeServer]:
-    """Serve the wizard for an operator at its scan step; yields the server."""
-    app = App(operator, Serving(port=0))
+    closing = threading.Event()
+    thread = threading.Thread(
+        target=_run_viewer, args=(server, draws, closing), name="viewer", daemon=True
+    )
+    thread.start()
     try:
-        app.shell.go("scan")
-        yield app.server
+        yield
     finally:
-        app.close()
+        closing.set()
+        thread.join(5.0)
+
+
+def _run_viewer(server: SafeServer, draws: bool, closing: threading.Event) -> None:
+    """Connect again and again until closed, and draw or stall according to ``draws``."""
+    while not closing.is_set():
+        with contextlib.suppress(WebSocketException, OSError), _connect(server) as connection:
+            connection.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **_VIEWPOINT}))
+            if draws:
+                _answer_requests(connection, closing)
+            else:  # until the server gives it up, and once more then
+                while not closing.wait(0.1) and connection.state.name == "OPEN":
+                    pass
+
+
+def _answer_requests(connection: Connection, closing: threading.Event) -> None:
+    """Receive messages until closed, and answer the server's requests for acknowledgement."""
+    unpack = zstandard.ZstdDecompressor()
+    while not closing.is_set():
+        try:
+            raw = connection.recv(timeout=0.2)
+        except TimeoutError:
+            continue
+        assert isinstance(raw, bytes)
+        whole, packed = (int.from_bytes(raw[at : at + 8], "little") for at in (0, 8))
+        received = msgspec.msgpack.decode(unpack.decompress(raw[16 : 16 + packed], whole))
+        for message in received["messages"]:
+            if message["type"] == "LocalStorageGetItemRequestMessage":
+                answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
+                kind = "LocalStorageGetItemResponseMessage"
+                connection.send(msgspec.msgpack.encode({"type": kind, **answer}))
+
+
+def _connect(server: SafeServer) -> ClientConnection:
+    """Open a WebSocket to the server with the view token, as viser's page does."""
+    grant, host = server.access.grants["watch"], f"127.0.0.1:{server.port}"
+    return connect(
+        f"ws://{host}{grant.path}/",
+        sock=socket.create_connection(("127.0.0.1", server.port), timeout=5),
+        additional_headers=[
+            ("Cookie", f"{grant.cookie_name}={grant.value}"),
+            ("Origin", f"http://{host}"),
+        ],
+        subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+        max_size=2**26,
+        ping_interval=None,  # who stalls does not give up by itself
+    )
 
 
 def true_calibration(folder: Path, rig: SimulatedRig) -> None:
@@ -260,12 +243,6 @@ def _wait_until(condition: Callable[[], bool], operator: Operator) -> None:
                 f" {_get_last_notice(operator)}"
             )
         time.sleep(0.02)
-
-
-def _get_shown_rate(operator: Operator) -> float:
-    """Frames per s that the live scan shows at present; 0 without one."""
-    live = operator.snapshot().live
-    return 0.0 if live is None else live.shown_per_s
 
 
 def _get_last_notice(operator: Operator) -> str:

@@ -18,6 +18,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.geometry import cuda_device
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, move_points, turn_about
+from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.onepass import LightLevels
 from slviewer.reconstruction.onepass_cuda import CudaPass
 from slviewer.registration.pairwise import register
@@ -131,8 +132,6 @@ def gpu_rows(
     sequence: PatternSequence,
     model: PixelwiseModel | SplinedModel,
     frames: np.ndarray,
-    times: int = TIMES,
-    ahead: int = AHEAD,
 ) -> list[Row]:
     """One pass over frames (n, h, w) of axis x: the kernel alone, then a whole cloud, repaired,
     with copies there and back; nothing without a device."""
@@ -145,9 +144,9 @@ def gpu_rows(
     scan = one.run(here)
     if cuda_device.find_device() is None:  # it failed, with a warning
         return []
-    alone, least, moved = _time_kernel(one, here, scan.light, times, ahead)
-    whole = median(lambda: one.run(here, scan.light, scan), times)
-    ordinary = median(lambda: one.run(frames, scan.light, scan), times)
+    alone, least, moved = _time_kernel(one, here, scan.light)
+    whole = median(lambda: one.run(here, scan.light, scan), TIMES)
+    ordinary = median(lambda: one.run(frames, scan.light, scan), TIMES)
     stage, fast = f"one pass over {len(frames)} frames, {model.name}, {name}", moved / least / 1e9
     note = f"{least / alone:.0%} of the {fast:.0f} GB/s of a copy on the device"
     return [
@@ -165,9 +164,7 @@ def gpu_rows(
     ]
 
 
-def _time_kernel(
-    one: CudaPass, frames: np.ndarray, light: LightLevels, times: int, ahead: int
-) -> tuple[float, float, int]:
+def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple[float, float, int]:
     """(seconds of the first pass, seconds of a copy on the device that moves as much, bytes moved),
     by its clock."""
     from numba import cuda
@@ -177,8 +174,8 @@ def _time_kernel(
     source, target = (cuda.device_array(card.bytes_moved // 2, np.uint8) for _ in range(2))
     marks = [cuda.event() for _ in range(3)]
     durations = []
-    for _ in range(times):
-        for _ in range(ahead):
+    for _ in range(TIMES):
+        for _ in range(AHEAD):
             target.copy_to_device(source, stream=card.stream)
         marks[0].record(card.stream)
         target.copy_to_device(source, stream=card.stream)
@@ -291,7 +288,8 @@ def _make_relief(seed: int, shift_mm: float) -> tuple[np.ndarray, np.ndarray]:
     )
     slope_y, slope_x = np.gradient(z, u, u)
     normals = np.stack([slope_x, slope_y, -np.ones_like(z)], -1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     noise = 0.03 * np.random.default_rng(seed).standard_normal(z.shape)
     points = np.stack([x, y, 600.0 + z + noise], -1)
-    return points.reshape(-1, 3).astype(np.float32), normals.reshape(-1, 3).astype(np.float32)
+    return points.reshape(-1, 3).astype(np.float32), unit_vectors(normals).reshape(-1, 3).astype(
+        np.float32
+    )

@@ -5,6 +5,7 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slviewer.calibration.observe import Observation, Smoothing
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import calibrate_stereo
+from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
-from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
-from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.pose_evidence import DecodedPose
-from slviewer.pipeline.poses import read_pose
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Starts, register_all
@@ -31,9 +28,9 @@ from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.turning import STEPS, turning
-from slviewer.target.board import Board
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
+from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import RigView
@@ -57,40 +54,33 @@ LINEAR = 1.1
 """Largest exponent that counts as linear."""
 
 
-def time_scaling(progress: Progress = ignore_progress) -> list[Row]:
+def time_scaling(progress: Progress) -> list[Row]:
     """Rows of each size, with the largest memory of its arrays, and of each kind the exponent of
     its growth."""
     rig = letter(SCALE)
     plan = letter_plan(rig, poses=max(POSES))
     scene = plan["pose_01"]
-    stages: dict[str, tuple[float, Callable[[], list[Row]]]] = {
-        "pixels": (0.0, lambda: _time_pixels(rig, scene)),
-        "captures of a session": (0.2, lambda: _time_captures(rig, scene)),
-        "scans": (0.3, lambda: _time_scans(rig)),
-        "reading poses": (0.5, lambda: _time_poses(rig, plan)),
-        "whole captures": (0.8, lambda: _time_whole_captures(scene)),
-        "batches": (0.95, lambda: _time_batches(scene)),
-    }
-    rows: list[Row] = []
-    for name, (done, work) in stages.items():
-        progress(done, name)
-        rows += work()
+    progress(0.0, "pixels")
+    rows = _time_pixels(rig, scene)
+    progress(0.2, "captures of a session")
+    rows += _time_captures(rig, scene)
+    progress(0.3, "scans")
+    rows += _time_scans(rig)
+    progress(0.5, "reading poses")
+    rows += _time_poses(rig, plan)
+    progress(0.8, "whole captures")
+    rows += _time_whole_captures(scene)
+    progress(0.95, "batches")
+    rows += _time_batches(scene)
     progress(1.0, "measured")
     return rows
 
 
 def _measure_growth(
-    kind: str,
-    sizes: tuple[float, ...],
-    work: Callable[[float], Callable[[], object]],
-    measure_s: Callable[[Callable[[], object], int, bool], float] = median,
+    kind: str, sizes: tuple[float, ...], work: Callable[[float], Callable[[], object]]
 ) -> list[Row]:
     """Time ``work(size)()`` for each size; the last row's note is what ``_describe_growth`` says of
-    all of them.
-
-    ``measure_s``: returns the seconds of a run, from how often it is run and whether it is run once
-    before.
-    """
+    all of them."""
     seconds, rows = [], []
     for size in sizes:
         run = work(size)
@@ -98,8 +88,8 @@ def _measure_growth(
         run()  # the first time, which also compiles
         memory = tracemalloc.get_traced_memory()[1] / 1e6
         tracemalloc.stop()
-        once = measure_s(run, 1, False)
-        seconds.append(once if once > SLOW_S else measure_s(run, 5, False))
+        once = median(run, 1, False)
+        seconds.append(once if once > SLOW_S else median(run, 5, False))
         rows.append(row(f"{kind}: {size:g}", seconds[-1], memory))
     rows[-1]["note"] = _describe_growth(sizes, seconds)
     return rows
@@ -112,11 +102,9 @@ def _describe_growth(sizes: tuple[float, ...], seconds: list[float]) -> str:
     return f"grows with the power {exponent:.2f}: {verdict}"
 
 
-def _time_pixels(
-    rig: SimulatedRig, scene: Any, megapixels: tuple[float, ...] = MEGAPIXELS
-) -> list[Row]:
+def _time_pixels(rig: SimulatedRig, scene: Any) -> list[Row]:
     """Rows of decoding 25 frames of several sizes, which are resized from rendered ones."""
-    sequence = one_axis(p18(rig.projector.size), "x")
+    sequence = scan_sequence(rig)
     frames = Renderer(rig, scene).capture(sequence)
 
     def decode_size(size: float) -> Callable[[], object]:
@@ -125,15 +113,13 @@ def _time_pixels(
         large = np.stack([cv2.resize(frame, None, fx=scale, fy=scale) for frame in frames])
         return lambda: decode(sequence, large, "x")
 
-    return _measure_growth("decode 25 frames, MP", megapixels, decode_size)
+    return _measure_growth("decode 25 frames, MP", MEGAPIXELS, decode_size)
 
 
-def _time_captures(
-    rig: SimulatedRig, scene: Any, counts: tuple[float, ...] = CAPTURES
-) -> list[Row]:
+def _time_captures(rig: SimulatedRig, scene: Any) -> list[Row]:
     """Rows of the wizard's snapshot of a session with so many captures."""
     with tempfile.TemporaryDirectory(prefix="slviewer-bench-") as folder:
-        sequence = one_axis(p18(rig.projector.size), "x")
+        sequence = scan_sequence(rig)
         frames = Renderer(rig, scene).capture(sequence)
         with Session.open_or_create(Path(folder, "session")) as session:
             first = session.save_capture(
@@ -148,16 +134,16 @@ def _time_captures(
                 reader = SessionReader(session, planner)
                 return lambda: reader.read(RigView(), None)
 
-            rows = _measure_growth("snapshot of a session, captures", counts, read_session)
+            rows = _measure_growth("snapshot of a session, captures", CAPTURES, read_session)
             planner.close()
     return rows
 
 
-def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]:
+def _time_scans(rig: SimulatedRig) -> list[Row]:
     """Rows of registering scans of an object on a turntable that makes `STEPS` or more, with
     made-up noise."""
     rng, clouds = np.random.default_rng(0), {}
-    steps = max(STEPS, *counts)
+    steps = max(STEPS, *SCANS)
     for name, scene in turning(steps).items():
         points = Renderer(rig, scene).truth().points
         points[..., 2] += rng.normal(0, NOISE_MM, points.shape[:2])
@@ -170,22 +156,15 @@ def _time_scans(rig: SimulatedRig, counts: tuple[int, ...] = SCANS) -> list[Row]
         angles = {name: 360.0 / steps * k for k, name in enumerate(chosen)}
         return lambda: register_all(chosen, names[0], Starts(table_deg=angles))
 
-    return _measure_growth("register scans of a turn", counts, register)
+    return _measure_growth("register scans of a turn", SCANS, register)
 
 
 def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
     """Rows of the stereo calibration and the joint adjustment of so many target poses."""
-    sequence, board = p18(rig.projector.size), Board.parse(TARGET)
     observations: list[Observation] = []
     for name in (name for name in plan if name.startswith("pose_")):
-        frames = Renderer(rig, plan[name]).capture(sequence)
-        phases = decode_frames(name, sequence, frames)
-        read = read_pose(
-            DecodedPose(name, sequence, frames, phases, texture_8bit(sequence, frames), board),
-            Smoothing(),
-        )
-        if read.observation is not None:
-            observations.append(read.observation)
+        with suppress(InputError):  # no board is detected
+            observations.append(observe_rendered(rig, plan[name], name, 0))
 
     def calibrate(count: float) -> Callable[[], object]:
         """Return the calibration from the first so many poses."""
@@ -235,7 +214,7 @@ def _save_scans(session: Path, scale: float, scene: Any, count: int) -> None:
     """Make a session with the rig's true calibration and so many equal scans."""
     rig = letter(scale)
     true_calibration(session, rig)
-    sequence = one_axis(p18(rig.projector.size), "x")
+    sequence = scan_sequence(rig)
     frames = Renderer(rig, scene).capture(sequence)
     with Session.open(session, write=True) as store:
         for number in range(1, count + 1):

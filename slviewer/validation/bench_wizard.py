@@ -8,14 +8,13 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.reconstruct import reconstruct
 from slviewer.records.verification import Verification
 from slviewer.validation.bench_rows import Row, median, row, run_python
@@ -50,11 +49,8 @@ _FUNCTIONS = 8
 class _Stopwatch:
     """Waiting times, s, by their names, from the snapshots of a wizard at work.
 
-    A listener of the operator's, which is called on one thread only. ``clock``: returns the present
-    time in s.
+    A listener of the operator's, which is called on one thread only.
     """
-
-    clock: Callable[[], float] = time.perf_counter
 
     seconds: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in LIMITS})
     _last_frame: float | None = None
@@ -63,7 +59,7 @@ class _Stopwatch:
 
     def note(self, snapshot: Snapshot) -> None:
         """Note the time of what differs from the snapshot before."""
-        now, before, self._before = self.clock(), self._before, snapshot
+        now, before, self._before = time.perf_counter(), self._before, snapshot
         if before is None or before.session is None or snapshot.session is None:
             return
         if before.rig.capture is not None and snapshot.rig.capture is None:
@@ -116,8 +112,7 @@ class _Sampler:
     """Samples, on a thread of its own, which of the counted functions every other thread is in, act
     by act."""
 
-    def __init__(self, is_counted: Callable[[str], bool] = _is_counted) -> None:
-        self._is_counted = is_counted
+    def __init__(self) -> None:
         self.act = ""
         self.samples: dict[str, Counter[str]] = {}
         self._stopped = threading.Event()
@@ -138,9 +133,7 @@ class _Sampler:
                 if thread == self._thread.ident or frame.f_code.co_filename.endswith(_WAITING):
                     continue
                 inner: Any = frame
-                while inner is not None and not self._is_counted(
-                    inner.f_globals.get("__name__", "")
-                ):
+                while inner is not None and not _is_counted(inner.f_globals.get("__name__", "")):
                     inner = inner.f_back
                 if inner is not None:
                     name = f"{inner.f_globals['__name__']}.{inner.f_code.co_qualname}".replace(
@@ -153,7 +146,7 @@ _WAITING = ("threading.py", "selectors.py", "socket.py", "queue.py", "subprocess
 """Files of the standard library in which a thread waits."""
 
 
-def time_wizard(scale: float = 0.5, progress: Progress = ignore_progress) -> list[Row]:
+def time_wizard(scale: float, progress: Progress) -> list[Row]:
     """Rows of what an operator waits for, with the seconds of the slowest acts of the Autopilot and
     of the functions that the slowest one spent them in.
 

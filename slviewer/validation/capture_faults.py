@@ -3,12 +3,14 @@ of the scene."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
+from typing import TypeVar
 from zlib import crc32
 
 import numpy as np
 
-from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
+from slviewer.fringe.sequence import Axis, Frame, PerAxis
 from slviewer.validation.simulated_capture import (
     AXES,
     BLACK,
@@ -22,6 +24,7 @@ from slviewer.validation.simulated_capture import (
 )
 
 Rng = np.random.Generator
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -38,21 +41,23 @@ class FaultyCapture:
     frames: tuple[int, ...] = ()
 
 
+Kinds = tuple[CaptureKind, ...]
+Strike = Callable[[CaptureSetup, Rng], FaultyCapture]
+
+
 @dataclass(frozen=True)
 class CaptureFault:
     """``strike`` puts the fault into a sound capture; ``kinds``: captures that can have it."""
 
-    strike: Callable[[CaptureSetup, Rng], FaultyCapture]
-    kinds: tuple[CaptureKind, ...]
+    strike: Strike
+    kinds: Kinds = KINDS
 
 
-ANY = KINDS
-PHASE: tuple[CaptureKind, ...] = tuple(k for k in KINDS if k != "gray")
-CODED: tuple[CaptureKind, ...] = ("p18", "complementary")
+PHASE: Kinds = tuple(k for k in KINDS if k != "gray")
+CODED: Kinds = ("p18", "complementary")
 """With phase steps and Gray bits."""
-BITS: tuple[CaptureKind, ...] = (*CODED, "gray")
-LEVELS: tuple[CaptureKind, ...] = ("multifrequency", "heterodyne", "micro")
-FEW: tuple[CaptureKind, ...] = ("complementary", *LEVELS)
+BITS: Kinds = (*CODED, "gray")
+FEW: Kinds = ("complementary", "multifrequency", "heterodyne", "micro")
 """With three or four phase steps."""
 
 
@@ -67,6 +72,16 @@ def _faulty(
     return FaultyCapture(changed, sound, frozenset(causes), tuple(frames))
 
 
+def _change(*causes: str, is_linear: bool = False, **changes: object) -> Strike:
+    """What only changes some fields of the setup, of a linear projector if that matters."""
+
+    def strike(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
+        """The capture with the changes."""
+        return _faulty(replace(setup, gamma=1.0) if is_linear else setup, causes, (), **changes)
+
+    return strike
+
+
 def _count(setup: CaptureSetup) -> int:
     """Number of images."""
     return len(setup.shown.frames)
@@ -77,15 +92,21 @@ def _coded(setup: CaptureSetup) -> list[int]:
     return [i for i, frame in enumerate(setup.shown.frames) if frame.kind != "texture"]
 
 
-def _steps(sequence: PatternSequence) -> list[tuple[int, ...]]:
+def _steps(setup: CaptureSetup) -> list[tuple[int, ...]]:
     """Indices of the phase steps of each period and axis."""
-    return [indices for axis in sequence.axes for _, indices in sequence.phase_shifts(axis)]
+    shown = setup.shown
+    return [indices for axis in shown.axes for _, indices in shown.phase_shifts(axis)]
+
+
+def _show(setup: CaptureSetup, instead: Mapping[int, int]) -> tuple[int, ...]:
+    """The order of the patterns, with others at some places."""
+    return tuple(instead.get(i, i) for i in range(_count(setup)))
 
 
 def _is_same_pattern(setup: CaptureSetup, a: int, b: int) -> bool:
     """Whether two frames show the same, as two bits that are black all over the projector."""
     first, second = setup.shown.frames[a], setup.shown.frames[b]
-    shown = [pattern_levels(setup.shown, f, setup.wave) for f in (first, second)]
+    shown = [pattern_levels(setup.shown, f) for f in (first, second)]
     if first.axis == second.axis:
         return bool(np.array_equal(shown[0], shown[1]))
     return all(np.ptp(levels) == 0 for levels in shown) and shown[0][0] == shown[1][0]
@@ -113,21 +134,15 @@ def _draw_axes(rng: Rng) -> tuple[Axis, ...]:
     return choices[rng.integers(3)]
 
 
-def _set_axes(values: Mapping[Axis, float], default: float) -> PerAxis[float]:
-    """A pair of values, ``default`` for an axis that is missing."""
-    return PerAxis(*(values.get(axis, default) for axis in AXES))
+def _set_axes(axes: Sequence[Axis], value: T, otherwise: T) -> PerAxis[T]:
+    """A pair of values: one for some of the axes, and another for the others."""
+    return PerAxis(*(value if axis in axes else otherwise for axis in AXES))
 
 
 def _cover(setup: CaptureSetup) -> CaptureSetup:
     """The capture of a plane that reaches beyond the projector's field on all sides, so that all
     coordinates occur."""
-    view = replace(setup.view, scene="plane", field=0.85)
-    return replace(setup, view=view)
-
-
-def _linear(setup: CaptureSetup) -> CaptureSetup:
-    """The capture with a linear projector."""
-    return replace(setup, gamma=1.0)
+    return replace(setup, view=replace(setup.view, scene="plane", field=0.85))
 
 
 # The order of the frames
@@ -156,22 +171,15 @@ def _missing_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     return _faulty(setup, ["missing-frame"], _same_run(setup, k), order=order)
 
 
-def _is_same_shift(setup: CaptureSetup, a: int, b: int) -> bool:
-    """Whether two frames are steps of one period."""
-    return any(a in steps and b in steps for steps in _steps(setup.shown))
-
-
 def _exchange(setup: CaptureSetup, a: int, b: int) -> FaultyCapture:
     """Two frames have changed places."""
-    order = list(range(_count(setup)))
-    order[a], order[b] = b, a
     causes = ["frame-order"]
     first, second = setup.shown.frames[a], setup.shown.frames[b]
-    if _is_same_shift(setup, a, b):
+    if any(a in steps and b in steps for steps in _steps(setup)):
         causes.append("step-order")
     elif first.kind == second.kind == "gray" and first.axis == second.axis:
         causes.append("bit-order")  # the same images
-    return _faulty(setup, causes, [a, b], order=tuple(order))
+    return _faulty(setup, causes, [a, b], order=_show(setup, {a: b, b: a}))
 
 
 def _exchange_neighbours(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -181,14 +189,14 @@ def _exchange_neighbours(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
         for a, b in pairwise(_coded(setup))
         if b == a + 1 and not _is_same_pattern(setup, a, b)
     ]
-    return _exchange(setup, *(int(k) for k in rng.choice(pairs)))
+    return _exchange(setup, *rng.choice(pairs).tolist())
 
 
 def _exchange_distant(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """Two frames have changed places, with several between them."""
     coded = _coded(setup)
     while True:
-        a, b = sorted(int(k) for k in rng.choice(coded, 2, replace=False))
+        a, b = sorted(rng.choice(coded, 2, replace=False).tolist())
         if b - a >= 4 and not _is_same_pattern(setup, a, b):
             return _exchange(setup, a, b)
 
@@ -198,33 +206,31 @@ def _repeat_frame(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     k = int(rng.choice([k for k in _coded(setup)[1:] if not _is_same_pattern(setup, k, k - 1)]))
     if rng.random() < 0.5:
         return _faulty(setup, ["duplicate-frame"], [k], copies=((k, k - 1),))
-    order = list(range(_count(setup)))
-    order[k] = k - 1
-    return _faulty(setup, ["duplicate-frame"], [k], order=tuple(order))
+    return _faulty(setup, ["duplicate-frame"], [k], order=_show(setup, {k: k - 1}))
 
 
 def _replace_frame(setup: CaptureSetup, rng: Rng, pattern: int) -> FaultyCapture:
     """One frame shows something else."""
-    frames, wave = setup.shown.frames, setup.wave
-    usable = [k for k in _coded(setup) if pattern_levels(setup.shown, frames[k], wave).any()]
+    frames = setup.shown.frames
+    usable = [k for k in _coded(setup) if pattern_levels(setup.shown, frames[k]).any()]
     k = int(rng.choice(usable))
-    order = list(range(_count(setup)))
-    order[k] = pattern
-    return _faulty(setup, ["duplicate-frame", "frame-order"], [k], order=tuple(order))
+    order = _show(setup, {k: pattern})
+    return _faulty(setup, ["duplicate-frame", "frame-order"], [k], order=order)
 
 
 def _order_steps(setup: CaptureSetup, permute: Callable[[int], Sequence[int]]) -> FaultyCapture:
     """The steps of every period are shown in the order ``permute(steps)``."""
-    order = list(range(_count(setup)))
-    counts = {len(steps) for steps in _steps(setup.shown)}
+    counts = {len(steps) for steps in _steps(setup)}
     orders = {n: permute(n) for n in sorted(counts)}
-    for steps in _steps(setup.shown):
-        for place, step in zip(steps, orders[len(steps)], strict=True):
-            order[place] = steps[step]
+    instead = {
+        place: steps[step]
+        for steps in _steps(setup)
+        for place, step in zip(steps, orders[len(steps)], strict=True)
+    }
     causes = ["step-order"]
-    if all(sum(k != step for k, step in enumerate(orders[n])) == 2 for n in counts):
+    if all(sum(k != step for k, step in enumerate(order)) == 2 for order in orders.values()):
         causes.append("frame-order")  # two steps of each period have changed places
-    return _faulty(setup, causes, order=tuple(order))
+    return _faulty(setup, causes, order=_show(setup, instead))
 
 
 def _reverse_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -241,7 +247,7 @@ def _permute_steps(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
             order = rng.permutation(n)
             differences = {int(d) for d in np.diff(order, append=order[0]) % n}
             if differences not in ({1}, {n - 1}):
-                return [int(k) for k in order]
+                return order.tolist()
 
     return _order_steps(setup, permute)
 
@@ -260,8 +266,7 @@ def _flip_sign(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     # phase steps alone, reversed along both axes, are those of a projector upside down
     axes = _draw_axes(rng) if setup.kind in CODED else (AXES[rng.integers(2)],)
     causes = ["step-order"] if setup.kind in CODED else ["step-order", "axis-reversed"]
-    sign = PerAxis(*(-1 if axis in axes else 1 for axis in AXES))
-    return _describe(setup, causes, phase_sign=sign)
+    return _describe(setup, causes, phase_sign=_set_axes(axes, -1, 1))
 
 
 def _omit_offset(setup: CaptureSetup, rng: Rng, offset: float) -> FaultyCapture:
@@ -269,14 +274,13 @@ def _omit_offset(setup: CaptureSetup, rng: Rng, offset: float) -> FaultyCapture:
     causes = ["phase-offset"]
     if setup.kind in CODED and abs(offset) > 3:
         causes.append("gray-origin")  # half a period: the same images
-    values = _set_axes({axis: offset for axis in _draw_axes(rng)}, 0.0)
+    values = _set_axes(_draw_axes(rng), offset, 0.0)
     return _faulty(setup, causes, shown=replace(setup.shown, phase_offset_rad=values))
 
 
 def _move_origin(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """The Gray code begins half a period earlier than described."""
-    half = setup.shown.period_px("x") / 2
-    values = _set_axes({axis: -0.5 - half for axis in _draw_axes(rng)}, -0.5)
+    values = _set_axes(_draw_axes(rng), -0.5 - setup.shown.period_px("x") / 2, -0.5)
     shown = replace(setup.shown, gray_origin_px=values)
     return _faulty(setup, ["gray-origin", "phase-offset"], shown=shown)
 
@@ -290,17 +294,20 @@ def _scale_cell(setup: CaptureSetup, rng: Rng, factor: float) -> FaultyCapture:
     return _describe(_cover(setup), causes, gray_cell_px=cell)
 
 
-def _renumber_bits(frames: Sequence[Frame], renumber: Callable[[Frame], int]) -> tuple[Frame, ...]:
-    """The frames with other numbers of bits."""
-    return tuple(
-        replace(f, bit=renumber(f)) if f.kind in ("gray", "inverse") else f for f in frames
+def _renumber_bits(
+    setup: CaptureSetup, causes: Sequence[str], renumber: Callable[[Frame], int]
+) -> FaultyCapture:
+    """The capture whose description has other numbers of bits."""
+    frames = tuple(
+        replace(f, bit=renumber(f)) if f.kind in ("gray", "inverse") else f
+        for f in setup.described.frames
     )
+    return _describe(setup, causes, frames=frames)
 
 
 def _reverse_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """The bits are numbered from the least significant one."""
-    frames = _renumber_bits(setup.described.frames, lambda f: f.bits - 1 - f.bit)
-    return _describe(setup, ["bit-order"], frames=frames)
+    return _renumber_bits(setup, ["bit-order"], lambda f: f.bits - 1 - f.bit)
 
 
 def _exchange_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -316,8 +323,7 @@ def _exchange_bits(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
         shift = bits[frame.axis] - fewest
         return number.get(frame.bit - shift, frame.bit - shift) + shift
 
-    frames = _renumber_bits(setup.described.frames, renumber)
-    return _describe(setup, ["bit-order", "frame-order"], frames=frames)
+    return _renumber_bits(setup, ["bit-order", "frame-order"], renumber)
 
 
 def _scale_period(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -368,44 +374,19 @@ def _drift(setup: CaptureSetup, rng: Rng, share: float) -> FaultyCapture:
     n = _count(setup)
     gains = np.linspace(1, 1 - share, n)
     gains = gains[::-1] if rng.random() < 0.5 else gains
-    return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
+    return _faulty(setup, ["exposure-drift"], gains=tuple(gains.tolist()))
 
 
 def _vary_exposure(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """The exposure of each image differs at random by 5 %."""
     gains = 1 + 0.05 * np.clip(rng.standard_normal(_count(setup)), -2.5, 2.5)
-    return _faulty(setup, ["exposure-drift"], gains=tuple(float(g) for g in gains))
-
-
-def _flicker(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The light of the projector and of the room varies by 10 % along the rows."""
-    return _faulty(setup, ["flicker"], flicker=0.1)
+    return _faulty(setup, ["exposure-drift"], gains=tuple(gains.tolist()))
 
 
 def _switch_lamp(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
     """A lamp is switched on in the middle, of 30 % of the mean grey level."""
     k = _draw_middle(setup, rng, 0.35, 0.65)
     return _faulty(setup, ["room-light"], room_step=(k, 0.3))
-
-
-def _saturate(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """White saturates 30 % of the illuminated pixels."""
-    return _faulty(setup, ["saturation"], clipped_share=0.3)
-
-
-def _darken(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The brightest pixels reach 2.5 % of full scale."""
-    return _faulty(setup, ["dark"], exposure=0.025)
-
-
-def _bend_response(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The projector has a gamma of 2.2, which few steps do not average out."""
-    return _faulty(_linear(setup), ["gamma"], gamma=2.2)
-
-
-def _clip_sine(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """The cosines are 40 + 200 cos, clipped to 0 ... 255."""
-    return _faulty(_linear(setup), ["gamma", "saturation"], wave=(40.0, 200.0))
 
 
 # The scene
@@ -423,12 +404,8 @@ def _move(setup: CaptureSetup, rng: Rng, steadily: bool) -> FaultyCapture:
     shifts = setup.shown.phase_shifts("x" if beside else "y")
     k = int(rng.choice(shifts[-1][1][1:])) if shifts else _draw_middle(setup, rng, 0.35, 0.65)
     motion = 0.15 * np.arange(n) if steadily else 1.5 * (np.arange(n) >= k)
-    return _faulty(setup, ["moved"], motion_px=tuple(float(s) for s in motion), direction=direction)
-
-
-def _ghost(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
-    """Each image holds 15 % of the one before."""
-    return _faulty(setup, ["ghosting"], ghost=0.15)
+    motion_px = tuple(motion.tolist())
+    return _faulty(setup, ["moved"], motion_px=motion_px, direction=direction)
 
 
 def _narrow_stripes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
@@ -447,44 +424,45 @@ def _narrow_stripes(setup: CaptureSetup, rng: Rng) -> FaultyCapture:
 
 
 CAPTURE_FAULTS: Mapping[str, CaptureFault] = {
-    "late from the start": CaptureFault(_late_from_start, ANY),
-    "late from one frame on": CaptureFault(_late_from_frame, ANY),
-    "frame missing": CaptureFault(_missing_frame, ANY),
-    "neighbours exchanged": CaptureFault(_exchange_neighbours, ANY),
-    "distant frames exchanged": CaptureFault(_exchange_distant, ANY),
-    "frame repeated": CaptureFault(_repeat_frame, ANY),
-    "foreign frame": CaptureFault(lambda s, rng: _replace_frame(s, rng, FOREIGN), ANY),
-    "black frame": CaptureFault(lambda s, rng: _replace_frame(s, rng, BLACK), ANY),
+    "late from the start": CaptureFault(_late_from_start),
+    "late from one frame on": CaptureFault(_late_from_frame),
+    "frame missing": CaptureFault(_missing_frame),
+    "neighbours exchanged": CaptureFault(_exchange_neighbours),
+    "distant frames exchanged": CaptureFault(_exchange_distant),
+    "frame repeated": CaptureFault(_repeat_frame),
+    "foreign frame": CaptureFault(partial(_replace_frame, pattern=FOREIGN)),
+    "black frame": CaptureFault(partial(_replace_frame, pattern=BLACK)),
     "steps reversed": CaptureFault(_reverse_steps, PHASE),
     # each order of three steps is a shift or a reversal
     "steps permuted": CaptureFault(_permute_steps, (*CODED, "micro")),
     "phase sign flipped": CaptureFault(_flip_sign, PHASE),
-    "offset of a quarter period": CaptureFault(
-        lambda s, rng: _omit_offset(s, rng, np.pi / 2), PHASE
-    ),
-    "offset of half a period": CaptureFault(lambda s, rng: _omit_offset(s, rng, np.pi), PHASE),
+    "offset of a quarter period": CaptureFault(partial(_omit_offset, offset=np.pi / 2), PHASE),
+    "offset of half a period": CaptureFault(partial(_omit_offset, offset=np.pi), PHASE),
     "Gray origin moved": CaptureFault(_move_origin, CODED),
-    "Gray cell halved": CaptureFault(lambda s, rng: _scale_cell(s, rng, 0.5), BITS),
-    "Gray cell doubled": CaptureFault(lambda s, rng: _scale_cell(s, rng, 2.0), BITS),
+    "Gray cell halved": CaptureFault(partial(_scale_cell, factor=0.5), BITS),
+    "Gray cell doubled": CaptureFault(partial(_scale_cell, factor=2.0), BITS),
     "bits reversed": CaptureFault(_reverse_bits, BITS),
     "two bits exchanged": CaptureFault(_exchange_bits, BITS),
     "period 12 % too long": CaptureFault(_scale_period, PHASE),
-    "axes exchanged": CaptureFault(_exchange_axes, ANY),
-    "axis mirrored": CaptureFault(_mirror_projector, ANY),
-    "projector too small": CaptureFault(lambda s, rng: _scale_projector(s, rng, 0.7), ANY),
-    "projector too large": CaptureFault(lambda s, rng: _scale_projector(s, rng, 1.5), ANY),
-    "drift of 8 %": CaptureFault(lambda s, rng: _drift(s, rng, 0.08), ANY),
-    "drift of 30 %": CaptureFault(lambda s, rng: _drift(s, rng, 0.3), ANY),
-    "random exposure": CaptureFault(_vary_exposure, ANY),
-    "flicker": CaptureFault(_flicker, ANY),
-    "lamp switched on": CaptureFault(_switch_lamp, ANY),
-    "saturated": CaptureFault(_saturate, ANY),
-    "dark": CaptureFault(_darken, ANY),
-    "gamma 2.2": CaptureFault(_bend_response, FEW),
-    "clipped cosine": CaptureFault(_clip_sine, PHASE),
-    "moved": CaptureFault(lambda s, rng: _move(s, rng, False), ANY),
-    "moving": CaptureFault(lambda s, rng: _move(s, rng, True), ANY),
-    "ghosting": CaptureFault(_ghost, ANY),
+    "axes exchanged": CaptureFault(_exchange_axes),
+    "axis mirrored": CaptureFault(_mirror_projector),
+    "projector too small": CaptureFault(partial(_scale_projector, factor=0.7)),
+    "projector too large": CaptureFault(partial(_scale_projector, factor=1.5)),
+    "drift of 8 %": CaptureFault(partial(_drift, share=0.08)),
+    "drift of 30 %": CaptureFault(partial(_drift, share=0.3)),
+    "random exposure": CaptureFault(_vary_exposure),
+    "flicker": CaptureFault(_change("flicker", flicker=0.1)),
+    "lamp switched on": CaptureFault(_switch_lamp),
+    "saturated": CaptureFault(_change("saturation", clipped_share=0.3)),
+    "dark": CaptureFault(_change("dark", exposure=0.025)),
+    # few steps do not average it out
+    "gamma 2.2": CaptureFault(_change("gamma", is_linear=True, gamma=2.2), FEW),
+    "clipped cosine": CaptureFault(
+        _change("gamma", "saturation", is_linear=True, wave=(40.0, 200.0)), PHASE
+    ),
+    "moved": CaptureFault(partial(_move, steadily=False)),
+    "moving": CaptureFault(partial(_move, steadily=True)),
+    "ghosting": CaptureFault(_change("ghosting", ghost=0.15)),
     "narrow stripes": CaptureFault(_narrow_stripes, ("gray",)),
 }
 

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.validation.proof import Proof
-from slviewer.validation.prove_accuracy import prove_accuracy
+from slviewer.validation.prove_accuracy import prove_accuracy, prove_uncertainty
 from slviewer.validation.prove_captures import prove_captures
 from slviewer.validation.prove_causes import prove_causes
 from slviewer.validation.prove_edges import prove_edges
@@ -15,7 +15,6 @@ from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_plan import prove_plan
 from slviewer.validation.prove_registration import prove_registration
 from slviewer.validation.prove_surfaces import prove_surfaces
-from slviewer.validation.prove_uncertainty import prove_uncertainty
 
 Claim = Literal[
     "accuracy",

@@ -1,5 +1,5 @@
-"""Whether the splined calibration measures as well as the camera's noise allows, on simulated rigs
-with known truth.
+"""Whether the splined calibration measures as well as the camera's noise allows, and predicts its
+own errors, on simulated rigs with known truth.
 
 Each rig is calibrated with every model, which then measures the Letter's planes and spheres. All of
 it happens in memory, one capture after another: a full-size session of so many would fill a disk.
@@ -7,40 +7,46 @@ it happens in memory, one capture after another: a full-size session of so many 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 from statistics import fmean
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import calibrate_pixelwise
+from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.splined.uncertainty import volume_sigmas
+from slviewer.calibration.splined.unknowns import Arrangement
+from slviewer.calibration.splined.volume import (
+    Volume,
+    remove_rigid_motion,
+    select_depth_axis,
+    sigma_3d,
+    view_pixels,
+    working_volume,
+)
 from slviewer.errors import InputError
 from slviewer.evaluation.compare import Comparison, fit_clouds
+from slviewer.evaluation.fit import ShapeResult, ShapeSearch
 from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
-from slviewer.evaluation.plane import evaluate_plane
 from slviewer.evaluation.render import Row
-from slviewer.evaluation.sphere import SphereResult, evaluate_sphere
 from slviewer.fringe.phase import PhaseMap
-from slviewer.pipeline.feedback import Progress, ignore_progress, part
+from slviewer.fringe.sequence import Axis
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
-from slviewer.simulation.boards import BoardShape
+from slviewer.records.verification import Shape
+from slviewer.simulation.boards import FLAT, BoardShape
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import PerfectModel
-from slviewer.target.board import Board
-from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.rendered_calibration import (
-    DEFAULT_SETTINGS,
-    CalibrationSettings,
-    calibrate_rendered,
-    render_phase,
-)
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, root_mean_square, track
+from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
 COVERED = 6
@@ -62,6 +68,10 @@ OVER_STEREO = 1.03
 MIN_MEASURED = 0.9
 """Share of the pixels to be scored: a model that masks what it measures badly would look better
 than it is."""
+PREDICTED_BAND = (0.7, 1.5)
+"""Of predicted over true error of the calibration, pooled over all rigs."""
+GRID = (13, 10, 5)
+"""Places where these are compared: columns, rows, depths."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +83,7 @@ class RigCase:
     seed: int = 0
     texture: Literal["coarse", "fine"] = "coarse"
     local_distortion_px: float | None = None
-    shape: BoardShape = field(default_factory=BoardShape)
+    shape: BoardShape = FLAT
 
     def rig(self, scale: float) -> SimulatedRig:
         """The rig, its camera at ``scale`` times the Letter's resolution."""
@@ -85,7 +95,7 @@ class RigCase:
 BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
 
 
-def rig_cases(seed: int = 0) -> tuple[RigCase, ...]:
+def rig_cases(seed: int) -> tuple[RigCase, ...]:
     """The default rig and five others; another seed makes six others of the same kinds."""
     return (
         RigCase("coarse", seed),
@@ -154,25 +164,10 @@ class RigFigures:
         return radius, spacing
 
 
-def prove_accuracy(
-    scale: float = 1.0,
-    *,
-    rigs: Sequence[RigCase] | None = None,
-    poses: int = POSES,
-    shapes: Sequence[str] = (),
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
-    seed: int = 0,
-    progress: Progress = ignore_progress,
-) -> Proof:
-    """Calibrate and measure one rig after another; by default the six of ``rig_cases``.
-
-    ``shapes``: those of the Letter's planes and spheres that are measured; by default all.
-    """
-    cases = {case.name: case for case in (rig_cases(seed) if rigs is None else rigs)}
-    figures = [
-        measure_rig(case, scale, poses, report, shapes, settings)
-        for _, case, report in track(progress, cases)
-    ]
+def prove_accuracy(scale: float, seed: int, progress: Progress) -> Proof:
+    """Calibrate and measure the six of ``rig_cases``, one rig after another."""
+    cases = {case.name: case for case in rig_cases(seed)}
+    figures = [measure_rig(case, scale, report) for _, case, report in track(progress, cases)]
     return judge_accuracy(figures, scale)
 
 
@@ -235,29 +230,14 @@ def _make_row(rig: RigFigures) -> Row:
     }
 
 
-def measure_rig(
-    case: RigCase,
-    scale: float,
-    poses: int,
-    progress: Progress = ignore_progress,
-    shapes: Sequence[str] = (),
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
-) -> RigFigures:
-    """Calibrate a rig from ``poses`` rendered captures of its board, and measure shapes with it.
-
-    ``shapes``: names among the Letter's ten planes and six spheres; by default all.
-    """
+def measure_rig(case: RigCase, scale: float, progress: Progress) -> RigFigures:
+    """Calibrate a rig from ``POSES`` rendered captures of its board, and measure the Letter's ten
+    planes and six spheres with it."""
     start = perf_counter()
     rig = case.rig(scale)
-    plan = letter_plan(rig, Board.parse(settings.target), poses, case.shape)
-    measured_shapes = {
-        name: scene
-        for name, scene in plan.items()
-        if name.startswith(("plane_", "sphere_")) and (not shapes or name in shapes)
-    }
-    stereo, splined, observations = calibrate_rendered(
-        rig, plan, part(progress, 0.0, 0.6), settings
-    )
+    plan = letter_plan(rig, poses=POSES, shape=case.shape)
+    shapes = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
+    stereo, splined, observations = calibrate_rendered(rig, plan, part(progress, 0.0, 0.6))
     models: dict[str, Model] = {
         "stereo": stereo,
         "pixelwise": calibrate_pixelwise(observations, stereo),
@@ -267,17 +247,23 @@ def measure_rig(
     covered = covered_pixels(observations)
     planes: dict[str, PlaneFigures] = {}
     spheres: dict[str, Spheres] = {}
-    fits: dict[str, dict[str, SphereResult]] = {}
-    for name, scene, _ in track(progress, measured_shapes, 0.6, 1.0):
-        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name), settings)
-        comparison, measured = compare_fits(models, phase, covered, isinstance(scene, Spheres))
+    fits: dict[str, dict[str, ShapeResult]] = {}
+    for name, scene, _ in track(progress, shapes, 0.6, 1.0):
+        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name))
         if isinstance(scene, Spheres):
             spheres[name] = scene
-            for model, result in comparison.results.items():
-                assert isinstance(result, SphereResult)
+            for model, result in compare_fits(models, phase, covered, "sphere")[0].results.items():
                 fits.setdefault(model, {})[name] = result
         else:
-            planes[name] = _make_plane_figures(comparison, measured)
+            comparison, measured = compare_fits(models, phase, covered, "plane")
+            shares, own = comparison.incidence or {}, comparison.results["splined"]
+            planes[name] = PlaneFigures(
+                max(shares, key=lambda region: shares[region]),
+                {model: result.rms_mm for model, result in comparison.results.items()},
+                own.noise_floor_mm,
+                own.points,
+                measured,
+            )
     return RigFigures(
         case.name,
         case.seed,
@@ -312,7 +298,7 @@ def covered_pixels(observations: Sequence[Observation]) -> np.ndarray:
 
 
 def compare_fits(
-    models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, is_sphere: bool
+    models: Mapping[str, Model], phase: PhaseMap, covered: np.ndarray, shape: Shape
 ) -> tuple[Comparison, float]:
     """Every model's fit to one capture over the covered pixels, and the share of these that splined
     measures."""
@@ -324,36 +310,129 @@ def compare_fits(
             np.where(covered[..., None], points, np.float32(np.nan)), phase.axis, name, sigma
         )
     comparison = fit_clouds(
-        "sphere" if is_sphere else "plane",
+        shape,
         {name: clouds[name] for name in JUDGED},
         phase.illuminated,
         depth_range=DEPTH_RANGE_MM,
-        radius=SPHERE_RADIUS_MM if is_sphere else None,
+        radius=SPHERE_RADIUS_MM,
     )
-    splined = comparison.results["splined"]
+    start = comparison.results["splined"].shape
     for name in clouds.keys() - set(JUDGED):
         points, sigma = clouds[name].points, clouds[name].sigma_z
         try:
-            comparison.results[name] = (
-                evaluate_sphere(points, comparison.common, sigma, SPHERE_RADIUS_MM, splined.sphere)
-                if isinstance(splined, SphereResult)
-                else evaluate_plane(points, comparison.common, sigma, splined.plane)
-            )
+            search = ShapeSearch(shape, points, sigma)
+            comparison.results[name] = search.evaluate(comparison.common, start)
         except InputError:
             continue  # it measures nothing there
     to_score = comparison.region & clouds["stereo"].mask & clouds[FLOOR].mask
     return comparison, float(comparison.common.sum() / max(to_score.sum(), 1))
 
 
-def _make_plane_figures(comparison: Comparison, measured: float) -> PlaneFigures:
-    """The figures of one plane from its comparison and the share of its pixels that were
-    measured."""
-    shares = comparison.incidence or {}
-    splined = comparison.results["splined"]
-    return PlaneFigures(
-        max(shares, key=lambda region: shares[region]),
-        {name: result.rms_mm for name, result in comparison.results.items()},
-        splined.noise_floor_mm,
-        splined.points,
-        measured,
+@dataclass(frozen=True, eq=False)
+class PredictedErrors:
+    """One calibration: ``predicted`` (n,) mm and ``true`` (n,) mm errors over its working volume,
+    in 3D without the rigid motion that fits the supported places best; ``supported`` (n,) bool."""
+
+    predicted: np.ndarray
+    true: np.ndarray
+    supported: np.ndarray
+
+    def row(self, rig: str) -> dict[str, Any]:
+        """The figures in mm; NaN where target poses support everything."""
+        inside, elsewhere = self.supported, ~self.supported
+        predicted, true, predicted_elsewhere, true_elsewhere = (
+            root_mean_square(errors[places])
+            for places in (inside, elsewhere)
+            for errors in (self.predicted, self.true)
+        )
+        return {
+            "rig": rig,
+            "supported": float(np.mean(inside)),
+            "predicted": predicted,
+            "true": true,
+            "ratio": predicted / true,
+            "below_2_sigma": float(np.mean((self.true < 2 * self.predicted)[inside])),
+            "ratio_elsewhere": predicted_elsewhere / true_elsewhere,
+        }
+
+
+def prove_uncertainty(scale: float, seed: int, progress: Progress) -> Proof:
+    """Calibrate rigs of different lenses and boards from rendered captures, and compare what each
+    predicts of its errors with these. ``scale``: resolution of the camera, as a share of the
+    Letter's.
+
+    Raises CalibrationRejected where one cannot be calibrated.
+    """
+    rigs = {}
+    for name, case, report in track(progress, {case.name: case for case in rig_cases(seed)}):
+        rig = case.rig(scale)
+        plan = letter_plan(rig, poses=POSES, shape=case.shape)
+        rigs[name] = compare_with_truth(calibrate_rendered(rig, plan, report)[1], rig)
+    return judge_uncertainty(rigs, scale)
+
+
+def judge_uncertainty(rigs: Mapping[str, PredictedErrors], scale: float) -> Proof:
+    """The proof: whether the ratio of predicted to true errors, pooled over the rigs, lies in
+    ``PREDICTED_BAND``."""
+    fields = zip(*(vars(each).values() for each in rigs.values()), strict=True)
+    pooled = PredictedErrors(*map(np.concatenate, fields)).row("pooled")
+    rows = [each.row(name) for name, each in rigs.items()] + ([pooled] if len(rigs) > 1 else [])
+    table = [
+        {
+            "rig": row["rig"],
+            "supported %": 100 * row["supported"],
+            "predicted um": round(1000 * row["predicted"], 1),
+            "true um": round(1000 * row["true"], 1),
+            "predicted / true": round(row["ratio"], 2),
+            "below 2 sigma %": round(100 * row["below_2_sigma"], 1),
+            "where no pose captures": round(row["ratio_elsewhere"], 2),
+        }
+        for row in rows
+    ]
+    least, most = PREDICTED_BAND
+    holds = least <= pooled["ratio"] <= most
+    line = (
+        f"predicted over true 3D error, pooled over {len(rigs)} rigs of {POSES} poses at scale"
+        f" {scale:g}: {pooled['ratio']:.2f} {'lies' if holds else 'does NOT lie'} between {least}"
+        f" and {most}; where no pose captures {pooled['ratio_elsewhere']:.2f}"
     )
+    return Proof(
+        holds, scale, table, {"poses": POSES, "ratio": pooled["ratio"], "rigs": rows}, below=[line]
+    )
+
+
+def compare_with_truth(model: SplinedModel, true: SimulatedRig) -> PredictedErrors:
+    """The errors that a calibration of a simulated rig predicts over the working volume, and its
+    true ones."""
+    bundle, rig = model.bundle, model.rig
+    columns, rows, depths = GRID
+    volume = working_volume(rig, bundle.depth_range_mm, columns=columns, rows=rows, depths=depths)
+    axis = select_depth_axis(rig, volume)
+    errors = true_errors(true, rig, volume, axis)
+    known = np.isfinite(errors).all(axis=1)
+    volume = Volume(
+        *(each[known] for each in (volume.pixels, volume.z, volume.points, volume.projector))
+    )
+    supported = volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
+    predicted = volume_sigmas(bundle, axis, volume)
+    return PredictedErrors(
+        predicted,
+        sigma_3d(remove_rigid_motion(errors[known].reshape(1, -1), volume.points, supported)),
+        supported,
+    )
+
+
+def true_errors(true: SimulatedRig, rig: Arrangement, volume: Volume, axis: Axis) -> np.ndarray:
+    """(n, 3) mm: the point that the calibrated ``rig`` measures for camera pixels at the volume's
+    depths, less the true one; NaN where a lens has no answer."""
+    row = 0 if axis == "x" else 1
+    rays = np.column_stack([true.camera.undistort(volume.pixels), np.ones(len(volume.z))])
+    points = rays * volume.z[:, None]
+    measured = true.project(points)[:, row]
+    z = volume.z.copy()
+    for _ in range(6):  # Newton, the slope from a step of a ten-thousandth
+        here, there = (
+            view_pixels(rig, volume.pixels, depths)[1][:, row] for depths in (z, 1.0001 * z)
+        )
+        z = z + 1e-4 * z * (measured - here) / (there - here)
+    return view_pixels(rig, volume.pixels, z)[0] - points

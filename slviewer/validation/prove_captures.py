@@ -5,19 +5,23 @@ Small captures of six kinds are simulated, some with one fault each. The truth i
 simulation; how the faults are made does not depend on how they are searched for.
 """
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Literal
 
 import numpy as np
 
+from slviewer.errors import InputError
 from slviewer.evaluation.render import Row
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.capture_phases import check_capture, decode_frames
+from slviewer.pipeline.examination import examine_frames
+from slviewer.pipeline.exposure_check import check_capture_exposure
+from slviewer.pipeline.feedback import Progress
 from slviewer.validation.capture_faults import CAPTURE_FAULTS, FaultyCapture, draw_faulty
-from slviewer.validation.capture_findings import Named, decode_coordinates, examine
 from slviewer.validation.proof import BandCheck, Proof, prove_checks
 from slviewer.validation.simulated_capture import (
     KINDS,
@@ -43,7 +47,66 @@ LEAST_NAMED, MOST_HARMFUL, MOST_ALARMS = 0.9, 0.04, 0.01
 """Share of faults that are named or harmless; of those that are neither noticed nor harmless; and
 of sound captures with an alarm."""
 
-Examine = Callable[[PatternSequence, np.ndarray], list[Named]]
+Severity = Literal["bad", "warning", "note"]
+_SEVERITIES: dict[str, Severity] = {"rejected": "bad", "doubtful": "warning", "note": "note"}
+"""Of the findings of an examination; the worst first."""
+_REFUSALS = {
+    r"are saturated": "saturation",
+    r"light from other surfaces": "indirect-light",
+    r"outside the projector": "projector-size",
+    r"which the projector spans": "fringe-period|projector-size",
+    r"which a Gray cell spans": "gray-cell|fringe-period",
+    r"Gray bits number": "fringe-period|gray-cell|projector-size",
+    r"modulation is": "dark",
+    r"rows and between the frames": "flicker",
+    r"light of the room": "room-light",
+    r"brightness varies": "exposure-drift",
+}
+"""Causes that messages of refusals state in words."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """A finding: its cause, or the causes between which it leaves the choice, joined by "|"; the
+    frames that it names (from 0, none for all); and its severity."""
+
+    cause: str
+    frames: tuple[int, ...]
+    severity: Severity
+    message: str = ""
+
+
+def examine_capture(sequence: PatternSequence, stack: np.ndarray) -> list[Named]:
+    """What the program finds in a capture (n, h, w): the worst first, else in its own order."""
+    examination = examine_frames(sequence, stack)
+    found = [
+        Named(f.cause, f.frames, _SEVERITIES[f.severity], f.sentence) for f in examination.findings
+    ]
+    if examination.rejected:
+        return found
+    try:
+        phases = decode_frames("capture", sequence, stack)
+        check_capture("capture", sequence, stack, phases, examination)
+    except InputError as error:
+        causes = (cause for words, cause in _REFUSALS.items() if re.search(words, str(error)))
+        return [Named(next(causes, "unreadable"), (), "bad", str(error)), *found]
+    exposure = check_capture_exposure(sequence, stack, phases)
+    if exposure.verdict in ("bad", "warning"):
+        cause = "saturation" if "saturated." in exposure.sentence else "dark"
+        severity: Severity = "bad" if exposure.verdict == "bad" else "warning"
+        found.append(Named(cause, (), severity, exposure.sentence))
+    order = list(_SEVERITIES.values())
+    return sorted(found, key=lambda named: order.index(named.severity))
+
+
+def decode_coordinates(sequence: PatternSequence, stack: np.ndarray) -> dict[Axis, np.ndarray]:
+    """The decoded coordinate (h, w) px of each axis, NaN where masked; empty where it is
+    refused."""
+    try:
+        phases = decode_frames("capture", sequence, stack)
+    except InputError:
+        return {}
+    return {axis: phase.coordinate for axis, phase in phases.items()}
 
 
 @dataclass(frozen=True)
@@ -77,21 +140,12 @@ def _name_finding(named: Named) -> str:
     return f"{named.cause}{frames}{note}"
 
 
-def prove_captures(
-    scale: float = 1.0,
-    *,
-    kinds: Sequence[CaptureKind] = KINDS,
-    faults: Sequence[str] = (NO_FAULT, *CAPTURE_FAULTS),
-    seeds: Sequence[int] = (),
-    seed: int = 0,
-    progress: Progress = ignore_progress,
-) -> Proof:
+def prove_captures(scale: float, seed: int, progress: Progress) -> Proof:
     """Examine sound captures, and captures with every fault of every kind, and count the outcomes.
 
-    ``scale``: share of the captures of a full run. ``seeds``: instead, one capture of each of these
-    seeds for every fault and kind.
+    ``scale``: share of the captures of a full run.
     """
-    plan = list(plan_cases(scale, kinds, faults, seeds, seed))
+    plan = list(plan_cases(scale, seed))
     cases: list[CaptureCase] = []
     for i, (fault, kind, each) in enumerate(plan):
         progress(i / len(plan), f"{fault}, {kind}")
@@ -99,31 +153,18 @@ def prove_captures(
     return summarize_cases(cases, scale)
 
 
-def plan_cases(
-    scale: float,
-    kinds: Sequence[CaptureKind],
-    faults: Sequence[str],
-    seeds: Sequence[int] = (),
-    seed: int = 0,
-) -> Iterator[tuple[str, CaptureKind, int]]:
+def plan_cases(scale: float, seed: int) -> Iterator[tuple[str, CaptureKind, int]]:
     """Yield (fault, kind, seed) of each capture; see `prove_captures`."""
-    for number, fault in enumerate(faults):
-        own = [k for k in kinds if fault == NO_FAULT or k in CAPTURE_FAULTS[fault].kinds]
-        if seeds:
-            yield from ((fault, kind, each) for each in seeds for kind in own)
-            continue
-        full = SOUND if fault == NO_FAULT else REPEATS * len(own)
-        count = round(scale * full)
-        if own:
-            for i in range(max(1, count)):
-                # a part of the kinds, another one for each fault
-                kind = own[(i + number) % len(own)]
-                yield fault, kind, 1000 * seed + i // len(own)
+    for number, fault in enumerate((NO_FAULT, *CAPTURE_FAULTS)):
+        kinds = KINDS if fault == NO_FAULT else CAPTURE_FAULTS[fault].kinds
+        full = SOUND if fault == NO_FAULT else REPEATS * len(kinds)
+        for i in range(max(1, round(scale * full))):
+            # a part of the kinds, another one for each fault
+            kind = kinds[(i + number) % len(kinds)]
+            yield fault, kind, 1000 * seed + i // len(kinds)
 
 
-def examine_case(
-    fault: str, kind: CaptureKind, seed: int, examiner: Examine = examine
-) -> CaptureCase:
+def examine_case(fault: str, kind: CaptureKind, seed: int) -> CaptureCase:
     """Render one capture, sound where ``fault`` is "none", examine it, and judge the result."""
     if fault == NO_FAULT:
         setup = draw_setup(kind, seed)
@@ -134,18 +175,14 @@ def examine_case(
     capture = render_capture(setup)
     start = perf_counter()
     try:
-        named: list[Named] | None = examiner(setup.described, capture.stack)
+        named = examine_capture(setup.described, capture.stack)
+        outcome = judge_findings(named, faulty)
     except Exception as error:  # the other cases still have to run
-        named, crash = None, f"{type(error).__name__}: {error}"
+        named, outcome = [Named(f"{type(error).__name__}: {error}", (), "bad")], "CRASH"
     seconds, errors = perf_counter() - start, ""
     frames = " of frame " + " or ".join(map(str, faulty.frames)) if faulty.frames else ""
     expected = (" or ".join(sorted(faulty.causes)) or "nothing") + frames
-    if named is None:
-        outcome: Outcome = "CRASH"
-        named = [Named(crash, (), "bad")]
-    elif (judged := judge_findings(named, faulty)) is not None:
-        outcome = judged
-    else:
+    if outcome is None:
         outcome, errors = judge_errors(faulty, capture)
     return CaptureCase(
         fault, kind, seed, outcome, expected, tuple(named), errors, setup.text(), seconds
@@ -232,18 +269,14 @@ def summarize_cases(cases: Sequence[CaptureCase], scale: float) -> Proof:
         _list_row(fault, [c for c in cases if c.fault == fault])
         for fault in dict.fromkeys(c.fault for c in cases)
     ]
-    named = Counter(case.outcome for case in faulty)
-    checks = []
-    if faulty:
-        passed = (named["right"] + named["harmless"]) / len(faulty)
-        harmful = (named["HARMFUL"] + named["LOST"] + named["CRASH"]) / len(faulty)
-        checks += [
-            BandCheck("faults", "share that is named or harmless", passed, LEAST_NAMED, 1.0),
-            BandCheck("faults", "share that is harmful", harmful, 0.0, MOST_HARMFUL),
-        ]
-    if sound:
-        alarms = sum(case.outcome != "sound" for case in sound) / len(sound)
-        checks.append(BandCheck("sound", "share with an alarm", alarms, 0.0, MOST_ALARMS))
+    passed = sum(case.outcome in PASSED for case in faulty) / len(faulty)
+    harmful = sum(case.outcome in ("HARMFUL", "LOST", "CRASH") for case in faulty) / len(faulty)
+    alarms = sum(case.outcome != "sound" for case in sound) / len(sound)
+    checks = [
+        BandCheck("faults", "share that is named or harmless", passed, LEAST_NAMED, 1.0),
+        BandCheck("faults", "share that is harmful", harmful, 0.0, MOST_HARMFUL),
+        BandCheck("sound", "share with an alarm", alarms, 0.0, MOST_ALARMS),
+    ]
     lines = list(_list_totals(faulty, sound))
     lines += [case.text() for case in cases if case.outcome not in PASSED]
     return prove_checks(checks, scale, rows, {"cases": cases}, below=lines)
@@ -256,10 +289,8 @@ def _list_row(fault: str, cases: Sequence[CaptureCase]) -> Row:
     for kind in KINDS:
         own = Counter(case.outcome for case in cases if case.kind == kind)
         row[kind] = " ".join(f"{own[o]} {o}" for o in outcomes if own[o]) or "-"
-    total = Counter(case.outcome for case in cases)
-    passed = sum(total[outcome] for outcome in PASSED)
-    row["right %"] = 100 * passed / len(cases)
-    row["harmful"] = total["HARMFUL"] + total["LOST"]
+    row["right %"] = 100 * sum(case.outcome in PASSED for case in cases) / len(cases)
+    row["harmful"] = sum(case.outcome in ("HARMFUL", "LOST") for case in cases)
     row["s"] = float(np.mean([case.seconds for case in cases]))
     return row
 
@@ -267,11 +298,9 @@ def _list_row(fault: str, cases: Sequence[CaptureCase]) -> Row:
 def _list_totals(faulty: Sequence[CaptureCase], sound: Sequence[CaptureCase]) -> Iterator[str]:
     """Yield the totals of all faults and of all sound captures in words."""
     for name, cases, outcomes in (("faults", faulty, OF_FAULTS), ("sound", sound, OF_SOUND)):
-        if not cases:
-            continue
         total = Counter(case.outcome for case in cases)
         counts = ", ".join(f"{total[o]} {o}" for o in outcomes)
-        passed = 100 * sum(total[outcome] for outcome in PASSED) / len(cases)
+        passed = 100 * sum(case.outcome in PASSED for case in cases) / len(cases)
         seconds = np.quantile([case.seconds for case in cases], [0.5, 0.95])
         yield (
             f"{len(cases)} {name}: {counts}; {passed:.1f} % right; {seconds[0]:.2f} s to examine in"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.evaluation.render import Row
-from slviewer.fringe.phase import PhaseMap
+from slviewer.geometry.vectors import box_middle
 from slviewer.pipeline.feedback import Progress
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
@@ -74,11 +74,9 @@ def measure_ridges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float]:
     and corrected."""
     board = Board.parse(PRINT)
     R = rotation(TILT)
-    middle = (board.points.min(axis=0) + board.points.max(axis=0)) / 2
-    scene = printed_board(board, Pose(R, np.array([0.0, 0.0, DEPTH_MM]) - R @ middle))
-    renderer = Renderer(rig, scene)
-    phase = render_phase(renderer, "print", seed)
-    before, after = _measure_depth_errors(rig, phase, renderer.truth().points[..., 2])
+    place = np.array([0.0, 0.0, DEPTH_MM]) - R @ box_middle(board.points)
+    scene = printed_board(board, Pose(R, place))
+    before, after = _measure_depth_errors(Renderer(rig, scene), "print", seed)
     distance, side = _signed_distance(rig, scene)
     return _measure_ridge(before, distance, side), _measure_ridge(after, distance, side)
 
@@ -88,11 +86,8 @@ def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float
     are in both clouds: as decoded, and corrected."""
     scene = demo_object(Pose(np.eye(3), np.array([0.0, 0.0, DEPTH_MM])))
     renderer = Renderer(rig, scene)
-    truth = renderer.truth().points
-    before, after = _measure_depth_errors(
-        rig, render_phase(renderer, "object", seed), truth[..., 2]
-    )
-    near = _find_creases(truth) & np.isfinite(before) & np.isfinite(after)
+    before, after = _measure_depth_errors(renderer, "object", seed)
+    near = _find_creases(renderer.truth().points) & np.isfinite(before) & np.isfinite(after)
     rms_before, rms_after = (
         root_mean_square(np.clip(each[near], -1.0, 1.0)) for each in (before, after)
     )
@@ -100,15 +95,14 @@ def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float
 
 
 def _measure_depth_errors(
-    rig: SimulatedRig, phase: PhaseMap, true_z: np.ndarray
+    renderer: Renderer, name: str, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth errors (h, w) mm of the phase as decoded, and of the cloud that the program makes of
-    it."""
-    model = PerfectModel(rig)
-    return (
-        model.points(phase)[..., 2] - true_z,
-        reconstruct_cloud(model, {"x": phase}).points[..., 2] - true_z,
-    )
+    """Depth errors (h, w) mm of a scan's phase as decoded, and of the cloud that the program makes
+    of it."""
+    model, phase = PerfectModel(renderer.rig), render_phase(renderer, name, seed)
+    cloud = reconstruct_cloud(model, {"x": phase})
+    true_z = renderer.truth().points[..., 2]
+    return model.points(phase)[..., 2] - true_z, cloud.points[..., 2] - true_z
 
 
 def _signed_distance(rig: SimulatedRig, scene: BoardScene) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.rigid import move_points, transform_from_rvec
 from slviewer.geometry.shapes import fit_plane
+from slviewer.geometry.vectors import box_middle
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.boards import Pose, printed_board
@@ -70,9 +71,8 @@ def prove_guidance(scale: float, seed: int, progress: Progress) -> Proof:
             rig = letter(scale, rig_seed)
             targets = [_render_plane(rig, name, 100 + i) for i, name in enumerate(planes())]
         start = perf_counter()
-        observations, predicted = (_observe_guided if way == "guided" else _observe_random)(
-            rig, POSES, report
-        )
+        observe = _observe_guided if way == "guided" else _observe_random
+        observations, predicted = observe(rig, report)
         report(0.9, "calibrating")
         model = calibrate_observed(rig, observations)[1]
         rms, floor, supported, unmeasured = zip(
@@ -126,20 +126,16 @@ def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
     return Proof(holds, scale, rows, {"outcomes": figures}, below=lines)
 
 
-def _observe_random(
-    rig: SimulatedRig, count: int, report: Progress
-) -> tuple[list[Observation], None]:
+def _observe_random(rig: SimulatedRig, report: Progress) -> tuple[list[Observation], None]:
     """The observations of poses drawn at random like the Letter's; undetected ones are skipped."""
     observations = [
-        _observe_pose(rig, pose, i, part(report, 0.9 * i / count, 0.9))
-        for i, pose in enumerate(target_poses(rig, BOARD, count))
+        _observe_pose(rig, pose, i, part(report, 0.9 * i / POSES, 0.9))
+        for i, pose in enumerate(target_poses(rig, BOARD, POSES))
     ]
     return [each for each in observations if each is not None], None
 
 
-def _observe_guided(
-    rig: SimulatedRig, count: int, report: Progress
-) -> tuple[list[Observation], float | None]:
+def _observe_guided(rig: SimulatedRig, report: Progress) -> tuple[list[Observation], float | None]:
     """The observations of poses that the wizard suggests, and the sigma in mm that it predicts at
     the end."""
     rng = np.random.default_rng([rig.seed, 0x6D])
@@ -150,16 +146,16 @@ def _observe_guided(
         planned = plan_next_pose(
             PlanInput(BOARD, rig.camera.size, rig.projector.size, features, refused=refused)
         )
-        if len(observations) == count:
+        if len(observations) == POSES:
             return observations, planned.sigma_mm
         i = len(observations) + refused
-        if planned.suggestion is None or refused > count:
+        if planned.suggestion is None or refused > POSES:
             raise InputError(
                 f"{refused} of {i} suggested poses could not be read, at {rig.camera.size} px"
             )
         pose = _vary_pose(rig, _solve_suggested_pose(rig, planned.suggestion.outline_px), rng)
         observation = _observe_pose(
-            rig, pose, i, part(report, 0.9 * len(observations) / count, 0.9)
+            rig, pose, i, part(report, 0.9 * len(observations) / POSES, 0.9)
         )
         if observation is None:
             refused += 1
@@ -201,7 +197,7 @@ def _solve_suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarr
 def _vary_pose(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
     """Sample a pose near the given one with every feature in view, as a hand moves the board until
     it is detected."""
-    middle = (BOARD.points.min(0) + BOARD.points.max(0)) / 2
+    middle = box_middle(BOARD.points)
     centre = move_points(T_camera_board, middle[None])[0]
     for k in range(_TRIES):
         steady = 1 - k / _TRIES

@@ -9,23 +9,60 @@ rigid motion that a calibration leaves open has been removed: it is fitted to th
 import re
 import shutil
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Literal, get_args
 
+import cv2
 import numpy as np
 
 from slviewer.errors import SlviewerError, UsageError
+from slviewer.evaluation.letter import SPHERE_RADIUS_MM
 from slviewer.evaluation.render import Row
+from slviewer.examination.examine import examine
+from slviewer.fringe.presets import AXES, gray_bits, phase_steps
+from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
+from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.simulation.hostile import FAULTS, SEVERITIES, Direction, Fault, Severity
-from slviewer.simulation.rig import letter
-from slviewer.validation.hostile_captures import SCANS, CaseReport, HostileBench, MeasuredScan
+from slviewer.pipeline.import_captures import import_captures
+from slviewer.pipeline.models import ModelName
+from slviewer.pipeline.operation import Job
+from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
+from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.verification import Shape
+from slviewer.session.store import Session
+from slviewer.session.toml import describe_sequence
+from slviewer.simulation.boards import printed_board
+from slviewer.simulation.hostile import (
+    FAULTS,
+    SEVERITIES,
+    SOUND,
+    Direction,
+    Fault,
+    Severity,
+    expose_frames,
+    hostile_light,
+    render_light,
+)
+from slviewer.simulation.hostile_frames import Frames
+from slviewer.simulation.hostile_scenes import CleanScene, MirrorTable
+from slviewer.simulation.plans import planes, spheres, target_poses
+from slviewer.simulation.renderer import Renderer
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.target.board import Board
 from slviewer.validation.proof import Proof, root_mean_square
 
+BOARD = Board.parse("circles:21x16:9")
+SCANS = ("plane_04", "sphere_3")
+"""Inside the calibrated depths."""
+STEPS, PERIOD_PX, BITS = 8, 16.0, 7
+_SAME_SURFACE_MM = 3.0
 MOST_OVER_FLOOR = 1.5
 """Times the undisturbed RMS, within which a case is measured."""
 SIGMAS = 3.0
@@ -44,24 +81,24 @@ Outcome = Literal[
 ]  # fmt: skip
 PASSED: tuple[Outcome, ...] = ("measured", "degraded, warned", "noisier as predicted", "refused")
 
-_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
-    (r"outside the projector", frozenset({"projector-size"})),
-    (r"no pixel carries a readable", frozenset({"unreadable"})),
-    (r"[Cc]ircles were|[Cc]ircles detected|board's columns", frozenset({"board"})),
-    (r"% of the image before", frozenset({"crosstalk"})),
-    (r"are saturated and masked", frozenset({"saturation"})),
-    (r"fringes are weak", frozenset({"dark"})),
-    (r"lamps or a projector that flicker", frozenset({"flicker"})),
-    (r"images were compressed", frozenset({"jpeg"})),
-    (r"x and y are exchanged", frozenset({"axes-swapped"})),
-    (r"axis is reversed|turned by 180", frozenset({"axis-reversed"})),
-    (r"calibration is of another rig", frozenset({"other-rig", "moved"})),
-)
-"""What messages without a structured cause name, by their facts."""
-_OPEN: tuple[tuple[str, frozenset[str]], ...] = (
-    (r"uncertainty of the points", frozenset({"other-rig", "moved", "motion"})),
-    (r"neighbouring pixels scatter", frozenset({"noise"})),
-)
+_WORDS = {
+    r"outside the projector": "projector-size",
+    r"no pixel carries a readable": "unreadable",
+    r"[Cc]ircles were|[Cc]ircles detected|board's columns": "board",
+    r"% of the image before": "crosstalk",
+    r"are saturated and masked": "saturation",
+    r"fringes are weak": "dark",
+    r"lamps or a projector that flicker": "flicker",
+    r"images were compressed": "jpeg",
+    r"x and y are exchanged": "axes-swapped",
+    r"axis is reversed|turned by 180": "axis-reversed",
+    r"calibration is of another rig": "other-rig|moved",
+}
+"""What messages without a structured cause name, by their facts; several causes joined by "|"."""
+_OPEN = {
+    r"uncertainty of the points": "other-rig|moved|motion",
+    r"neighbouring pixels scatter": "noise",
+}
 """What messages name that leave the cause open: right where it is among them, and never wrong."""
 
 
@@ -112,6 +149,198 @@ class HostileCase:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredScan:
+    """A scan, point by point.
+
+    ``points`` (n, 3) mm as measured, ``truth`` (n, 3) mm of the same pixels, NaN where they see no
+    surface directly, ``sigma`` (n,) mm predicted for z; ``on_target`` (n,) bool: of the plane or
+    sphere, which has ``expected`` pixels that the projector lights.
+    """
+
+    points: np.ndarray
+    truth: np.ndarray
+    sigma: np.ndarray
+    on_target: np.ndarray
+    expected: int
+
+
+@dataclass(eq=False)
+class CaseRun:
+    """A case in a ``session``, and the program's messages on it: its warnings, the causes that it
+    named, and the error that ended it."""
+
+    session: Path
+    fault: Fault = SOUND
+    severity: Severity = "mild"
+    warnings: list[str] = field(default_factory=list)
+    named: list[frozenset[str]] = field(default_factory=list)
+    error: Exception | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class HostileBench:
+    """A rig, its scenes, and their clean light, each rendered when it is first needed.
+
+    ``folder`` takes the sessions and images. ``models`` are fitted by every calibration, the last
+    of them measures.
+    """
+
+    rig: SimulatedRig
+    folder: Path
+    poses: int = 7
+    models: tuple[ModelName, ...] = ("stereo",)
+    seed: int = 0
+    _light: dict[str, tuple[Frames, Renderer]] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def sequence(self) -> PatternSequence:
+        """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at
+        the end."""
+        frames = [
+            frame
+            for axis in AXES
+            for frame in (
+                *phase_steps(axis, STEPS, PERIOD_PX),
+                *gray_bits(axis, BITS),
+                Frame("complementary", axis),
+            )
+        ]
+        return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
+
+    @cached_property
+    def scenes(self) -> dict[str, CleanScene]:
+        """Target poses and scans by name, in the order of their numbers."""
+        scenes: dict[str, CleanScene] = {
+            f"pose_{i:02d}": printed_board(BOARD, pose, seed=self.rig.seed)
+            for i, pose in enumerate(target_poses(self.rig, BOARD, self.poses), 1)
+        }
+        plane, ball = SCANS
+        return {**scenes, plane: planes()[plane], ball: spheres()[ball]}
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the target poses."""
+        return tuple(name for name in self.scenes if name.startswith("pose_"))
+
+    def capture(
+        self, name: str, fault: Fault = SOUND, severity: Severity = "mild"
+    ) -> tuple[Frames, Renderer, Renderer]:
+        """(n, h, w) uint8, and the renderers of the scene as it was and of the clean one."""
+        scene, number = self.scenes[name], list(self.scenes).index(name)
+        if name not in self._light:
+            self._light[name] = render_light(self.rig, scene, self.sequence)
+        light, clean = self._light[name]
+        renderer = clean
+        if fault.is_optical:
+            light, renderer = hostile_light(fault, severity, self.rig, scene, self.sequence, number)
+        frames = expose_frames(renderer, light, self.sequence, number, fault, severity, self.seed)
+        return frames, renderer, clean
+
+    def measure_anew(self, run: CaseRun) -> list[MeasuredScan]:
+        """Calibrate from target poses, of which some have the fault of the run, and measure the
+        clean scans; the run gets the causes of the calibration's verdict too."""
+        shutil.rmtree(run.session, ignore_errors=True)
+        struck = run.fault.struck[SEVERITIES.index(run.severity)]
+        frames = {
+            name: self.capture(name, run.fault if i < struck else SOUND, run.severity)[0]
+            for i, name in enumerate(self.targets)
+        }
+        self._store(run, "calibration", frames)
+        try:
+            settings = CalibrateSettings(str(BOARD), self.models)
+            calibrate.run(run.session, settings, warn=run.warnings.append)
+        finally:
+            with Session.open(run.session) as store:
+                verdict = load_last_verdict(store)
+            run.named += [frozenset({cause}) for cause in verdict.causes] if verdict else []
+        return self.measure_scans(run)
+
+    def measure_scans(self, run: CaseRun, fault: Fault = SOUND) -> list[MeasuredScan]:
+        """Measure all scans, captured with the fault if there is one, with the calibration of the
+        run's session."""
+        shots = {name: self.capture(name, fault, run.severity) for name in SCANS}
+        self._store(run, "scan", {name: shot[0] for name, shot in shots.items()})
+        return [self._measure(run, name, shot[1:]) for name, shot in shots.items()]
+
+    def _store(
+        self, run: CaseRun, role: Literal["calibration", "scan"], captures: Mapping[str, Frames]
+    ) -> None:
+        """Write frames as images with a TOML, and import them as anyone would."""
+        source = self.folder / "images"
+        shutil.rmtree(source, ignore_errors=True)
+        files = [write_images(source / name, frames) for name, frames in captures.items()]
+        toml = source / "sequence.toml"
+        toml.write_text(describe_sequence(self.sequence, files[0]))
+        messages = run.warnings
+        try:
+            import_captures(
+                source,
+                run.session,
+                "frames",
+                sequence=toml,
+                role=role,
+                force=True,
+                warn=messages.append,
+            )
+        except SlviewerError as error:
+            messages = [*messages, str(error)]
+            raise
+        finally:
+            # the causes of the program's own findings whose sentence is part of a message
+            run.named += [
+                frozenset({finding.cause})
+                for name, frames in captures.items()
+                if (about := [message for message in messages if name in message])
+                for finding in examine(self.sequence, frames).findings
+                if any(finding.sentence in message for message in about)
+            ]
+
+    def _measure(self, run: CaseRun, name: str, truth: tuple[Renderer, Renderer]) -> MeasuredScan:
+        """Reconstruct a stored scan and fit its shape; compare with the ``truth`` that the
+        renderers know."""
+        shape: Shape = "plane" if name.startswith("plane") else "sphere"
+        with Session.open(run.session) as store:
+            job, out = Job(store, warn=run.warnings.append), self.folder / "cloud.ply"
+            done = reconstruct_capture(job, ReconstructSettings(name, self.models[-1], out=out))
+            try:
+                radius = SPHERE_RADIUS_MM if shape == "sphere" else None
+                settings = VerifySettings([name], shape, self.models, radius=radius)
+                verify.run(store, settings, warn=job.warn)
+            except SlviewerError as error:
+                run.warnings.append(str(error))
+        return _match_with_truth(done.cloud, *truth)
+
+
+def _match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:
+    """The cloud's points beside those that a perfect instrument would measure, of the scene as it
+    was."""
+    truth = renderer.truth()
+    points = truth.points
+    if isinstance(renderer.scene, MirrorTable):
+        direct = renderer.scene.is_direct(renderer.rig.camera.rays())
+        points = np.where(direct[..., None], points, np.nan)
+    with np.errstate(invalid="ignore"):
+        target = np.abs(points[..., 2] - clean.truth().points[..., 2]) < _SAME_SURFACE_MM
+    measured = cloud.mask
+    return MeasuredScan(
+        cloud.points[measured].astype(float),
+        points[measured],
+        cloud.sigma[measured].astype(float),
+        target[measured],
+        int(np.count_nonzero(target & truth.mask)),
+    )
+
+
+def write_images(folder: Path, frames: Frames) -> list[str]:
+    """Write frames (n, h, w) uint8 as numbered image files, and return their names."""
+    folder.mkdir(parents=True)
+    names = [f"{k:02d}.bmp" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        cv2.imwrite(str(folder / name), frame)  # written ten times as fast as PNG
+    return names
+
+
 def prove_hostile(
     scale: float = 0.5,
     *,
@@ -129,16 +358,17 @@ def prove_hostile(
     """
     chosen = choose_cases(cases)
     rig = letter(scale, seed) if splined else letter(scale, seed, local_distortion_px=0.0)
+    models: tuple[ModelName, ...] = ("stereo", "splined") if splined else ("stereo",)
     done: list[HostileCase] = []
     with tempfile.TemporaryDirectory(prefix="slviewer-hostile-") as folder:
-        models = ("stereo", "splined") if splined else ("stereo",)
         progress(0.0, "the undisturbed rig")
-        trial = _Trial(
-            HostileBench(rig, Path(folder), poses=8 if splined else 7, models=models, seed=seed)
-        )
+        bench = HostileBench(rig, Path(folder), 8 if splined else 7, models, seed)
+        sound = bench.measure_anew(CaseRun(bench.folder / "sound"))
+        gauge = fit_gauge(sound)
+        floor = score(sound, gauge)
         for i, (name, severity, direction) in enumerate(chosen):
             progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
-            done.append(trial.run(name, severity, direction))
+            done.append(run_case(bench, (name, severity, direction), gauge, floor))
     failed = [case for case in done if not case.passed]
     lines = [f"{len(done) - len(failed)} of {len(done)} hold, at scale {scale:g}"]
     for case in failed:
@@ -174,95 +404,55 @@ def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direct
     return chosen
 
 
-class _Trial:
-    """The undisturbed session, and each case against it."""
-
-    def __init__(self, bench: HostileBench) -> None:
-        self._bench = bench
-        self._session = bench.folder / "sound"
-        report = CaseReport()
-        bench.store(self._session, {name: bench.capture(name)[0] for name in bench.targets}, report)
-        bench.calibrate(self._session, report)
-        measured = self._measure_scans(self._session, report)
-        self._gauge = fit_gauge(measured)
-        self._floor = score(measured, self._gauge)
-
-    def run(self, name: str, severity: Severity, direction: Direction) -> HostileCase:
-        """Run one case; an error, a crash too, is its result."""
-        start, report = perf_counter(), CaseReport()
-        measured: Sequence[MeasuredScan] = ()
-        try:
-            if direction == "scan":
-                measured = self._measure_scans(self._session, report, FAULTS[name], severity)
-            else:
-                measured = self._measure_after_faulty_calibration(FAULTS[name], severity, report)
-        except Exception as error:  # the other cases still have to run
-            report.error = error
-        gauge = self._gauge if direction == "scan" or not measured else fit_gauge(measured)
-        figures = score(measured, gauge) if measured else None
-        outcome, named = judge_case(FAULTS[name], severity, report, figures, self._floor)
-        messages = [
-            *report.warnings,
-            *([f"{type(report.error).__name__}: {report.error}"] if report.error else []),
-        ]
-        seconds = perf_counter() - start
-        return HostileCase(
-            name,
-            severity,
-            direction,
-            outcome,
-            outcome in PASSED,
-            figures,
-            self._floor,
-            named,
-            tuple(messages),
-            seconds,
-        )
-
-    def _measure_scans(
-        self,
-        session: Path,
-        report: CaseReport,
-        fault: Fault | None = None,
-        severity: Severity = "mild",
-    ) -> list[MeasuredScan]:
-        """Measure all scans, captured with the fault if there is one, with the calibration of a
-        session."""
-        shots = {name: self._bench.capture(name, fault, severity) for name in SCANS}
-        self._bench.store(session, {name: shot[0] for name, shot in shots.items()}, report)
-        return [
-            self._bench.measure(session, name, shot[1:], report) for name, shot in shots.items()
-        ]
-
-    def _measure_after_faulty_calibration(
-        self, fault: Fault, severity: Severity, report: CaseReport
-    ) -> Sequence[MeasuredScan]:
-        """Calibrate from target poses of which some have the fault, and measure the clean scans."""
-        bench, session = self._bench, self._bench.folder / "hostile"
-        shutil.rmtree(session, ignore_errors=True)
-        struck = bench.targets[: fault.struck[SEVERITIES.index(severity)]]
-        frames = {
-            n: bench.capture(n, *((fault, severity) if n in struck else ()))[0]
-            for n in bench.targets
-        }
-        bench.store(session, frames, report)
-        bench.calibrate(session, report)
-        return self._measure_scans(session, report)
+def run_case(
+    bench: HostileBench,
+    case: tuple[str, Severity, Direction],
+    gauge: np.ndarray,
+    floor: Figures,
+) -> HostileCase:
+    """Run one case against the undisturbed session; an error, a crash too, is its result."""
+    start, (name, severity, direction), figures = perf_counter(), case, None
+    session = bench.folder / ("sound" if direction == "scan" else "hostile")
+    run = CaseRun(session, FAULTS[name], severity)
+    try:
+        if direction == "scan":
+            measured = bench.measure_scans(run, run.fault)
+        else:
+            measured = bench.measure_anew(run)
+            gauge = fit_gauge(measured)
+        figures = score(measured, gauge)
+    except Exception as error:  # the other cases still have to run
+        run.error = error
+    outcome, named = judge_case(run, figures, floor)
+    messages = list(run.warnings)
+    if run.error:
+        messages.append(f"{type(run.error).__name__}: {run.error}")
+    return HostileCase(
+        *case,
+        outcome,
+        outcome in PASSED,
+        figures,
+        floor,
+        named,
+        tuple(messages),
+        perf_counter() - start,
+    )
 
 
 def judge_case(
-    fault: Fault, severity: Severity, report: CaseReport, figures: Figures | None, floor: Figures
+    run: CaseRun, figures: Figures | None, floor: Figures
 ) -> tuple[Outcome, tuple[str, ...]]:
     """The outcome of a case, and the causes that the program named."""
-    texts = [*report.warnings, *([str(report.error)] if report.error and not report.named else [])]
-    named = report.named + _match_causes(_WORDS, texts)
+    fault, error = run.fault, run.error
+    texts = [*run.warnings, *([str(error)] if error and not run.named else [])]
+    named = run.named + _match_causes(_WORDS, texts)
     named += [causes for causes in _match_causes(_OPEN, texts) if causes & fault.causes]
     words = tuple(dict.fromkeys("|".join(sorted(each)) for each in named))
-    if report.error is not None and not isinstance(report.error, SlviewerError):
+    if error is not None and not isinstance(error, SlviewerError):
         return "CRASH", words
     is_right = any(each & fault.causes for each in named)
-    must_measure = fault.must_measure and severity == "mild"
-    if figures is None or report.error is not None:
+    must_measure = fault.must_measure and run.severity == "mild"
+    if figures is None or error is not None:
         return (
             "WRONG REASON" if not is_right else "TURNED AWAY" if must_measure else "refused"
         ), words
@@ -271,11 +461,13 @@ def judge_case(
     return _judge_figures(figures, floor, is_right, must_measure), words
 
 
-def _match_causes(
-    facts: Sequence[tuple[str, frozenset[str]]], texts: Sequence[str]
-) -> list[frozenset[str]]:
+def _match_causes(facts: Mapping[str, str], texts: Sequence[str]) -> list[frozenset[str]]:
     """The causes whose pattern is in one of the texts."""
-    return [causes for pattern, causes in facts if any(re.search(pattern, text) for text in texts)]
+    return [
+        frozenset(causes.split("|"))
+        for pattern, causes in facts.items()
+        if any(re.search(pattern, text) for text in texts)
+    ]
 
 
 def _judge_figures(figures: Figures, floor: Figures, is_right: bool, must_measure: bool) -> Outcome:

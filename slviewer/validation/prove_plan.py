@@ -31,6 +31,7 @@ DEGREES = range(2, 7)
 TILT = 0.002
 RADIUS, HALF = 10.0, 15.0
 Case = tuple[float, Quantity]
+Rng = np.random.Generator
 
 
 def prove_plan(scale: float, seed: int, progress: Progress) -> Proof:
@@ -44,32 +45,26 @@ def prove_plan(scale: float, seed: int, progress: Progress) -> Proof:
     rows, checks = [], []
     for k, (kind, measure, _) in enumerate(track(progress, CASES)):
         cases = [measure(side, np.random.default_rng([seed, k, i])) for i in range(REPEATS)]
-        truths, U = (
-            np.array([truth for truth, _ in cases]),
-            np.array([q.U or 0.0 for _, q in cases]),
-        )
-        errors = np.array([q.value for _, q in cases]) - truths
+        truths, values, U = np.array([(truth, q.value, q.U or 0.0) for truth, q in cases]).T
+        errors = values - truths
         covered = 100 * float(np.mean(np.abs(errors) <= U))
         chance = 100 * float(np.sqrt(0.95 * 0.05 / REPEATS))
         least, most = BAND[0] - chance, BAND[1] + chance
-        checks.append(
-            BandCheck(kind, f"% of {REPEATS} repeats covered by U (k = 2)", covered, least, most)
-        )
-        rows.append(
-            {
-                "characteristic": kind,
-                "mean true mm": round(float(truths.mean()), 4),
-                "mean error mm": round(float(errors.mean()), 4),
-                "std. dev. mm": round(float(errors.std()), 4),
-                "U / 2 mm": round(float(U.mean()) / 2, 4),
-                "covered %": round(covered, 1),
-            }
-        )
+        what = f"% of {REPEATS} repeats covered by U (k = 2)"
+        checks.append(BandCheck(kind, what, covered, least, most))
+        figures = {
+            "mean true mm": truths.mean(),
+            "mean error mm": errors.mean(),
+            "std. dev. mm": errors.std(),
+            "U / 2 mm": U.mean() / 2,
+        }
+        rounded = {title: round(float(value), 4) for title, value in figures.items()}
+        rows.append({"characteristic": kind, **rounded, "covered %": round(covered, 1)})
     record = {"noise_mm": NOISE_MM, "points": side**2, "repeats": REPEATS, "rows": rows}
     return prove_checks(checks, scale, rows, record)
 
 
-def draw_form(rng: np.random.Generator) -> np.ndarray:
+def draw_form(rng: Rng) -> np.ndarray:
     """Draw the coefficients (7, 7) of a form, mm: of degrees `DEGREES` in sum, decaying with the
     degree."""
     degree = np.add.outer(np.arange(7), np.arange(7))
@@ -88,9 +83,7 @@ def remove_fit(values: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
-def make_plate(
-    side: int, rng: np.random.Generator, tilt: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
+def make_plate(side: int, rng: Rng, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) of a plate of 40 x 40 mm with drawn form, which rises by ``tilt`` along x, and
     its true heights."""
     uv = make_grid(side)
@@ -98,50 +91,46 @@ def make_plate(
     return np.column_stack([20 * uv, heights + NOISE_MM * rng.normal(size=len(uv))]), heights
 
 
-def make_cylinder(side: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) of a cylinder with drawn form: waves about its axis that change along it; their
-    angles and places along it (n, 2), -1 to 1, and true deviations (n,)."""
-    uv = make_grid(side)
+def make_cylinder(uv: np.ndarray, form: np.ndarray, rng: Rng) -> np.ndarray:
+    """Points (n, 3) of a cylinder at places ``uv`` (n, 2), around it and along it, -1 to 1, with
+    deviations ``form`` (n,)."""
     angles = np.pi * uv[:, 0]
-    along = legendre.legvander(uv[:, 1], 6)
-    form = np.zeros(len(uv))
-    for wave in (np.cos, np.sin):
-        waves = wave(np.outer(angles, np.arange(7)))
-        form += np.einsum("nk,km,nm->n", waves, draw_form(rng), along)
     r = RADIUS + form + NOISE_MM * rng.normal(size=len(uv))
-    return np.stack([r * np.cos(angles), r * np.sin(angles), HALF * uv[:, 1]], axis=1), uv, form
+    return np.stack([r * np.cos(angles), r * np.sin(angles), HALF * uv[:, 1]], axis=1)
 
 
-def _flatness(side: int, rng: np.random.Generator) -> Case:
+def _flatness(side: int, rng: Rng) -> Case:
     """The flatness of a plate."""
     points, heights = make_plate(side, rng)
     truth = np.ptp(remove_fit(heights, np.column_stack([points[:, :2], np.ones(len(points))])))
     return float(truth), form_error("flatness", fit_feature("plane", points), points)
 
 
-def _roundness(side: int, rng: np.random.Generator) -> Case:
+def _roundness(side: int, rng: Rng) -> Case:
     """The roundness of a thin ring, which has the form of one section."""
-    angles = np.pi * make_grid(side)[:, 0]
+    uv, form = make_grid(side), np.zeros(side**2)
     harmonics, amplitudes = np.arange(2, 7), FORM_MM * DECAY ** np.arange(5)
-    form = np.zeros(len(angles))
     for wave in (np.cos, np.sin):
-        form += wave(np.outer(angles, harmonics)) @ (amplitudes * rng.normal(size=5))
-    r = RADIUS + form + NOISE_MM * rng.normal(size=len(form))
-    points = np.stack(
-        [r * np.cos(angles), r * np.sin(angles), HALF * make_grid(side)[:, 1]], axis=1
-    )
+        waves = wave(np.outer(np.pi * uv[:, 0], harmonics))
+        form += waves @ (amplitudes * rng.normal(size=5))
+    points = make_cylinder(uv, form, rng)
     return float(np.ptp(form)), form_error("roundness", fit_feature("cylinder", points), points)
 
 
-def _cylindricity(side: int, rng: np.random.Generator) -> Case:
-    """The cylindricity of a cylinder."""
-    points, uv, form = make_cylinder(side, rng)
+def _cylindricity(side: int, rng: Rng) -> Case:
+    """The cylindricity of a cylinder, whose waves about its axis change along it."""
+    uv, form = make_grid(side), np.zeros(side**2)
+    along = legendre.legvander(uv[:, 1], 6)
+    for wave in (np.cos, np.sin):
+        waves = wave(np.outer(np.pi * uv[:, 0], np.arange(7)))
+        form += np.einsum("nk,km,nm->n", waves, draw_form(rng), along)
+    points = make_cylinder(uv, form, rng)
     c, s, h = np.cos(np.pi * uv[:, 0]), np.sin(np.pi * uv[:, 0]), uv[:, 1]
     truth = np.ptp(remove_fit(form, np.column_stack([np.ones(len(c)), c, s, h * c, h * s])))
     return float(truth), form_error("cylindricity", fit_feature("cylinder", points), points)
 
 
-def _orientation(side: int, rng: np.random.Generator, upright: bool) -> Case:
+def _orientation(side: int, rng: Rng, upright: bool) -> Case:
     """The parallelism of a tilted plate, or the perpendicularity of a leaning wall, to a plate
     without form."""
     points, heights = make_plate(side, rng, TILT)
@@ -154,7 +143,7 @@ def _orientation(side: int, rng: np.random.Generator, upright: bool) -> Case:
     return float(np.ptp(heights)), measured
 
 
-def _position(side: int, rng: np.random.Generator) -> Case:
+def _position(side: int, rng: Rng) -> Case:
     """The position of a cap of a sphere about a drawn centre, against the origin."""
     c, t = rng.uniform(np.cos(1.0), 1, side**2), rng.uniform(0, 2 * np.pi, side**2)
     q = np.sqrt(1 - c * c)
@@ -167,7 +156,7 @@ def _position(side: int, rng: np.random.Generator) -> Case:
     )
 
 
-def _profile(side: int, rng: np.random.Generator) -> Case:
+def _profile(side: int, rng: Rng) -> Case:
     """The profile of a plate against the plane z = 0."""
     points, heights = make_plate(side, rng)
     nominal = Feature("plane", np.zeros(3), np.array([0.0, 0.0, 1.0]))
@@ -176,7 +165,7 @@ def _profile(side: int, rng: np.random.Generator) -> Case:
     )
 
 
-CASES: dict[str, Callable[[int, np.random.Generator], Case]] = {
+CASES: dict[str, Callable[[int, Rng], Case]] = {
     "flatness": _flatness,
     "roundness": _roundness,
     "cylindricity": _cylindricity,

@@ -5,21 +5,18 @@ Three depths and a full turn of an object are measured with the splined calibrat
 target poses, registered and fused; pairs that do not determine a pose must be refused.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter as the_letter
 from slviewer.evaluation.render import Row
 from slviewer.fringe.decode import texture
-from slviewer.fringe.presets import p18
-from slviewer.fringe.sequence import one_axis
-from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.geometry.rigid import fit_rigid, move_points, rotation_angle
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
 from slviewer.pipeline.feedback import Progress, part
@@ -28,7 +25,6 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct_cloud
 from slviewer.registration.markers import measure_markers
 from slviewer.registration.multiway import MultiwayAlignment, Starts, register_all
-from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.decals import (
@@ -49,7 +45,7 @@ from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
+from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase, scan_sequence
 
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
@@ -99,27 +95,23 @@ class RegisteredScans:
 
     def rows(self) -> list[Row]:
         """A table row for each registered pair, true and predicted errors beside each other."""
-        rows = []
+        rows: list[Row] = []
         for (scan, onto), pair in self.alignment.pairs.items():
-            shift, turn = self.error(scan, onto, pair.T_reference_scan, pair.uncertainty.centre)
-            rows.append(_make_row(scan, onto, pair, shift, turn))
+            predicted = pair.uncertainty
+            shift, turn = self.error(scan, onto, pair.T_reference_scan, predicted.centre)
+            rows.append({
+                "scan": scan,
+                "onto": onto,
+                "error um": 1000 * shift,
+                "error mdeg": 1000 * turn,
+                "predicted um": 1000 * predicted.shift_mm,
+                "predicted mdeg": 1000 * predicted.turn_deg,
+                "RMS mm": pair.rms_mm,
+                "point to point mm": pair.inlier_rmse_mm,
+                "overlap %": 100 * pair.overlap,
+                "start": pair.start,
+            })  # fmt: skip
         return rows
-
-
-def _make_row(scan: str, onto: str, pair: Registration, shift: float, turn: float) -> Row:
-    """The table row of a registered pair: true errors (mm, degrees) beside the predicted ones."""
-    return {
-        "scan": scan,
-        "onto": onto,
-        "error um": 1000 * shift,
-        "error mdeg": 1000 * turn,
-        "predicted um": 1000 * pair.uncertainty.shift_mm,
-        "predicted mdeg": 1000 * pair.uncertainty.turn_deg,
-        "RMS mm": pair.rms_mm,
-        "point to point mm": pair.inlier_rmse_mm,
-        "overlap %": 100 * pair.overlap,
-        "start": pair.start,
-    }
 
 
 def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
@@ -133,9 +125,7 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     measured, true = [], []
     for name, scene, _ in track(progress, scans, 0.5, 0.75):
         renderer = Renderer(rig, scene)
-        clouds[name] = reconstruct_cloud(
-            model, {"x": render_phase(renderer, name, POSES + len(clouds))}
-        )
+        clouds[name] = _scan(model, renderer, name, POSES + len(clouds))
         known = np.flatnonzero(clouds[name].mask & renderer.truth().mask)[::_EVERY]
         measured.append(clouds[name].points.reshape(-1, 3)[known].astype(float))
         true.append(renderer.truth().points.reshape(-1, 3)[known])
@@ -156,33 +146,40 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
         return RegisteredScans(chosen, alignment, truth, perf_counter() - start)
 
     depths = register("object_", "object_r3", None, part(progress, 0.75, 0.8))
-    angles = {
-        name: STEP_DEG * k
-        for k, name in enumerate(name for name in scans if name.startswith("turn_"))
-    }
+    turns = [name for name in scans if name.startswith("turn_")]
+    angles = {name: STEP_DEG * k for k, name in enumerate(turns)}
     turn = register("turn_", "turn_01", Starts(table_deg=angles), part(progress, 0.8, 0.88))
-    checks = check_registration(depths, turn)
+    rows = depths.rows() + turn.rows()
+    checks = check_registration(depths, turn, rows)
     progress(0.88, "fusing and meshing")
     surfaces, lines, surface_record = _check_surfaces(depths, turn, scans)
+    checks += surfaces
     refusals: dict[str, dict[str, str]] = {}
     for what, (wanted, *pair), _ in track(progress, _make_ambiguous_pairs(), 0.95, 0.98):
-        reason = _describe_refusal({
-            name: reconstruct_cloud(model,
-            {"x": render_phase(Renderer(rig, scene), name, 900 + len(refusals))})
-            for name, scene in zip("ab", pair, strict=True)
-        })  # fmt: skip
+        number = 900 + len(refusals)
+        reason = _describe_refusal(
+            {
+                name: _scan(model, Renderer(rig, scene), name, number)
+                for name, scene in zip("ab", pair, strict=True)
+            }
+        )
         refusals[what] = {"wanted": wanted, "got": reason}
         is_right = float(reason in wanted.split("/"))
-        surfaces.append(
+        checks.append(
             BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0)
         )
     for k, (what, marked) in enumerate(_make_marked_pairs().items()):
         progress(0.98, f"{what} by markers")
-        surfaces.append(
-            _check_markers(rig, model, what, marked, T_calibrated_camera, 950 + 2 * k, scale)
+        error = _measure_marked(rig, model, marked, T_calibrated_camera, 950 + 2 * k)
+        checks.append(
+            BandCheck(
+                f"two scans of a {what}, by markers",
+                "largest error in mm",
+                error,
+                1e-4,
+                MARKERS_MM / scale,
+            )
         )
-    rows = depths.rows() + turn.rows()
-    checks += surfaces
     r1, r2 = the_letter.EXPERIMENT_3_ICP_RMS_MM.values()
     return prove_checks(
         checks,
@@ -197,9 +194,16 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     )
 
 
-def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[BandCheck]:
-    """Errors of the poses against their bounds, loops, duration, and predicted against true
-    errors."""
+def _scan(model: Model, renderer: Renderer, name: str, number: int) -> Cloud:
+    """The cloud of a rendered scan, whose noise ``number`` seeds."""
+    return reconstruct_cloud(model, {"x": render_phase(renderer, name, number)})
+
+
+def check_registration(
+    depths: RegisteredScans, turn: RegisteredScans, rows: Sequence[Row]
+) -> list[BandCheck]:
+    """Errors of the poses against their bounds, loops, duration, and predicted against true errors
+    of the pairs' ``rows``."""
     checks = []
     onto = depths.alignment.reference
     for name in depths.clouds:
@@ -210,7 +214,6 @@ def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[B
             checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
             checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
     adjusted = max((loop.after.shift_mm for loop in turn.alignment.loops), default=float("nan"))
-    rows = depths.rows() + turn.rows()
     checks += [
         BandCheck("three depths", "seconds to register", depths.seconds, 0.0, SECONDS),
         BandCheck("turn", "largest loop error in mm once adjusted", adjusted, 0.0, LOOP_MM),
@@ -222,10 +225,8 @@ def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[B
             np.linalg.norm([row[f"{kind} {unit}"] for row in rows])
             for kind in ("predicted", "error")
         )
-        ratio = float(predicted / true)
-        checks.append(
-            BandCheck("all pairs", f"predicted over true error of the {what}", ratio, *HONEST)
-        )
+        claim = f"predicted over true error of the {what}"
+        checks.append(BandCheck("all pairs", claim, float(predicted / true), *HONEST))
     return checks
 
 
@@ -237,13 +238,10 @@ def _check_surfaces(
 
     def rms(surface: PointSet, name: str) -> float:
         """RMS deviation in mm from the object, after a best fit that begins at the true pose."""
-        nominal, T = (
-            Mesh(scenes[name].vertices, scenes[name].triangles),
-            np.linalg.inv(depths.poses[name]),
-        )
-        return deviation(surface.points, nominal, normals=surface.normals, initial=T).statistics()[
-            "rms"
-        ]
+        nominal = Mesh(scenes[name].vertices, scenes[name].triangles)
+        T = np.linalg.inv(depths.poses[name])
+        found = deviation(surface.points, nominal, normals=surface.normals, initial=T)
+        return found.statistics()["rms"]
 
     single = {
         name: rms(fuse({name: cloud}, {name: np.eye(4)}).surface, name)
@@ -322,20 +320,18 @@ def _make_pose(turns_deg: tuple[float, float, float], place_mm: tuple[float, flo
     return Pose(rotation(np.radians(turns_deg)), np.array(place_mm))
 
 
-def _check_markers(
+def _measure_marked(
     rig: SimulatedRig,
     model: Model,
-    what: str,
     pair: tuple[MarkedScene, MarkedScene],
     T_calibrated_camera: np.ndarray,
     number: int,
-    scale: float,
-) -> BandCheck:
-    """The largest error over the surface of the second scan, registered by markers onto the
+) -> float:
+    """The largest error, mm, over the surface of the second scan, registered by markers onto the
     first."""
     clouds = {}
     for k, (name, scene) in enumerate(zip("ab", pair, strict=True)):
-        sequence = one_axis(p18(rig.projector.size), "x")
+        sequence = scan_sequence(rig)
         frames = Renderer(rig, scene).capture(sequence, number + k)
         phases = decode_frames(name, sequence, frames)
         clouds[name] = reconstruct_cloud(model, phases, texture=texture(sequence, frames))
@@ -344,13 +340,10 @@ def _check_markers(
     true = [T_calibrated_camera @ scene.pose.matrix for scene in pair]
     points = clouds["b"].measured[::_EVERY].astype(float)
     gap = move_points(T, points) - move_points(true[0] @ np.linalg.inv(true[1]), points)
-    error = float(np.linalg.norm(gap, axis=1).max())
-    return BandCheck(
-        f"two scans of a {what}, by markers", "largest error in mm", error, 1e-4, MARKERS_MM / scale
-    )
+    return float(np.linalg.norm(gap, axis=1).max())
 
 
 def _measure_motion(D: np.ndarray, centre: np.ndarray) -> tuple[float, float]:
     """How far a motion (4, 4) shifts a point (3,), mm, and its angle, degrees."""
     shift = np.linalg.norm(move_points(D, centre[None]) - centre)
-    return float(shift), float(np.degrees(Rotation.from_matrix(D[:3, :3]).magnitude()))
+    return float(shift), float(np.degrees(rotation_angle(D[:3, :3])))

@@ -5,7 +5,6 @@ geometry, so that the codes alone are compared; then surfaces without indirect l
 nothing should be masked.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from slviewer.evaluation.render import Row
 from slviewer.fringe.decode import decode
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import PRESETS
-from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.feedback import Progress
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.concave import Indirect, bowl, groove, wax
@@ -96,52 +95,52 @@ def prove_surfaces(scale: float, seed: int, progress: Progress) -> Proof:
     """
     rig = letter(scale, seed)
     model = PerfectModel(rig)
+    defocus = DEFOCUS * rig.light.defocus_px_mm
+    blurred = replace(rig, light=replace(rig.light, defocus_px_mm=defocus))
     rows: list[Row] = []
-    record: dict[str, dict[str, dict[str, float]]] = {}
+    record: dict[str, dict[str, SequenceErrors]] = {}
     checks: list[BandCheck] = []
+    gains: list[str] = []
     for name, (scene, is_indirect), _ in track(progress, surface_cases()):
-        blurred = replace(
-            rig, light=replace(rig.light, defocus_px_mm=DEFOCUS * rig.light.defocus_px_mm)
-        )
         renderer = Renderer(blurred if name.startswith("unsharp") else rig, scene)
-        errors = {
-            preset: measure_errors(renderer, PRESETS[preset], model, seed)
+        errors = record[name] = {
+            preset: measure_errors(renderer, preset, model, seed)
             for preset in ("p18", "complementary", "multifrequency", "micro")
         }
-        record[name] = {preset: dict(vars(each)) for preset, each in errors.items()}
-        rows += [_make_row(name, preset, each) for preset, each in errors.items()]
+        rows += [
+            {
+                "surface": name,
+                "patterns": preset,
+                "RMS mm": each.rms_mm,
+                "with mask": each.masked_rms_mm,
+                ">5 sigma %": round(100 * each.wrong, 2),
+                "of these masked %": 100 * each.caught,
+                "gross masked %": 100 * each.gross_caught,
+                "good masked %": round(100 * each.lost, 2),
+            }
+            for preset, each in errors.items()
+        ]
+        gain = errors["p18"].rms_mm / errors["micro"].rms_mm
+        gains.append(f"{name} {gain:.1f}")
         if not is_indirect:
             worst = max(errors, key=lambda preset: errors[preset].lost)
-            checks.append(
-                BandCheck(
-                    name, f"good points masked with {worst}", errors[worst].lost, 0.0, MOST_LOST
-                )
-            )
+            what = f"good points masked with {worst}"
+            checks.append(BandCheck(name, what, errors[worst].lost, 0.0, MOST_LOST))
         if name == JUDGED:
-            gain = errors["p18"].rms_mm / errors["micro"].rms_mm
-            caught, what = (
-                errors["p18"].gross_caught,
-                f"share of p18's points over {GROSS_PX:g} px wrong masked",
-            )
-            checks.append(
-                BandCheck(name, "error of p18 over that of micro", gain, LEAST_GAIN, np.inf)
-            )
-            checks.append(BandCheck(name, what, caught, LEAST_CAUGHT, 1.0))
-    gains = ", ".join(
-        f"{name} {each['p18']['rms_mm'] / each['micro']['rms_mm']:.1f}"
-        for name, each in record.items()
-    )
-    return prove_checks(
-        checks, scale, rows, {"surfaces": record}, below=[f"p18's RMS over micro's: {gains}"]
-    )
+            what = f"share of p18's points over {GROSS_PX:g} px wrong masked"
+            checks += [
+                BandCheck(name, "error of p18 over that of micro", gain, LEAST_GAIN, np.inf),
+                BandCheck(name, what, errors["p18"].gross_caught, LEAST_CAUGHT, 1.0),
+            ]
+    line = f"p18's RMS over micro's: {', '.join(gains)}"
+    return prove_checks(checks, scale, rows, {"surfaces": record}, below=[line])
 
 
 def measure_errors(
-    renderer: Renderer, preset: Callable[[tuple[int, int]], PatternSequence], model: PerfectModel,
-    seed: int
-) -> SequenceErrors:  # fmt: skip
+    renderer: Renderer, preset: str, model: PerfectModel, seed: int
+) -> SequenceErrors:
     """Return the errors in depth of one sequence on the renderer's scene, along axis x."""
-    sequence = one_axis(preset(renderer.rig.projector.size), "x")
+    sequence = one_axis(PRESETS[preset](renderer.rig.projector.size), "x")
     frames = renderer.capture(sequence, seed)
     plain = decode(sequence, frames, "x", mask_indirect=False)
     masked = decode(sequence, frames, "x").reason == Reason.INDIRECT
@@ -152,26 +151,15 @@ def measure_errors(
     valid = plain.mask & truth.mask & np.isfinite(error)
     wrong = valid & (off > WRONG_SIGMAS * plain.sigma_px)
     gross = valid & (off > GROSS_PX)
+    caught, gross_caught, lost = (
+        float(np.mean(masked[points])) if points.any() else np.nan
+        for points in (wrong, gross, valid & ~wrong)
+    )
     return SequenceErrors(
         root_mean_square(error[valid]),
         root_mean_square(error[valid & ~masked]),
         float(np.mean(wrong[valid])),
-        *(
-            float(np.mean(masked[points])) if points.any() else np.nan
-            for points in (wrong, gross, valid & ~wrong)
-        ),
+        caught,
+        gross_caught,
+        lost,
     )
-
-
-def _make_row(name: str, preset: str, errors: SequenceErrors) -> Row:
-    """Return a row of the table."""
-    return {
-        "surface": name,
-        "patterns": preset,
-        "RMS mm": errors.rms_mm,
-        "with mask": errors.masked_rms_mm,
-        ">5 sigma %": round(100 * errors.wrong, 2),
-        "of these masked %": 100 * errors.caught,
-        "gross masked %": 100 * errors.gross_caught,
-        "good masked %": round(100 * errors.lost, 2),
-    }

@@ -1,7 +1,6 @@
 """A simulated rig calibrated in memory from rendered target poses, as the proofs share it."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 from slviewer.calibration.centres import calibrate_centres
 from slviewer.calibration.observe import Observation, observe
@@ -12,7 +11,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, ignore_progress
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig
@@ -22,27 +21,10 @@ from slviewer.target.detect import detect
 from slviewer.validation.proof import track
 
 
-@dataclass(frozen=True)
-class CalibrationSettings:
-    """The board, the patterns as a function of the projector's size, and the cells across each
-    displacement field.
-
-    ``cells_across``: None for as many as the splined calibration has by default.
-    """
-
-    target: str = TARGET
-    make_sequence: Callable[[tuple[int, int]], PatternSequence] = p18
-    cells_across: int | None = None
-
-
-DEFAULT_SETTINGS = CalibrationSettings()
-
-
 def calibrate_rendered(
     rig: SimulatedRig,
     plan: Mapping[str, Scene],
-    progress: Progress = ignore_progress,
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
+    progress: Progress,
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
     """Render the target poses of a plan, numbered in their order, and calibrate the stereo and the
     splined model.
@@ -52,47 +34,41 @@ def calibrate_rendered(
     """
     targets = {name: scene for name, scene in plan.items() if name.startswith("pose_")}
     observations = [
-        observe_rendered(rig, scene, name, i, settings)
+        observe_rendered(rig, scene, name, i)
         for i, (name, scene, _) in enumerate(track(progress, targets, 0.0, 0.8))
     ]
     progress(0.8, "calibrating")
-    return calibrate_observed(rig, observations, settings)
+    return calibrate_observed(rig, observations)
 
 
 def calibrate_observed(
-    rig: SimulatedRig,
-    observations: list[Observation],
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
+    rig: SimulatedRig, observations: list[Observation]
 ) -> tuple[StereoModel, SplinedModel, list[Observation]]:
     """Calibrate the stereo and the splined model from observations of the target's poses.
 
     Returns both models, and the observations with circles at their centres.
     """
-    stereo, observations = calibrate_centres(observations, rig.projector.size, settings.target)
-    splined = calibrate_splined(observations, stereo, cells_across=settings.cells_across)
-    return stereo, splined, observations
+    stereo, observations = calibrate_centres(observations, rig.projector.size, TARGET)
+    return stereo, calibrate_splined(observations, stereo), observations
 
 
-def observe_rendered(
-    rig: SimulatedRig,
-    scene: Scene,
-    name: str,
-    number: int,
-    settings: CalibrationSettings = DEFAULT_SETTINGS,
-) -> Observation:
+def observe_rendered(rig: SimulatedRig, scene: Scene, name: str, number: int) -> Observation:
     """The observation of a rendered target pose, whose noise ``number`` seeds. Raises InputError
     where no board is detected."""
-    sequence = settings.make_sequence(rig.projector.size)
+    sequence = p18(rig.projector.size)
     frames = Renderer(rig, scene).capture(sequence, number)
-    board = Board.parse(settings.target)
+    board = Board.parse(TARGET)
     return observe(
         name, board, detect(board, texture(sequence, frames)), decode_frames(name, sequence, frames)
     )
 
 
-def render_phase(
-    renderer: Renderer, name: str, number: int, settings: CalibrationSettings = DEFAULT_SETTINGS
-) -> PhaseMap:
+def render_phase(renderer: Renderer, name: str, number: int) -> PhaseMap:
     """The phase of axis x of a rendered scan, whose noise ``number`` seeds."""
-    only_x = one_axis(settings.make_sequence(renderer.rig.projector.size), "x")
-    return decode_frames(name, only_x, renderer.capture(only_x, number))["x"]
+    sequence = scan_sequence(renderer.rig)
+    return decode_frames(name, sequence, renderer.capture(sequence, number))["x"]
+
+
+def scan_sequence(rig: SimulatedRig) -> PatternSequence:
+    """The patterns of axis x alone, with which scans are captured."""
+    return one_axis(p18(rig.projector.size), "x")

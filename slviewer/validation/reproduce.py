@@ -1,35 +1,159 @@
-"""The Letter's experiments repeated on the simulated rig, with its tables beside ours."""
+"""The Letter's experiments repeated on the simulated rig, with its tables beside ours: as text,
+JSON and report."""
 
 import json
 import shutil
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
+from slviewer.evaluation.render import Row, render
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import MergeSettings, merge_scans
+from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_models, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
 from slviewer.pipeline.verify import VerifySettings, compare_captures
-from slviewer.records.verification import centre_distances_mm
+from slviewer.records.plain import to_plain
+from slviewer.records.verification import Shape, centre_distances_mm
+from slviewer.report.data import (
+    CloudView,
+    ErrorMaps,
+    MergePair,
+    PlaneRow,
+    ReproductionData,
+    SpacingRow,
+    SphereRow,
+)
+from slviewer.report.page import write_page
+from slviewer.report.reproduction import (
+    inside_ratio,
+    reproduction_headlines,
+    reproduction_sections,
+    reproduction_title,
+)
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
-from slviewer.validation.reproduction import MODELS, Reproduction, write_reproduction
 
+MODELS = ("stereo", "pixelwise", "splined")
 QUICK_SCALE = 0.5
 PIXEL = (500, 500)
 """Where the Letter shows its curves, at full resolution."""
 OBJECTS = ("object_r1", "object_r2", "object_r3")
+SHAPES: tuple[tuple[Shape, float, float], ...] = (("plane", 0.65, 0.75), ("sphere", 0.75, 0.82))
+"""Shapes whose captures are compared, and the progress from and to which that takes."""
+SHOWN_PLANES = (1, 3, 8)
+"""Those whose error maps the Letter shows."""
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """The results of all experiments."""
+
+    quick: bool
+    stereo: StereoModel
+    pixelwise: PixelwiseModel
+    planes: Mapping[str, Comparison]
+    spheres: Mapping[str, Comparison]
+    spacings_mm: Mapping[str, tuple[float, Mapping[str, float]]]
+    merged: MergedScans
+    report: Path
+
+    @property
+    def in_range_ratio(self) -> float:
+        """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their
+        points in R2."""
+        return inside_ratio(self.plane_rows())[0]
+
+    @property
+    def spacing_rms_mm(self) -> dict[str, float]:
+        """RMS error of the distances between all pairs of sphere centres, by model."""
+        errors = {
+            m: [(measured[m] - known) ** 2 for known, measured in self.spacings_mm.values()]
+            for m in MODELS
+        }
+        return {m: float(np.sqrt(np.mean(squares))) for m, squares in errors.items()}
+
+    def plane_rows(self) -> list[PlaneRow]:
+        """The report's rows of the planes, beside the Letter's values."""
+        return [
+            PlaneRow(
+                name,
+                comparison.incidence or {},
+                _get_rms(comparison),
+                _get_noise_floor(comparison),
+                dict(zip(("R1", "R2", "R3"), theirs.incidence, strict=True)),
+                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
+            )
+            for (name, comparison), theirs in zip(self.planes.items(), letter.TABLE_1, strict=True)
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures that ``text`` shows, and the values that they are computed from."""
+        return {
+            "quick": self.quick,
+            "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
+            "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.depth_axis),
+            "planes": {name: to_plain(c.record()) for name, c in self.planes.items()},
+            "spheres": {name: to_plain(c.record()) for name, c in self.spheres.items()},
+            "in_range_ratio": self.in_range_ratio,
+            "spacing_rms_mm": self.spacing_rms_mm,
+            "merge": to_plain(self.merged.record),
+            "report": str(self.report),
+        }
+
+    def text(self) -> str:
+        """Both tables with the Letter's figures beside ours, and further results."""
+        rms, theirs = self.stereo.reprojection_rms_px, letter.REPROJECTION_RMS_PX
+        icp = letter.EXPERIMENT_3_ICP_RMS_MM
+        spacing = self.spacing_rms_mm
+        pairs = [
+            f"  {name}: RMS {pair.point_to_point_rms_mm:.3f} mm point to point "
+            f"(the Letter: {icp[name[-2:].upper()]:.2f}), "
+            f"{pair.rms_mm:.3f} mm point to plane, overlap {100 * pair.overlap:.0f} %"
+            for name, pair in self.merged.record.pairs.items()
+        ]
+        size = "x".join(map(str, self.stereo.rig.camera.size))
+        session = self.report.parent / "session"
+        used_gb = sum(f.stat().st_size for f in session.rglob("*") if f.is_file()) / 1e9
+        return "\n".join(
+            [
+                f"Simulated rig, camera {size}, {len(self.stereo.poses)} target poses. RMS in mm.",
+                (
+                    f"Reprojection RMS: camera {rms['camera']:.3f} px, projector"
+                    f" {rms['projector']:.3f} px (the Letter: {theirs['camera']:.3f},"
+                    f" {theirs['projector']:.3f})."
+                ),
+                "",
+                "Flat board (Table 1)",
+                _render_table(self.planes),
+                f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
+                "",
+                f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
+                _render_table(self.spheres),
+                "Distances between the sphere centres, RMS error: "
+                + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
+                + ".",
+                "",
+                f"Object at three depths (experiment 3), reference {self.merged.record.reference}",
+                *pairs,
+                "",
+                f"Report: {self.report}",
+                f"Session: {session} ({used_gb:.1f} GB)",
+            ]
+        )
 
 
 def reproduce(
@@ -64,46 +188,41 @@ def reproduce(
         names = store.capture_names("scan")
         stereo, pixelwise = load_stereo(store), load_model(store, "pixelwise")
         observations = load_observations(store, list(stereo.poses))
-    assert isinstance(pixelwise, PixelwiseModel)
-    planes, spheres = (
-        [n for n in names if n.startswith("plane_")],
-        [n for n in names if n.startswith("sphere_")],
-    )
-    flat = _compare_models(
-        session, VerifySettings(planes, "plane"), part(progress, 0.65, 0.75), warn
-    )
-    round_ = VerifySettings(spheres, "sphere", radius=letter.SPHERE_RADIUS_MM)
-    balls = _compare_models(session, round_, part(progress, 0.75, 0.82), warn)
-    with Session.open(session) as store:
+        assert isinstance(pixelwise, PixelwiseModel)
+        comparisons = []
+        for shape, start, end in SHAPES:
+            compared = compare_captures(
+                Job(store, part(progress, start, end), warn),
+                VerifySettings(
+                    [name for name in names if name.startswith(shape)],
+                    shape,
+                    MODELS,
+                    letter.DEPTH_RANGE_MM,
+                    letter.SPHERE_RADIUS_MM,
+                ),
+                load_models(store, MODELS),
+            )
+            comparisons.append({each.capture.name: each.found for each in compared})
+        planes, spheres = comparisons
         settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
         merged = merge_scans(Job(store, part(progress, 0.82, 0.9)), settings)
     result = Reproduction(
         quick=quick,
         stereo=stereo,
         pixelwise=pixelwise,
-        planes=flat,
-        spheres=balls,
-        spacings_mm=_compare_spacings(session, balls),
+        planes=planes,
+        spheres=spheres,
+        spacings_mm=_compare_spacings(session, spheres),
         merged=merged,
         report=out / "report.html",
     )
     progress(0.92, "drawing the report")
     pixel = (round((PIXEL[0] + 0.5) * scale - 0.5), round((PIXEL[1] + 0.5) * scale - 0.5))
-    write_reproduction(result, observations, pixel, seed)
+    data = _make_report_data(result, observations, pixel, seed)
+    headlines, sections = reproduction_headlines(data), reproduction_sections(data)
+    write_page(result.report, *reproduction_title(data), headlines, sections)
     progress(1.0, "reproduced")
     return result
-
-
-def _compare_models(
-    session: Path, settings: VerifySettings, progress: Progress, warn: Warn
-) -> dict[str, Comparison]:
-    """Return the comparison of the models on each capture, in the Letter's depth ranges."""
-    settings = replace(settings, models=MODELS, depth_range=letter.DEPTH_RANGE_MM)
-    with Session.open(session) as store:
-        compared = compare_captures(
-            Job(store, progress, warn), settings, load_models(store, MODELS)
-        )
-        return {each.capture.name: each.found for each in compared}
 
 
 def _simulate(session: Path, scale: float, seed: int, progress: Progress) -> None:
@@ -145,3 +264,109 @@ def _compare_spacings(
             {name: found.record() for name, found in spheres.items()}
         ).items()
     }
+
+
+def _render_table(comparisons: Mapping[str, Comparison]) -> str:
+    """The table with the columns that fit a terminal, without coverage and excluded points, which
+    the report has."""
+    rows: list[Row] = [
+        {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
+        for row in letter.letter_rows(comparisons)
+    ]
+    return render(rows)
+
+
+def _make_report_data(
+    result: Reproduction, observations: Sequence[Observation], pixel: tuple[int, int], seed: int
+) -> ReproductionData:
+    """The report's input from the results, with the curves of one camera pixel (u, v)."""
+    stereo, pixelwise, merged = result.stereo, result.pixelwise, result.merged
+    fit = pixelwise.fits[pixelwise.depth_axis]
+    clouds = [CloudView(name, cloud.points) for name, cloud in merged.clouds.items()]
+    whole = merged.fused
+    return ReproductionData(
+        camera=stereo.rig.camera.size,
+        projector=stereo.rig.projector.size,
+        quick=result.quick,
+        seed=seed,
+        poses=len(stereo.poses),
+        depth_range_mm=letter.DEPTH_RANGE_MM,
+        reprojection_rms_px=stereo.reprojection_rms_px,
+        letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
+        fit_rms_mm=pixelwise.median_rms_mm(pixelwise.depth_axis),
+        planes=result.plane_rows(),
+        spheres=[
+            SphereRow(
+                name,
+                theirs.region,
+                letter.SPHERE_RADIUS_MM,
+                _get_rms(c),
+                _get_noise_floor(c),
+                {m: r.radius_mm for m, r in c.results.items()},
+                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
+                {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
+            )
+            for (name, c), theirs in zip(result.spheres.items(), letter.TABLE_2, strict=True)
+        ],
+        spacings=[
+            SpacingRow(name, known, measured)
+            for name, (known, measured) in result.spacings_mm.items()
+        ],
+        pairs=[
+            MergePair(
+                name,
+                merged.record.reference,
+                pair.point_to_point_rms_mm or float("nan"),
+                pair.overlap,
+                letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
+            )
+            for name, pair in merged.record.pairs.items()
+        ],
+        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
+        rms_maps_mm=fit.rms_mm,
+        plane_maps=_make_error_maps(
+            {name: result.planes[name] for name in (f"plane_{i:02d}" for i in SHOWN_PLANES)}
+        ),
+        sphere_maps=_make_error_maps(result.spheres),
+        plane_outlines={
+            name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()
+        },
+        clouds=clouds,
+        merged=CloudView(
+            "merged", whole.surface.points, whole.surface.normals, whole.source, whole.names
+        ),
+        poses_left_out=stereo.excluded,
+        letter_points=letter.EXPERIMENT_3_POINTS,
+    )
+
+
+def _make_error_maps(comparisons: Mapping[str, Comparison]) -> list[ErrorMaps]:
+    """The signed errors of every model over the pixels that counted."""
+    return [
+        ErrorMaps(
+            title,
+            {m: np.where(r.inliers, r.error_map, np.nan) for m, r in each.results.items()},
+            _get_rms(each),
+            list(_get_noise_floor(each).values())[-1],
+        )
+        for title, each in comparisons.items()
+    ]
+
+
+def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
+    """Points (n, 3) mm of the stereo model's plane on the rays of the evaluated pixels."""
+    result = comparison.results["stereo"]
+    v, u = np.nonzero(result.inliers)
+    chosen = np.arange(0, len(u), max(1, len(u) // 5000))
+    d = np.column_stack([rays[v[chosen], u[chosen]], np.ones(len(chosen))])
+    return d * (result.plane.offset / (d @ result.plane.normal))[:, None]
+
+
+def _get_rms(comparison: Comparison) -> Mapping[str, float]:
+    """Return the RMS of each model, mm."""
+    return {m: r.rms_mm for m, r in comparison.results.items()}
+
+
+def _get_noise_floor(comparison: Comparison) -> Mapping[str, float]:
+    """Noise floor of each model, mm."""
+    return {m: r.noise_floor_mm for m, r in comparison.results.items()}

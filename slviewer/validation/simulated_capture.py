@@ -5,16 +5,18 @@ Everything that is shown, seen and described is stated by a `CaptureSetup`; a fa
 its fields. Nothing here uses the code that decodes or checks captures.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, get_args
 from zlib import crc32
 
 import cv2
 import numpy as np
 
-from slviewer.fringe.presets import bits_for, gray_bits, micro, p18, phase_steps
+from slviewer.fringe.presets import bits_for, complementary, gray_bits, micro, p18, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, Size
+from slviewer.simulation.hostile_frames import add_crosstalk, compress_jpeg, row_phase, scale_frames
 from slviewer.validation.simulated_scene import (
     FOCAL,
     SCENES,
@@ -100,6 +102,13 @@ class CaptureSetup:
         has_gamma = self.gamma > 1 and steps and min(steps) <= FEW_STEPS
         return frozenset({"gamma"}) if has_gamma else frozenset()
 
+    @property
+    def displacements(self) -> list[tuple[float, float, float]]:
+        """Displacement of the scene in each image."""
+        per_px, (x, y, z) = 1 / (FOCAL * self.view.camera[0]), self.direction
+        motion = self.motion_px or [0.0] * len(self.shown.frames)
+        return [(s * x * per_px, s * y * per_px, s * z * per_px) for s in motion]
+
     def text(self) -> str:
         """The quality in one line."""
         noise = "low" if self.noise == min(NOISES) else "high"
@@ -120,48 +129,45 @@ class SimulatedCapture:
 
 
 def build_sequence(kind: CaptureKind, view: View, blur_px: float) -> PatternSequence:
-    """The patterns of one kind for the projector of a view, x before y."""
-    size = view.projector
-    builders: dict[CaptureKind, Callable[[], PatternSequence]] = {
-        "p18": lambda: p18(size),
-        "complementary": lambda: _complementary(size),
-        "multifrequency": lambda: _multifrequency(size),
-        "heterodyne": lambda: _heterodyne(size),
-        "gray": lambda: gray_code(size, _choose_cell(view, blur_px)),
-        "micro": lambda: micro(size),
+    """The patterns of one kind for the projector of a view, x before y; of Gray cells, two of which
+    are a stripe, those that the camera resolves."""
+    least = LEAST_STRIPE * max(1.0, blur_px) / (2 * view.pixels_per_column)
+    cell = min(cell for cell in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0) if cell >= least)
+    builders: dict[CaptureKind, Callable[[Size], PatternSequence]] = {
+        "p18": p18,
+        "complementary": partial(complementary, steps=4),
+        "multifrequency": partial(_three_periods, periods_of=_covering_periods),
+        "heterodyne": partial(_three_periods, periods_of=_close_periods),
+        "gray": partial(gray_code, cell_px=cell),
+        "micro": micro,
     }
-    return builders[kind]()
+    return builders[kind](view.projector)
 
 
-def _complementary(size: Size) -> PatternSequence:
-    """4 steps of 16 px, Gray bits and the complementary bit."""
+def _three_periods(
+    size: Size, periods_of: Callable[[int], tuple[float, float, float]]
+) -> PatternSequence:
+    """3 steps of the three periods px that an axis of each extent has."""
     frames: list[Frame] = []
     for axis, extent in zip(AXES, size, strict=True):
-        frames += phase_steps(axis, 4, 16.0) + gray_bits(axis, bits_for(extent / 16 + 1))
-        frames.append(Frame("complementary", axis))
-    return PatternSequence(size, (*frames, Frame("texture")))
-
-
-def _multifrequency(size: Size) -> PatternSequence:
-    """3 steps of three periods, of which the longest covers the projector."""
-    frames: list[Frame] = []
-    for axis, extent in zip(AXES, size, strict=True):
-        longest = 1.1 * extent
-        for period in (longest, (16 * longest) ** 0.5, 16.0):
+        for period in periods_of(extent):
             frames += phase_steps(axis, 3, period)
     return PatternSequence(size, (*frames, Frame("texture")))
 
 
-def _heterodyne(size: Size) -> PatternSequence:
-    """3 steps of three close periods, whose beats of 3 and 4 fringes have a beat of one."""
-    frames: list[Frame] = []
-    for axis, extent in zip(AXES, size, strict=True):
-        for count in (16, 19, 23):
-            frames += phase_steps(axis, 3, 1.05 * extent / count)
-    return PatternSequence(size, (*frames, Frame("texture")))
+def _covering_periods(extent: int) -> tuple[float, float, float]:
+    """Periods of which the longest covers the projector."""
+    longest = 1.1 * extent
+    return longest, (16 * longest) ** 0.5, 16.0
 
 
-def gray_code(size: Size, cell_px: float, origin_px: float = -0.5) -> PatternSequence:
+def _close_periods(extent: int) -> tuple[float, float, float]:
+    """Close periods, whose beats of 3 and 4 fringes have a beat of one."""
+    long = 1.05 * extent
+    return long / 16, long / 19, long / 23
+
+
+def gray_code(size: Size, cell_px: float) -> PatternSequence:
     """Gray code alone in cells of ``cell_px``, each bit followed by its inverse, then white and
     black."""
     frames: list[Frame] = []
@@ -169,17 +175,8 @@ def gray_code(size: Size, cell_px: float, origin_px: float = -0.5) -> PatternSeq
         for bit in gray_bits(axis, bits_for(extent / cell_px)):
             frames += [bit, replace(bit, kind="inverse")]
     return PatternSequence(
-        size,
-        (*frames, Frame("white"), Frame("black")),
-        gray_origin_px=origin_px,
-        gray_cell_px=cell_px,
+        size, (*frames, Frame("white"), Frame("black")), gray_origin_px=-0.5, gray_cell_px=cell_px
     )
-
-
-def _choose_cell(view: View, blur_px: float) -> float:
-    """Width px of Gray cells, of which the camera resolves the stripes, two cells wide."""
-    least = LEAST_STRIPE * max(1.0, blur_px) / (2 * view.pixels_per_column)
-    return min(cell for cell in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0) if cell >= least)
 
 
 def draw_setup(kind: CaptureKind, seed: int) -> CaptureSetup:
@@ -229,44 +226,25 @@ def _measure_contrast(sequence: PatternSequence, view: View, blur_px: float) -> 
 
 def render_capture(setup: CaptureSetup) -> SimulatedCapture:
     """Render the images of a capture, with independent noise in each."""
-    count = len(setup.shown.frames)
-    order = setup.order or tuple(range(count))
-    displacements = _list_displacements(setup, len(order))
+    order = setup.order or range(len(setup.shown.frames))
     light = np.empty((len(order), *setup.view.camera[::-1]), np.float32)
     tables = {k: _tabulate_pattern(setup, k) for k in {k for k in order if k >= 0}}
     for i, k in enumerate(order):
-        geometry = trace_view(setup.view, displacements[i])
-        light[i] = _illuminate(setup, geometry, tables[k] if k >= 0 else None)
+        geometry = trace_view(setup.view, setup.displacements[i])
+        light[i] = _illuminate(setup, geometry, tables.get(k))
         if k == FOREIGN:
             light[i] = _photograph_another_scene(setup, i)
         if setup.blur_px:
             light[i] = cv2.GaussianBlur(light[i], (0, 0), setup.blur_px)
-    white = _photograph_white(setup, trace_view(setup.view, displacements[0]))
-    stack = _record(setup, _disturb(setup, light), white)
+    stack = _record(setup, _disturb(setup, light))
     for image, source in setup.copies:
         stack[image] = stack[source]
-    return SimulatedCapture(stack, _find_truth(setup, displacements))
-
-
-def _list_displacements(setup: CaptureSetup, count: int) -> list[tuple[float, float, float]]:
-    """Displacement of the scene in each image."""
-    if not setup.motion_px:
-        return [(0.0, 0.0, 0.0)] * count
-    per_px = 1 / (FOCAL * setup.view.camera[0])
-    x, y, z = setup.direction
-    return [(s * x * per_px, s * y * per_px, s * z * per_px) for s in setup.motion_px]
-
-
-def _find_truth(
-    setup: CaptureSetup, displacements: Sequence[tuple[float, float, float]]
-) -> dict[Axis, np.ndarray]:
-    """True coordinates of each axis, of the middle of the time in which its images are taken."""
     truth: dict[Axis, np.ndarray] = {}
-    for which, axis in enumerate(AXES):
+    for which, axis in enumerate(AXES):  # of the middle of the time in which its images are taken
         own = [i for i, f in enumerate(setup.shown.frames) if f.axis == axis]
-        middle = displacements[own[len(own) // 2]]
+        middle = setup.displacements[own[len(own) // 2]]
         truth[axis] = trace_view(setup.view, middle).true_coordinates()[which]
-    return truth
+    return SimulatedCapture(stack, truth)
 
 
 def pattern_levels(
@@ -319,32 +297,22 @@ def _illuminate(
     return total / len(coordinates) + room
 
 
-def _photograph_white(setup: CaptureSetup, geometry: Geometry) -> np.ndarray:
-    """Light (h, w) at the camera's pixels under white; NaN where the projector does not reach."""
-    white = geometry.shade.mean(axis=0)
-    is_lit = (geometry.shade > 0).all(axis=0)
-    return np.where(is_lit, white + setup.ambient * geometry.albedo.mean(axis=0), np.nan)
-
-
 def _photograph_another_scene(setup: CaptureSetup, image: int) -> np.ndarray:
     """A picture (h, w) that has nothing to do with the patterns, about as bright."""
-    width, height = setup.view.camera
     rng = np.random.default_rng([setup.seed, image, 7])
     coarse = rng.uniform(0, 1, (7, 9)).astype(np.float32)
-    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    return cv2.resize(coarse, setup.view.camera, interpolation=cv2.INTER_CUBIC).clip(0, 1)
 
 
 def _disturb(setup: CaptureSetup, light: np.ndarray) -> np.ndarray:
     """Light (n, h, w) with ghosts, gains, flicker and the lamp of the room."""
-    n, height, _ = light.shape
     if setup.ghost:
-        before = np.concatenate([light[:1], light[:-1]])
-        light = np.float32(1 - setup.ghost) * light + np.float32(setup.ghost) * before
+        light = add_crosstalk(light, setup.ghost)
     if setup.gains:
-        light = light * np.array(setup.gains, np.float32)[:, None, None]
+        light = scale_frames(light, np.array(setup.gains))
     if setup.flicker:
-        rows = 1.7 * np.arange(height)[None] / height + 0.37 * np.arange(n)[:, None]
-        light = light * (1 + setup.flicker * np.sin(2 * np.pi * rows)).astype(np.float32)[..., None]
+        phase = row_phase(light, 1.7, 0.37 * np.arange(len(light))[:, None])
+        light = light * (1 + setup.flicker * np.sin(phase)).astype(np.float32)
     first, share = setup.room_step
     if share:
         albedo = trace_view(setup.view).albedo.mean(axis=0)
@@ -354,14 +322,14 @@ def _disturb(setup: CaptureSetup, light: np.ndarray) -> np.ndarray:
     return light
 
 
-def _record(setup: CaptureSetup, light: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """The images (n, h, w) that the camera records of light (n, h, w); ``white`` sets the
-    exposure."""
-    known = white[np.isfinite(white)]
-    if setup.clipped_share:
-        gain = 1 / float(np.quantile(known, 1 - setup.clipped_share))
-    else:
-        gain = setup.exposure / float(np.quantile(known, 0.99))
+def _record(setup: CaptureSetup, light: np.ndarray) -> np.ndarray:
+    """The images (n, h, w) that the camera records of light (n, h, w); white where the projector
+    reaches sets the exposure."""
+    geometry = trace_view(setup.view, setup.displacements[0])
+    white = geometry.shade.mean(axis=0) + setup.ambient * geometry.albedo.mean(axis=0)
+    known = white[(geometry.shade > 0).all(axis=0)]
+    share, level = (setup.clipped_share, 1.0) if setup.clipped_share else (0.01, setup.exposure)
+    gain = level / float(np.quantile(known, 1 - share))
     full = (1 << setup.bit_depth) - 1
     rng = np.random.default_rng([setup.seed, crc32(setup.kind.encode()), 3])
     dtype = np.uint8 if setup.bit_depth == 8 else np.uint16
@@ -373,7 +341,4 @@ def _record(setup: CaptureSetup, light: np.ndarray, white: np.ndarray) -> np.nda
         variance = relative**2 * (0.25 + 0.75 * np.clip(signal, 0, 1))
         signal = signal + np.sqrt(variance) * rng.standard_normal(signal.shape, np.float32)
         out[i] = np.clip(np.rint(signal * full), 0, full)
-        if setup.jpeg:
-            data = cv2.imencode(".jpg", out[i], [cv2.IMWRITE_JPEG_QUALITY, setup.jpeg])[1]
-            out[i] = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    return out
+    return compress_jpeg(out, setup.jpeg) if setup.jpeg else out

@@ -30,8 +30,8 @@ from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.records.table import render_text
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.simulation.rig import SimulatedRig
-from slviewer.validation.prove_uncertainty import (
-    BAND,
+from slviewer.validation.prove_accuracy import (
+    PREDICTED_BAND,
     PredictedErrors,
     compare_with_truth,
     judge_uncertainty,
@@ -214,14 +214,16 @@ def test_a_proof_pools_its_rigs_and_says_whether_it_holds() -> None:
     supported = np.array([True, True, False])
     cautious = PredictedErrors(np.array([2.0, 2.0, 9.0]), np.array([1.0, 1.0, 3.0]), supported)
     bold = PredictedErrors(np.array([1.0, 1.0, 1.0]), np.array([2.0, 2.0, 3.0]), supported)
-    too_bold = judge_uncertainty({"bold": bold}, 0.5, 25)
-    assert not judge_uncertainty({"cautious": cautious}, 0.5, 25).holds and not too_bold.holds
-    both = judge_uncertainty({"cautious": cautious, "bold": bold}, 0.5, 25)
+    too_bold = judge_uncertainty({"bold": bold}, 0.5)
+    assert not judge_uncertainty({"cautious": cautious}, 0.5).holds and not too_bold.holds
+    both = judge_uncertainty({"cautious": cautious, "bold": bold}, 0.5)
     record = both.to_json()
     assert both.holds and record["holds"] and record["ratio"] == pytest.approx(1)
     assert [row["rig"] for row in record["rigs"]] == ["cautious", "bold", "pooled"]
-    assert missing_facts(both.text(), "1.00", *BAND) == []
-    assert missing_facts(too_bold.text(), f"{too_bold.to_json()['ratio']:.2f}", *BAND) == []
+    assert missing_facts(both.text(), "1.00", *PREDICTED_BAND) == []
+    assert (
+        missing_facts(too_bold.text(), f"{too_bold.to_json()['ratio']:.2f}", *PREDICTED_BAND) == []
+    )
 
 
 @pytest.mark.computes

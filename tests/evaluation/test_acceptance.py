@@ -12,10 +12,20 @@ from facts import missing_facts, raises
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.artefact import Artefact, Limits
-from slviewer.evaluation.acceptance.figures import K_95, decide, make_length_error, narrowest_range
-from slviewer.evaluation.acceptance.measure import FLATNESS, FORM, SIZE, SPACING, measure_artefact
-from slviewer.evaluation.acceptance.result import conclude_test
+from slviewer.evaluation.acceptance import (
+    FLATNESS,
+    FORM,
+    K_95,
+    SIZE,
+    SPACING,
+    Artefact,
+    Limits,
+    conclude_test,
+    decide,
+    make_length_error,
+    measure_artefact,
+    narrowest_range,
+)
 from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18

@@ -6,8 +6,7 @@ from facts import missing_facts, raises
 from planted import board_before_a_wall, cloud, plane_depth, rays, rectangle
 
 from slviewer.errors import InputError
-from slviewer.evaluation.plane import evaluate_plane
-from slviewer.evaluation.region import find_plane
+from slviewer.evaluation.fit import ShapeSearch, evaluate_plane
 
 SIGMA = 0.05
 
@@ -127,7 +126,7 @@ def test_clouds_without_a_plane_are_refused() -> None:
     with pytest.raises(InputError):
         evaluate_plane(empty, None)
     with pytest.raises(InputError):
-        find_plane(cloud(np.random.default_rng(0).uniform(300, 900, (300, 400))))
+        ShapeSearch("plane", cloud(np.random.default_rng(0).uniform(300, 900, (300, 400)))).find()
     with raises(InputError, "organised", "(120000, 3)"):
         evaluate_plane(empty.reshape(-1, 3), None)
     with raises(InputError, "mask", "(3, 4)", "(300, 400)"):

@@ -5,7 +5,7 @@ import pytest
 from planted import cloud, plane_depth, sphere_depth
 
 from slviewer.errors import InputError
-from slviewer.evaluation.sphere import evaluate_sphere, evaluate_spheres
+from slviewer.evaluation.fit import evaluate_sphere, evaluate_spheres
 
 SIGMA = 0.04
 CENTRE, RADIUS = (15.0, -10.0, 680.0), 98.0

@@ -14,7 +14,7 @@ from slviewer.examination.ghost import has_ghost, measure_ghost
 from slviewer.examination.sample import sample_capture
 from slviewer.fringe.presets import p18
 from slviewer.simulation.boards import Pose, blank_board
-from slviewer.simulation.hostile import FAULTS, expose_frames, render_light
+from slviewer.simulation.hostile import FAULTS, SOUND, expose_frames, render_light
 from slviewer.simulation.rig import letter
 
 pytestmark = pytest.mark.computes
@@ -32,9 +32,7 @@ def rendered():
 def exposed(fault=None, severity="mild"):
     """The frames of a capture with a fault."""
     light, renderer = rendered()
-    return expose_frames(
-        RIG, light, SEQUENCE, renderer.room_light(), 0, FAULTS[fault] if fault else None, severity
-    )
+    return expose_frames(renderer, light, SEQUENCE, 0, FAULTS[fault] if fault else SOUND, severity)
 
 
 def evaluated(fault=None, severity="mild"):

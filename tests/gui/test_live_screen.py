@@ -61,7 +61,7 @@ def test_live_clouds_are_shown_saved_and_stopped(browser: Browser, app: App) -> 
 @pytest.mark.slow
 @pytest.mark.computes
 def test_live_rate_is_measured_beside_stalled_viewer() -> None:
-    found = live_rate(SCALE, 1.0, warm_s=0.1)
+    found = live_rate(SCALE, 1.0)
     assert found.size == (240, 180) and found.points > 3000
     assert found.captures_per_s + found.captures_per_s_stalled > 0
     assert found.clouds_per_s > 0 and found.shown_per_s > 0 and found.latency_ms > 1

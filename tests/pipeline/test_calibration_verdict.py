@@ -25,7 +25,7 @@ from slviewer.pipeline.poses import load_judged
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.validation.faulty_captures import BOARD, FaultBench
+from slviewer.validation.prove_causes import BOARD, FaultBench
 
 pytestmark = pytest.mark.computes
 

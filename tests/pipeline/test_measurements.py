@@ -16,7 +16,7 @@ from trimesh.creation import box
 
 import slviewer as sl
 from slviewer.errors import InputError, SessionError, UsageError
-from slviewer.evaluation.region import find_spheres
+from slviewer.evaluation.fit import ShapeSearch
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
@@ -85,7 +85,8 @@ def folder(made, tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def regions(balls) -> list[np.ndarray]:
     """The pixels of each ball, from left to right."""
-    return [region for _, region in find_spheres(balls.points, 2, balls.sigma_mm, RADIUS)]
+    search = ShapeSearch("sphere", balls.points, balls.sigma_mm, RADIUS)
+    return [region for _, region in search.find_several(2)]
 
 
 def ball_about(on: MeasuredSurface, region: np.ndarray) -> Region:

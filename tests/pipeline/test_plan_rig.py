@@ -8,6 +8,7 @@ from facts import missing_facts, raises
 
 from slviewer.cli import main
 from slviewer.errors import InputError
+from slviewer.evaluation import rig_plan
 from slviewer.evaluation.rig_plan import PlannedLight, predict_rig
 from slviewer.pipeline.plan_rig import _read_camera, _read_projector, plan_rig
 
@@ -40,10 +41,16 @@ def test_the_simulation_measures_what_is_predicted(camera, projector, distance, 
     assert "simulated" in planned.text()
 
 
-def planned(camera, projector, distance, baseline=200.0, *, lens=None, light=None, period_px=None):
+def predict(*given):
     """The plan, its usable range looked for at the distance alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig_plan, "_DEPTHS", np.ones(1))
+        return predict_rig(*given)
+
+
+def planned(camera, projector, distance, baseline=200.0, *, lens=None, light=None, period_px=None):
     devices = _read_camera(camera, lens)[0], _read_projector(projector)[0]
-    return predict_rig(*devices, distance, baseline, light, period_px, depth_factors=[1.0])
+    return predict(*devices, distance, baseline, light or PlannedLight(), period_px)
 
 
 def test_noise_follows_baseline_distance_and_steps():
@@ -66,9 +73,9 @@ def test_the_recommended_period_has_the_least_noise():
     camera, _ = _read_camera("machine-vision-5mp", 25.0)
     projector, _ = _read_projector("projector-1080p")
     blurred = type(projector)(**{**vars(projector), "blur_px": 2.0})
-    best = predict_rig(camera, blurred, 600.0, 240.0, depth_factors=[1.0]).period_px
+    best = predict(camera, blurred, 600.0, 240.0, PlannedLight()).period_px
     sigmas = {
-        p: predict_rig(camera, blurred, 600.0, 240.0, period_px=p, depth_factors=[1.0]).sigma_middle
+        p: predict(camera, blurred, 600.0, 240.0, PlannedLight(), p).sigma_middle
         for p in np.arange(8.0, 26.0)
     }
     assert 10 < best < 20 and abs(min(sigmas, key=sigmas.__getitem__) - best) <= 1

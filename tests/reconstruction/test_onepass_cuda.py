@@ -29,7 +29,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.reconstruction.onepass_cuda import CudaPass, has_pass, one_pass
-from slviewer.validation.bench_rows import gpu_rows
+from slviewer.validation import bench_rows
 
 pytestmark = pytest.mark.computes
 
@@ -155,7 +155,8 @@ def scans_to(folder):
         assert cuda_device.find_device() is not None
         maps = {key: value for key, value in vars(scan).items() if isinstance(value, np.ndarray)}
         np.savez(folder / f"{number}.npz", **maps)
-    rows = gpu_rows(*made("complementary code, splined"), times=1, ahead=1)
+    bench_rows.TIMES = bench_rows.AHEAD = 1  # in this process alone
+    rows = bench_rows.gpu_rows(*made("complementary code, splined"))
     (folder / "rows.json").write_text(json.dumps(rows))
     for case in list(CASES)[::2]:
         sequence, model, frames = made(case)

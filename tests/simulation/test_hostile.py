@@ -45,7 +45,6 @@ RNG = np.random.default_rng(3)
 def shot(**change):
     return Shot(
         **{
-            "number": 0,
             "sequence": SEQUENCE,
             "rng": np.random.default_rng(5),
             "room_light": RENDERER.room_light(),
@@ -55,16 +54,16 @@ def shot(**change):
 
 
 def test_drift_has_the_rms_that_it_says():
-    gains = faults.drifting_gains(32, 0.1, RNG)
+    gains = faults.vary_exposure(np.ones((32, 2, 2)), 0.1, shot(rng=RNG))
     assert np.std(gains) == pytest.approx(0.1, rel=0.02) and np.mean(gains) == pytest.approx(
         1, abs=0.02
     )
-    scaled = faults.scale_frames(LIGHT, gains)
-    assert np.allclose(scaled.sum((1, 2)) / LIGHT.sum((1, 2)), gains, rtol=1e-5)
+    scaled = faults.scale_frames(LIGHT, gains[: len(LIGHT), 0, 0])
+    assert np.allclose(scaled.sum((1, 2)) / LIGHT.sum((1, 2)), gains[: len(LIGHT), 0, 0], rtol=1e-5)
 
 
 def test_an_exposure_loop_settles_at_its_target():
-    gains = faults.exposure_loop_gains(np.full((40, 2, 2), 80.0), 0.3)
+    gains = faults.follow_exposure(np.full((40, 2, 2), 80.0), 0.3, shot())[:, 0, 0] / 80.0
     assert gains[0] == pytest.approx(1.3) and gains[-1] == pytest.approx(1, abs=2e-3)
     assert np.all(np.diff(gains) < 0)
 
@@ -89,7 +88,7 @@ def test_a_lamp_adds_light_and_no_modulation():
 
 
 def test_jpeg_passes_a_codec_that_loses_more_at_lower_quality():
-    frames = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light())
+    frames = expose_frames(RENDERER, LIGHT, SEQUENCE)
     coded = {quality: faults.compress_jpeg(frames, quality) for quality in (85, 65, 50)}
     lost = [float(np.std(each.astype(float) - frames)) for each in coded.values()]
     assert 0.5 < lost[0] < lost[1] < lost[2] < 6
@@ -133,17 +132,12 @@ def test_hot_pixels_are_as_many_as_said_and_stay_where_they_are():
 
 def test_a_dim_projector_has_the_amplitude_that_it_says():
     light, _ = hostile_light(FAULTS["dim-projector"], "severe", RIG, PLANE, SEQUENCE, 0)
-    phase = decode(SEQUENCE, expose_frames(RIG, light, SEQUENCE, RENDERER.room_light()), "x")
+    phase = decode(SEQUENCE, expose_frames(RENDERER, light, SEQUENCE), "x")
     assert np.median(phase.modulation[RENDERER.truth().mask]) == pytest.approx(6, rel=0.15)
 
 
 def test_noise_is_that_of_the_rig_where_nothing_is_wrong():
-    frames = np.stack(
-        [
-            expose_frames(RIG, LIGHT[:1], SEQUENCE, RENDERER.room_light(), seed=k)[0]
-            for k in range(24)
-        ]
-    )
+    frames = np.stack([expose_frames(RENDERER, LIGHT[:1], SEQUENCE, seed=k)[0] for k in range(24)])
     inner = RENDERER.truth().mask & (LIGHT[0] > 50)
     variance = frames.astype(float).var(0, ddof=1)[inner].mean()
     expected = RIG.sensor.read_variance + RIG.sensor.shot_variance * LIGHT[0][inner].mean() + 1 / 12
@@ -188,15 +182,13 @@ def test_the_mirror_shows_the_plane_below_itself_and_lights_it_again():
 )
 def test_every_fault_disturbs_the_capture_more_the_more_severe_it_is(name):
     fault, number = FAULTS[name], 3
-    clean = expose_frames(RIG, LIGHT, SEQUENCE, RENDERER.room_light(), number).astype(float)
+    clean = expose_frames(RENDERER, LIGHT, SEQUENCE, number).astype(float)
     changes = []
     for severity in SEVERITIES:
         light, renderer = LIGHT, RENDERER
         if fault.is_optical:
             light, renderer = hostile_light(fault, severity, RIG, PLANE, SEQUENCE, number)
-        frames = expose_frames(
-            renderer.rig, light, SEQUENCE, renderer.room_light(), number, fault, severity
-        )
+        frames = expose_frames(renderer, light, SEQUENCE, number, fault, severity)
         assert frames.shape == clean.shape and frames.dtype == np.uint8
         changes.append(np.abs(frames - clean).mean())
     assert min(changes) > 0

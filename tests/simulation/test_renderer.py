@@ -187,10 +187,5 @@ def test_what_cannot_be_rendered_is_refused():
         Renderer(rig, blank_board(FACING)).capture(p18((800, 600)))
     with pytest.raises(InputError):
         Renderer(rig, sphere((5000.0, 0.0, 600.0))).capture(PHASE_X)
-    with raises(InputError, "(3, 4)", "uint8"):
-        white = (None, np.full(912, 255, np.uint8))
-        Renderer(rig, blank_board(FACING)).frame(
-            white, np.zeros(2, np.uint32), np.zeros((3, 4), np.uint8)
-        )
     with raises(InputError, "scale 0"):
         letter(0.0)

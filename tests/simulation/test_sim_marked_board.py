@@ -1,6 +1,8 @@
 """A simulated board with its mark is numbered from the same circle at any turn; without it, from
 the one that is up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
+from slviewer.target.mark import mark_geometry
 
 BOARD = Board.parse("circles:11x8:14")
 
@@ -22,7 +25,8 @@ def test_the_first_circle_is_the_marked_one(turned: float) -> None:
     image = np.empty(rig.camera.size[::-1], np.uint8)
     found = {}
     for marked in (True, False):
-        scene = printed_board(BOARD, pose, marked=marked)
+        mark = mark_geometry(BOARD) if marked else None
+        scene = replace(printed_board(BOARD, pose), mark=mark)
         Renderer(rig, scene).frame(("x", np.full(912, 255.0)), np.arange(2, dtype=np.uint32), image)
         found[marked] = detect(BOARD, image)
         assert found[marked].marked == marked

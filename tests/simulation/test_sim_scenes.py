@@ -1,5 +1,7 @@
 """The surfaces that rays meet, and the shadows they throw."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -28,7 +30,7 @@ def test_a_blank_board_lies_on_its_plane():
 
 
 def test_a_bowed_board_has_the_shape_it_says():
-    scene = blank_board(TILTED, shape=BoardShape(0.3, -0.2, 0.25))
+    scene = replace(blank_board(TILTED), shape=BoardShape(0.3, -0.2, 0.25))
     surface = scene.trace(RIG.camera.rays())
     hit = np.isfinite(surface.points[..., 2])
     local = (surface.points[hit] - TILTED.t) @ TILTED.R
@@ -44,7 +46,7 @@ def test_a_bowed_board_has_the_shape_it_says():
 def test_printed_circles_cover_their_share_of_the_plate():
     board = Board.parse("circles:21x16:9")
     pose = Pose(np.eye(3), np.array([-90.0, -67.5, 620.0]))
-    scene = printed_board(board, pose, BoardShape(misplaced_mm=0.02), margin_mm=9)
+    scene = printed_board(board, pose, BoardShape(misplaced_mm=0.02))
     surface = scene.trace(RIG.camera.rays())
     # mm^2, but for the lens's distortion
     per_pixel = np.prod(620 / np.array(RIG.camera.focal_px) / 0.25)
@@ -54,7 +56,7 @@ def test_printed_circles_cover_their_share_of_the_plate():
     dark = (scene.white - surface.albedo[inner]).sum() / (scene.white - scene.dark)
     assert dark * per_pixel == pytest.approx(336 * np.pi * 2.25**2, rel=0.02)
     assert np.allclose(scene.misplacement.std(), 0.02, rtol=0.1)
-    again = printed_board(board, TILTED, BoardShape(misplaced_mm=0.02), margin_mm=9)
+    again = printed_board(board, TILTED, BoardShape(misplaced_mm=0.02))
     assert np.array_equal(scene.misplacement, again.misplacement)  # the same board at another pose
 
 

@@ -5,14 +5,18 @@ import time
 from collections.abc import Callable
 from types import SimpleNamespace
 
+import pytest
+
 from slviewer.validation import bench_wizard
 from slviewer.validation.bench_wizard import _Sampler, _Stopwatch
 
 
-def test_waiting_begins_with_the_last_frame() -> None:
+def test_waiting_begins_with_the_last_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     seconds = iter(range(100))
     session = {"poses": (), "scans": (), "verifications": (), "pending_plan": None}
-    watch = _Stopwatch(clock=lambda: float(next(seconds)))
+    clock = SimpleNamespace(perf_counter=lambda: float(next(seconds)))
+    monkeypatch.setattr(bench_wizard, "time", clock)
+    watch = _Stopwatch()
 
     def publish(capture: object = None, **changes: object) -> None:
         session.update(changes)
@@ -44,7 +48,7 @@ def test_waiting_begins_with_the_last_frame() -> None:
     assert set(found) <= set(bench_wizard.LIMITS)
 
 
-def test_the_functions_of_an_act_are_sampled() -> None:
+def test_the_functions_of_an_act_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
     stop = []
 
     def work() -> None:
@@ -53,7 +57,8 @@ def test_the_functions_of_an_act_are_sampled() -> None:
 
     thread = threading.Thread(target=work)
     thread.start()
-    sampler = _Sampler(lambda module: module == __name__)
+    monkeypatch.setattr(bench_wizard, "_is_counted", lambda module: module == __name__)
+    sampler = _Sampler()
     sampler.act = "working"
     try:
         with sampler:

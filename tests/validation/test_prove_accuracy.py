@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +11,16 @@ from facts import missing_facts
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import AXES, gray_bits, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.simulation.plans import planes
+from slviewer.pipeline.feedback import ignore_progress
+from slviewer.simulation.boards import BoardShape
+from slviewer.simulation.plans import letter_plan, planes
 from slviewer.simulation.renderer import Renderer
-from slviewer.simulation.rig import letter
+from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.scenes import Scene
 from slviewer.simulation.truth import PerfectModel
+from slviewer.target.board import Board
+from slviewer.validation import prove_accuracy as accuracy
+from slviewer.validation import rendered_calibration
 from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import (
     FLOOR,
@@ -23,8 +30,8 @@ from slviewer.validation.prove_accuracy import (
     prove_accuracy,
     rig_cases,
 )
-from slviewer.validation.rendered_calibration import CalibrationSettings
 
+TARGET = "circles:14x11:13"
 SHAPES = ("plane_03", "sphere_3", "sphere_4")
 """Inside the calibrated depths, where a few poses already suffice."""
 
@@ -39,8 +46,20 @@ def few_steps(projector: tuple[int, int]) -> PatternSequence:
 
 @pytest.fixture(scope="module")
 def proof() -> Proof:
-    settings = CalibrationSettings("circles:14x11:13", few_steps, cells_across=8)
-    return prove_accuracy(0.15, rigs=rig_cases()[:1], poses=8, shapes=SHAPES, settings=settings)
+    """The proof of one rig, from fewer and coarser poses than it usually has."""
+    calibrate = partial(rendered_calibration.calibrate_splined, cells_across=8)
+
+    def small_plan(rig: SimulatedRig, poses: int, shape: BoardShape) -> dict[str, Scene]:
+        plan = letter_plan(rig, Board.parse(TARGET), 8, shape)
+        return {name: plan[name] for name in plan if name[:5] == "pose_" or name in SHAPES}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rendered_calibration, "TARGET", TARGET)
+        patch.setattr(rendered_calibration, "p18", few_steps)
+        patch.setattr(rendered_calibration, "calibrate_splined", calibrate)
+        patch.setattr(accuracy, "letter_plan", small_plan)
+        patch.setattr(accuracy, "rig_cases", lambda seed: rig_cases(seed)[:1])
+        return prove_accuracy(0.15, 0, ignore_progress)
 
 
 @pytest.mark.computes

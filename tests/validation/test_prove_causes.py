@@ -2,14 +2,15 @@
 runs."""
 
 import json
-from functools import cache
+from functools import cache, partial
 
 import pytest
 from facts import missing_facts
 
-from slviewer.validation.faulty_captures import FAULTS
+from slviewer.pipeline.feedback import ignore_progress
+from slviewer.validation import prove_causes as causes
 from slviewer.validation.proof import Proof
-from slviewer.validation.prove_causes import prove_causes
+from slviewer.validation.prove_causes import FAULTS, FaultBench
 
 SINGLE = (
     "board transposed in one pose",
@@ -40,7 +41,12 @@ REST = tuple(fault for fault in ALL if fault not in FEW)
 @cache
 def prove(faults: tuple[str, ...]) -> Proof:
     """The proof of some faults, and of a clean calibration beside REST."""
-    return prove_causes(0.15, faults=faults, clean=int(faults == REST), poses=7, steps=6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(causes, "FAULTS", {name: FAULTS[name] for name in faults})
+        patch.setattr(causes, "FaultBench", partial(FaultBench, steps=6))
+        patch.setattr(causes, "POSES", 7)
+        patch.setattr(causes, "CLEAN", int(faults == REST))
+        return causes.prove_causes(0.15, 0, ignore_progress)
 
 
 def test_every_cause_has_a_fault_here() -> None:

@@ -1,6 +1,7 @@
 """How a case of the hostile rig is judged, and three of them through the program's own path."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from facts import raises
 
 from slviewer.errors import InputError, UsageError
 from slviewer.simulation.hostile import FAULTS
-from slviewer.validation.hostile_captures import CaseReport, MeasuredScan
 from slviewer.validation.prove_hostile import (
+    CaseRun,
     Figures,
+    MeasuredScan,
     choose_cases,
     fit_gauge,
     judge_case,
@@ -27,9 +29,8 @@ RIGHT, OTHER = frozenset({"flicker"}), frozenset({"projector-size"})
 
 
 def outcome(figures, *named, severity="medium", error=None):
-    return judge_case(
-        FAULTS["flicker"], severity, CaseReport([], list(named), error), figures, FLOOR
-    )[0]
+    run = CaseRun(Path(), FAULTS["flicker"], severity, [], list(named), error)
+    return judge_case(run, figures, FLOOR)[0]
 
 
 def test_cases_are_judged_by_errors_and_by_what_was_said():
