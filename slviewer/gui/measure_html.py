@@ -22,8 +22,8 @@ from slviewer.inspection.colours import deviation_colours
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.report.canvas import finish_figure, new_figure, style_axes
-from slviewer.report.measurements import draw_deviations
 from slviewer.report.page import Figure
+from slviewer.report.surfaces import draw_deviations
 
 _TONES: dict[str, Tone] = {"pass": "good", "fail": "error", "undecided": "warning"}
 _HIGH = 230

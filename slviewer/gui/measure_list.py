@@ -20,7 +20,7 @@ from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measurements import section_lines
 from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
 from slviewer.records.measurement import Measurement
-from slviewer.report.measurements import section_plot
+from slviewer.report.surfaces import section_plot
 from slviewer.wizard.measure_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 

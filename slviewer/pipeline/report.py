@@ -50,9 +50,9 @@ from slviewer.report.data import (
     SessionData,
 )
 from slviewer.report.maps import verification_maps
-from slviewer.report.measurements import draw_deviation, section_plot
 from slviewer.report.page import Figure, write_page
 from slviewer.report.session import session_headlines, session_sections, session_title
+from slviewer.report.surfaces import draw_deviation, section_plot
 from slviewer.session.capture import Capture
 from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session

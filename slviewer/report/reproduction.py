@@ -6,14 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from slviewer.records.table import Cell, Column, Table
-from slviewer.report.bars import rms_bars
 from slviewer.report.canvas import HALF
-from slviewer.report.clouds import draw_clouds, draw_merged_cloud
-from slviewer.report.curves import pixel_curves
 from slviewer.report.data import PlaneRow, ReproductionData
-from slviewer.report.maps import draw_error_maps, error_limit, rms_maps
+from slviewer.report.maps import draw_error_maps, error_limit, pixel_curves, rms_maps
 from slviewer.report.page import Headline, Item, PageNotice, Section
-from slviewer.report.space import planes_in_space
+from slviewer.report.planes import planes_in_space, rms_bars
+from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
 from slviewer.report.tables import (
     format_number,
     known_mean,

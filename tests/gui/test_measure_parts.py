@@ -19,7 +19,7 @@ from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import DECIDED, Measurement
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.quantities import Quantity
-from slviewer.report.measurements import section_plot
+from slviewer.report.surfaces import section_plot
 from slviewer.wizard.surfaces import place_at
 
 CENTRE = np.array([10.0, 20.0, 500.0])

@@ -13,14 +13,13 @@ from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.report import maps
-from slviewer.report.bars import rms_bars
 from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
-from slviewer.report.clouds import draw_clouds, draw_merged_cloud
-from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CloudView, PixelCurve
+from slviewer.report.maps import pixel_curves
 from slviewer.report.page import Figure
+from slviewer.report.planes import planes_in_space, rms_bars
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
-from slviewer.report.space import planes_in_space
+from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
 
 pytestmark = pytest.mark.computes
 

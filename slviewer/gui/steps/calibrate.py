@@ -32,9 +32,8 @@ from slviewer.gui.widgets import (
 from slviewer.pipeline.report import calibration_view
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.model_comparison import ModelComparison
-from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures, PixelCurve
-from slviewer.report.maps import rms_maps
+from slviewer.report.maps import pixel_curves, rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import lens_rows, rig_rows
