@@ -336,6 +336,7 @@ def _mask_invalid(values: np.ndarray) -> Any:
 
 
 DATA = "#c2502e"
+_Fitted = Callable[[np.ndarray], np.ndarray]
 
 
 def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
@@ -361,7 +362,7 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
         """Depth z in mm by the rational function, at projector coordinates (n,)."""
         return (c0 + c1 * at) / (1 + c2 * at)
 
-    curves = (
+    curves: tuple[tuple[str, str, np.ndarray, np.ndarray, _Fitted], ...] = (
         ("z over phase (eq. 9)", "absolute phase, rad", phase, z, depth),
         ("x over z (eq. 10)", "z, mm", z, x, partial(np.multiply, c3)),
         ("y over z (eq. 11)", "z, mm", z, y, partial(np.multiply, c4)),
@@ -410,7 +411,7 @@ def _draw_fit(
     lower: Any,
     at: np.ndarray,
     values: np.ndarray,
-    fitted: Callable[[np.ndarray], np.ndarray],
+    fitted: _Fitted,
 ) -> None:
     """Draw values (n,) mm of a pixel over phases or depths (n,) with the function fitted to them
     into the upper axes, the residuals in um into the lower ones."""
