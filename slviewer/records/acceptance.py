@@ -125,10 +125,10 @@ class ErrorBudget(msgspec.Struct, frozen=True):
     def table(self) -> Table:
         """Return the contributions, and the expanded uncertainty below."""
         columns = [
-            Column("source", align="left"),
+            Column("source"),
             Column("standard uncertainty", "mm", digits=4),
             Column("type", align="centre"),
-            Column("from", align="left", detail=True),
+            Column("from", detail=True),
         ]
         without = f" Unknown: {' and '.join(self.unknown)}; U excludes it." if self.unknown else ""
         notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
@@ -220,13 +220,13 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
 
     def _list_tables(self, name: str) -> list[Table]:
         columns = [
-            Column("property", align="left"),
+            Column("property"),
             Column("worst", "mm", digits=4),
-            Column("at", align="left", detail=True),
+            Column("at", detail=True),
             Column("uncertainty U, k = 2", "mm", digits=4),
             *(Column(end, "mm", "95 % lie", digits=4, detail=True) for end in ("from", "to")),
             Column("limit", "mm"),
-            Column("decision", align="left"),
+            Column("decision"),
         ]
         rows: list[list[Value | Cell]] = [
             [
@@ -249,7 +249,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     def _list_positions(self) -> Table:
         shown = [each.property for each in self.judgements]
         columns = [
-            Column("position", align="left"),
+            Column("position"),
             *(Column(name, "mm", digits=4) for name in shown),
             Column("RMS", "mm"),
             Column("noise floor", "mm"),

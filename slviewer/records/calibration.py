@@ -49,7 +49,7 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     def table(self) -> Table:
         """Return the figures of both devices, and notes on poses and features."""
         devices = ("camera", "projector")
-        columns = [Column("quantity", align="left"), *map(Column, devices), Column("both")]
+        columns = [Column("quantity"), *map(Column, devices), Column("both")]
         rms, focal = (
             self.reprojection_rms_px,
             [self.focal_px.get(device, (None, None)) for device in devices],
@@ -107,7 +107,7 @@ class PixelwiseFit(msgspec.Struct, frozen=True, tag="pixelwise"):
     def table(self) -> Table:
         """Return a line for each axis."""
         columns = [
-            Column("axis", align="left"),
+            Column("axis"),
             Column("pixels fitted", "%", digits=1),
             Column("poses a pixel", digits=0),
             *(Column(f"RMS in {name}", "mm") for name in "zxy"),
@@ -213,7 +213,7 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
             f"{name} is excluded from the splined model: it {why}."
             for name, why in self.excluded.items()
         ]
-        columns = [Column("quantity", align="left"), Column("value")]
+        columns = [Column("quantity"), Column("value", align="right")]
         return Table(columns, rows, f"Joint adjustment (splined), {self.steps} steps", notes)
 
 

@@ -71,10 +71,10 @@ class Drift(Record, frozen=True, kw_only=True):
         """Return a table of the checks, the latest first, and one of what the latest found of each
         axis."""
         columns = [
-            Column("check", align="left"),
-            Column("time, UTC", align="left", detail=True),
-            Column("capture", align="left"),
-            Column("answer", align="left"),
+            Column("check"),
+            Column("time, UTC", detail=True),
+            Column("capture"),
+            Column("answer"),
             Column("change of scale", "ppm", digits=0),
             Column("±", "ppm", digits=0),
             Column("epipolar error", "px", digits=4),
@@ -103,7 +103,7 @@ class Drift(Record, frozen=True, kw_only=True):
 
     def _list_movements(self, name: str) -> Table:
         columns = [
-            Column("axis of the projector", align="left"),
+            Column("axis of the projector"),
             Column("turn", "mrad"),
             Column("±", "mrad"),
             Column("shift", "µm", digits=0),

@@ -144,15 +144,15 @@ class Inspection(Record, frozen=True, kw_only=True):
     def list_results(self) -> Table:
         """Return the table of parts by characteristic."""
         columns = [
-            Column("part", align="left"),
-            Column("characteristic", align="left"),
-            Column("type", align="left", detail=True),
+            Column("part"),
+            Column("characteristic"),
+            Column("type", detail=True),
             Column("value", digits=4),
             Column("U (k=2)", digits=4),
-            Column("unit", align="left"),
+            Column("unit"),
             *(Column(limit, digits=4, detail=True) for limit in ("nominal", "lower", "upper")),
-            Column("decision", align="left"),
-            Column("reason", align="left", detail=True),
+            Column("decision"),
+            Column("reason", detail=True),
         ]
         rows: list[list[Value | Cell]] = [
             [
@@ -174,11 +174,11 @@ class Inspection(Record, frozen=True, kw_only=True):
 
     def _list_capability(self) -> list[Table]:
         columns = [
-            Column("characteristic", align="left"),
+            Column("characteristic"),
             Column("parts"),
             Column("mean", digits=4),
             Column("std. dev.", digits=4),
-            Column("unit", align="left"),
+            Column("unit"),
             *(
                 Column(title, digits=2, group=index, detail=title != "value")
                 for index in ("Cp", "Cpk")

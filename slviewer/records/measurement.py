@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.records.acceptance import Decision
+from slviewer.records.acceptance import MARKS, Decision
 from slviewer.records.plain import from_plain
 from slviewer.records.quantities import Quantity
 from slviewer.records.record import Count, Matrix4, Record, Vector
-from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.table import Cell, Column, Table, Value
 
 What = Literal[
     "point", "distance", "section", "plane", "sphere", "cylinder", "relation", "deviation"
@@ -24,7 +24,6 @@ RULE = (
     " and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
     " exceeds it by more than the uncertainty, else too close to tell"
 )
-_MARKS: dict[Decision, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
 _UNCERTAINTY = (
     "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty."
     " –: a residual or a plain reading, which has none."
@@ -187,10 +186,10 @@ class NominalDeviation(msgspec.Struct, frozen=True):
                 ("outside by more than U", verdict.outside, "%", None),
                 ("U of a point, k = 2", verdict.U_mm, "mm", None),
             ]
-        columns = [Column("quantity", align="left"), Column("value", digits=4)]
-        columns += [Column("unit", align="left"), Column("decision", align="left")]
+        columns = [Column("quantity"), Column("value", digits=4)]
+        columns += [Column("unit"), Column("decision")]
         rows: list[list[Value | Cell]] = [
-            [title, value, unit, "" if decided is None else Cell(DECIDED[decided], _MARKS[decided])]
+            [title, value, unit, "" if decided is None else Cell(DECIDED[decided], MARKS[decided])]
             for title, value, unit, decided in lines
         ]
         share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
@@ -358,19 +357,19 @@ def _settings_of_comparison(meta: Mapping[str, Any]) -> dict[str, Any]:
 def list_quantities(found: Mapping[str, Measurement]) -> Table:
     """Return the table of all quantities of measurements."""
     columns = [
-        Column("measurement", align="left"),
-        Column("type", align="left", detail=True),
-        Column("scan", align="left"),
-        Column("quantity", align="left"),
+        Column("measurement"),
+        Column("type", detail=True),
+        Column("scan"),
+        Column("quantity"),
         Column("value", digits=4),
-        Column("unit", align="left"),
+        Column("unit"),
         Column("U (k=2)", digits=4),
-        Column("calibration in U", align="left", detail=True),
-        Column("of", align="left", detail=True),
+        Column("calibration in U", detail=True),
+        Column("of", detail=True),
     ]
     rows: list[list[Value | Cell]] = [
         [name, each.what, each.source, q.name, q.value, q.unit, q.U,
-         q.U and ("yes" if q.whole else "no"), each.where]
+         None if q.U is None else "yes" if q.whole else "no", each.where]
         for name, each in found.items()
         for q in each.quantities
     ]  # fmt: skip

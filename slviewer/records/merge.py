@@ -178,8 +178,8 @@ class Merge(Record, frozen=True, kw_only=True):
 
     def _list_tables(self, name: str) -> list[Table]:
         columns = [
-            Column("scan", align="left"),
-            Column("onto", align="left"),
+            Column("scan"),
+            Column("onto"),
             Column("RMS", "mm"),
             Column("point to point", "mm", detail=True),
             Column("overlap", "%", digits=0),
@@ -221,7 +221,7 @@ class Merge(Record, frozen=True, kw_only=True):
             tables.append(
                 Table(
                     [
-                        Column("loop", align="left"),
+                        Column("loop"),
                         *(
                             Column(end, u, digits=d, detail=u == "°")
                             for end in ends

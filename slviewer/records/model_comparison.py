@@ -81,7 +81,7 @@ class ModelComparison(Record, frozen=True, kw_only=True):
 
     def _make_table(self) -> Table:
         columns = [
-            Column("model", align="left"),
+            Column("model"),
             Column("plane", "mm", digits=4),
             Column("board", "mm", digits=4),
             Column("scale", "ppm", digits=0),

@@ -48,11 +48,11 @@ class Placement(Record, frozen=True, kw_only=True):
     def tables(cls, found: Mapping[str, "Placement"]) -> list[Table]:  # type: ignore[override]
         """Return one table with a line for each scan."""
         columns = [
-            Column("scan", align="left"),
-            Column("onto", align="left"),
+            Column("scan"),
+            Column("onto"),
             Column("RMS", "mm"),
             Column("overlap", "%", digits=0),
-            Column("kept apart because", align="left"),
+            Column("kept apart because"),
         ]
         rows: list[list[Value | Cell]] = [
             [

@@ -60,8 +60,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
         """Return one table with a line for each cloud."""
         columns = [
-            Column("capture", align="left"),
-            Column("model", align="left"),
+            Column("capture"),
+            Column("model"),
             Column("axis", align="centre", detail=True),
             Column("points"),
             Column("nearest", "mm", digits=0),
@@ -69,7 +69,7 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             Column("noise", "mm"),
             Column("calibration", "mm", digits=4, detail=True),
             Column("masked", "%", digits=1, detail=True),
-            Column("scale", align="left", detail=True),
+            Column("scale", detail=True),
         ]
         rows: list[list[Value | Cell]] = []
         for name, each in found.items():

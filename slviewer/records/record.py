@@ -85,7 +85,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         rows: list[list[Value]] = [
             [name, *(each.get(f) for f in names)] for name, each in figures.items()
         ]
-        return [Table([Column("name", align="left"), *map(figure_column, names)], rows, cls.title)]
+        return [Table([Column("name"), *map(figure_column, names)], rows, cls.title)]
 
     @property
     def is_good(self) -> bool:

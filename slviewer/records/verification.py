@@ -103,7 +103,7 @@ class Verification(Record, frozen=True, kw_only=True):
             rows: list[list[Value]] = [
                 [f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()
             ]
-            columns = [Column("spheres", align="left"), *(Column(model, "mm") for model in models)]
+            columns = [Column("spheres"), *(Column(model, "mm") for model in models)]
             tables.append(Table(columns, rows, "Distances between the centres of spheres"))
         return tables
 
@@ -132,11 +132,11 @@ def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
     """Return the table of measured planes or spheres: a line for each capture and model."""
     first = next(iter(next(iter(found.values())).models))
     columns = [
-        Column("capture", align="left"),
-        Column("model", align="left"),
+        Column("capture"),
+        Column("model"),
         Column("RMS", "mm"),
         Column("noise floor", "mm"),
-        Column(f"against {first}", align="left", detail=True),
+        Column(f"against {first}", detail=True),
         Column("radius", "mm"),
         *(Column(depths, "%", "share in", digits=1, detail=True) for depths in ("R1", "R2", "R3")),
         Column("points", detail=True),

@@ -129,7 +129,7 @@ def _calibration_section(data: ReproductionData) -> Section:
         name = f"pixel-wise fit in {axis}, median over the pixels"
         rows.append([name, "mm", data.fit_rms_mm.get(axis), "below 0.15"])
     columns = [
-        Column("RMS", align="left"),
+        Column("RMS"),
         Column("unit", align="centre"),
         Column("this rig"),
         Column("the Letter's rig"),
@@ -275,7 +275,7 @@ def plane_table(rows: Sequence[PlaneRow], caption: str) -> Table:
     letter = _values_by_model(rows, "letter_rms_mm")
     shares = Column("R1 / R2 / R3", "%", align="centre")
     columns: list[_CellColumn] = [
-        (Column("plane", align="left"), [*(row.name for row in rows), "mean"]),
+        (Column("plane"), [*(row.name for row in rows), "mean"]),
         (shares, [*(_format_incidence(row.incidence) for row in rows), ""]),
     ]
     for model in rms:
@@ -304,14 +304,14 @@ def sphere_table(rows: Sequence[SphereRow], caption: str) -> Table:
     radius, letter = _values_by_model(rows, "radius_mm"), _values_by_model(rows, "letter_rms_mm")
     errors = _signed_errors(rms, radius, [row.true_radius_mm for row in rows])
     columns: list[_CellColumn] = [
-        (Column("sphere", align="left"), [*(row.name for row in rows), "mean"]),
+        (Column("sphere"), [*(row.name for row in rows), "mean"]),
         (Column("range", align="centre"), [*(row.region for row in rows), ""]),
     ]
     for model in rms:
         columns += _rms_columns(model, rms, floor)
         columns += [
             (Column("radius", "mm", model), radius.get(model, [np.nan] * (len(rows) + 1))),
-            (Column("error", "mm", model), _error_cells(model, errors, signed=True)),
+            (Column("error", "mm", model, "right"), _error_cells(model, errors, signed=True)),
         ]
     columns += _comparison_columns(errors, "radius against")
     for model, values in letter.items():
@@ -336,13 +336,13 @@ def spacing_table(rows: Sequence[SpacingRow], caption: str) -> Table:
     known = [row.known_mm for row in rows]
     errors = _signed_errors(measured, measured, known)
     columns: list[_CellColumn] = [
-        (Column("spheres", align="left"), [*(row.name for row in rows), "mean size of the error"]),
+        (Column("spheres"), [*(row.name for row in rows), "mean size of the error"]),
         (Column("known", "mm"), [*known, ""]),
     ]
     for model, values in measured.items():
         columns += [
             (Column("measured", "mm", model), [*values[:-1], ""]),
-            (Column("error", "mm", model), _error_cells(model, errors, signed=True)),
+            (Column("error", "mm", model, "right"), _error_cells(model, errors, signed=True)),
         ]
     return _build_table([*columns, *_comparison_columns(errors, "against")], caption)
 
@@ -351,8 +351,8 @@ def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
     """Table of the alignment of each scan to the reference, beside the Letter's value where there
     is one."""
     columns = [
-        Column("scan", align="left"),
-        Column("reference", align="left"),
+        Column("scan"),
+        Column("reference"),
         Column("ICP RMS", "mm"),
         Column("overlap", "%", digits=0),
         Column("the Letter's ICP RMS", "mm", digits=2),
@@ -363,7 +363,7 @@ def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
     ]
     table = Table(columns, rows, caption)
     has_letter = any(np.isfinite(pair.letter_rms_mm) for pair in pairs)
-    return table if has_letter else table.select(columns[:-1])
+    return table if has_letter else table.select(table.columns[:-1])
 
 
 def _format_incidence(incidence: Mapping[str, float]) -> str | None:
@@ -426,7 +426,7 @@ def _comparison_columns(
     first, *others = errors
     return [
         (
-            Column(f"{words} {first}", "", model, "left"),
+            Column(f"{words} {first}", "", model),
             list(map(compare_errors, errors[model], errors[first])),
         )
         for model in others

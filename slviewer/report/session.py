@@ -129,7 +129,7 @@ def _restrictions_section(data: SessionData) -> Section:
         if data.region
         else ""
     )
-    columns = [Column("scan", align="left"), Column("edit", align="left")]
+    columns = [Column("scan"), Column("edit")]
     table = Table(columns, data.edits, "Edits in effect, in their order")
     return Section("Region and edits", text, [table] if data.edits else [])
 
@@ -139,12 +139,12 @@ def _captures_section(data: SessionData) -> Section:
     used."""
     marks: dict[str, Mark] = {"used": "better", "unused": "worse", "excluded": "worse"}
     columns = [
-        *(Column(title, align="left") for title in ("capture", "role", "state")),
-        Column("camera", "px"),
-        Column("projector", "px"),
+        *(Column(title) for title in ("capture", "role", "state")),
+        Column("camera", "px", align="right"),
+        Column("projector", "px", align="right"),
         Column("frames"),
         Column("period", "px", align="centre"),
-        *(Column(title, align="left") for title in ("made", "why not used")),
+        *(Column(title) for title in ("made", "why not used")),
     ]
     rows: list[list[Value | Cell]] = [
         [
@@ -211,13 +211,13 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
 def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
     """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
     typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
-    columns = [Column("pose", align="left"), Column("camera", "px"), Column("projector", "px")]
+    columns = [Column("pose"), Column("camera", "px"), Column("projector", "px")]
     rows: list[list[Value | Cell]] = []
     for name, values in pose_rms_px.items():
         high = np.array(values) > WORST * typical
         cells = [Cell(v, "worse" if h else "") for v, h in zip(values, high, strict=True)]
         rows.append([name, *cells, Cell("look at this pose" if high.any() else "", "worse")])
-    columns.append(Column("", align="left"))
+    columns.append(Column(""))
     return Table(columns, rows, "Reprojection RMS of each pose").without_empty()
 
 
@@ -274,10 +274,10 @@ def _format_depths(stereo: StereoModel) -> str:
 def _parameters_section(stereo: StereoModel) -> Section:
     """The section with the parameters of both lenses and the pose of the projector."""
     columns = [
-        Column("parameter", align="left"),
+        Column("parameter"),
         Column("unit", align="centre"),
-        Column("camera"),
-        Column("projector"),
+        Column("camera", align="right"),
+        Column("projector", align="right"),
     ]
     note = "± is one standard deviation, from the lens's own calibration."
     return Section(
@@ -286,7 +286,7 @@ def _parameters_section(stereo: StereoModel) -> Section:
         " camera's frame.",
         [
             Table(columns, lens_rows(stereo), "Lenses", [note]),
-            Table([Column("quantity", align="left"), Column("value")], rig_rows(stereo), "Rig"),
+            Table([Column("quantity"), Column("value", align="right")], rig_rows(stereo), "Rig"),
         ],
     )
 
