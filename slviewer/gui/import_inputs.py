@@ -10,8 +10,7 @@ from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Text
 from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel
-from slviewer.session.importers.layouts import layouts
-from slviewer.session.importers.slstudio import Codec
+from slviewer.session.importers.layouts import Codec, layouts
 from slviewer.wizard.snapshot import Snapshot
 
 _DETECT = "detect"

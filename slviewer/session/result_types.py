@@ -22,7 +22,7 @@ Size = tuple[Extent, Extent]
 _Triple = tuple[float, float, float]
 _Matrix3 = tuple[_Triple, _Triple, _Triple]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
-_Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
+Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
 
 
 class Meta(dict[str, Any]):

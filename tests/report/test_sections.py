@@ -376,6 +376,6 @@ def test_how_good_a_calibration_is() -> None:
         "plane_01",
         "recalibrate",
         "the board seems too large",
-        "60.5",
+        "60.500",
     )
     assert missing_facts(words, *facts) == []

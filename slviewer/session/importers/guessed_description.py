@@ -6,9 +6,8 @@ from pathlib import Path
 
 from slviewer.errors import InputError
 from slviewer.examination.guess import Guess, guess_sequence
-from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
-from slviewer.session.importers.imported import visible
+from slviewer.session.importers.imported import images_by_name, visible
 from slviewer.session.names import join_names
 from slviewer.session.reading import expand_user
 from slviewer.session.toml import format_value, table_lines

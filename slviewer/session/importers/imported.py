@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import translate
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +147,28 @@ def define_layout(
         )
 
     return FolderLayout(name, holds, read, is_capture, default)
+
+
+def has_wildcard(name: str) -> bool:
+    """Return whether a name contains the wildcards * or ?."""
+    return "*" in name or "?" in name
+
+
+def match_files(folder: Path, pattern: str) -> list[Path]:
+    """The images in a folder, or in the inner folder that the pattern names, whose name matches, in
+    natural order."""
+    *inner, last = pattern.split("/")
+    folder = folder.joinpath(*inner)
+    if not folder.is_dir():
+        return []
+    matches = re.compile(translate(last.replace("[", "[[]"))).match
+    return [file for file in images_by_name(folder) if matches(file.name)]
+
+
+def images_by_name(folder: Path) -> list[Path]:
+    """The images of a folder in natural order of their names: 2 before 10."""
+    images = [entry for entry in visible(folder) if entry.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted(images, key=lambda file: natural_key(file.name))
 
 
 def match_images(

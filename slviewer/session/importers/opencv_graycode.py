@@ -14,7 +14,6 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.presets import gray
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.session.importers.frame_groups import images_by_name, match_files
 from slviewer.session.importers.images import read_frames
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -22,6 +21,8 @@ from slviewer.session.importers.imported import (
     Imports,
     collect_captures,
     has_images,
+    images_by_name,
+    match_files,
     unknown_files_warning,
 )
 from slviewer.session.names import join_names
