@@ -18,7 +18,7 @@ from slviewer.gui.widgets import (
     report_table,
     to_html,
 )
-from slviewer.inspection.colours import deviation_colours
+from slviewer.inspection.deviation import deviation_colours
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.report.canvas import finish_figure, new_figure, style_axes

@@ -15,7 +15,7 @@ from slviewer.gui.measure_section import CURSORS, SectionPlot, cursor_points
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import PLOT_PX, Painter, Plot
 from slviewer.gui.widgets import Text, link, paragraph
-from slviewer.inspection.colours import colour_limit
+from slviewer.inspection.deviation import colour_limit
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measurements import section_lines
 from slviewer.pipeline.stored_records import Stored, load_arrays, name_records

@@ -12,7 +12,7 @@ from slviewer.gui.panel import PanelContext
 from slviewer.gui.pictures import Painter
 from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, paint
-from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
+from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.measurement import Measurement

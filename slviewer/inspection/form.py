@@ -36,7 +36,7 @@ from slviewer.inspection.uncertainty import (
     draw_steps,
     joint_covariance,
 )
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
 OrientationKind = Literal["parallelism", "perpendicularity"]
@@ -126,12 +126,7 @@ def smooth_deviations(
         if within.all():
             break
         counted[np.flatnonzero(counted)[~within]] = False
-    d, points, normals, coordinates = (
-        d[counted],
-        points[counted],
-        normals[counted],
-        coordinates[counted],
-    )
+    d, points, normals, coordinates = (each[counted] for each in (d, points, normals, coordinates))
     if len(d) < n:
         removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
         whole, residuals = _project_out(d, removed, basis)
@@ -181,20 +176,14 @@ def zone_width(
         change = 1e-3 * smooth.noise_mm + 1e-9
         by_field = np.zeros(len(field))
         for k in (int(field.argmin()), int(field.argmax())):
-            moved = field.copy()
-            moved[k] += np.sign(field[k] - np.median(field)) * change
-            by_field[k] = (
-                (float(width(moved[:, None])[0]) - value)
-                / change
-                * np.sign(field[k] - np.median(field))
-            )
+            sign = np.sign(field[k] - np.median(field))
+            step = np.zeros(len(field))
+            step[k] = sign * change
+            by_field[k] = (float(width((field + step)[:, None])[0]) - value) / change * sign
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
-        variance += float(
-            np.sum(
-                shared(smooth.points[places], answers[None, :, None] * smooth.normals[places]) ** 2
-            )
-        )
+        effects = shared(smooth.points[places], answers[None, :, None] * smooth.normals[places])
+        variance += float(np.sum(effects**2))
     # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have
     # widened it
     sigma = float(np.sqrt(variance + (widths.mean() - value) ** 2 / 3))
@@ -214,13 +203,9 @@ def form_error(
     InputError for another feature or for too few points.
     """
     f = fit.feature
-    wanted = {
-        "flatness": ("plane",),
-        "cylindricity": ("cylinder",),
-        "roundness": ("sphere", "cylinder"),
-    }[kind]
-    if f.kind not in wanted:
-        raise InputError(f"A {f.kind} has no {kind}: choose a {' or a '.join(wanted)}.")
+    wanted = {"flatness": "plane", "cylindricity": "cylinder", "roundness": "sphere or cylinder"}
+    if f.kind not in wanted[kind].split(" or "):
+        raise InputError(f"A {f.kind} has no {kind}: choose a {wanted[kind]}.")
     points = points[finite_rows(points)]
     if kind == "roundness":
         points, axis = _section_points(f, points)
@@ -377,7 +362,7 @@ def profile_error(
     def displaced(places: np.ndarray) -> np.ndarray:
         """Changes of the deviations (n, draws) by the draws of the alignment."""
         assert moves is not None
-        nearest = _nearest_rows(smooth.points, places)
+        nearest = cKDTree(smooth.points).query(places)[1]
         return np.einsum("bni,ni->nb", moves(places), smooth.normals[nearest])
 
     return zone_width(
@@ -512,7 +497,8 @@ def _patch_misfit(
     by how much (mm) some lie off what noise explains."""
     low = coordinates.min(axis=0)
     side = max(float(np.ptp(coordinates, axis=0).max()) / PATCHES, 1e-12)
-    cubes, patch = occupied_cubes(_pad(coordinates - low), side)
+    padding = (0, 0), (0, 3 - coordinates.shape[1])
+    cubes, patch = occupied_cubes(np.pad(coordinates - low, padding), side)
     counts = np.bincount(patch, minlength=len(cubes))
     means = np.bincount(patch, residuals, len(cubes)) / np.maximum(counts, 1)
     large = counts >= POINTS_PER_TERM
@@ -528,11 +514,6 @@ def _patch_misfit(
     worst = int(np.argmax(beyond))
     # a defect seldom fills its patch
     return factor, 2 * float(np.abs(means[large])[worst]) if beyond[worst] > 0 else 0.0
-
-
-def _pad(coordinates: np.ndarray) -> np.ndarray:
-    """Coordinates (n, k) as (n, 3), with zeros."""
-    return np.pad(coordinates, ((0, 0), (0, 3 - coordinates.shape[1])))
 
 
 def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
@@ -568,8 +549,3 @@ def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     towards = points.mean(axis=0) - f.place
     axis = unit_vectors(np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))]))
     return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis
-
-
-def _nearest_rows(points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """The rows (m,) of ``points`` (n, 3) nearest to places (m, 3)."""
-    return cKDTree(points).query(places)[1]

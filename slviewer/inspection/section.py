@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 from slviewer.registration.open3d_loader import open3d
 
 BAND = 12.0

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import msgspec
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.table import Cell, Column, Mark, Rows, Table
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
@@ -228,7 +228,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             Column("limit", "mm"),
             Column("decision"),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [
                 each.property,
                 each.worst.error_mm,
@@ -259,7 +259,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             ),
             Column("points", detail=True),
         ]
-        rows: list[list[Value | Cell]] = []
+        rows: Rows = []
         for each in self.positions:
             shares = [(each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")]
             errors = [

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from slviewer.records.record import Count, Record, Share
-from slviewer.records.table import Column, Table, Value
+from slviewer.records.table import Column, Rows, Table
 from slviewer.records.verdict import Verdict
 
 MIN_WEIGHT = 0.7
@@ -54,7 +54,7 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
             self.reprojection_rms_px,
             [self.focal_px.get(device, (None, None)) for device in devices],
         )
-        rows: list[list[Value]] = [
+        rows: Rows = [
             ["reprojection RMS, px", *map(rms.get, devices), rms.get("stereo")],
             ["focal length x, px", *(x for x, _ in focal), None],
             ["focal length y, px", *(y for _, y in focal), None],
@@ -112,7 +112,7 @@ class PixelwiseFit(msgspec.Struct, frozen=True, tag="pixelwise"):
             Column("poses a pixel", digits=0),
             *(Column(f"RMS in {name}", "mm") for name in "zxy"),
         ]
-        rows: list[list[Value]] = [
+        rows: Rows = [
             [axis, 100 * fit.fitted, fit.poses, fit.z_mm, fit.x_mm, fit.y_mm]
             for axis, fit in self.axes.items()
         ]

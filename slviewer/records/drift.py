@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from slviewer.records.record import Record, Vector
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table
 
 DriftVerdict = Literal["still good", "recalibrate"]
 
@@ -81,7 +81,7 @@ class Drift(Record, frozen=True, kw_only=True):
             Column("±", "px", digits=4, detail=True),
             Column("misfit", "px", detail=True),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [
                 name,
                 each.time[:16].replace("T", " "),

@@ -9,7 +9,7 @@ import msgspec
 
 from slviewer.records.acceptance import MARKS, Decision
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table
 
 RULE = (
     "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
@@ -154,7 +154,7 @@ class Inspection(Record, frozen=True, kw_only=True):
             Column("decision"),
             Column("reason", detail=True),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [
                 *(each.part, wanted.name, wanted.kind, result.value, result.U, wanted.unit),
                 *(wanted.nominal, wanted.lower, wanted.upper),
@@ -185,7 +185,7 @@ class Inspection(Record, frozen=True, kw_only=True):
                 for title in ("value", "from", "to")
             ),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [wanted.name, c.parts, c.mean, c.sigma, wanted.unit, *(c.cp or (None,) * 3), *c.cpk]
             for wanted, c in zip(self.characteristic, self.capability, strict=False)
             if c is not None

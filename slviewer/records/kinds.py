@@ -8,7 +8,6 @@ from slviewer.records import (  # each registers its own
     measurement,
     merge,
     model_comparison,
-    placement,
     reconstruction,
     verification,
 )
@@ -23,7 +22,6 @@ __all__ = [
     "measurement",
     "merge",
     "model_comparison",
-    "placement",
     "reconstruction",
     "verification",
 ]

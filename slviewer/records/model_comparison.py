@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table, Value
 
 
 class HeldOutError(msgspec.Struct, frozen=True):
@@ -88,7 +88,7 @@ class ModelComparison(Record, frozen=True, kw_only=True):
             Column("camera", "px"),
             Column("projector", "px"),
         ]
-        rows: list[list[Value | Cell]] = []
+        rows: Rows = []
         for model, each in self.models.items():
             row: list[Value | Cell] = [Cell(model, "strong" if model == self.recommended else "")]
             for figure in HeldOutError.__struct_fields__:

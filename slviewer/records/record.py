@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import Column, Table, Value
+from slviewer.records.table import Column, Rows, Table
 
 RECORDS: dict[str, type["Record"]] = {}
 """The kinds of records by the folder of their results."""
@@ -82,9 +82,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         each, and a column for every figure."""
         figures = {name: record.figures() for name, record in found.items()}
         names = list(dict.fromkeys(figure for each in figures.values() for figure in each))
-        rows: list[list[Value]] = [
-            [name, *(each.get(f) for f in names)] for name, each in figures.items()
-        ]
+        rows: Rows = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
         return [Table([Column("name"), *map(figure_column, names)], rows, cls.title)]
 
     @property

@@ -25,6 +25,9 @@ class Cell:
     mark: Mark = ""
 
 
+Rows = list[list[Value | Cell]]
+
+
 @dataclass(frozen=True)
 class Column:
     """A column's heading, its unit, the group of neighbours that it shares a heading with, and the

@@ -9,7 +9,7 @@ import msgspec
 
 from slviewer.records.plain import to_plain
 from slviewer.records.record import Count, Record, Vector, list_numbers
-from slviewer.records.table import Cell, Column, Table, Value, compare_errors
+from slviewer.records.table import Cell, Column, Rows, Table, compare_errors
 
 Shape = Literal["plane", "sphere"]
 MAX_EXCLUDED = 0.02
@@ -100,7 +100,7 @@ class Verification(Record, frozen=True, kw_only=True):
                 tables.append(_make_table(of_shape, caption))
         if distances := centre_distances_mm(found):
             models = list(dict.fromkeys(model for each in distances.values() for model in each))
-            rows: list[list[Value]] = [
+            rows: Rows = [
                 [f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()
             ]
             columns = [Column("spheres"), *(Column(model, "mm") for model in models)]
@@ -144,7 +144,7 @@ def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
         Column("coverage", "%", digits=1),
         Column("masked", "%", digits=1, detail=True),
     ]
-    rows: list[list[Value | Cell]] = []
+    rows: Rows = []
     for name, each in found.items():
         for model, fit in each.models.items():
             compared = (

@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from slviewer.records.table import Cell, Column, Mark, Table, Value, better_worse, compare_errors
+from slviewer.records.table import (
+    Cell,
+    Column,
+    Mark,
+    Rows,
+    Table,
+    Value,
+    better_worse,
+    compare_errors,
+)
 from slviewer.report.canvas import HALF
 from slviewer.report.data import (
     ByModel,
@@ -116,7 +125,7 @@ def _calibration_section(data: ReproductionData) -> Section:
     items += [
         PageNotice(f"{name} was excluded: {why}") for name, why in data.poses_left_out.items()
     ]
-    rows: list[list[Value]] = [
+    rows: Rows = [
         [
             f"reprojection, {device}",
             "px",
@@ -357,7 +366,7 @@ def merge_table(pairs: Sequence[MergePair], caption: str) -> Table:
         Column("overlap", "%", digits=0),
         Column("the Letter's ICP RMS", "mm", digits=2),
     ]
-    rows: list[list[Value]] = [
+    rows: Rows = [
         [pair.name, pair.reference, pair.rms_mm, 100 * pair.overlap, pair.letter_rms_mm]
         for pair in pairs
     ]

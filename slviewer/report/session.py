@@ -9,7 +9,7 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
-from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.table import Cell, Column, Mark, Rows, Table
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification
 from slviewer.report.canvas import percentile
@@ -146,7 +146,7 @@ def _captures_section(data: SessionData) -> Section:
         Column("period", "px", align="centre"),
         *(Column(title) for title in ("made", "why not used")),
     ]
-    rows: list[list[Value | Cell]] = [
+    rows: Rows = [
         [
             row.name,
             row.role,
@@ -212,7 +212,7 @@ def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
     """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
     typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
     columns = [Column("pose"), Column("camera", "px"), Column("projector", "px")]
-    rows: list[list[Value | Cell]] = []
+    rows: Rows = []
     for name, values in pose_rms_px.items():
         high = np.array(values) > WORST * typical
         cells = [Cell(v, "worse" if h else "") for v, h in zip(values, high, strict=True)]

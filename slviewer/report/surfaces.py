@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
-from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
+from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
 from slviewer.report.canvas import (
     DENSITY,

@@ -78,6 +78,7 @@ def _parse(file_format: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     mesh = scene.to_mesh()
     if mesh.is_empty:
         raise ValueError("no triangles")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 

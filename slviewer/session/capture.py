@@ -19,7 +19,7 @@ from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes, write_synced_json
 from slviewer.session.names import is_safe_name
 from slviewer.session.reading import decoding, read_json
-from slviewer.session.result_types import Exposure, Size
+from slviewer.session.results import Exposure, Size
 from slviewer.session.stack import (
     FrameStack,
     check_indices,

@@ -20,7 +20,7 @@ from slviewer.records.plain import from_plain
 from slviewer.session.atomic import replace_file, replace_json
 from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json
-from slviewer.session.result_types import Exposure
+from slviewer.session.results import Exposure
 
 _Millimetres = Annotated[float, msgspec.Meta(gt=-1e6, lt=1e6)]
 _Triple = tuple[_Millimetres, _Millimetres, _Millimetres]

@@ -77,7 +77,7 @@ def read_nominal(
     data = _read_bytes(path)
     notes: list[str] = []
     if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
-        vertices, faces = _weld(*cad.load_triangles(path.name, form, data))
+        vertices, faces = cad.load_triangles(path.name, form, data)
         _check_triangles(path.name, vertices, faces, max_triangles)
         units = "mm"
         if form != "3mf":
@@ -115,16 +115,11 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
         for name, mm in MM.items()
         if 1 / MATCHING_SIZE_RATIO < ratio / mm < MATCHING_SIZE_RATIO and name != "mm"
     ]
-    many = (
-        f"about {_format_size(ratio)} times larger"
-        if ratio > 1
-        else f"about {_format_size(1 / ratio)} times smaller"
+    times, than = (ratio, "larger") if ratio > 1 else (1 / ratio, "smaller")
+    comparison = (
+        f"{nominal.name} measures {_format_size(model)} mm across if its numbers are mm, and the"
+        f" scan {_format_size(scan)} mm, about {_format_size(times)} times {than}"
     )
-    sizes = (
-        f"{_format_size(model)} mm across if its numbers are mm, and the scan"
-        f" {_format_size(scan)} mm"
-    )
-    comparison = f"{nominal.name} measures {sizes}, {many}"
     if fitting:
         raise InputError(
             f"{comparison}: give --units {' or --units '.join(fitting)} if it is so, else"
@@ -173,9 +168,9 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
             mesh: Any = trimesh.load(
                 io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False
             )
-            vertices, faces = _weld(
-                np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-            )
+            mesh.merge_vertices(merge_tex=True, merge_norm=True)
+            vertices = np.asarray(mesh.vertices, np.float64)
+            faces = np.asarray(mesh.faces, np.int64)
     except MemoryError as error:
         raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
     except Exception as error:  # a file from anywhere may make its reader fail in any way
@@ -183,11 +178,11 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
             f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model"
             " again, as triangles"
         ) from error
-    declared = re.search(rb"element face (\d{1,12})\b", data[:65536]) if form == "ply" else None
+    declared = _declared_faces(data) if form == "ply" else 0
     # a text that breaks off is read as far as it goes
-    if declared and len(faces) < int(declared[1]):
+    if len(faces) < declared:
         raise SessionError(
-            f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read;"
+            f"{name} is truncated: {len(faces):,} of {declared:,} triangles were read;"
             " export the model again"
         )
     return vertices, faces
@@ -198,13 +193,7 @@ def _check_triangles(
 ) -> None:
     """Raise SessionError where vertices and faces are not triangles, too many, or reach beyond what
     is read."""
-    if (
-        vertices.ndim != 2
-        or vertices.shape[1:] != (3,)
-        or faces.ndim != 2
-        or faces.shape[1:] != (3,)
-        or not len(faces)
-    ):
+    if not vertices.shape[1:] == faces.shape[1:] == (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
     if len(faces) > max_triangles:
         raise _too_many(name, f"{len(faces):,} triangles", max_triangles)
@@ -229,19 +218,16 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
         data = b"\n".join(
             re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE)
         )
-        corners = max(
-            map(len, map(bytes.split, re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE))),
-            default=0,
-        )
+        faces = re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE)
+        corners = max((len(face.split()) for face in faces), default=0)
         if corners > MAX_CORNERS:
             raise SessionError(
                 f"{name} has a face of {corners - 1:,} corners: export the model again, as"
                 " triangles"
             )
-        count = data.count(b"f ") + data.count(b"f\t")
+        count = len(faces)
     elif form == "ply":
-        declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
-        count = int(declared[1]) if declared else 0
+        count = _declared_faces(data)
     elif is_text:
         data = re.sub(rb"(?im)^[ \t]*endsolid[^\n]*\n\s*solid[^\n]*\n", b"", data)
         count = data.lower().count(b"endfacet")
@@ -257,19 +243,10 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
     return data
 
 
-def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) without those that repeat others to 8 decimals, and faces (m, 3) with their
-    new indices."""
-    rounded = np.round(vertices, 8) + 0.0  # no negative zeros
-    mixed = np.zeros(len(rounded), np.uint64)
-    for column in rounded.T.copy().view(np.uint64):
-        mixed = (mixed ^ column) * np.uint64(11400714819323198485)
-        mixed ^= mixed >> np.uint64(29)
-    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-    # two points share a hash: all are kept
-    if not np.array_equal(rounded[first[inverse]], rounded, equal_nan=True):
-        return vertices, faces
-    return vertices[first], inverse[faces]
+def _declared_faces(data: bytes) -> int:
+    """Return the number of faces that the header of a PLY declares; 0 where it declares none."""
+    declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
+    return int(declared[1]) if declared else 0
 
 
 def _is_text_stl(data: bytes) -> bool:
@@ -324,21 +301,15 @@ def _orient_faces(
 ) -> tuple[np.ndarray, bool]:
     """Return the faces wound consistently, outwards where the model is closed; and whether it is
     closed."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    forward = directed[:, 0] < directed[:, 1]
-    keys = np.where(forward, directed[:, 0], directed[:, 1]) * (len(vertices) + 1) + directed.max(
-        axis=1
-    )
-    order = np.argsort(keys, kind="stable")
-    sides = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(keys[order]) != 0, [True]])))
-    closed, manifold = bool((sides == 2).all()), bool((sides <= 2).all())
-    # of a manifold: the places of each edge that two faces share
-    pair = np.flatnonzero(np.diff(keys[order]) == 0)
-    one, other = order[pair], order[pair + 1]
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices.astype(np.float64), faces, process=False)
+    edge, directed = mesh.edges_unique_inverse, mesh.edges
+    sides = np.bincount(edge)
     # neighbours that turn alike run along their side in opposite directions
-    alike = forward[one] == forward[other]
-    if alike.any():
-        turned = _turn_alike(vertices, faces, one // 3, other // 3, alike) if manifold else None
+    balance = np.bincount(edge, np.sign(directed[:, 1] - directed[:, 0]))
+    if ((balance != 0) & (sides > 1)).any():
+        turned = _turn_alike(mesh) if sides.max() == 2 else None
         if turned is None:
             notes.append(
                 "its triangles do not all turn one way, and cannot be turned: some deviations may"
@@ -347,26 +318,24 @@ def _orient_faces(
             return faces, False
         faces = turned
         notes.append("its triangles did not all turn one way: they were turned")
-    if closed:
-        a, b, c = (
-            vertices[faces[:, k]].astype(np.float64) - vertices.mean(axis=0) for k in range(3)
-        )
-        if float(np.sum(a * np.cross(b, c))) < 0:
-            faces = faces[:, ::-1].copy()
-            notes.append("its triangles faced inwards: they were turned")
-    else:
+    if not (sides == 2).all():
         notes.append("it is open: outside is where its triangles face")
-    return faces, closed
+        return faces, False
+    if trimesh.Trimesh(mesh.vertices, faces, process=False).volume < 0:
+        faces = faces[:, ::-1].copy()
+        notes.append("its triangles faced inwards: they were turned")
+    return faces, True
 
 
-def _turn_alike(
-    vertices: np.ndarray, faces: np.ndarray, one: np.ndarray, other: np.ndarray, alike: np.ndarray
-) -> np.ndarray | None:
-    """Faces (m, 3) turned one way, each part of the surface the way in which most of its area
-    faces; None where that is impossible. ``one``, ``other`` (k,): faces that share an edge,
-    ``alike`` (k,): one of the two has to be turned.
-    """
-    m = len(faces)
+def _turn_alike(mesh: Any) -> np.ndarray | None:
+    """Faces (m, 3) of a manifold turned one way, each part of the surface the way in which most of
+    its area faces; None where that is impossible."""
+    from trimesh.grouping import group_rows
+
+    pairs = group_rows(mesh.edges_sorted, require_count=2)
+    one, other = mesh.edges_face[pairs].T
+    alike = mesh.edges[pairs[:, 0], 0] == mesh.edges[pairs[:, 1], 0]
+    m = len(mesh.faces)
     # a node for each face as it is, and one for it turned: two components a part, which are its two
     # orientations
     start = np.concatenate([one, one + m])
@@ -376,10 +345,8 @@ def _turn_alike(
     as_is, turned = labels[:m], labels[m:]
     if (as_is == turned).any():
         return None
-    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     # area that an orientation leaves as it is
-    kept = np.bincount(as_is, area, int(labels.max()) + 1)
+    kept = np.bincount(as_is, mesh.area_faces, int(labels.max()) + 1)
     wrong = kept[as_is] < kept[turned]
     wrong |= (kept[as_is] == kept[turned]) & (as_is > turned)
-    return np.where(wrong[:, None], faces[:, ::-1], faces)
+    return np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces).astype(np.int32)

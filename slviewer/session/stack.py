@@ -24,7 +24,7 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
-from slviewer.session.result_types import Extent
+from slviewer.session.results import Extent
 
 _THREADS = (
     4  # moving and hashing frames releases the interpreter; more threads only queue for the disk

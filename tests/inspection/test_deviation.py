@@ -8,10 +8,15 @@ from facts import raises
 
 from slviewer.errors import InputError
 from slviewer.inspection import placing
-from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
-from slviewer.inspection.deviation import Deviation, deviation
+from slviewer.inspection.deviation import (
+    EXCLUDED_COLOUR,
+    Deviation,
+    colour_limit,
+    deviation,
+    deviation_colours,
+    judge_deviation,
+)
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.tolerance import judge_deviation
 from slviewer.records.measurement import ToleranceVerdict
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.registration.refusal import Refused

@@ -12,7 +12,7 @@ from facts import raises
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.session.capture import NewCapture
-from slviewer.session.importers import layouts, opencv_graycode
+from slviewer.session.importers import layouts
 
 COLUMNS, ROWS = 640, 120
 SIZE = (COLUMNS, ROWS)
@@ -112,31 +112,31 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
     for number, pattern in enumerate(patterns, 1):
         write(tmp_path / "scan" / f"pattern_cam1_im{number}.png", pattern)
     assert layouts.detect_layout(tmp_path) == "opencv-graycode"
-    (capture,) = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
+    (capture,) = layouts.OPENCV_GRAYCODE.read(tmp_path, projector=SIZE)
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
     if shadow:
         for number, pattern in enumerate([*patterns[:-2], *patterns[:-3:-1]], 1):
             write(tmp_path / "black_first" / f"pattern_cam1_im{number}.png", pattern)
-        (other,) = opencv_graycode.LAYOUT.read(tmp_path / "black_first", projector=SIZE)
+        (other,) = layouts.OPENCV_GRAYCODE.read(tmp_path / "black_first", projector=SIZE)
         assert other.frames[-2].mean() > 2 * other.frames[-1].mean()
         for number, pattern in enumerate([*patterns[:-2:2], *patterns[1:-2:2], *patterns[-2:]], 1):
             write(tmp_path / "block" / f"pattern_cam1_im{number}.png", pattern)
         with raises(InputError, *(f"pattern_cam1_im{n}.png" for n in (1, 2, 18)), "--guess"):
-            opencv_graycode.LAYOUT.read(tmp_path / "block", projector=SIZE)
+            layouts.OPENCV_GRAYCODE.read(tmp_path / "block", projector=SIZE)
         shutil.rmtree(tmp_path / "black_first")
         shutil.rmtree(tmp_path / "block")
     write(tmp_path / "scan" / "pattern_cam2_im1.png", U / COLUMNS)
     with raises(InputError, "pattern_cam1_imN", "pattern_cam2_imN", '--files "pattern_cam1_im'):
-        opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
-    found = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
+        layouts.OPENCV_GRAYCODE.read(tmp_path, projector=SIZE)
+    found = layouts.OPENCV_GRAYCODE.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
     # as many images as another projector without, or with them
     other = (2000, ROWS) if shadow else (COLUMNS, 60)
     with pytest.raises(InputError):
-        opencv_graycode.LAYOUT.read(tmp_path, projector=other, files="pattern_cam1_*")
+        layouts.OPENCV_GRAYCODE.read(tmp_path, projector=other, files="pattern_cam1_*")
     with raises(InputError, f"{len(patterns)} images", "4000x120", 40):
-        opencv_graycode.LAYOUT.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
+        layouts.OPENCV_GRAYCODE.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
 
 
 @pytest.mark.computes
