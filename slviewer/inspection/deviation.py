@@ -8,12 +8,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance.figures import judge_property, make_length_error
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.vectors import rms
 from slviewer.inspection.nominal_surface import NominalSurface, search_start
 from slviewer.inspection.uncertainty import RigidSpread, scatter_covariance
-from slviewer.records.acceptance import Decision
+from slviewer.records.acceptance import Decision, worst_decision
 from slviewer.records.measurement import ToleranceVerdict
 from slviewer.registration.pairwise import Registration
 from slviewer.surface.shapes import Mesh
@@ -225,9 +224,6 @@ def _measure_coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float,
     return float(measured.mean()), places[~measured]
 
 
-LIMITED = "deviation of 99.7 % of the points"
-
-
 def judge_deviation(
     deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: float
 ) -> ToleranceVerdict:
@@ -242,18 +238,16 @@ def judge_deviation(
     off = np.abs(signed)
     inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
     numbers = deviation.statistics()
-    ends = [
-        make_length_error(LIMITED, end, numbers[end], typical / 2) for end in ("p_low", "p_high")
-    ]
-    decisions = [
-        judge_property(LIMITED, [end], tolerance_mm).decision or "undecided" for end in ends
-    ]
+    low, high = (
+        (end, judge_limits(end, typical, -tolerance_mm, tolerance_mm))
+        for end in (numbers["p_low"], numbers["p_high"])
+    )
     return ToleranceVerdict(
         tolerance_mm,
         typical,
-        (ends[0].error_mm, decisions[0]),
-        (ends[1].error_mm, decisions[1]),
-        judge_property(LIMITED, ends, tolerance_mm).decision or "undecided",
+        low,
+        high,
+        worst_decision({low[1], high[1]}),
         100 * float(np.mean(off <= tolerance_mm)),
         100 * float(inside.mean()),
         100 * float(outside.mean()),

@@ -117,12 +117,11 @@ would meet, if they do, is far away and means nothing."""
 
 @dataclass(frozen=True)
 class Meaning:
-    """A quantity between two kinds of features, in words, and how it is computed; the first kind
-    comes first in ``features.KINDS``."""
+    """A quantity between two kinds of features, and how it is computed; the first kind comes first
+    in `KINDS`."""
 
     name: str
     unit: Unit
-    words: str
     of: Callable[[Feature, Feature], float]
 
 
@@ -167,57 +166,45 @@ def _size(feature: Feature) -> float:
 
 
 MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
-    ("point", "point"): (Meaning("distance", "mm", "between the two points", _distance),),
-    ("point", "plane"): (
-        Meaning("height", "mm", "of the point over the plane, positive on the camera's side",
-        _height),
-    ),
+    ("point", "point"): (Meaning("distance", "mm", _distance),),
+    # positive on the camera's side
+    ("point", "plane"): (Meaning("height", "mm", _height),),
     ("point", "sphere"): (
-        Meaning("distance from the centre", "mm", "of the point", _distance),
-        Meaning(
-            "distance from the surface", "mm", "of the point, negative inside", lambda p,
-            s: _distance(p, s) - _size(s)
-        ),
+        Meaning("distance from the centre", "mm", _distance),
+        # negative inside
+        Meaning("distance from the surface", "mm", lambda p, s: _distance(p, s) - _size(s)),
     ),
     ("point", "cylinder"): (
-        Meaning("distance from the axis", "mm", "of the point", _offset),
-        Meaning(
-            "distance from the surface", "mm", "of the point, negative inside", lambda p,
-            c: _offset(p, c) - _size(c)
-        ),
+        Meaning("distance from the axis", "mm", _offset),
+        Meaning("distance from the surface", "mm", lambda p, c: _offset(p, c) - _size(c)),
     ),
     ("plane", "plane"): (
-        Meaning("angle", "deg", "between the planes, 0 to 90", _angle),
-        Meaning("distance", "mm",
-                "of the middle of each region from the other's plane, the mean of both",
-                _plane_gap),
+        Meaning("angle", "deg", _angle),
+        # of the middle of each region from the other's plane, the mean of both
+        Meaning("distance", "mm", _plane_gap),
     ),
     ("plane", "sphere"): (
-        Meaning("height of the centre", "mm", "over the plane", lambda p, s: _height(s, p)),
-        Meaning("gap", "mm", "to the sphere, negative where they cut", lambda p,
-        s: abs(_height(s, p)) - _size(s)),
+        Meaning("height of the centre", "mm", lambda p, s: _height(s, p)),
+        # negative where they cut
+        Meaning("gap", "mm", lambda p, s: abs(_height(s, p)) - _size(s)),
     ),
     ("plane", "cylinder"): (
-        Meaning("angle", "deg", "between the axis and the plane", lambda p, c: 90.0 - _angle(p, c)),
-        Meaning("height of the axis", "mm",
-        "over the plane, in the middle of the cylinder's region",
-                lambda p, c: _height(c, p)),
+        # between the axis and the plane
+        Meaning("angle", "deg", lambda p, c: 90.0 - _angle(p, c)),
+        # in the middle of the cylinder's region
+        Meaning("height of the axis", "mm", lambda p, c: _height(c, p)),
     ),
     ("sphere", "sphere"): (
-        Meaning("distance of the centres", "mm", "of the two spheres", _distance),
-        Meaning("gap", "mm", "between the spheres", lambda a,
-        b: _distance(a, b) - _size(a) - _size(b)),
+        Meaning("distance of the centres", "mm", _distance),
+        Meaning("gap", "mm", lambda a, b: _distance(a, b) - _size(a) - _size(b)),
     ),
-    ("sphere", "cylinder"): (
-        Meaning("distance from the axis", "mm", "of the sphere's centre", _offset),
-    ),
+    ("sphere", "cylinder"): (Meaning("distance from the axis", "mm", _offset),),
     ("cylinder", "cylinder"): (
-        Meaning("angle", "deg", "between the axes, 0 to 90", _angle),
-        Meaning("distance of the axes", "mm",
-        f"the shortest; within {PARALLEL_DEG:g} degrees of parallel, that in the "
-                "middle of the regions", _axis_gap),
+        Meaning("angle", "deg", _angle),
+        # the shortest; near parallel, that in the middle of the regions
+        Meaning("distance of the axes", "mm", _axis_gap),
     ),
-}  # fmt: skip
+}
 """The quantities of each pair of feature kinds."""
 
 
@@ -240,13 +227,8 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
             """Return the quantity after the features' parameters change by a step (p + q,)."""
             return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
 
-        return Quantity(
-            meaning.name,
-            meaning.of(a, b),
-            meaning.unit,
-            propagate_covariance(moved, covariance),
-            whole,
-        )
+        sigma = propagate_covariance(moved, covariance)
+        return Quantity(meaning.name, meaning.of(a, b), meaning.unit, sigma, whole)
 
     return [quantity(meaning) for meaning in MEANINGS[a.kind, b.kind]]
 

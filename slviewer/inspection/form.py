@@ -13,7 +13,7 @@ never narrower than the minimum zones of ISO 1101.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -303,34 +303,25 @@ def position_error(
     if f.direction is None:
         reached = np.zeros((1, 3))
     elif f.kind == "cylinder":
-        lengths = (points - f.place) @ f.direction
-        reached = np.array([lengths.min(), lengths.max()])[:, None] * f.direction
+        along = (points - f.place) @ f.direction
+        reached = np.array([along.min(), along.max()])[:, None] * f.direction
     else:
         reached = points[:: -(-len(points) // 200)] - f.place
     rng = np.random.default_rng(2)
     moves = None if alignment is None else alignment.draw(rng)
     steps = draw_steps(fit.spread.covariance, rng)
 
+    place_or_axis = replace(nominal, radius=None)
+
     def off(feature: Feature, moved: np.ndarray | float) -> float:
         """Twice how far a feature, moved by (k, 3), is off its nominal."""
-        if feature.direction is None:
-            return 2 * float(np.linalg.norm(feature.place + moved - nominal.place))
-        normal_or_axis = nominal.unit_direction
-        if feature.kind == "cylinder":
-            ends = (
-                feature.place
-                + (reached @ f.unit_direction)[:, None] * feature.unit_direction
-                + moved
-            )
-            offsets = ends - nominal.place
-            return 2 * float(
-                lengths(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis).max()
-            )
-        # the plane's points under the measured ones
-        heights = reached - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
-        return 2 * float(
-            np.abs((feature.place + heights + moved - nominal.place) @ normal_or_axis).max()
-        )
+        places = feature.place + reached + moved
+        if f.kind == "cylinder":
+            turned = feature.unit_direction - f.unit_direction
+            places = places + (reached @ f.unit_direction)[:, None] * turned
+        elif f.kind == "plane":  # the plane's points under the measured ones
+            places = places - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
+        return 2 * float(np.abs(place_or_axis.distance(places)).max())
 
     shifts = np.zeros((DRAWS, len(reached), 3)) if moves is None else moves(f.place + reached)
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])

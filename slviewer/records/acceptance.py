@@ -1,6 +1,6 @@
 """Tests of a calibration with certified artefacts, against the operator's limits."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import hypot
 from typing import Any, ClassVar, Literal
 
@@ -19,6 +19,11 @@ RULE = (
     " ISO 10360-13, and claims conformity with neither."
 )
 MARKS: Mapping[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
+
+
+def worst_decision(decisions: Collection[Decision]) -> Decision:
+    """Return "fail" where one fails, else "undecided" where one is, else "pass"."""
+    return next((each for each in ("fail", "undecided") if each in decisions), "pass")
 
 
 class PropertyError(msgspec.Struct, frozen=True):
@@ -183,12 +188,9 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
         """Convert a record of version 0.2, whose figures were one entry."""
-        old = meta.get("accepted")
-        return (
-            {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})}
-            if isinstance(old, dict)
-            else meta
-        )
+        if not isinstance(old := meta.get("accepted"), dict):
+            return meta
+        return {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})}
 
     @property
     def is_good(self) -> bool:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import msgspec
 
-from slviewer.records.acceptance import MARKS, Decision
+from slviewer.records.acceptance import MARKS, Decision, worst_decision
 from slviewer.records.record import Count, Record
 from slviewer.records.table import Cell, Column, Rows, Table
 
@@ -66,8 +66,7 @@ class PartResult(msgspec.Struct, frozen=True):
     decision: Decision = "pass"
 
     def __post_init__(self) -> None:
-        decisions = {each.decision for each in self.results}
-        worst = next((each for each in ("fail", "undecided") if each in decisions), "pass")
+        worst = worst_decision({each.decision for each in self.results})
         msgspec.structs.force_setattr(self, "decision", worst)
 
 

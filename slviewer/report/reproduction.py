@@ -121,8 +121,7 @@ def inside_ratio(rows: Sequence[PlaneRow]) -> tuple[float, int]:
 def _calibration_section(data: ReproductionData) -> Section:
     """The section about the calibration: notices, reprojection errors, per-pixel fits and
     curves."""
-    items: list[Item] = [PageNotice(note) for note in data.notes]
-    items += [
+    items: list[Item] = [
         PageNotice(f"{name} was excluded: {why}") for name, why in data.poses_left_out.items()
     ]
     rows: Rows = [

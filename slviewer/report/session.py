@@ -9,6 +9,7 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.table import Cell, Column, Mark, Rows, Table
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification
@@ -57,7 +58,7 @@ def session_headlines(data: SessionData) -> list[Headline]:
                     f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else "",
                 )
             )
-    fits = [(percentile(fit.rms_mm[0], 50), fit.axis) for fit in data.pixel_fits]
+    fits = [(percentile(rms[0], 50), axis) for axis, rms in data.pixel_fits.items()]
     if known := [fit for fit in fits if np.isfinite(fit[0])]:
         rms_z, axis = min(known)
         note = f"median over the pixels, axis {axis}"
@@ -102,7 +103,7 @@ def session_sections(data: SessionData) -> list[Section]:
             "Each camera pixel's own rational function from phase to depth, and lines from depth to"
             " x and y."
         )
-        maps = [rms_maps(fit.rms_mm, fit.axis) for fit in data.pixel_fits]
+        maps = [rms_maps(rms, axis) for axis, rms in data.pixel_fits.items()]
         sections.append(Section("Pixel-wise model", text, maps))
     sections += [_records_section(view) for view in data.records]
     if data.region or data.edits:
@@ -250,7 +251,7 @@ def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
     """Table rows with the projector's pose in the camera frame as text: (quantity, value with its
     unit)."""
     R, t = stereo.rig.R, np.asarray(stereo.rig.t, float).ravel()
-    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    angle = np.degrees(rotation_angle(R))
     axes = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
     return [
         ("baseline (distance of the two devices)", f"{np.linalg.norm(t):.2f} mm"),

@@ -174,6 +174,8 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
 def draw_merged_cloud(view: CloudView) -> Figure:
     """The merged cloud: illuminated as one surface, and coloured by the scan that each point comes
     from."""
+    from matplotlib.colors import to_rgba_array
+
     points, normals, source = _sample_points(view)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)
@@ -183,7 +185,7 @@ def draw_merged_cloud(view: CloudView) -> Figure:
     left.imshow(render_points(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
     left.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
     style_image_axes(right, "by scan, in turns")
-    palette = np.array([_parse_colour(colour) for colour in SCANS])
+    palette = to_rgba_array(SCANS)[:, :3]
     shown = _select_mosaic(points, source) if len(points) else np.arange(0)
     points, normals, source = points[shown], normals[shown], source[shown]
     right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
@@ -209,22 +211,17 @@ def _sample_points(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     """Points, normals and source (n,) of at most MOST_POINTS measured points, evenly thinned."""
     from slviewer.reconstruction.reconstruct import normals as grid_normals
 
-    points, normals = view.points, view.normals
-    if points.ndim == 3:
+    points = view.points
+    if view.normals is None or view.source is None:
         step = max(1, int(np.ceil(np.sqrt(np.isfinite(points[..., 2]).sum() / MOST_POINTS))))
         points = np.ascontiguousarray(points[::step, ::step], np.float32)
-        normals = grid_normals(points) if normals is None else normals[::step, ::step]
-        points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
+        normals = grid_normals(points).reshape(-1, 3)
+        points = points.reshape(-1, 3)
         source = np.zeros(len(points), np.intp)
     else:
         step = max(1, -(-len(points) // MOST_POINTS))
-        points = points[::step]
-        normals = np.full(points.shape, np.nan) if normals is None else normals[::step]
-        source = (
-            np.zeros(len(points), np.intp)
-            if view.source is None
-            else view.source[::step].astype(np.intp)
-        )
+        points, normals = points[::step], view.normals[::step]
+        source = view.source[::step].astype(np.intp)
     known = np.isfinite(points).all(axis=1)
     return points[known], normals[known], source[known]
 
@@ -250,14 +247,8 @@ def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
 
 
 def _format_count(view: CloudView) -> str:
-    """Text with the number of valid points of a view, and its note."""
-    count = int(np.isfinite(view.points[..., 2]).sum())
-    return f"{count:,} points" + (f"; {view.note}" if view.note else "")
-
-
-def _parse_colour(colour: str) -> tuple[float, ...]:
-    """RGB, 0 to 1, of a colour ``#rrggbb``."""
-    return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    """Text with the number of valid points of a view."""
+    return f"{int(np.isfinite(view.points[..., 2]).sum()):,} points"
 
 
 Lines = Sequence[NDArray[np.floating]]

@@ -13,8 +13,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from slviewer.errors import InputError, SessionError
+from slviewer.geometry.vectors import lengths
 from slviewer.session import cad
-from slviewer.session.reading import expand_user, read_file
+from slviewer.session.reading import expand_user, read_input
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
@@ -144,13 +145,8 @@ def _read_bytes(path: Path) -> bytes:
             f"{path.name} is not a nominal model that can be read: give an STL, PLY, OBJ, STEP or"
             " 3MF file"
         )
-    try:
-        return read_file(path, MAX_BYTES)
-    except OSError as error:
-        reason = error.strerror or error
-        raise SessionError(
-            f"{path} cannot be read ({reason}): give a file of up to {MAX_BYTES >> 20} MiB"
-        ) from error
+    remedy = f"give a file of up to {MAX_BYTES >> 20} MiB"
+    return read_input(path, MAX_BYTES, remedy, SessionError)
 
 
 def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndarray, np.ndarray]:
@@ -269,8 +265,8 @@ def _drop_degenerate(
     """Vertices and faces without triangles that have no area, and without the vertices that only
     those had."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    sides = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
-    sound = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9 * sides**2
+    sides = np.maximum(lengths(b - a), lengths(c - a))
+    sound = lengths(np.cross(b - a, c - a)) > 1e-9 * sides**2
     flat = len(faces) - int(np.count_nonzero(sound))
     if flat > MAX_DEGENERATE_SHARE * len(faces):
         raise SessionError(
@@ -284,14 +280,13 @@ def _drop_degenerate(
     rolled = np.take_along_axis(
         faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1
     )
-    order = np.lexsort(rolled.T[::-1])
-    repeated = order[1:][(np.diff(rolled[order], axis=0) == 0).all(axis=1)]
-    if len(repeated):
+    first = np.unique(rolled, axis=0, return_index=True)[1]
+    if repeated := len(faces) - len(first):
         notes.append(
-            f"{len(repeated):,} of {len(faces):,} triangles were repetitions of others: they were"
+            f"{repeated:,} of {len(faces):,} triangles were repetitions of others: they were"
             " removed"
         )
-        faces = np.delete(faces, repeated, axis=0)
+        faces = faces[np.sort(first)]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 

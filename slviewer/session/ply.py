@@ -11,7 +11,7 @@ from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.printable import escape_controls
 from slviewer.session.atomic import arriving_file
-from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_file
+from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_input
 
 PLACE, NORMAL, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
@@ -91,12 +91,7 @@ def read_ply(path: str | Path) -> Ply:
     polygons).
     """
     path = Path(path)
-    try:
-        data = read_file(path, MAX_CLOUD_BYTES)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror or error}): check its name."
-        ) from None
+    data = read_input(path, MAX_CLOUD_BYTES, "check its name.")
     end = data.find(b"end_header\n")
     lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:

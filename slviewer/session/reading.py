@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from slviewer.errors import DamagedError, InputError
+from slviewer.errors import DamagedError, InputError, SlviewerError
 
 MAX_JSON_BYTES = 1 << 24
 MAX_TOML_BYTES = 1 << 20
@@ -68,6 +68,17 @@ def read_file(path: Path, max_bytes: int) -> bytes:
         return file.read(size)  # of a growing file, what it had
 
 
+def read_input(
+    path: Path, max_bytes: int, remedy: str, error: type[SlviewerError] = InputError
+) -> bytes:
+    """Return the content of a regular file; raises ``error``, with the reason and the remedy, where
+    `read_file` raises OSError."""
+    try:
+        return read_file(path, max_bytes)
+    except OSError as fault:
+        raise error(f"{path} cannot be read ({_reason(fault)}): {remedy}") from fault
+
+
 def read_json(
     path: Path, remedy: str = "restore it from a copy, or move its folder away"
 ) -> dict[str, Any]:
@@ -86,14 +97,10 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     """The tables of a TOML file. Raises InputError where it cannot be read, with the reason."""
     path = expand_user(path)
     try:
-        text = read_file(path, MAX_TOML_BYTES).decode()
+        text = read_input(path, MAX_TOML_BYTES, "give the TOML file that is needed here").decode()
         if _DEEP_KEY.search(text):  # which would take the parser hours
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         data: dict[str, Any] = _check_values(tomllib.loads(text))
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({_reason(error)}): give the TOML file that is needed here"
-        ) from error
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{path} is not TOML ({_reason(error)}): correct it there") from error
     return data

@@ -7,7 +7,7 @@ import trimesh
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.inspection import placing
+from slviewer.inspection import nominal_surface
 from slviewer.inspection.deviation import (
     EXCLUDED_COLOUR,
     Deviation,
@@ -162,8 +162,8 @@ def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
         normals @ R.T,
         Mesh(box.vertices, box.faces),
     )
-    views = placing.VIEWS[-2:]  # corners; a box has no front
-    start = placing.search_start(
+    views = nominal_surface.VIEWS[-2:]  # corners; a box has no front
+    start = nominal_surface.search_start(
         scan, facing, NominalSurface(nominal), None, lambda share: None, views
     )
     found = deviation(scan, nominal, normals=facing, initial=start.T_reference_scan)
@@ -218,20 +218,22 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
 
 def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
     monkeypatch.setattr(
-        placing, "register_prepared", lambda *given, **options: pytest.fail("a pose was refined")
+        nominal_surface,
+        "register_prepared",
+        lambda *given, **options: pytest.fail("a pose was refined"),
     )
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
     box = trimesh.creation.box((120, 100, 70))
     other = NominalSurface(Mesh(box.vertices, box.faces))
     with raises(Refused, "nominal model", "%") as refusal:
-        placing.search_start(
+        nominal_surface.search_start(
             points[seen][::3],
             normals[seen][::3],
             other,
             None,
             lambda share: None,
-            placing.VIEWS[:2],
+            nominal_surface.VIEWS[:2],
         )
     assert refusal.value.reason == "overlap"
     with raises(InputError, "triangles"):

@@ -94,6 +94,14 @@ def test_position_is_the_diameter_of_the_zone() -> None:
     assert_covers(q, 2 * np.linalg.norm([0.03, 0.02, 0.01]), 0.015)
 
 
+def test_position_of_an_axis_is_that_of_its_ends() -> None:
+    points = cylinder(8, 0.0, tilt=0.004)
+    fit = fit_feature("cylinder", points)
+    nominal = Feature("cylinder", np.zeros(3), np.array([0.0, 0.0, 1.0]), fit.feature.radius)
+    ends = np.abs(points[:, 2]).max()
+    assert_covers(position_error(fit, points, nominal), 2 * 0.004 * ends, 0.03)
+
+
 def test_profile_is_twice_the_largest_deviation() -> None:
     points = plate(11, bow=0.1)
     nominal = Feature("plane", np.zeros(3), np.array([0.0, 0.0, 1.0]))

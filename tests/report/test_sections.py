@@ -165,7 +165,6 @@ def test_an_empty_reproduction_still_makes_a_page() -> None:
         fit_rms_mm={},
         reprojection_rms_px={},
         poses_left_out={"pose_02": "board not found"},
-        notes=["something was odd"],
     )
     sections = reproduction_sections(data)
     assert len(sections) == 4 and len(reproduction_headlines(data)) == 2
@@ -229,7 +228,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
 
 def test_a_session_with_nothing_in_it() -> None:
     data = dataclasses.replace(
-        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), records=(), warnings=()
+        session_data(WIDTH), captures=[], calibration=None, pixel_fits={}, records=(), warnings=()
     )
     (section,) = session_sections(data)
     assert missing_facts(texts(section), "captures") == [] and session_headlines(data) == []
@@ -240,7 +239,7 @@ def test_a_calibration_made_elsewhere() -> None:
     assert data.calibration is not None
     bare = CalibrationFigures(StereoModel.from_rig(data.calibration.stereo.rig))
     sections = session_sections(
-        dataclasses.replace(data, calibration=bare, records=(), pixel_fits=())
+        dataclasses.replace(data, calibration=bare, records=(), pixel_fits={})
     )
     assert missing_facts(texts(sections[1]), "elsewhere") == []
 

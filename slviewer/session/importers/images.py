@@ -17,7 +17,7 @@ from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
-from slviewer.session.reading import MAX_IMAGE_BYTES, read_file
+from slviewer.session.reading import MAX_IMAGE_BYTES, read_file, read_input
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
@@ -135,12 +135,7 @@ def reduce_channels(
 def read_image(path: Path) -> np.ndarray:
     """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly
     an image."""
-    try:
-        data = read_file(path, MAX_IMAGE_BYTES)
-    except OSError as error:
-        raise InputError(
-            f"{_short_path(path)} cannot be read ({error.strerror or error}): check the file"
-        ) from error
+    data = read_input(path, MAX_IMAGE_BYTES, "check the file")
     if fault := _describe_fault(data):
         raise InputError(f"{_short_path(path)} is {fault}: copy or record it again")
     width = height = 0

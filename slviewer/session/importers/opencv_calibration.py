@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.rig import LARGEST_BASELINE_MM
+from slviewer.geometry.rigid import nearest_rotation
 from slviewer.session.importers.filestorage import Storage
 
 ENTRIES = ("K_camera", "D_camera", "K_projector", "D_projector", "R", "T")
@@ -149,10 +150,9 @@ def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
         raise InputError(
             f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3"
         )
-    U, _, Vt = np.linalg.svd(matrix)
-    nearest = U @ Vt
+    nearest = nearest_rotation(matrix)
     error = np.abs(matrix - nearest).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
+    if error > _ROTATION_TOLERANCE:
         raise InputError(
             f"{where} is not a rotation (off by {error:.2g}, determinant"
             f" {np.linalg.det(matrix):.3g}): check it"
