@@ -242,12 +242,25 @@ def collect_captures(
     and has nothing of one inside is skipped too. Raises InputError where the source holds no
     captures (they should look like `looks_like`), or none can be used.
     """
-    folders, empty, warnings = _capture_folders(source, is_capture, looks_like)
-    recordings, skipped = (
-        [],
-        [Skipped(folder.name, f"it holds no frames ({looks_like})") for folder in empty],
-    )
-    for folder in folders:
+    source, *inner = list_folders(source)
+    captures = [source] if is_capture(source) else list(filter(is_capture, inner))
+    if not captures:
+        raise InputError(
+            f"{source} holds no captures: {looks_like} was looked for in it and in the folders"
+            " inside"
+        )
+    recordings, warnings, skipped = [], [], []
+    stems = {_name_pattern(folder) for folder in captures}
+    for folder in inner if captures != [source] else ():
+        if folder in captures:
+            continue
+        if _name_pattern(folder) in stems:
+            skipped.append(Skipped(folder.name, f"it holds no frames ({looks_like})"))
+        else:
+            warnings.append(
+                f"folder {folder.name} was left aside: it holds no capture ({looks_like})"
+            )
+    for folder in captures:
         try:
             recording, more = describe(folder, capture_name(folder, prefix))
         except InputError as error:
@@ -283,33 +296,15 @@ def none_usable(skipped: Sequence[Skipped]) -> InputError:
     )
 
 
-def _capture_folders(
-    source: Path, is_capture: Callable[[Path], bool], looks_like: str
-) -> tuple[list[Path], list[Path], list[str]]:
-    """Capture folders in counting order, folders that are only named like these, and warnings about
-    all others."""
+def list_folders(source: Path) -> list[Path]:
+    """The folder, and those right inside it in counting order. InputError where it is none."""
     source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     if not source.is_dir():
         raise InputError(
             f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
         )
-    if is_capture(source):
-        return [source], [], []
-    inner = sorted(
-        (entry for entry in visible(source) if entry.is_dir()),
-        key=lambda entry: natural_key(entry.name),
-    )
-    captures = [folder for folder in inner if is_capture(folder)]
-    if not captures:
-        raise InputError(
-            f"{source} holds no captures: {looks_like} was looked for in it and in the folders"
-            " inside"
-        )
-    stems = {_name_pattern(folder) for folder in captures}
-    others = [folder for folder in inner if folder not in captures]
-    empty = [folder for folder in others if _name_pattern(folder) in stems]
-    return captures, empty, [f"folder {f.name} was left aside: it holds no capture ({looks_like})"
-                             for f in others if f not in empty]  # fmt: skip
+    inner = [entry for entry in visible(source) if entry.is_dir()]
+    return [source, *sorted(inner, key=lambda entry: natural_key(entry.name))]
 
 
 def capture_name(folder: Path, prefix: str | None) -> str:

@@ -56,13 +56,13 @@ from slviewer.session.importers.imported import (
     define_layout,
     has_images,
     images_by_name,
+    list_folders,
     match_files,
     match_images,
     unknown_files_warning,
     visible,
 )
 from slviewer.session.names import join_names
-from slviewer.session.reading import expand_user
 
 _ILLUMINATED, _MOSTLY = 0.25, 0.9
 """Share of the largest difference from which on a pixel counts; share of these in which white is
@@ -465,14 +465,9 @@ def detect_layout(source: Path) -> str:
 
     A TOML in the folder describes the images: it decides.
     """
-    source = expand_user(source)
-    if not source.is_dir():
-        raise InputError(
-            f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
-        )
-    if find_description(source) is not None:
+    folders = list_folders(source)
+    if find_description(folders[0]) is not None:
         return "frames"
-    folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
     candidates = [
         name
         for name, layout in layouts().items()
