@@ -7,10 +7,15 @@ import numpy as np
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.rigid import move_points
-from slviewer.inspection.datums import datum_frame, datum_spread, face_towards
 from slviewer.inspection.deviation import Deviation, deviation, judge_limits
 from slviewer.inspection.features import relation
-from slviewer.inspection.fitting import FeatureFit, fit_feature
+from slviewer.inspection.fitting import (
+    FeatureFit,
+    datum_frame,
+    datum_spread,
+    face_towards,
+    fit_feature,
+)
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.uncertainty import RigidSpread, Shared

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.inspection.datums import datum_frame
 from slviewer.inspection.features import Feature
+from slviewer.inspection.fitting import datum_frame
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measured_surface import load_surface

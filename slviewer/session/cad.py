@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import SessionError
-from slviewer.session.isolated import limit_process, run_isolated
+from slviewer.session.reading import limit_process, run_isolated
 
 PACKAGES = {"step": ("cascadio",), "stp": ("cascadio",), "3mf": ("lxml", "networkx")}
 """What reading a format needs."""

@@ -3,16 +3,19 @@ numbers.
 
 Only regular files are read (a pipe or a device would never end), and none larger than its kind may
 be. What JSON and TOML hold is limited to what a record needs: `MAX_DEPTH` levels and integers of 64
-bits, so that nothing that walks it later runs out of stack or range.
+bits, so that nothing that walks it later runs out of stack or range. Parsers that a malformed file
+can crash or exhaust run in a process of their own within limits.
 """
 
 import json
 import os
 import re
 import stat
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -163,3 +166,50 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, OSError):
         return str(error.strerror or error)
     return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+MEMORY_BYTES = 2 << 30
+_PATIENCE_S = 60
+
+
+def run_isolated(
+    module: str, *arguments: str, data: bytes = b"", cpu_s: int = 10
+) -> tuple[int, bytes]:
+    """Run ``python -m module`` with arguments and ``data`` as its input; return its exit status and
+    what it wrote.
+
+    The module limits itself by `limit_process`, to ``cpu_s`` of processor time. Status 1: it raised
+    an exception; any other but 0: it crashed, or needed more memory or time than it may.
+    """
+    paths = os.pathsep.join(filter(None, sys.path))
+    environment = {
+        **os.environ,
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": paths,
+        "SLVIEWER_CPU_S": str(cpu_s),
+    }
+    sent: dict[str, Any] = {"input": data} if data else {"stdin": subprocess.DEVNULL}
+    try:
+        ran = subprocess.run(
+            [sys.executable, "-m", module, *arguments],
+            **sent,
+            capture_output=True,
+            timeout=_PATIENCE_S + cpu_s,
+            env=environment,
+        )
+    except subprocess.TimeoutExpired:
+        return -1, b""
+    return ran.returncode, ran.stdout
+
+
+def limit_process() -> None:
+    """Limit memory and processor time of this process, where the system can."""
+    if sys.platform == "win32":
+        return
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        seconds = int(os.environ["SLVIEWER_CPU_S"])
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

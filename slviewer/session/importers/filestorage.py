@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.session.isolated import limit_process, run_isolated
-from slviewer.session.reading import read_input
+from slviewer.session.reading import limit_process, read_input, run_isolated
 
 _MAX_BYTES = 1 << 24
 _MAX_NUMBERS = 10_000
