@@ -1,6 +1,6 @@
 """A nominal model: signed distances of points from it, and initial alignment of a scan to it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -154,12 +154,11 @@ def search_start(
     surface: NominalSurface,
     sigma_mm: float | None,
     report: Callable[[float], None],
-    views: Sequence[np.ndarray] = VIEWS,
 ) -> Registration:
     """The scan (n, 3) registered to the nominal.
 
     A scan shows one side of a part: the nominal is tried as a camera sees it from each of
-    ``views``, until one fits well; else the best that is accepted. Raises the first refusal where
+    `VIEWS`, until one fits well; else the best that is accepted. Raises the first refusal where
     none is.
     """
     places, facing = surface.sample(SAMPLES)
@@ -170,8 +169,8 @@ def search_start(
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None
-    for turn, view in enumerate(views):
-        report(turn / len(views))
+    for turn, view in enumerate(VIEWS):
+        report(turn / len(VIEWS))
         visible = surface.seen_from(places, facing, view, MIN_FACING_COSINE)
         if np.count_nonzero(visible) < MIN_VISIBLE:
             continue

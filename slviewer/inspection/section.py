@@ -160,9 +160,9 @@ def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
     return Quantity("radius", sides[0] * sides[1] * sides[2] / (2 * area), "mm")
 
 
-def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None) -> np.ndarray:
-    """(2,) mm: where a cursor at ``x`` meets the section, at the line nearest to ``y`` or else the
-    highest one; the nearest point drawn where no line passes x."""
+def nearest_on_section(lines: list[np.ndarray], x: float) -> np.ndarray:
+    """(2,) mm: where a cursor at ``x`` meets the section, at the highest line; the nearest point
+    drawn where no line passes x."""
     met = []
     for line in lines:
         left, right = line[:-1], line[1:]
@@ -174,4 +174,4 @@ def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None
     if not heights.size:
         drawn = np.concatenate(lines)
         return drawn[np.argmin(np.abs(drawn[:, 0] - x))]
-    return np.array([x, heights.max() if y is None else heights[np.argmin(np.abs(heights - y))]])
+    return np.array([x, heights.max()])

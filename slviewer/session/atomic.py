@@ -44,13 +44,13 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def rename(source: Path, target: Path, patience_s: float = _PATIENCE_S) -> None:
+def rename(source: Path, target: Path) -> None:
     """Rename a file over another one, or a folder to a name that is free.
 
     Windows refuses while another program has it open, such as a virus scanner, an indexer or a copy
-    of the folder: it is tried again for ``patience_s``.
+    of the folder: it is tried again for some seconds.
     """
-    end = time.monotonic() + patience_s
+    end = time.monotonic() + _PATIENCE_S
     while True:
         try:
             os.replace(source, target) if source.is_file() else os.rename(source, target)
@@ -86,10 +86,10 @@ def replace_json(path: Path, data: Any) -> None:
     replace_file(path, to_json(data))
 
 
-def replace_file(path: Path, data: bytes, patience_s: float = _PATIENCE_S) -> None:
+def replace_file(path: Path, data: bytes) -> None:
     """Replace a file by a new one in one step. Raises SessionError where the disk refuses, or
-    another program still has the old one open after ``patience_s``; the old one then stays."""
-    with _arriving(path, len(data), patience_s) as temporary:
+    another program still has the old one open after some seconds; the old one then stays."""
+    with _arriving(path, len(data)) as temporary:
         write_bytes(temporary, data)
 
 
@@ -117,7 +117,7 @@ def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
 
 
 @contextmanager
-def _arriving(path: Path, needs_bytes: int, patience_s: float = _PATIENCE_S) -> Iterator[Path]:
+def _arriving(path: Path, needs_bytes: int) -> Iterator[Path]:
     """Context manager: a path beside ``path`` for a file that is renamed to it at the end, and
     removed where that fails."""
     temporary = _staging_path(path, "tmp")
@@ -125,7 +125,7 @@ def _arriving(path: Path, needs_bytes: int, patience_s: float = _PATIENCE_S) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield temporary
-            rename(temporary, path, patience_s)
+            rename(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise

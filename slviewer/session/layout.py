@@ -53,14 +53,11 @@ def session_folder(path: str | Path) -> Path:
     return folder
 
 
-def new_folder(path: str | Path, is_windows: bool = _IS_WINDOWS) -> tuple[Path, bool]:
+def new_folder(path: str | Path) -> tuple[Path, bool]:
     """A folder that a session may be made in, and whether it was made here, else empty;
-    SessionError otherwise.
-
-    ``is_windows``: paths are limited.
-    """
+    SessionError otherwise."""
     folder = _absolute_path(path)
-    if is_windows and len(str(folder)) > _LONGEST_FOLDER:
+    if _IS_WINDOWS and len(str(folder)) > _LONGEST_FOLDER:
         raise SessionError(
             f"the path of the session has {len(str(folder))} characters, and Windows allows 259 for"
             f" each file in it: choose a place with at most {_LONGEST_FOLDER}"

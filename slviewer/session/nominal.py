@@ -64,28 +64,26 @@ class Nominal:
         return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"
 
 
-def read_nominal(
-    path: Path | str, units: Units | None = None, max_triangles: int = MAX_TRIANGLES
-) -> Nominal:
+def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given
     in mm; or in a STEP or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too
     large, damaged, truncated, of another format, without triangles, or with more than
-    ``max_triangles``.
+    `MAX_TRIANGLES`.
     """
     path = expand_user(path)
     data = _read_bytes(path)
     notes: list[str] = []
     if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
         vertices, faces = cad.load_triangles(path.name, form, data)
-        _check_triangles(path.name, vertices, faces, max_triangles)
+        _check_triangles(path.name, vertices, faces)
         units = "mm"
         if form != "3mf":
             notes.append(f"its surfaces were triangulated within {cad.CHORD_MM:g} mm")
     else:
-        vertices, faces = _load_triangles(path.name, data, max_triangles)
-        _check_triangles(path.name, vertices, faces, max_triangles)
+        vertices, faces = _load_triangles(path.name, data)
+        _check_triangles(path.name, vertices, faces)
         vertices = vertices * MM[units or "mm"]
     if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
@@ -149,13 +147,13 @@ def _read_bytes(path: Path) -> bytes:
     return read_input(path, MAX_BYTES, remedy, SessionError)
 
 
-def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndarray, np.ndarray]:
+def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged
     duplicate vertices."""
     import trimesh
 
     form = name.rpartition(".")[2].lower()
-    data = _simplify(name, form, data, max_triangles)
+    data = _simplify(name, form, data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -184,15 +182,13 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
     return vertices, faces
 
 
-def _check_triangles(
-    name: str, vertices: np.ndarray, faces: np.ndarray, max_triangles: int
-) -> None:
+def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise SessionError where vertices and faces are not triangles, too many, or reach beyond what
     is read."""
     if not vertices.shape[1:] == faces.shape[1:] == (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
-    if len(faces) > max_triangles:
-        raise _too_many(name, f"{len(faces):,} triangles", max_triangles)
+    if len(faces) > MAX_TRIANGLES:
+        raise _too_many(name, f"{len(faces):,} triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     if not np.isfinite(vertices).all():
@@ -201,7 +197,7 @@ def _check_triangles(
         )
 
 
-def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
+def _simplify(name: str, form: str, data: bytes) -> bytes:
     """Return a file without what only costs time: the groups of an OBJ, all but one of the sections
     of a text STL.
 
@@ -209,7 +205,7 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
     """
     is_text = form == "obj" or (form == "stl" and _is_text_stl(data))
     if is_text and len(data) > MAX_TEXT_BYTES:
-        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text", max_triangles)
+        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text")
     if form == "obj":
         data = b"\n".join(
             re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE)
@@ -234,8 +230,8 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
                 f"{name} holds no triangles, or is truncated: it announces {count:,} triangles;"
                 " export the model again"
             )
-    if count > max_triangles:
-        raise _too_many(name, f"{count:,} triangles", max_triangles)
+    if count > MAX_TRIANGLES:
+        raise _too_many(name, f"{count:,} triangles")
     return data
 
 
@@ -252,10 +248,10 @@ def _is_text_stl(data: bytes) -> bool:
     return data[:512].lstrip().lower().startswith(b"solid") and not binary
 
 
-def _too_many(name: str, amount: str, max_triangles: int) -> SessionError:
+def _too_many(name: str, amount: str) -> SessionError:
     """Return the error for a model that is too large."""
     return SessionError(
-        f"{name} has {amount}, and at most {max_triangles:,} triangles are read: decimate it first"
+        f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first"
     )
 
 
