@@ -74,7 +74,9 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     share = (low / (low - high))[:, None]
     places = vertices[edges[:, 0]] * (1 - share) + vertices[edges[:, 1]] * share
     drawn = plane.drawn(places)
-    lines = [_order_line(drawn[chain]) for chain in _join_segments(segments, len(edges))]
+    lines = [drawn[chain] for chain in _join_segments(segments, len(edges))]
+    # a closed line begins and ends at one place
+    lines = [line if line[0, 0] <= line[-1, 0] else line[::-1] for line in lines]
     return sorted(lines, key=lambda line: -float(lengths(np.diff(line, axis=0)).sum()))
 
 
@@ -103,12 +105,6 @@ def triangulate_near(
     radii = o3d.utility.DoubleVector([3.0 * spacing, 6.0 * spacing])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
     return points[near], np.asarray(mesh.triangles, np.int64)
-
-
-def _order_line(line: np.ndarray) -> np.ndarray:
-    """Return an open line (k, 2) from left to right; closed lines unchanged."""
-    closed = np.array_equal(line[0], line[-1])
-    return line if closed or line[0, 0] <= line[-1, 0] else line[::-1]
 
 
 def _join_segments(segments: np.ndarray, count: int) -> list[list[int]]:

@@ -285,8 +285,13 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
             axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid"
         )
         coordinate, reason = phase.coordinate[::step, ::step], phase.reason[::step, ::step]
+        if not np.isfinite(coordinate).any():  # one value keeps the colour scale finite
+            coordinate = np.zeros_like(coordinate)
         image = axes.imshow(
-            _mask_invalid(coordinate), cmap="viridis", aspect="equal", interpolation="nearest"
+            np.ma.masked_invalid(coordinate),
+            cmap="viridis",
+            aspect="equal",
+            interpolation="nearest",
         )
         cover = np.zeros((*reason.shape, 4), np.float32)
         for code, colour in REASON_COLOURS.items():
@@ -326,13 +331,6 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
         " the colour of their reason.",
         f"Maps of the decoded projector coordinates of {title}: {listed}",
     )
-
-
-def _mask_invalid(values: np.ndarray) -> Any:
-    """Invalid pixels masked; where all are, one value keeps the colour scale finite."""
-    if not np.isfinite(values).any():
-        values = np.zeros_like(values)
-    return np.ma.masked_invalid(values)
 
 
 DATA = "#c2502e"

@@ -145,7 +145,10 @@ def planes_in_space(
     every = np.concatenate(list(hulls.values()))
     low, high = every.min(axis=0), every.max(axis=0)
     low[2], high[2] = min(low[2], near), max(high[2], far)
-    scene = _Scene(hulls, _shorten_names(list(hulls)), depth_range_mm, low, high)
+    # names without their common prefix and leading zeros: plane_01 becomes 1
+    common = len(commonprefix(list(hulls))) if len(hulls) > 1 else 0  # noqa: RUF071, of letters
+    short = {name: name[common:].lstrip("0_- ") or name for name in hulls}
+    scene = _Scene(hulls, short, depth_range_mm, low, high)
     drawing = new_figure(FULL, 450)
     grid = drawing.add_gridspec(2, 2, width_ratios=(1.05, 1))
     scene.draw_perspective(drawing.add_subplot(grid[:, 0], projection="3d"))
@@ -294,9 +297,3 @@ def _convex_hull(name: str, points: np.ndarray) -> np.ndarray:
     centred = points - points.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     return points[ConvexHull(centred @ directions[:2].T).vertices]
-
-
-def _shorten_names(names: list[str]) -> dict[str, str]:
-    """Names without their common prefix and leading zeros: plane_01 becomes 1."""
-    common = len(commonprefix(names)) if len(names) > 1 else 0  # noqa: RUF071, of letters
-    return {name: name[common:].lstrip("0_- ") or name for name in names}

@@ -35,10 +35,10 @@ class ImportableRecording:
         """The capture with its frames; InputError where an image cannot be used.
         `settings["channel"]` states which channel of colour frames was taken."""
         channel = self.channel or DEFAULT_CHANNEL
-        shown, middle = (
-            _colour_frame(self.sequence),
-            len(self.exposures_ms) // 2 * len(self.sequence.frames),
-        )
+        kinds = [frame.kind for frame in self.sequence.frames]
+        # the frame that shows the scene's colours, in the middle one of several exposures
+        shown = next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), None)
+        middle = len(self.exposures_ms) // 2 * len(kinds)
         colour_frame = None if shown is None else shown + middle
         images = read_frames(self.files, colour_frame, channel, self.sequence.full_scale)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
@@ -335,9 +335,3 @@ def unknown_files_warning(folder: Path, files: Sequence[Path]) -> list[str]:
 def _name_pattern(folder: Path) -> str:
     """Return a folder's name in lower case with every number replaced by "#"."""
     return re.sub(r"\d+", "#", folder.name.lower())
-
-
-def _colour_frame(sequence: PatternSequence) -> int | None:
-    """Return the index of the frame for the scene's colours: the texture, else white."""
-    kinds = [frame.kind for frame in sequence.frames]
-    return next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), None)
