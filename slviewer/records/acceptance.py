@@ -172,6 +172,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     kind: ClassVar[str] = "acceptance"
     title: ClassVar[str] = "Acceptance"
     is_history: ClassVar[bool] = True
+    newest_first: ClassVar[bool] = True
     artefact: CertifiedArtefact
     model: str
     positions: list[PositionErrors]
@@ -210,17 +211,8 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
         """Return none: repeated, the test would find a scale that was corrected since."""
         return {}
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "AcceptanceTest"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each test, the properties, the positions, and the budget of a length; the
-        last test first."""
-        return [
-            table
-            for name, each in reversed(list(found.items()))
-            for table in each._list_tables(name)
-        ]
-
-    def _list_tables(self, name: str) -> list[Table]:
+    def list_tables(self, name: str) -> list[Table]:
+        """Return the properties, the positions, and the budget of a length."""
         columns = [
             Column("property"),
             Column("worst", "mm", digits=4),

@@ -1,7 +1,6 @@
 """Parts that were measured and judged by an inspection plan."""
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -91,6 +90,7 @@ class Inspection(Record, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "inspection"
     title: ClassVar[str] = "Inspection"
+    newest_first: ClassVar[bool] = True
     plan: str
     characteristic: tuple[Characteristic, ...]
     parts: tuple[PartResult, ...]
@@ -129,16 +129,9 @@ class Inspection(Record, frozen=True, kw_only=True):
             if result.value is not None
         }
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "Inspection"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each run of a plan, the parts by characteristic, and the capability; the last
-        run first."""
-        runs = list(found.values())[::-1]
-        return [
-            table
-            for each in runs
-            for table in (each.list_results().without_empty(), *each._list_capability())
-        ]
+    def list_tables(self, name: str) -> list[Table]:
+        """Return the table of the parts by characteristic, and that of the capability."""
+        return [self.list_results().without_empty(), *self._list_capability()]
 
     def list_results(self) -> Table:
         """Return the table of parts by characteristic."""

@@ -167,13 +167,8 @@ class Merge(Record, frozen=True, kw_only=True):
         }
         return {"points": float(self.points), **pairs}
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "Merge"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each merge, a table of its pairs and one of its loops, and notes of all that
-        was excluded."""
-        return [table for name, each in found.items() for table in each._list_tables(name)]
-
-    def _list_tables(self, name: str) -> list[Table]:
+    def list_tables(self, name: str) -> list[Table]:
+        """Return a table of the pairs and one of the loops, and notes of all that was excluded."""
         columns = [
             Column("scan"),
             Column("onto"),

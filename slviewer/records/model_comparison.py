@@ -74,12 +74,8 @@ class ModelComparison(Record, frozen=True, kw_only=True):
         minutes."""
         return {}
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "ModelComparison"]) -> list[Table]:  # type: ignore[override]
+    def list_tables(self, name: str) -> list[Table]:
         """Return a table of the errors with a line for each model; the least ones are marked."""
-        return [each._make_table() for each in found.values()]
-
-    def _make_table(self) -> Table:
         columns = [
             Column("model"),
             Column("plane", "mm", digits=4),
@@ -109,4 +105,4 @@ class ModelComparison(Record, frozen=True, kw_only=True):
             f"Recommended of these: {self.recommended}.",
             *(f"{model} could not be compared: {why}." for model, why in self.failed.items()),
         ]
-        return Table(columns, rows, "RMS on held-out poses", notes)
+        return [Table(columns, rows, "RMS on held-out poses", notes)]
