@@ -79,8 +79,7 @@ if TYPE_CHECKING:
     from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct_cloud
-    from slviewer.records.measurement import Measurement
-    from slviewer.records.quantities import Quantity
+    from slviewer.records.measurement import Measurement, Quantity
     from slviewer.records.verification import Verification
     from slviewer.registration.multiway import register_all as align_clouds
     from slviewer.report.maps import draw_error_maps
@@ -108,7 +107,7 @@ _EXPORTS = {
     "PatternSequence": "fringe.sequence",
     "PhaseMap": "fringe.phase",
     "Pose": "simulation.boards",
-    "Quantity": "records.quantities",
+    "Quantity": "records.measurement",
     "Reason": "fringe.phase",
     "Session": "pipeline.session_operations:SessionOperations",
     "SimulatedWorld": "devices.world",

@@ -32,8 +32,7 @@ from slviewer.fringe.frame_light import FrameLight, equalize_frames, estimate_fr
 from slviewer.fringe.layout import axis_layout, check_stack
 from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.records.examination import Examination
-from slviewer.records.verdict import Finding
+from slviewer.records.verdict import Examination, Finding
 
 
 def examine(

@@ -12,8 +12,7 @@ from slviewer.pipeline.turn import FULL_TURN_DEG, STEPS
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.session.capture import Role
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel
-from slviewer.session.importers.layouts import layouts
-from slviewer.session.importers.slstudio import Codec
+from slviewer.session.importers.layouts import Codec, layouts
 from slviewer.wizard.snapshot import ExposureChange, Snapshot
 
 _MULTIPLES: dict[str, tuple[float, ...]] = {

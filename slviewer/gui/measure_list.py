@@ -24,7 +24,7 @@ from slviewer.gui.widgets import (
     report_table,
     to_html,
 )
-from slviewer.inspection.colours import colour_limit
+from slviewer.inspection.deviation import colour_limit
 from slviewer.inspection.section import (
     CutPlane,
     measure_cursors,
@@ -35,8 +35,8 @@ from slviewer.pipeline.measurements import section_lines
 from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.report.canvas import finish_figure, new_figure, style_axes
-from slviewer.report.measurements import draw_deviations, section_plot
 from slviewer.report.page import Figure
+from slviewer.report.surfaces import draw_deviations, section_plot
 from slviewer.wizard.measure_requests import PLAN, TABLE
 from slviewer.wizard.snapshot import SessionView
 

@@ -1,4 +1,5 @@
-"""Signed deviations of a scan from a nominal model after best-fit alignment."""
+"""Signed deviations of a scan from a nominal model after best-fit alignment: their statistics and
+colours, and whether they stay within a tolerance, as far as their uncertainty lets one say."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +10,10 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points, turn_about
 from slviewer.geometry.vectors import rms
-from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.placing import search_start
+from slviewer.inspection.nominal_surface import NominalSurface, search_start
 from slviewer.inspection.uncertainty import RigidSpread, scatter_covariance
+from slviewer.records.acceptance import Decision, worst_decision
+from slviewer.records.measurement import ToleranceVerdict
 from slviewer.registration.pairwise import Registration
 from slviewer.surface.shapes import Mesh
 
@@ -220,3 +222,83 @@ def _measure_coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float,
     away, _ = tree.query(places, workers=-1)
     measured = away <= SPACINGS * float(np.percentile(spacing[:, 1], 95))
     return float(measured.mean()), places[~measured]
+
+
+def judge_deviation(
+    deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: float
+) -> ToleranceVerdict:
+    """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the
+    surface's normal."""
+    if not tolerance_mm > 0:
+        raise InputError(f"A tolerance of {tolerance_mm:g} mm was given: give a positive one.")
+    counted = deviation.counted
+    signed = deviation.signed[counted].astype(np.float64)
+    U = 2 * np.hypot(np.nan_to_num(sigma_mm[counted].astype(np.float64)), deviation.alignment_mm)
+    typical = float(np.median(U))
+    off = np.abs(signed)
+    inside, outside = off + U <= tolerance_mm, off - U > tolerance_mm
+    numbers = deviation.statistics()
+    low, high = (
+        (end, judge_limits(end, typical, -tolerance_mm, tolerance_mm))
+        for end in (numbers["p_low"], numbers["p_high"])
+    )
+    return ToleranceVerdict(
+        tolerance_mm,
+        typical,
+        low,
+        high,
+        worst_decision({low[1], high[1]}),
+        100 * float(np.mean(off <= tolerance_mm)),
+        100 * float(inside.mean()),
+        100 * float(outside.mean()),
+        100 * float(np.mean(~inside & ~outside)),
+    )
+
+
+def judge_limits(value: float, U: float, lower: float | None, upper: float | None) -> Decision:
+    """Decide by guard bands whether a value of expanded uncertainty U (k = 2) lies between limits,
+    of which one may be absent: "pass" inside both by U, "fail" beyond one by more than U, else
+    "undecided"."""
+    low, high = (-np.inf if lower is None else lower), (np.inf if upper is None else upper)
+    if not (np.isfinite(value) and np.isfinite(U)):
+        return "undecided"
+    if low + U <= value <= high - U:
+        return "pass"
+    return "fail" if value < low - U or value > high + U else "undecided"
+
+
+EXCLUDED_COLOUR = (150, 154, 160)
+_AT = np.array([-1.0, -0.6, -0.25, 0.0, 0.25, 0.6, 1.0])
+_RGB = np.array(
+    [
+        (26, 54, 140),
+        (48, 126, 208),
+        (150, 205, 232),
+        (236, 238, 226),
+        (250, 205, 120),
+        (232, 112, 52),
+        (150, 18, 38),
+    ],
+    np.float64,
+)
+"""From too little (blue) through none (near white) to too much (red): distinguishable with any
+colour vision."""
+
+
+def deviation_colours(signed: np.ndarray, limit: float) -> np.ndarray:
+    """(n, 3) uint8 RGB of deviations (n,) mm from -limit to limit and beyond; grey for NaN."""
+    if not limit > 0:
+        raise InputError(f"A range of {limit:g} mm was given for the colours: give a positive one.")
+    share = np.clip(np.nan_to_num(np.asarray(signed, np.float64) / limit), -1, 1)
+    colours = np.stack([np.interp(share, _AT, _RGB[:, k]) for k in range(3)], axis=-1)
+    colours[~np.isfinite(signed)] = EXCLUDED_COLOUR
+    return np.asarray(np.round(colours), np.uint8)
+
+
+def colour_limit(signed: np.ndarray, tolerance_mm: float | None = None) -> float:
+    """Return half the range of the colour scale, mm: the tolerance, or the value that contains 99.5
+    % of the points."""
+    if tolerance_mm is not None:
+        return tolerance_mm
+    known = np.abs(signed[np.isfinite(signed)])
+    return max(float(np.percentile(known, 99.5)), 1e-6) if known.size else 1.0

@@ -1,5 +1,7 @@
-"""What is picked or fitted on a measured surface: a point, a plane, a sphere, a cylinder."""
+"""What is picked or fitted on a measured surface: a point, a plane, a sphere, a cylinder; distances
+and angles between them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -7,6 +9,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import lengths, unit_vectors
+from slviewer.inspection.uncertainty import Spread, joint_covariance, propagate_covariance
+from slviewer.records.measurement import Quantity, Unit
 
 Kind = Literal["point", "plane", "sphere", "cylinder"]
 KINDS: tuple[Kind, ...] = ("point", "plane", "sphere", "cylinder")
@@ -104,3 +108,133 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     so few."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+PARALLEL_DEG = 5.0
+"""Axes nearer to parallel than this are as far apart as they are in the measured region: where they
+would meet, if they do, is far away and means nothing."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A quantity between two kinds of features, and how it is computed; the first kind comes first
+    in `KINDS`."""
+
+    name: str
+    unit: Unit
+    of: Callable[[Feature, Feature], float]
+
+
+def _distance(a: Feature, b: Feature) -> float:
+    """Return the distance in mm between the places of two features."""
+    return float(np.linalg.norm(b.place - a.place))
+
+
+def _angle(a: Feature, b: Feature) -> float:
+    """Return the angle between two directions, 0 to 90 degrees."""
+    u, v = a.unit_direction, b.unit_direction
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), abs(u @ v))))
+
+
+def _offset(a: Feature, axis: Feature) -> float:
+    """Return the distance in mm of a feature's place from an axis."""
+    return float(np.linalg.norm(np.cross(a.place - axis.place, axis.unit_direction)))
+
+
+def _height(a: Feature, plane: Feature) -> float:
+    """Return the signed distance in mm of a feature's place from a plane."""
+    return float((a.place - plane.place) @ plane.unit_direction)
+
+
+def _plane_gap(a: Feature, b: Feature) -> float:
+    """Return the distance in mm of two nearly parallel planes: mean of each place's distance from
+    the other."""
+    return 0.5 * (abs(_height(a, b)) + abs(_height(b, a)))
+
+
+def _axis_gap(a: Feature, b: Feature) -> float:
+    """Return the shortest distance in mm between two axes, which may be parallel."""
+    if _angle(a, b) < PARALLEL_DEG:
+        return 0.5 * (_offset(a, b) + _offset(b, a))
+    across = np.cross(a.unit_direction, b.unit_direction)
+    return float(abs((b.place - a.place) @ across) / np.linalg.norm(across))
+
+
+def _size(feature: Feature) -> float:
+    """Return the feature's radius in mm; 0 where it has none."""
+    return feature.radius or 0.0
+
+
+MEANINGS: dict[tuple[str, str], tuple[Meaning, ...]] = {
+    ("point", "point"): (Meaning("distance", "mm", _distance),),
+    # positive on the camera's side
+    ("point", "plane"): (Meaning("height", "mm", _height),),
+    ("point", "sphere"): (
+        Meaning("distance from the centre", "mm", _distance),
+        # negative inside
+        Meaning("distance from the surface", "mm", lambda p, s: _distance(p, s) - _size(s)),
+    ),
+    ("point", "cylinder"): (
+        Meaning("distance from the axis", "mm", _offset),
+        Meaning("distance from the surface", "mm", lambda p, c: _offset(p, c) - _size(c)),
+    ),
+    ("plane", "plane"): (
+        Meaning("angle", "deg", _angle),
+        # of the middle of each region from the other's plane, the mean of both
+        Meaning("distance", "mm", _plane_gap),
+    ),
+    ("plane", "sphere"): (
+        Meaning("height of the centre", "mm", lambda p, s: _height(s, p)),
+        # negative where they cut
+        Meaning("gap", "mm", lambda p, s: abs(_height(s, p)) - _size(s)),
+    ),
+    ("plane", "cylinder"): (
+        # between the axis and the plane
+        Meaning("angle", "deg", lambda p, c: 90.0 - _angle(p, c)),
+        # in the middle of the cylinder's region
+        Meaning("height of the axis", "mm", lambda p, c: _height(c, p)),
+    ),
+    ("sphere", "sphere"): (
+        Meaning("distance of the centres", "mm", _distance),
+        Meaning("gap", "mm", lambda a, b: _distance(a, b) - _size(a) - _size(b)),
+    ),
+    ("sphere", "cylinder"): (Meaning("distance from the axis", "mm", _offset),),
+    ("cylinder", "cylinder"): (
+        Meaning("angle", "deg", _angle),
+        # the shortest; near parallel, that in the middle of the regions
+        Meaning("distance of the axes", "mm", _axis_gap),
+    ),
+}
+"""The quantities of each pair of feature kinds."""
+
+
+def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list[Quantity]:
+    """Compute all quantities between two features, in either order, with their uncertainty where it
+    is known.
+
+    The uncertainty that both share through one calibration counts once.
+    """
+    if KINDS.index(a.kind) > KINDS.index(b.kind):
+        a, a_spread, b, b_spread = b, b_spread, a, a_spread
+    covariance = joint_covariance(a_spread, b_spread)
+    whole = a_spread.shared is not None and b_spread.shared is not None
+    p = a.parameters
+
+    def quantity(meaning: Meaning) -> Quantity:
+        """Return the value of one quantity between both features, with its uncertainty."""
+
+        def moved(step: np.ndarray) -> float:
+            """Return the quantity after the features' parameters change by a step (p + q,)."""
+            return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
+
+        sigma = propagate_covariance(moved, covariance)
+        return Quantity(meaning.name, meaning.of(a, b), meaning.unit, sigma, whole)
+
+    return [quantity(meaning) for meaning in MEANINGS[a.kind, b.kind]]
+
+
+def distance(a: np.ndarray, b: np.ndarray, a_spread: Spread, b_spread: Spread) -> Quantity:
+    """Return the distance between two picked points (3,) mm, with its uncertainty."""
+    return relation(
+        Feature("point", np.asarray(a)), a_spread, Feature("point", np.asarray(b)), b_spread
+    )[0]

@@ -1,21 +1,152 @@
 """Planes, spheres and cylinders fitted to a selected region, with their uncertainty, or refused
-where none fits."""
+where none fits; robust starts by the least median of squares over small samples; and the 3-2-1
+alignment of a part by three such features."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.optimize
+from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance import narrowest_range
 from slviewer.evaluation.fit import MAX_SIGMA, fit_settled, within_sigmas
+from slviewer.geometry.rigid import move_points, rigid_transform
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
-from slviewer.geometry.vectors import diagonal, finite_rows, rms
+from slviewer.geometry.shapes import fit_plane, fit_sphere
+from slviewer.geometry.vectors import diagonal, finite_rows, lengths, rms, unit_vectors
 from slviewer.inspection.features import Feature, Kind
-from slviewer.inspection.starts import estimate_start, fit_plane_feature, fit_sphere_feature
-from slviewer.inspection.uncertainty import Shared, Spread, propagate_covariance, scatter_covariance
-from slviewer.records.quantities import Quantity
+from slviewer.inspection.uncertainty import (
+    RigidSpread,
+    Shared,
+    Spread,
+    propagate_covariance,
+    scatter_covariance,
+)
+from slviewer.records.measurement import Quantity
 from slviewer.records.verification import MAX_EXCLUDED
+
+SAMPLE = 1000
+HYPOTHESES = 400
+POLISHED = 5
+NEIGHBOURS = (12, 60)
+NEAR = 2.5
+"""Robust standard deviations: what lies nearer belongs to a hypothesis."""
+
+
+def estimate_start(
+    kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]
+) -> Feature:
+    """Estimate the shape that is closest to at least half of the points (n, 3); the same points
+    give the same result.
+
+    ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no
+    sample holds a shape.
+    """
+    rng = np.random.default_rng(0)
+    sample = points[rng.choice(len(points), min(SAMPLE, len(points)), replace=False)]
+    normals = local_normals(sample, points) if kind == "cylinder" else None
+    # samples of the whole region show its curvature; noise would hide it from neighbours
+    rated: list[tuple[float, int, Feature]] = []
+    for n in range(HYPOTHESES if kind != "plane" else HYPOTHESES // 4):
+        try:
+            candidate = _fit_sample(kind, sample, normals, rng)
+        except (InputError, np.linalg.LinAlgError):
+            continue
+        if candidate is not None:
+            rated.append((_median_distance(candidate, sample), n, candidate))
+    refused: InputError | None = None
+    best: tuple[float, Feature] | None = None
+    for rating, _, candidate in sorted(rated, key=lambda each: each[:2])[:POLISHED]:
+        for _ in range(3):
+            chosen = np.abs(candidate.distance(sample)) <= NEAR * 1.4826 * rating + 1e-9
+            try:
+                candidate = fit(sample[chosen], candidate)
+            except InputError as error:
+                refused = error
+                break
+            rating = _median_distance(candidate, sample)
+        else:
+            if best is None or rating < best[0]:
+                best = rating, candidate
+    if best is None:
+        raise refused or InputError(
+            f"No {kind} passes through the {len(points)} points: select another region."
+        )
+    return best[1]
+
+
+def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(m, 3): unit normals at ``sample`` (m, 3), of either sign, from neighbours among ``points``
+    (n, 3): about a tenth of the region across, so that the noise of a point does not tilt them."""
+    thin = points[:: max(1, len(points) // 6000)]
+    count = int(np.clip(len(thin) // 100, *NEIGHBOURS))
+    _, near = cKDTree(thin).query(sample, k=min(count, len(thin)))
+    patches = thin[near]
+    patches = patches - patches.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0]
+
+
+def _fit_sample(
+    kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
+) -> Feature | None:
+    """Return the shape through a minimal sample of points; None where they do not determine it."""
+    if kind == "cylinder":
+        assert normals is not None
+        return _cylinder_through(sample, normals, rng)
+    some = sample[rng.integers(0, len(sample), 3 if kind == "plane" else 4)]
+    if kind == "plane":
+        return fit_plane_feature(some)
+    offset = _offset_of_centre(some, 1e-9)
+    return (
+        None
+        if offset is None
+        else Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
+    )
+
+
+def _cylinder_through(
+    sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+) -> Feature | None:
+    """Return the cylinder through a sample of three points with normals: two normals give the axis
+    (Gauss map), and the circle through the points, projected along it, the rest."""
+    i, j, k = rng.integers(0, len(sample), 3)
+    axis = np.cross(normals[i], normals[j])
+    length = np.linalg.norm(axis)
+    if length < 0.05:
+        return None
+    axis /= length
+    u = unit_vectors(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
+    frame = np.stack([u, np.cross(axis, u)])
+    flat = sample[[i, j, k]] @ frame.T
+    offset = _offset_of_centre(flat, 1e-6)
+    if offset is None:
+        return None
+    return Feature("cylinder", (flat[0] + offset) @ frame, axis, float(np.linalg.norm(offset)))
+
+
+def _offset_of_centre(points: np.ndarray, flattest: float) -> np.ndarray | None:
+    """Return the centre (k,) of the sphere (circle) through points (k + 1, k), relative to the
+    first; None for points that are flatter than the share ``flattest``."""
+    edges = points[1:] - points[0]
+    if abs(np.linalg.det(edges)) <= flattest * lengths(edges).prod():
+        return None
+    return np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
+
+
+def _median_distance(feature: Feature, points: np.ndarray) -> float:
+    """Return the median absolute distance in mm of points (n, 3) from a feature."""
+    return float(np.median(np.abs(feature.distance(points))))
+
+
+def fit_plane_feature(points: np.ndarray) -> Feature:
+    """Return the least-squares plane of points (n, 3); its place is their centroid."""
+    plane = fit_plane(points)
+    middle = points.mean(axis=0)
+    return Feature("plane", middle - plane.distance(middle) * plane.normal, plane.normal)
+
 
 LEAST_POINTS = 50
 MAX_FITTED_POINTS = 20_000
@@ -126,18 +257,15 @@ def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feat
     if kind == "plane":
         return fit_plane_feature(points)
     if kind == "sphere":
-        return fit_sphere_feature(points)
+        sphere = fit_sphere(points)
+        return Feature("sphere", sphere.centre, None, sphere.radius)
     assert start is not None
     return _fit_cylinder(start, points)
 
 
 def _fit_robustly(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     """The feature, and which of the points it was fitted to: repeated until the set is stable."""
-
-    def fit(some: np.ndarray, start: Feature | None) -> Feature:
-        """Return the least-squares feature of some of the points, from a start if there is one."""
-        return least_squares(kind, some, start)
-
+    fit = partial(least_squares, kind)
     return fit_settled(fit, points, estimate_start(kind, points, fit))
 
 
@@ -192,8 +320,7 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
                 " fit a sphere or a cylinder, or select a flatter region."
             )
         return
-    other: Kind = "cylinder" if kind == "sphere" else "sphere"
-    rival, flat = _residual_of(other, some), _residual_of("plane", some)
+    other, rival, flat = _fit_rivals(kind, some)
     if rival * RIVAL_RATIO < mine and rival * RIVAL_RATIO < flat:
         raise InputError(
             f"The region is no {kind}: points lie {mine:.3g} mm off it, and {rival:.3g} mm off a"
@@ -209,9 +336,7 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
 def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
     """Describe which other shape the region holds where the requested one could not be fitted at
     all."""
-    some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
-    other: Kind = "cylinder" if kind == "sphere" else "sphere"
-    flat, rival = _residual_of("plane", some), _residual_of(other, some)
+    other, rival, flat = _fit_rivals(kind, points[:: -(-len(points) // MAX_COMPARED_POINTS)])
     best, residual = (other, rival) if rival * RIVAL_RATIO < flat else ("plane", flat)
     if not np.isfinite(residual):
         return error
@@ -219,6 +344,13 @@ def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> 
         f"The region holds no {kind}, rather a {best}: points lie {residual:.3g} mm off that (1"
         f" sigma); fit a {best}, or select more of the {kind}'s curve."
     )
+
+
+def _fit_rivals(kind: Kind, points: np.ndarray) -> tuple[Kind, float, float]:
+    """Return the other curved shape that points may have, and their `_residual_of` it and of a
+    plane."""
+    other: Kind = "cylinder" if kind == "sphere" else "sphere"
+    return other, _residual_of(other, points), _residual_of("plane", points)
 
 
 def _residual_of(kind: Kind, points: np.ndarray) -> float:
@@ -260,3 +392,84 @@ def _refuse_uncertain_radius(kind: Kind, feature: Feature, spread: Spread) -> No
             f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the"
             " region shows too little of its curve; select more of it."
         )
+
+
+MIN_SINE = 0.17
+"""Of the angle between directions that fix a frame: at 10 degrees they hardly do."""
+
+
+def datum_frame(features: Sequence[Feature]) -> np.ndarray:
+    """T_part_measured (4, 4) of three datums: the primary, a plane, is z = 0 with z along its
+    normal.
+
+    The secondary is a plane (x = 0, x along its normal), and then the tertiary a plane (y = 0) or a
+    sphere or cylinder (y = 0 through its place); or both are spheres or cylinders, and x runs from
+    the secondary's place, the origin, to the tertiary's. Raises InputError for others, or where
+    they do not fix a frame.
+    """
+    primary, secondary, tertiary = features
+    if primary.kind != "plane":
+        raise InputError(f"The primary datum is a {primary.kind}: choose a plane.")
+    z = primary.unit_direction
+    if secondary.kind == "plane":
+        towards = secondary.unit_direction
+    elif tertiary.kind != "plane":
+        towards = tertiary.place - secondary.place
+    else:
+        raise InputError(
+            "The secondary datum is not a plane, but the tertiary is one: exchange them."
+        )
+    across = towards - (towards @ z) * z
+    if not np.linalg.norm(across) > MIN_SINE * np.linalg.norm(towards):
+        raise InputError("The secondary datum fixes no direction in the primary: choose another.")
+    x = unit_vectors(across)
+    y = np.cross(z, x)
+    # rows n and values n . p of the planes through the origin of the part
+    if secondary.kind == "plane":
+        rows = [z, towards, tertiary.unit_direction if tertiary.kind == "plane" else y]
+        places = [primary.place, secondary.place, tertiary.place]
+    else:
+        rows, places = [z, x, y], [primary.place, secondary.place, secondary.place]
+    matrix = np.array(rows)
+    if not abs(float(np.linalg.det(matrix))) > MIN_SINE:
+        raise InputError("The three datums fix no origin: choose planes that meet in one point.")
+    origin = np.linalg.solve(matrix, [row @ place for row, place in zip(rows, places, strict=True)])
+    R = np.array([x, y, z])
+    return rigid_transform(R, -R @ origin)
+
+
+def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
+    """Covariance of the part coordinates of `datum_frame`, about ``middle`` (3,) mm in part
+    coordinates; the errors of the datums are taken as independent of each other."""
+    features = [fit.feature for fit in fits]
+    T = datum_frame(features)
+    back = np.linalg.inv(T)
+    covariance = np.zeros((6, 6))
+    for k, fit in enumerate(fits):
+        columns = []
+        for each in np.eye(fit.feature.parameters):
+            step = 1e-6
+            moved = (
+                datum_frame([*features[:k], features[k].moved(step * each), *features[k + 1 :]])
+                @ back
+            )
+            shift = move_points(moved, middle[None])[0] - middle
+            turn = moved[[2, 0, 1], [1, 2, 0]] - moved[[1, 2, 0], [2, 0, 1]]
+            columns.append(np.concatenate([turn / 2, shift]) / step)
+        J = np.array(columns).T
+        covariance += J @ fit.spread.covariance @ J.T
+    return RigidSpread(middle, covariance)
+
+
+def face_towards(fit: FeatureFit, side: np.ndarray) -> FeatureFit:
+    """The fit with a plane's normal turned to the half-space of a direction ``side`` (3,); others
+    unchanged."""
+    f = fit.feature
+    if f.kind != "plane" or f.unit_direction @ side >= 0:
+        return fit
+    # the second tangent stays, the first and the normal are reversed
+    sign = np.array([1.0, -1.0, -1.0])
+    spread = fit.spread
+    shared = None if spread.shared is None else spread.shared * sign
+    turned = Spread(spread.scatter * np.outer(sign, sign), shared, spread.calibration)
+    return replace(fit, feature=replace(f, direction=-f.unit_direction), spread=turned)

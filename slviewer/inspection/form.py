@@ -13,7 +13,7 @@ never narrower than the minimum zones of ISO 1101.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -36,7 +36,7 @@ from slviewer.inspection.uncertainty import (
     draw_steps,
     joint_covariance,
 )
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 
 FormKind = Literal["flatness", "roundness", "cylindricity"]
 OrientationKind = Literal["parallelism", "perpendicularity"]
@@ -126,12 +126,7 @@ def smooth_deviations(
         if within.all():
             break
         counted[np.flatnonzero(counted)[~within]] = False
-    d, points, normals, coordinates = (
-        d[counted],
-        points[counted],
-        normals[counted],
-        coordinates[counted],
-    )
+    d, points, normals, coordinates = (each[counted] for each in (d, points, normals, coordinates))
     if len(d) < n:
         removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
         whole, residuals = _project_out(d, removed, basis)
@@ -181,20 +176,14 @@ def zone_width(
         change = 1e-3 * smooth.noise_mm + 1e-9
         by_field = np.zeros(len(field))
         for k in (int(field.argmin()), int(field.argmax())):
-            moved = field.copy()
-            moved[k] += np.sign(field[k] - np.median(field)) * change
-            by_field[k] = (
-                (float(width(moved[:, None])[0]) - value)
-                / change
-                * np.sign(field[k] - np.median(field))
-            )
+            sign = np.sign(field[k] - np.median(field))
+            step = np.zeros(len(field))
+            step[k] = sign * change
+            by_field[k] = (float(width((field + step)[:, None])[0]) - value) / change * sign
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
-        variance += float(
-            np.sum(
-                shared(smooth.points[places], answers[None, :, None] * smooth.normals[places]) ** 2
-            )
-        )
+        effects = shared(smooth.points[places], answers[None, :, None] * smooth.normals[places])
+        variance += float(np.sum(effects**2))
     # what the draws' scatter adds to the width bounds by how much the mean's own scatter may have
     # widened it
     sigma = float(np.sqrt(variance + (widths.mean() - value) ** 2 / 3))
@@ -214,13 +203,9 @@ def form_error(
     InputError for another feature or for too few points.
     """
     f = fit.feature
-    wanted = {
-        "flatness": ("plane",),
-        "cylindricity": ("cylinder",),
-        "roundness": ("sphere", "cylinder"),
-    }[kind]
-    if f.kind not in wanted:
-        raise InputError(f"A {f.kind} has no {kind}: choose a {' or a '.join(wanted)}.")
+    wanted = {"flatness": "plane", "cylindricity": "cylinder", "roundness": "sphere or cylinder"}
+    if f.kind not in wanted[kind].split(" or "):
+        raise InputError(f"A {f.kind} has no {kind}: choose a {wanted[kind]}.")
     points = points[finite_rows(points)]
     if kind == "roundness":
         points, axis = _section_points(f, points)
@@ -318,34 +303,25 @@ def position_error(
     if f.direction is None:
         reached = np.zeros((1, 3))
     elif f.kind == "cylinder":
-        lengths = (points - f.place) @ f.direction
-        reached = np.array([lengths.min(), lengths.max()])[:, None] * f.direction
+        along = (points - f.place) @ f.direction
+        reached = np.array([along.min(), along.max()])[:, None] * f.direction
     else:
         reached = points[:: -(-len(points) // 200)] - f.place
     rng = np.random.default_rng(2)
     moves = None if alignment is None else alignment.draw(rng)
     steps = draw_steps(fit.spread.covariance, rng)
 
+    place_or_axis = replace(nominal, radius=None)
+
     def off(feature: Feature, moved: np.ndarray | float) -> float:
         """Twice how far a feature, moved by (k, 3), is off its nominal."""
-        if feature.direction is None:
-            return 2 * float(np.linalg.norm(feature.place + moved - nominal.place))
-        normal_or_axis = nominal.unit_direction
-        if feature.kind == "cylinder":
-            ends = (
-                feature.place
-                + (reached @ f.unit_direction)[:, None] * feature.unit_direction
-                + moved
-            )
-            offsets = ends - nominal.place
-            return 2 * float(
-                lengths(offsets - (offsets @ normal_or_axis)[:, None] * normal_or_axis).max()
-            )
-        # the plane's points under the measured ones
-        heights = reached - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
-        return 2 * float(
-            np.abs((feature.place + heights + moved - nominal.place) @ normal_or_axis).max()
-        )
+        places = feature.place + reached + moved
+        if f.kind == "cylinder":
+            turned = feature.unit_direction - f.unit_direction
+            places = places + (reached @ f.unit_direction)[:, None] * turned
+        elif f.kind == "plane":  # the plane's points under the measured ones
+            places = places - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
+        return 2 * float(np.abs(place_or_axis.distance(places)).max())
 
     shifts = np.zeros((DRAWS, len(reached), 3)) if moves is None else moves(f.place + reached)
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
@@ -377,7 +353,7 @@ def profile_error(
     def displaced(places: np.ndarray) -> np.ndarray:
         """Changes of the deviations (n, draws) by the draws of the alignment."""
         assert moves is not None
-        nearest = _nearest_rows(smooth.points, places)
+        nearest = cKDTree(smooth.points).query(places)[1]
         return np.einsum("bni,ni->nb", moves(places), smooth.normals[nearest])
 
     return zone_width(
@@ -512,7 +488,8 @@ def _patch_misfit(
     by how much (mm) some lie off what noise explains."""
     low = coordinates.min(axis=0)
     side = max(float(np.ptp(coordinates, axis=0).max()) / PATCHES, 1e-12)
-    cubes, patch = occupied_cubes(_pad(coordinates - low), side)
+    padding = (0, 0), (0, 3 - coordinates.shape[1])
+    cubes, patch = occupied_cubes(np.pad(coordinates - low, padding), side)
     counts = np.bincount(patch, minlength=len(cubes))
     means = np.bincount(patch, residuals, len(cubes)) / np.maximum(counts, 1)
     large = counts >= POINTS_PER_TERM
@@ -528,11 +505,6 @@ def _patch_misfit(
     worst = int(np.argmax(beyond))
     # a defect seldom fills its patch
     return factor, 2 * float(np.abs(means[large])[worst]) if beyond[worst] > 0 else 0.0
-
-
-def _pad(coordinates: np.ndarray) -> np.ndarray:
-    """Coordinates (n, k) as (n, 3), with zeros."""
-    return np.pad(coordinates, ((0, 0), (0, 3 - coordinates.shape[1])))
 
 
 def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
@@ -568,8 +540,3 @@ def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     towards = points.mean(axis=0) - f.place
     axis = unit_vectors(np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))]))
     return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis
-
-
-def _nearest_rows(points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """The rows (m,) of ``points`` (n, 3) nearest to places (m, 3)."""
-    return cKDTree(points).query(places)[1]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import finite_rows, lengths
@@ -23,37 +23,51 @@ class Region:
     """
 
     kind: Literal["ball", "box"]
-    centre: np.ndarray
-    size: np.ndarray
-    axes: np.ndarray | None = None
+    centre: NDArray[np.float64]
+    size: NDArray[np.float64]
+    axes: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        centre, size = np.asarray(self.centre, np.float64), np.asarray(self.size, np.float64)
+        if centre.shape != (3,) or not np.isfinite(centre).all():
+            raise InputError(f"{self.centre!r} is not a place: give x, y and z in mm.")
+        wanted = 1 if self.kind == "ball" else 3
+        if size.shape != (wanted,) or not ((size > 0) & (size < np.inf)).all():
+            raise InputError(
+                f"A {self.kind} needs {wanted} sizes above 0 mm, not {size.tolist()}: draw it"
+                " larger."
+            )
+        if self.axes is not None and self.axes.shape != (3, 3):
+            raise InputError("A region's axes are three directions (x, y, z).")
+        object.__setattr__(self, "centre", centre)
+        object.__setattr__(self, "size", size)
 
     @classmethod
     def ball(cls, centre: ArrayLike, radius: float) -> "Region":
         """Return the region within ``radius`` mm of ``centre`` (3,)."""
-        return cls("ball", _check_place(centre), _check_size([radius]))
+        return cls("ball", np.asarray(centre), np.array([radius]))
 
     @classmethod
     def box(cls, low: ArrayLike, high: ArrayLike, axes: np.ndarray | None = None) -> "Region":
         """Return the region between two corners (3,) mm, given along ``axes`` where there are
         some."""
-        a, b = _check_place(low), _check_place(high)
+        a, b = np.asarray(low, np.float64), np.asarray(high, np.float64)
         middle = (a + b) / 2
-        return cls(
-            "box", middle if axes is None else middle @ axes, _check_size(np.abs(b - a) / 2), axes
-        )
+        return cls("box", middle if axes is None else middle @ axes, np.abs(b - a) / 2, axes)
 
     @classmethod
     def around(cls, points: np.ndarray, axes: np.ndarray) -> "Region":
         """Return the smallest box with sides along the rows of ``axes`` (3, 3) that holds points
         (n, 3) mm."""
         along = points @ axes.T
-        low, high = along.min(axis=0), along.max(axis=0)
-        return cls(
-            "box",
-            _check_place((low + high) / 2 @ axes),
-            _check_size((high - low) / 2 + MARGIN_MM),
-            axes,
-        )
+        return cls.box(along.min(axis=0) - MARGIN_MM, along.max(axis=0) + MARGIN_MM, axes)
+
+    def moved(self, T: np.ndarray) -> "Region":
+        """Return the region after a rigid motion (4, 4), in the digits of a file."""
+        axes = (np.eye(3) if self.axes is None else self.axes) @ T[:3, :3].T
+        is_turned = self.kind == "box" and not np.allclose(axes, np.eye(3))
+        centre = (T[:3, :3] @ self.centre + T[:3, 3]).round(6)
+        return Region(self.kind, centre, self.size, axes.round(9) if is_turned else None)
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """Bool like points (h, w, 3) or (n, 3) without their last axis; False for NaN."""
@@ -74,20 +88,3 @@ class Region:
         if self.kind == "ball":
             return f"ball of radius {self.size[0]:.4g} mm at ({at})"
         return f"box of {' x '.join(f'{2 * s:.4g}' for s in self.size)} mm at ({at})"
-
-
-def _check_place(values: object) -> np.ndarray:
-    """Return a place (3,) float64 mm; InputError for another shape or values that are not
-    finite."""
-    vector = np.asarray(values, np.float64)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InputError(f"{values!r} is not a place: give x, y and z in mm.")
-    return vector
-
-
-def _check_size(values: object) -> np.ndarray:
-    """Return a size in mm as float64; InputError unless all its values are finite and above 0."""
-    size = np.asarray(values, np.float64)
-    if not (np.isfinite(size).all() and (size > 0).all()):
-        raise InputError("A region needs a size above 0 mm in every direction: draw it larger.")
-    return size

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 from slviewer.registration.open3d_loader import open3d
 
 BAND = 12.0
@@ -74,7 +74,9 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
     share = (low / (low - high))[:, None]
     places = vertices[edges[:, 0]] * (1 - share) + vertices[edges[:, 1]] * share
     drawn = plane.drawn(places)
-    lines = [_order_line(drawn[chain]) for chain in _join_segments(segments, len(edges))]
+    lines = [drawn[chain] for chain in _join_segments(segments, len(edges))]
+    # a closed line begins and ends at one place
+    lines = [line if line[0, 0] <= line[-1, 0] else line[::-1] for line in lines]
     return sorted(lines, key=lambda line: -float(lengths(np.diff(line, axis=0)).sum()))
 
 
@@ -103,12 +105,6 @@ def triangulate_near(
     radii = o3d.utility.DoubleVector([3.0 * spacing, 6.0 * spacing])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
     return points[near], np.asarray(mesh.triangles, np.int64)
-
-
-def _order_line(line: np.ndarray) -> np.ndarray:
-    """Return an open line (k, 2) from left to right; closed lines unchanged."""
-    closed = np.array_equal(line[0], line[-1])
-    return line if closed or line[0, 0] <= line[-1, 0] else line[::-1]
 
 
 def _join_segments(segments: np.ndarray, count: int) -> list[list[int]]:
@@ -160,9 +156,9 @@ def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
     return Quantity("radius", sides[0] * sides[1] * sides[2] / (2 * area), "mm")
 
 
-def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None) -> np.ndarray:
-    """(2,) mm: where a cursor at ``x`` meets the section, at the line nearest to ``y`` or else the
-    highest one; the nearest point drawn where no line passes x."""
+def nearest_on_section(lines: list[np.ndarray], x: float) -> np.ndarray:
+    """(2,) mm: where a cursor at ``x`` meets the section, at the highest line; the nearest point
+    drawn where no line passes x."""
     met = []
     for line in lines:
         left, right = line[:-1], line[1:]
@@ -174,4 +170,4 @@ def nearest_on_section(lines: list[np.ndarray], x: float, y: float | None = None
     if not heights.size:
         drawn = np.concatenate(lines)
         return drawn[np.argmin(np.abs(drawn[:, 0] - x))]
-    return np.array([x, heights.max() if y is None else heights[np.argmin(np.abs(heights - y))]])
+    return np.array([x, heights.max()])

@@ -25,7 +25,7 @@ from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals
-from slviewer.records.placement import Placement
+from slviewer.records.merge import Placement
 from slviewer.records.record import to_matrix
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object

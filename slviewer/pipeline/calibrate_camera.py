@@ -12,8 +12,8 @@ from slviewer.pipeline.capture_phases import capture_texture
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import match_names
 from slviewer.session.exporters import write_calibration
-from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import read_image
+from slviewer.session.importers.imported import images_by_name
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
 from slviewer.target.board import Board

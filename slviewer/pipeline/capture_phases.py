@@ -22,7 +22,7 @@ from slviewer.pipeline.examination import (
     load_or_save_examination,
 )
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.records.examination import Examination
+from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 

@@ -8,9 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.inspection.colours import colour_limit, deviation_colours
-from slviewer.inspection.deviation import Deviation, deviation
-from slviewer.inspection.tolerance import judge_deviation
+from slviewer.inspection.deviation import (
+    Deviation,
+    colour_limit,
+    deviation,
+    deviation_colours,
+    judge_deviation,
+)
 from slviewer.pipeline.feedback import part, stage
 from slviewer.pipeline.measure import provenance
 from slviewer.pipeline.measured_surface import (

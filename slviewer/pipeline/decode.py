@@ -14,9 +14,9 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.report.phase_maps import REASON_LABELS, phase_maps, reason_shares
+from slviewer.report.maps import REASON_LABELS, phase_maps, reason_shares
 from slviewer.session.atomic import to_json
-from slviewer.session.exr import write_exr
+from slviewer.session.exporters import write_exr
 
 MapFormat = Literal["npy", "exr"]
 REASONS = {

@@ -8,8 +8,8 @@ import numpy as np
 
 from slviewer.examination.examine import examine
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.records.examination import Examination
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 

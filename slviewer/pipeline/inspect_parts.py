@@ -19,7 +19,7 @@ from slviewer.pipeline.part_inspection import fail_part, inspect_part
 from slviewer.printable import format_csv
 from slviewer.records.inspection import Inspection, PartResult
 from slviewer.records.table import Value
-from slviewer.report.parts import write_parts_page
+from slviewer.report.session import write_parts_page
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import Plan, read_plan
 from slviewer.session.layout import is_session

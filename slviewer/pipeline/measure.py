@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal, NoReturn
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.inspection.features import distance
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.regions import Region
-from slviewer.inspection.relations import distance
 from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import Spread
 from slviewer.pipeline.measured_surface import (
@@ -24,9 +24,14 @@ from slviewer.pipeline.measured_surface import (
 from slviewer.pipeline.models import ModelName, available_models
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.stored_records import next_name
-from slviewer.records.measurement import MeasuredFeature, MeasuredRegion, Measurement, SectionPlane
+from slviewer.records.measurement import (
+    MeasuredFeature,
+    MeasuredRegion,
+    Measurement,
+    Quantity,
+    SectionPlane,
+)
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.quantities import Quantity
 from slviewer.records.record import to_vector
 from slviewer.session.names import clean_label
 from slviewer.session.store import Session

@@ -7,17 +7,21 @@ import numpy as np
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.rigid import move_points
-from slviewer.inspection.datums import datum_frame, datum_spread, face_towards
-from slviewer.inspection.deviation import Deviation, deviation
-from slviewer.inspection.fitting import FeatureFit, fit_feature
+from slviewer.inspection.deviation import Deviation, deviation, judge_limits
+from slviewer.inspection.features import relation
+from slviewer.inspection.fitting import (
+    FeatureFit,
+    datum_frame,
+    datum_spread,
+    face_towards,
+    fit_feature,
+)
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.relations import relation
-from slviewer.inspection.tolerance import judge_limits
 from slviewer.inspection.uncertainty import RigidSpread, Shared
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.records.inspection import Characteristic, CharacteristicResult, PartResult
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 from slviewer.session.inspection_plan import FORMS, SIZES, TO_DATUM, Plan, PlanFeature
 from slviewer.session.nominal import Nominal, check_size
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.inspection.datums import datum_frame
 from slviewer.inspection.features import Feature
+from slviewer.inspection.fitting import datum_frame
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measured_surface import load_surface
@@ -17,15 +17,13 @@ from slviewer.pipeline.part_inspection import fit_to_nominal
 from slviewer.pipeline.relate import load_feature
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.inspection import Characteristic
-from slviewer.records.measurement import Measurement
+from slviewer.records.measurement import Measurement, Quantity
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.quantities import Quantity
 from slviewer.session.inspection_plan import (
     KINDS,
     Alignment,
     Plan,
     PlanFeature,
-    PlanRegion,
     write_plan,
 )
 from slviewer.session.nominal import read_nominal
@@ -174,7 +172,7 @@ def _plan_feature(
     name: str, measured: Stored[Measurement], feature: Feature, T: np.ndarray
 ) -> PlanFeature:
     """A fitted feature with its region, in part coordinates."""
-    region = PlanRegion.of(from_plain(to_plain(measured.record.region), Region), T)
+    region = from_plain(to_plain(measured.record.region), Region).moved(T)
     place = tuple((T[:3, :3] @ feature.place + T[:3, 3]).round(6).tolist())
     direction = (
         None

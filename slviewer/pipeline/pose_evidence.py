@@ -17,8 +17,8 @@ from slviewer.calibration.diagnosis.numbering import detect_grid_size
 from slviewer.calibration.observe import Observation, pitch_px
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.records.examination import Examination
 from slviewer.records.plain import to_plain
+from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board

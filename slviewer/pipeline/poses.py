@@ -25,7 +25,7 @@ from slviewer.pipeline.pose_evidence import (
     load_evidence,
     save_evidence,
 )
-from slviewer.records.examination import Examination
+from slviewer.records.verdict import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board

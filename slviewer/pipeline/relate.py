@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.inspection.features import KINDS, Feature
-from slviewer.inspection.relations import relation
+from slviewer.inspection.features import KINDS, Feature, relation
 from slviewer.inspection.uncertainty import Spread
 from slviewer.pipeline.measure import uncertainty_notes
 from slviewer.pipeline.operation import Found, Job, operation

@@ -44,15 +44,14 @@ from slviewer.report.data import (
     CaptureRow,
     ModelsView,
     PixelCurve,
-    PixelFitView,
     PoseResiduals,
     RecordsView,
     SessionData,
 )
 from slviewer.report.maps import verification_maps
-from slviewer.report.measurements import draw_deviation, section_plot
 from slviewer.report.page import Figure, write_page
 from slviewer.report.session import session_headlines, session_sections, session_title
+from slviewer.report.surfaces import draw_deviation, section_plot
 from slviewer.session.capture import Capture
 from slviewer.session.scan_edits import list_edits, load_region
 from slviewer.session.store import Session
@@ -126,7 +125,7 @@ def _collect_data(store: Session) -> SessionData:
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
         calibration=None if stereo is None else _load_calibration(store, stereo, observations),
-        pixel_fits=[] if stereo is None else _load_pixel_fits(store),
+        pixel_fits={} if stereo is None else _load_pixel_fits(store),
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
@@ -141,13 +140,13 @@ def _collect_data(store: Session) -> SessionData:
     )
 
 
-def _load_pixel_fits(store: Session) -> list[PixelFitView]:
-    """Return the pixel-wise fits by axis; none where there is no such calibration."""
+def _load_pixel_fits(store: Session) -> dict[str, np.ndarray]:
+    """Return the RMS of the pixel-wise fits by axis; none where there is no such calibration."""
     if "pixelwise" not in available_models(store):
-        return []
+        return {}
     model = load_model(store, "pixelwise")
     assert isinstance(model, PixelwiseModel)
-    return [PixelFitView(axis, fit.rms_mm) for axis, fit in model.fits.items()]
+    return {axis: fit.rms_mm for axis, fit in model.fits.items()}
 
 
 def _load_models(store: Session) -> ModelsView | None:

@@ -11,7 +11,7 @@ from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.check_results import Check, CheckVerdict
 from slviewer.preflight.rig_under_test import RigUnderTest
-from slviewer.records.examination import ORDER_CAUSES
+from slviewer.records.verdict import ORDER_CAUSES
 
 _BEFORE, _AFTER = (1, 0, 0, 1, 0, 1), (0, 1, 1, 0)
 _STEPS = 12

@@ -21,8 +21,7 @@ from slviewer.pipeline.exposure_check import check_capture_exposure
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.preflight.light import MAX_NONLINEARITY
 from slviewer.preflight.order import check_repeats
-from slviewer.records.examination import LIGHT_CAUSES, ORDER_CAUSES, Examination
-from slviewer.records.verdict import Cause
+from slviewer.records.verdict import LIGHT_CAUSES, ORDER_CAUSES, Cause, Examination
 from slviewer.session.capture import Capture
 
 _MISPLACING_CAUSES = (*ORDER_CAUSES, "ghosting")

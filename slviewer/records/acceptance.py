@@ -1,13 +1,13 @@
 """Tests of a calibration with certified artefacts, against the operator's limits."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import hypot
 from typing import Any, ClassVar, Literal
 
 import msgspec
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.table import Cell, Column, Mark, Rows, Table
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
@@ -19,6 +19,11 @@ RULE = (
     " ISO 10360-13, and claims conformity with neither."
 )
 MARKS: Mapping[str, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
+
+
+def worst_decision(decisions: Collection[Decision]) -> Decision:
+    """Return "fail" where one fails, else "undecided" where one is, else "pass"."""
+    return next((each for each in ("fail", "undecided") if each in decisions), "pass")
 
 
 class PropertyError(msgspec.Struct, frozen=True):
@@ -125,10 +130,10 @@ class ErrorBudget(msgspec.Struct, frozen=True):
     def table(self) -> Table:
         """Return the contributions, and the expanded uncertainty below."""
         columns = [
-            Column("source", align="left"),
+            Column("source"),
             Column("standard uncertainty", "mm", digits=4),
             Column("type", align="centre"),
-            Column("from", align="left", detail=True),
+            Column("from", detail=True),
         ]
         without = f" Unknown: {' and '.join(self.unknown)}; U excludes it." if self.unknown else ""
         notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
@@ -167,6 +172,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     kind: ClassVar[str] = "acceptance"
     title: ClassVar[str] = "Acceptance"
     is_history: ClassVar[bool] = True
+    newest_first: ClassVar[bool] = True
     artefact: CertifiedArtefact
     model: str
     positions: list[PositionErrors]
@@ -183,12 +189,9 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     @classmethod
     def upgrade(cls, meta: Mapping[str, Any]) -> Mapping[str, Any]:
         """Convert a record of version 0.2, whose figures were one entry."""
-        old = meta.get("accepted")
-        return (
-            {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})}
-            if isinstance(old, dict)
-            else meta
-        )
+        if not isinstance(old := meta.get("accepted"), dict):
+            return meta
+        return {**old, "time": meta.get("time", ""), "inputs": meta.get("inputs", {})}
 
     @property
     def is_good(self) -> bool:
@@ -208,27 +211,18 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
         """Return none: repeated, the test would find a scale that was corrected since."""
         return {}
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "AcceptanceTest"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each test, the properties, the positions, and the budget of a length; the
-        last test first."""
-        return [
-            table
-            for name, each in reversed(list(found.items()))
-            for table in each._list_tables(name)
-        ]
-
-    def _list_tables(self, name: str) -> list[Table]:
+    def list_tables(self, name: str) -> list[Table]:
+        """Return the properties, the positions, and the budget of a length."""
         columns = [
-            Column("property", align="left"),
+            Column("property"),
             Column("worst", "mm", digits=4),
-            Column("at", align="left", detail=True),
+            Column("at", detail=True),
             Column("uncertainty U, k = 2", "mm", digits=4),
             *(Column(end, "mm", "95 % lie", digits=4, detail=True) for end in ("from", "to")),
             Column("limit", "mm"),
-            Column("decision", align="left"),
+            Column("decision"),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [
                 each.property,
                 each.worst.error_mm,
@@ -249,7 +243,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
     def _list_positions(self) -> Table:
         shown = [each.property for each in self.judgements]
         columns = [
-            Column("position", align="left"),
+            Column("position"),
             *(Column(name, "mm", digits=4) for name in shown),
             Column("RMS", "mm"),
             Column("noise floor", "mm"),
@@ -259,7 +253,7 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
             ),
             Column("points", detail=True),
         ]
-        rows: list[list[Value | Cell]] = []
+        rows: Rows = []
         for each in self.positions:
             shares = [(each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")]
             errors = [

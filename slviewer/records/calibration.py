@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from slviewer.records.record import Count, Record, Share
-from slviewer.records.table import Column, Table, Value
+from slviewer.records.table import Column, Rows, Table
 from slviewer.records.verdict import Verdict
 
 MIN_WEIGHT = 0.7
@@ -49,12 +49,12 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     def table(self) -> Table:
         """Return the figures of both devices, and notes on poses and features."""
         devices = ("camera", "projector")
-        columns = [Column("quantity", align="left"), *map(Column, devices), Column("both")]
+        columns = [Column("quantity"), *map(Column, devices), Column("both")]
         rms, focal = (
             self.reprojection_rms_px,
             [self.focal_px.get(device, (None, None)) for device in devices],
         )
-        rows: list[list[Value]] = [
+        rows: Rows = [
             ["reprojection RMS, px", *map(rms.get, devices), rms.get("stereo")],
             ["focal length x, px", *(x for x, _ in focal), None],
             ["focal length y, px", *(y for _, y in focal), None],
@@ -107,12 +107,12 @@ class PixelwiseFit(msgspec.Struct, frozen=True, tag="pixelwise"):
     def table(self) -> Table:
         """Return a line for each axis."""
         columns = [
-            Column("axis", align="left"),
+            Column("axis"),
             Column("pixels fitted", "%", digits=1),
             Column("poses a pixel", digits=0),
             *(Column(f"RMS in {name}", "mm") for name in "zxy"),
         ]
-        rows: list[list[Value]] = [
+        rows: Rows = [
             [axis, 100 * fit.fitted, fit.poses, fit.z_mm, fit.x_mm, fit.y_mm]
             for axis, fit in self.axes.items()
         ]
@@ -213,7 +213,7 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
             f"{name} is excluded from the splined model: it {why}."
             for name, why in self.excluded.items()
         ]
-        columns = [Column("quantity", align="left"), Column("value")]
+        columns = [Column("quantity"), Column("value", align="right")]
         return Table(columns, rows, f"Joint adjustment (splined), {self.steps} steps", notes)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from slviewer.records.record import Record, Vector
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table
 
 DriftVerdict = Literal["still good", "recalibrate"]
 
@@ -71,17 +71,17 @@ class Drift(Record, frozen=True, kw_only=True):
         """Return a table of the checks, the latest first, and one of what the latest found of each
         axis."""
         columns = [
-            Column("check", align="left"),
-            Column("time, UTC", align="left", detail=True),
-            Column("capture", align="left"),
-            Column("answer", align="left"),
+            Column("check"),
+            Column("time, UTC", detail=True),
+            Column("capture"),
+            Column("answer"),
             Column("change of scale", "ppm", digits=0),
             Column("±", "ppm", digits=0),
             Column("epipolar error", "px", digits=4),
             Column("±", "px", digits=4, detail=True),
             Column("misfit", "px", detail=True),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [
                 name,
                 each.time[:16].replace("T", " "),
@@ -103,7 +103,7 @@ class Drift(Record, frozen=True, kw_only=True):
 
     def _list_movements(self, name: str) -> Table:
         columns = [
-            Column("axis of the projector", align="left"),
+            Column("axis of the projector"),
             Column("turn", "mrad"),
             Column("±", "mrad"),
             Column("shift", "µm", digits=0),

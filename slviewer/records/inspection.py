@@ -1,15 +1,14 @@
 """Parts that were measured and judged by an inspection plan."""
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import msgspec
 
-from slviewer.records.acceptance import MARKS, Decision
+from slviewer.records.acceptance import MARKS, Decision, worst_decision
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table
 
 RULE = (
     "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
@@ -66,8 +65,7 @@ class PartResult(msgspec.Struct, frozen=True):
     decision: Decision = "pass"
 
     def __post_init__(self) -> None:
-        decisions = {each.decision for each in self.results}
-        worst = next((each for each in ("fail", "undecided") if each in decisions), "pass")
+        worst = worst_decision({each.decision for each in self.results})
         msgspec.structs.force_setattr(self, "decision", worst)
 
 
@@ -92,6 +90,7 @@ class Inspection(Record, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "inspection"
     title: ClassVar[str] = "Inspection"
+    newest_first: ClassVar[bool] = True
     plan: str
     characteristic: tuple[Characteristic, ...]
     parts: tuple[PartResult, ...]
@@ -130,31 +129,24 @@ class Inspection(Record, frozen=True, kw_only=True):
             if result.value is not None
         }
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "Inspection"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each run of a plan, the parts by characteristic, and the capability; the last
-        run first."""
-        runs = list(found.values())[::-1]
-        return [
-            table
-            for each in runs
-            for table in (each.list_results().without_empty(), *each._list_capability())
-        ]
+    def list_tables(self, name: str) -> list[Table]:
+        """Return the table of the parts by characteristic, and that of the capability."""
+        return [self.list_results().without_empty(), *self._list_capability()]
 
     def list_results(self) -> Table:
         """Return the table of parts by characteristic."""
         columns = [
-            Column("part", align="left"),
-            Column("characteristic", align="left"),
-            Column("type", align="left", detail=True),
+            Column("part"),
+            Column("characteristic"),
+            Column("type", detail=True),
             Column("value", digits=4),
             Column("U (k=2)", digits=4),
-            Column("unit", align="left"),
+            Column("unit"),
             *(Column(limit, digits=4, detail=True) for limit in ("nominal", "lower", "upper")),
-            Column("decision", align="left"),
-            Column("reason", align="left", detail=True),
+            Column("decision"),
+            Column("reason", detail=True),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [
                 *(each.part, wanted.name, wanted.kind, result.value, result.U, wanted.unit),
                 *(wanted.nominal, wanted.lower, wanted.upper),
@@ -174,18 +166,18 @@ class Inspection(Record, frozen=True, kw_only=True):
 
     def _list_capability(self) -> list[Table]:
         columns = [
-            Column("characteristic", align="left"),
+            Column("characteristic"),
             Column("parts"),
             Column("mean", digits=4),
             Column("std. dev.", digits=4),
-            Column("unit", align="left"),
+            Column("unit"),
             *(
                 Column(title, digits=2, group=index, detail=title != "value")
                 for index in ("Cp", "Cpk")
                 for title in ("value", "from", "to")
             ),
         ]
-        rows: list[list[Value | Cell]] = [
+        rows: Rows = [
             [wanted.name, c.parts, c.mean, c.sigma, wanted.unit, *(c.cp or (None,) * 3), *c.cpk]
             for wanted, c in zip(self.characteristic, self.capability, strict=False)
             if c is not None

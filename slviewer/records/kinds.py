@@ -1,6 +1,6 @@
 """All kinds of records: whoever looks one up imports them from here; each registers its own."""
 
-from slviewer.records import (  # each registers its own
+from slviewer.records import (  # noqa: F401, each registers its own
     acceptance,
     calibration,
     drift,
@@ -8,22 +8,9 @@ from slviewer.records import (  # each registers its own
     measurement,
     merge,
     model_comparison,
-    placement,
     reconstruction,
     verification,
 )
 from slviewer.records.record import RECORDS
 
-__all__ = [
-    "RECORDS",
-    "acceptance",
-    "calibration",
-    "drift",
-    "inspection",
-    "measurement",
-    "merge",
-    "model_comparison",
-    "placement",
-    "reconstruction",
-    "verification",
-]
+__all__ = ["RECORDS"]

@@ -1,5 +1,5 @@
 """What was measured on scans: points, distances, fitted shapes, their relations, deviations from
-nominal models."""
+nominal models; and a measured number with its unit and uncertainty."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,11 +9,41 @@ import msgspec
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.records.acceptance import Decision
+from slviewer.records.acceptance import COVERAGE, MARKS, Decision
 from slviewer.records.plain import from_plain
-from slviewer.records.quantities import Quantity
 from slviewer.records.record import Count, Matrix4, Record, Vector
-from slviewer.records.table import Cell, Column, Mark, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table
+
+Unit = Literal["mm", "deg", "mm²", "%", ""]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured value. ``sigma``: its standard uncertainty (k = 1) in ``unit``, None where it has
+    none (a residual, a count); ``U``: the expanded one (k = 2). ``whole``: whether they hold the
+    calibration's part, which only the splined model knows; without it they are too small."""
+
+    name: str
+    value: float
+    unit: Unit
+    sigma: float | None = None
+    whole: bool = True
+
+    @property
+    def U(self) -> float | None:
+        """Expanded uncertainty, k = 2, in the quantity's unit."""
+        return None if self.sigma is None else COVERAGE * self.sigma
+
+    def format(self) -> str:
+        """Return value ± U (k = 2) with the unit; a star where the calibration's part of U is
+        unknown."""
+        digits = 1 if self.unit == "%" else 3
+        unit = {"deg": "°", "%": " %", "": ""}.get(self.unit, f" {self.unit}")
+        # no minus before nothing
+        value = f"{round(self.value, digits) + 0.0:.{digits}f}".replace("-", "−")
+        U = "" if self.U is None else f" ± {self.U:.{digits}f}"
+        return f"{value}{U}{unit}{'*' if U and not self.whole else ''}"
+
 
 What = Literal[
     "point", "distance", "section", "plane", "sphere", "cylinder", "relation", "deviation"
@@ -24,7 +54,6 @@ RULE = (
     " and their expanded uncertainty (k = 2) together stay within the tolerance, fail if one"
     " exceeds it by more than the uncertainty, else too close to tell"
 )
-_MARKS: dict[Decision, Mark] = {"pass": "better", "fail": "worse", "undecided": "strong"}
 _UNCERTAINTY = (
     "U is the expanded uncertainty: the scatter of the points, and the calibration's uncertainty."
     " –: a residual or a plain reading, which has none."
@@ -167,31 +196,35 @@ class NominalDeviation(msgspec.Struct, frozen=True):
         """Return all figures, with the decision for each end of the range where there is a
         tolerance."""
         numbers, verdict, nominal = self.statistics_mm, self.verdict, self.nominal
-        low, high = (None, None) if verdict is None else (verdict.lowest[1], verdict.highest[1])
-        lines: list[tuple[str, float | None, str, Decision | None]] = [
-            ("mean", numbers.mean, "mm", None),
-            ("RMS", numbers.rms, "mm", None),
-            ("RMS of the scan's noise alone", self.noise_mm, "mm", None),
-            ("95 % are off by less than", numbers.within_95, "mm", None),
-            ("range of 99.7 %, lower end", numbers.p_low, "mm", low),
-            ("range of 99.7 %, upper end", numbers.p_high, "mm", high),
-            ("lowest", numbers.lowest, "mm", None),
-            ("highest", numbers.highest, "mm", None),
-            ("area of the nominal that was measured", 100 * self.coverage, "%", None),
+        low, high = (
+            ("", "")
+            if verdict is None
+            else (Cell(DECIDED[d], MARKS[d]) for _, d in (verdict.lowest, verdict.highest))
+        )
+        rows: Rows = [
+            ["mean", numbers.mean, "mm", ""],
+            ["RMS", numbers.rms, "mm", ""],
+            ["RMS of the scan's noise alone", self.noise_mm, "mm", ""],
+            ["95 % are off by less than", numbers.within_95, "mm", ""],
+            ["range of 99.7 %, lower end", numbers.p_low, "mm", low],
+            ["range of 99.7 %, upper end", numbers.p_high, "mm", high],
+            ["lowest", numbers.lowest, "mm", ""],
+            ["highest", numbers.highest, "mm", ""],
+            ["area of the nominal that was measured", 100 * self.coverage, "%", ""],
         ]
         if verdict is not None:
-            lines += [
-                (f"within ± {verdict.tolerance_mm:g} mm", verdict.within, "%", None),
-                ("inside by more than U", verdict.inside, "%", None),
-                ("too close to tell", verdict.close, "%", None),
-                ("outside by more than U", verdict.outside, "%", None),
-                ("U of a point, k = 2", verdict.U_mm, "mm", None),
+            rows += [
+                [f"within ± {verdict.tolerance_mm:g} mm", verdict.within, "%", ""],
+                ["inside by more than U", verdict.inside, "%", ""],
+                ["too close to tell", verdict.close, "%", ""],
+                ["outside by more than U", verdict.outside, "%", ""],
+                ["U of a point, k = 2", verdict.U_mm, "mm", ""],
             ]
-        columns = [Column("quantity", align="left"), Column("value", digits=4)]
-        columns += [Column("unit", align="left"), Column("decision", align="left")]
-        rows: list[list[Value | Cell]] = [
-            [title, value, unit, "" if decided is None else Cell(DECIDED[decided], _MARKS[decided])]
-            for title, value, unit, decided in lines
+        columns = [
+            Column("quantity"),
+            Column("value", digits=4),
+            Column("unit"),
+            Column("decision"),
         ]
         share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
         size = (
@@ -358,19 +391,19 @@ def _settings_of_comparison(meta: Mapping[str, Any]) -> dict[str, Any]:
 def list_quantities(found: Mapping[str, Measurement]) -> Table:
     """Return the table of all quantities of measurements."""
     columns = [
-        Column("measurement", align="left"),
-        Column("type", align="left", detail=True),
-        Column("scan", align="left"),
-        Column("quantity", align="left"),
+        Column("measurement"),
+        Column("type", detail=True),
+        Column("scan"),
+        Column("quantity"),
         Column("value", digits=4),
-        Column("unit", align="left"),
+        Column("unit"),
         Column("U (k=2)", digits=4),
-        Column("calibration in U", align="left", detail=True),
-        Column("of", align="left", detail=True),
+        Column("calibration in U", detail=True),
+        Column("of", detail=True),
     ]
-    rows: list[list[Value | Cell]] = [
+    rows: Rows = [
         [name, each.what, each.source, q.name, q.value, q.unit, q.U,
-         q.U and ("yes" if q.whole else "no"), each.where]
+         None if q.U is None else "yes" if q.whole else "no", each.where]
         for name, each in found.items()
         for q in each.quantities
     ]  # fmt: skip

@@ -1,4 +1,5 @@
-"""Scans of one object, registered and fused into one surface."""
+"""Scans of one object, registered and fused into one surface; and where each is while they are
+captured."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -6,9 +7,10 @@ from math import acos, degrees, dist
 from typing import Any, ClassVar
 
 import msgspec
+import numpy as np
 
-from slviewer.records.record import Count, Matrix4, Record, Vector
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.record import Count, Matrix4, Record, Share, Vector
+from slviewer.records.table import Cell, Column, Rows, Table
 
 MIN_OVERLAP = 0.3
 """Share of a scan below which its overlap with another is reported."""
@@ -44,7 +46,7 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def turned_deg(self) -> float:
         """The angle by which the scan was turned."""
-        trace = sum(self.T_reference_scan[k][k] for k in range(3))
+        trace = float(np.trace(np.array(self.T_reference_scan)[:3, :3]))
         return degrees(acos(max(-1.0, min(1.0, (trace - 1) / 2))))
 
     @property
@@ -52,13 +54,8 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
         """How far the centre of the overlap was moved; None where an older merge lacks it."""
         if self.middle is None:
             return None
-        R, t = (
-            [row[:3] for row in self.T_reference_scan[:3]],
-            [row[3] for row in self.T_reference_scan[:3]],
-        )
-        back = [x - s for x, s in zip(self.middle, t, strict=True)]
-        before = [sum(R[k][i] * back[k] for k in range(3)) for i in range(3)]
-        return dist(self.middle, before)
+        T, middle = np.array(self.T_reference_scan), np.array(self.middle)
+        return dist(middle, T[:3, :3].T @ (middle - T[:3, 3]))
 
 
 class LoopClosure(msgspec.Struct, frozen=True):
@@ -170,16 +167,11 @@ class Merge(Record, frozen=True, kw_only=True):
         }
         return {"points": float(self.points), **pairs}
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "Merge"]) -> list[Table]:  # type: ignore[override]
-        """Return, for each merge, a table of its pairs and one of its loops, and notes of all that
-        was excluded."""
-        return [table for name, each in found.items() for table in each._list_tables(name)]
-
-    def _list_tables(self, name: str) -> list[Table]:
+    def list_tables(self, name: str) -> list[Table]:
+        """Return a table of the pairs and one of the loops, and notes of all that was excluded."""
         columns = [
-            Column("scan", align="left"),
-            Column("onto", align="left"),
+            Column("scan"),
+            Column("onto"),
             Column("RMS", "mm"),
             Column("point to point", "mm", detail=True),
             Column("overlap", "%", digits=0),
@@ -191,10 +183,8 @@ class Merge(Record, frozen=True, kw_only=True):
             Column("their corners", "mm", detail=True),
         ]
         marked = {(each.scan, each.onto): each for each in self.markers}
-        rows: list[list[Value | Cell]] = []
-        for pair in sorted(
-            self.registered, key=lambda pair: self.reference not in (pair.scan, pair.onto)
-        ):
+        rows: Rows = []
+        for pair in sorted(self.registered, key=lambda p: self.reference not in (p.scan, p.onto)):
             marks = marked.get((pair.scan, pair.onto))
             rows.append(
                 [
@@ -207,41 +197,29 @@ class Merge(Record, frozen=True, kw_only=True):
                     pair.sigma_turn_deg,
                     pair.moved_mm,
                     pair.turned_deg,
-                    None if marks is None else len(marks.ids),
-                    None if marks is None else marks.rms_mm,
+                    *((None, None) if marks is None else (len(marks.ids), marks.rms_mm)),
                 ]
             )
-        tables = [
-            Table(
-                columns, rows, f"Merge {name}: registered pairs", self._list_notes()
-            ).without_empty()
-        ]
+        pairs = Table(columns, rows, f"Merge {name}: registered pairs", self._list_notes())
+        tables = [pairs.without_empty()]
         if self.loops:
-            ends = ("before", "after")
-            tables.append(
-                Table(
-                    [
-                        Column("loop", align="left"),
-                        *(
-                            Column(end, u, digits=d, detail=u == "°")
-                            for end in ends
-                            for u, d in (("mm", 3), ("°", 4))
-                        ),
-                    ],
-                    [
-                        [
-                            " – ".join([*o.scans, o.scans[0]]),
-                            o.error_mm,
-                            o.error_deg,
-                            o.left_mm,
-                            o.left_deg,
-                        ]
-                        for o in self.loops
-                    ],
-                    f"Merge {name}: closure error of its loops, before and after the joint"
-                    " adjustment",
-                )
-            )
+            columns = [
+                Column("loop"),
+                *(
+                    Column(end, unit, digits=digits, detail=unit == "°")
+                    for end in ("before", "after")
+                    for unit, digits in (("mm", 3), ("°", 4))
+                ),
+            ]
+            rows = [
+                [
+                    " – ".join([*loop.scans, loop.scans[0]]),
+                    *(loop.error_mm, loop.error_deg, loop.left_mm, loop.left_deg),
+                ]
+                for loop in self.loops
+            ]
+            caption = "closure error of its loops, before and after the joint adjustment"
+            tables.append(Table(columns, rows, f"Merge {name}: {caption}"))
         return tables
 
     def _list_notes(self) -> list[str]:
@@ -266,3 +244,69 @@ class Merge(Record, frozen=True, kw_only=True):
                 f" pair cover lie more than {worst.gate_mm:.2g} mm in front of the other's surface."
             )
         return [*notes, *(f"{each}." for each in (*self.restrictions, self.scale) if each)]
+
+
+class Placement(Record, frozen=True, kw_only=True):
+    """Scans aligned one after the other, each to those before it: a merge starts from there.
+
+    ``T_first_scan`` maps a scan's points, mm, into the frame of the first aligned scan; None where
+    it could not be aligned, with the reason ``why``. ``onto``: the scan that it was aligned to,
+    empty for the first, with the RMS of the distances along the normal and the share of its points
+    that overlap. ``seen_again``: share of the surface that more than one scan sees, of the last.
+    """
+
+    kind: ClassVar[str] = "placement"
+    title: ClassVar[str] = "Places of scans"
+    T_first_scan: Matrix4 | None = None
+    onto: str = ""
+    rms_mm: float | None = None
+    overlap: Share | None = None
+    why: str = ""
+    seen_again: Share | None = None
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the scan has its place."""
+        return self.T_first_scan is not None
+
+    def summary(self) -> str:
+        """Return where the scan is in one sentence."""
+        if self.T_first_scan is None:
+            return f"kept apart: {self.why}"
+        if not self.onto or self.rms_mm is None or self.overlap is None:
+            return "the first scan, which others are aligned to"
+        return (
+            f"aligned to {self.onto}: RMS {self.rms_mm:.3f} mm, overlap {100 * self.overlap:.0f} %"
+        )
+
+    def figures(self) -> dict[str, float]:
+        """Return none: a scan's place depends on the order in which the others were aligned."""
+        return {}
+
+    @classmethod
+    def tables(cls, found: Mapping[str, "Placement"]) -> list[Table]:  # type: ignore[override]
+        """Return one table with a line for each scan."""
+        columns = [
+            Column("scan"),
+            Column("onto"),
+            Column("RMS", "mm"),
+            Column("overlap", "%", digits=0),
+            Column("kept apart because"),
+        ]
+        rows: Rows = [
+            [
+                name,
+                p.onto,
+                p.rms_mm,
+                None if p.overlap is None else 100 * p.overlap,
+                Cell(p.why, "worse"),
+            ]
+            for name, p in found.items()
+        ]
+        again = [each.seen_again for each in found.values() if each.seen_again is not None]
+        notes = (
+            [f"{100 * again[-1]:.0f} % of the surface is seen by more than one scan."]
+            if again
+            else []
+        )
+        return [Table(columns, rows, cls.title, notes).without_empty()]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Cell, Column, Rows, Table, Value
 
 
 class HeldOutError(msgspec.Struct, frozen=True):
@@ -74,21 +74,17 @@ class ModelComparison(Record, frozen=True, kw_only=True):
         minutes."""
         return {}
 
-    @classmethod
-    def tables(cls, found: Mapping[str, "ModelComparison"]) -> list[Table]:  # type: ignore[override]
+    def list_tables(self, name: str) -> list[Table]:
         """Return a table of the errors with a line for each model; the least ones are marked."""
-        return [each._make_table() for each in found.values()]
-
-    def _make_table(self) -> Table:
         columns = [
-            Column("model", align="left"),
+            Column("model"),
             Column("plane", "mm", digits=4),
             Column("board", "mm", digits=4),
             Column("scale", "ppm", digits=0),
             Column("camera", "px"),
             Column("projector", "px"),
         ]
-        rows: list[list[Value | Cell]] = []
+        rows: Rows = []
         for model, each in self.models.items():
             row: list[Value | Cell] = [Cell(model, "strong" if model == self.recommended else "")]
             for figure in HeldOutError.__struct_fields__:
@@ -109,4 +105,4 @@ class ModelComparison(Record, frozen=True, kw_only=True):
             f"Recommended of these: {self.recommended}.",
             *(f"{model} could not be compared: {why}." for model, why in self.failed.items()),
         ]
-        return Table(columns, rows, "RMS on held-out poses", notes)
+        return [Table(columns, rows, "RMS on held-out poses", notes)]

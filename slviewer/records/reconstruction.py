@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Table, Value
+from slviewer.records.table import Column, Rows, Table
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is
@@ -60,8 +60,8 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
         """Return one table with a line for each cloud."""
         columns = [
-            Column("capture", align="left"),
-            Column("model", align="left"),
+            Column("capture"),
+            Column("model"),
             Column("axis", align="centre", detail=True),
             Column("points"),
             Column("nearest", "mm", digits=0),
@@ -69,9 +69,9 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             Column("noise", "mm"),
             Column("calibration", "mm", digits=4, detail=True),
             Column("masked", "%", digits=1, detail=True),
-            Column("scale", align="left", detail=True),
+            Column("scale", detail=True),
         ]
-        rows: list[list[Value | Cell]] = []
+        rows: Rows = []
         for name, each in found.items():
             near, far = each.depth_mm or (None, None)
             masked = None if each.masked is None else 100 * each.masked

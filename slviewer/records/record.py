@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import Column, Table, Value
+from slviewer.records.table import Column, Rows, Table
 
 RECORDS: dict[str, type["Record"]] = {}
 """The kinds of records by the folder of their results."""
@@ -53,6 +53,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     is_of_captures: ClassVar[bool] = True  # and not shown once these are deleted
     prefix: ClassVar[str] = ""
     labels: ClassVar[str] = "names"
+    newest_first: ClassVar[bool] = False  # of the tables that each record has
     operation: str = ""
     settings: dict[str, Any] = {}
     inputs: dict[str, str] = {}
@@ -78,14 +79,19 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def tables(cls, found: Mapping[str, "Record"]) -> list[Table]:
-        """Return the tables of some records of this kind, by the name of each: by default a line
-        each, and a column for every figure."""
+        """Return the tables of some records of this kind, by the name of each: by default those of
+        each, or a line each, and a column for every figure."""
+        listed = list(found.items())[:: -1 if cls.newest_first else 1]
+        if own := [table for name, record in listed for table in record.list_tables(name)]:
+            return own
         figures = {name: record.figures() for name, record in found.items()}
         names = list(dict.fromkeys(figure for each in figures.values() for figure in each))
-        rows: list[list[Value]] = [
-            [name, *(each.get(f) for f in names)] for name, each in figures.items()
-        ]
-        return [Table([Column("name", align="left"), *map(figure_column, names)], rows, cls.title)]
+        rows: Rows = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
+        return [Table([Column("name"), *map(figure_column, names)], rows, cls.title)]
+
+    def list_tables(self, name: str) -> list[Table]:
+        """Return the record's own tables; none where records of its kind share them."""
+        return []
 
     @property
     def is_good(self) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from slviewer.errors import InputError
@@ -25,15 +25,19 @@ class Cell:
     mark: Mark = ""
 
 
+Rows = list[list[Value | Cell]]
+
+
 @dataclass(frozen=True)
 class Column:
     """A column's heading, its unit, the group of neighbours that it shares a heading with, and the
-    decimals of its numbers. ``detail``: left out where a table is narrow."""
+    decimals of its numbers. ``align``: by default a `Table` puts texts to the left, numbers to the
+    right. ``detail``: left out where a table is narrow."""
 
     title: str
     unit: str = ""
     group: str = ""
-    align: Literal["left", "right", "centre"] = "right"
+    align: Literal["", "left", "right", "centre"] = ""
     digits: int = 3
     detail: bool = False
 
@@ -72,6 +76,17 @@ class Table:
                     f"a row of the table '{self.caption}' has {len(row)} cells and the table"
                     f" {len(self.columns)} columns: give one cell a column"
                 )
+        aligned = [
+            column if column.align else replace(column, align="left" if is_text else "right")
+            for column, is_text in zip(self.columns, self._find_texts(), strict=True)
+        ]
+        object.__setattr__(self, "columns", aligned)
+
+    def _find_texts(self) -> list[bool]:
+        """Return whether each column holds texts, and no numbers."""
+        rows = list(map(self.values, self.rows))
+        kinds = [{type(row[k]) for row in rows} - {type(None)} for k in range(len(self.columns))]
+        return [found == {str} for found in kinds]
 
     @property
     def groups(self) -> list[tuple[str, int]]:

@@ -9,7 +9,7 @@ import msgspec
 
 from slviewer.records.plain import to_plain
 from slviewer.records.record import Count, Record, Vector, list_numbers
-from slviewer.records.table import Cell, Column, Table, Value, compare_errors
+from slviewer.records.table import Cell, Column, Rows, Table, compare_errors
 
 Shape = Literal["plane", "sphere"]
 MAX_EXCLUDED = 0.02
@@ -100,10 +100,10 @@ class Verification(Record, frozen=True, kw_only=True):
                 tables.append(_make_table(of_shape, caption))
         if distances := centre_distances_mm(found):
             models = list(dict.fromkeys(model for each in distances.values() for model in each))
-            rows: list[list[Value]] = [
+            rows: Rows = [
                 [f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()
             ]
-            columns = [Column("spheres", align="left"), *(Column(model, "mm") for model in models)]
+            columns = [Column("spheres"), *(Column(model, "mm") for model in models)]
             tables.append(Table(columns, rows, "Distances between the centres of spheres"))
         return tables
 
@@ -132,11 +132,11 @@ def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
     """Return the table of measured planes or spheres: a line for each capture and model."""
     first = next(iter(next(iter(found.values())).models))
     columns = [
-        Column("capture", align="left"),
-        Column("model", align="left"),
+        Column("capture"),
+        Column("model"),
         Column("RMS", "mm"),
         Column("noise floor", "mm"),
-        Column(f"against {first}", align="left", detail=True),
+        Column(f"against {first}", detail=True),
         Column("radius", "mm"),
         *(Column(depths, "%", "share in", digits=1, detail=True) for depths in ("R1", "R2", "R3")),
         Column("points", detail=True),
@@ -144,7 +144,7 @@ def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
         Column("coverage", "%", digits=1),
         Column("masked", "%", digits=1, detail=True),
     ]
-    rows: list[list[Value | Cell]] = []
+    rows: Rows = []
     for name, each in found.items():
         for model, fit in each.models.items():
             compared = (

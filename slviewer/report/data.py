@@ -99,19 +99,15 @@ class ErrorMaps:
 
 @dataclass(frozen=True, eq=False)
 class CloudView:
-    """A scan to look at: ``points`` (h, w, 3) organised, or (n, 3), mm, NaN where invalid.
-
-    ``normals`` like ``points``, or None (computed from the grid); ``source`` (n,) numbers the scan
-    that each point of a merged cloud comes from, ``names`` names these; ``note`` is shown beside
-    the number of points.
-    """
+    """A scan to look at, ``points`` (h, w, 3) mm, NaN where invalid; or a merged cloud, ``points``
+    (n, 3) with ``normals``, ``source`` (n,), the number of the scan that each comes from, and the
+    ``names`` of these."""
 
     name: str
     points: np.ndarray
     normals: np.ndarray | None = None
     source: np.ndarray | None = None
     names: tuple[str, ...] = ()
-    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +116,7 @@ class ReproductionData:
 
     ``depth_range_mm`` bounds R2. ``rms_maps_mm`` (3, h, w) are the pixel-wise fits' RMS in z, x, y.
     ``plane_outlines`` holds, by plane, four or more points (n, 3) of it. ``reprojection_rms_px``
-    and the Letter's have the keys camera, projector (and stereo, ours). ``notes`` are warnings of
-    the run, one sentence each.
+    and the Letter's have the keys camera, projector (and stereo, ours).
     """
 
     camera: tuple[int, int]
@@ -146,7 +141,6 @@ class ReproductionData:
     merged: CloudView | None
     poses_left_out: Mapping[str, str] = field(default_factory=dict)
     letter_points: Mapping[str, int] = field(default_factory=dict)
-    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -190,14 +184,6 @@ class CalibrationFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class PixelFitView:
-    """The pixel-wise fits of one axis: ``rms_mm`` (3, h, w) in z, x, y."""
-
-    axis: str
-    rms_mm: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class RecordsView:
     """The records of one kind by their labels, and pictures of them."""
 
@@ -221,14 +207,15 @@ class SessionData:
     """A session's captures, its calibrations, and the records made with them.
 
     ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that
-    made ``calibration``. ``region``: the region of interest that is in effect, in words; ``edits``
+    made ``calibration``. ``pixel_fits``: {axis: RMS (3, h, w) of the pixel-wise fits in z, x, y}.
+    ``region``: the region of interest that is in effect, in words; ``edits``
     of scans in their order: scan and words.
     """
 
     name: str
     captures: Sequence[CaptureRow]
     calibration: CalibrationFigures | None = None
-    pixel_fits: Sequence[PixelFitView] = ()
+    pixel_fits: Mapping[str, np.ndarray] = field(default_factory=dict)
     records: Sequence[RecordsView] = ()
     warnings: Sequence[str] = ()
     verdict: Verdict | None = None

@@ -1,16 +1,23 @@
-"""Maps of per-pixel quantities in the camera image: RMS of the fit, error of the measured point."""
+"""Pictures of per-pixel quantities: RMS of the fit, error of the measured point, decoded projector
+coordinate, and the Letter's picture of one pixel's fit."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.sequence import Axis
 from slviewer.records.verification import Verification
 from slviewer.report.canvas import (
+    DENSITY,
     FULL,
     HALF,
     INK,
+    MODELS,
+    SMALL_PT,
     SOFT,
     TITLE_PT,
     add_colour_bar,
@@ -24,6 +31,7 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
+from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
 TITLE_PX = 34
@@ -230,3 +238,188 @@ def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
 def _format_median(value: float) -> str:
     """Text of a median RMS in mm; "no pixel fitted" for NaN."""
     return f"median {value:.3f} mm" if np.isfinite(value) else "no pixel fitted"
+
+
+REASON_LABELS = {
+    Reason.VALID: "valid",
+    Reason.DARK: "dark",
+    Reason.SATURATED: "saturated",
+    Reason.INCONSISTENT: "inconsistent",
+    Reason.OUTSIDE: "outside of the projector",
+    Reason.INDIRECT: "indirect light",
+}
+REASON_COLOURS = {
+    Reason.DARK: "#3a424b",
+    Reason.SATURATED: "#e5322d",
+    Reason.INCONSISTENT: "#ff8ad8",
+    Reason.OUTSIDE: "#ffffff",
+    Reason.INDIRECT: "#ff9a1f",
+}
+"""None of them occurs in the colour scale of the coordinates."""
+_AROUND_PX = 96  # titles above, the legend below
+
+
+def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
+    """Share of the pixels for each reason, VALID included, 0 to 1."""
+    counts = np.bincount(phase.reason.ravel(), minlength=max(Reason) + 1)
+    return {reason: float(counts[reason] / max(1, phase.reason.size)) for reason in Reason}
+
+
+def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
+    """The coordinates of each axis side by side; masked pixels in the colour of their reason, with
+    their shares."""
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Patch
+
+    h, w = next(iter(phases.values())).reason.shape
+    map_px = (FULL - 70 * len(phases)) // len(phases)
+    height = round(map_px * h / w) + _AROUND_PX
+    drawing = new_figure(FULL, height)
+    drawing.suptitle(title, x=0.004, ha="left", fontsize=SMALL_PT + 3, color=INK, fontweight="bold")
+    step = max(1, -(-w // (DENSITY * map_px)))
+    for axes, (axis, phase) in zip(
+        np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True
+    ):
+        shares = reason_shares(phase)
+        style_image_axes(
+            axes, f"axis {axis}: {100 * shares[Reason.VALID]:.1f} % of the pixels valid"
+        )
+        coordinate, reason = phase.coordinate[::step, ::step], phase.reason[::step, ::step]
+        if not np.isfinite(coordinate).any():  # one value keeps the colour scale finite
+            coordinate = np.zeros_like(coordinate)
+        image = axes.imshow(
+            np.ma.masked_invalid(coordinate),
+            cmap="viridis",
+            aspect="equal",
+            interpolation="nearest",
+        )
+        cover = np.zeros((*reason.shape, 4), np.float32)
+        for code, colour in REASON_COLOURS.items():
+            cover[reason == code] = (*to_rgb(colour), 1.0)
+        axes.imshow(cover, aspect="equal", interpolation="nearest")
+        add_colour_bar(
+            drawing,
+            image,
+            axes,
+            f"projector {'column' if axis == 'x' else 'row'}, px",
+            orientation="vertical",
+        )
+        patches = [
+            Patch(
+                facecolor=colour,
+                edgecolor=INK,
+                linewidth=0.5,
+                label=f"{REASON_LABELS[code]} {100 * shares[code]:.1f} %",
+            )
+            for code, colour in REASON_COLOURS.items()
+        ]
+        axes.legend(
+            handles=patches,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.01),
+            ncols=2,
+            fontsize=SMALL_PT,
+            frameon=False,
+        )
+    listed = ", ".join(
+        f"axis {axis} {100 * float(phase.mask.mean()):.1f} % valid"
+        for axis, phase in phases.items()
+    )
+    return finish_figure(
+        drawing,
+        f"{title}: the projector coordinate that each camera pixel sees, in px; masked pixels in"
+        " the colour of their reason.",
+        f"Maps of the decoded projector coordinates of {title}: {listed}",
+    )
+
+
+DATA = "#c2502e"
+_Fitted = Callable[[np.ndarray], np.ndarray]
+
+
+def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
+    """The rational function and the two lines of one camera pixel with their data, residuals in um
+    below.
+
+    A narrow figure has one curve a row, its residuals beside it.
+    """
+    n = len(curve.phase)
+    if any(np.shape(v) != (n,) for v in (curve.z, curve.x, curve.y)) or np.shape(
+        curve.coefficients
+    ) != (5,):
+        raise InputError(
+            f"pixel {curve.pixel} has {n} phases, and depths {np.shape(curve.z)}, x"
+            f" {np.shape(curve.x)}, y {np.shape(curve.y)} with coefficients"
+            f" {np.shape(curve.coefficients)}: (n,) each and (5,) are needed"
+        )
+    known = np.isfinite([curve.phase, curve.z, curve.x, curve.y]).all(axis=0)
+    phase, z, x, y = (np.asarray(v, float)[known] for v in (curve.phase, curve.z, curve.x, curve.y))
+    c0, c1, c2, c3, c4 = curve.coefficients
+
+    def depth(at: np.ndarray) -> np.ndarray:
+        """Depth z in mm by the rational function, at projector coordinates (n,)."""
+        return (c0 + c1 * at) / (1 + c2 * at)
+
+    curves: tuple[tuple[str, str, np.ndarray, np.ndarray, _Fitted], ...] = (
+        ("z over phase (eq. 9)", "absolute phase, rad", phase, z, depth),
+        ("x over z (eq. 10)", "z, mm", z, x, partial(np.multiply, c3)),
+        ("y over z (eq. 11)", "z, mm", z, y, partial(np.multiply, c4)),
+    )
+    narrow = width <= HALF
+    drawing = new_figure(width, 540 if narrow else 400)
+    if narrow:
+        grid = drawing.add_gridspec(3, 2, width_ratios=(1.35, 1))
+    else:
+        grid = drawing.add_gridspec(2, 3, height_ratios=(3, 1.15))
+    for i, (title, along, at, values, fitted) in enumerate(curves):
+        name, rms = "zxy"[i], curve.rms_mm[i]
+        upper = drawing.add_subplot(grid[i, 0] if narrow else grid[0, i])
+        lower = drawing.add_subplot(grid[i, 1] if narrow else grid[1, i], sharex=upper)
+        stated = f"RMS {1e3 * rms:.0f} µm"
+        if narrow:
+            style_axes(upper, f"{title}: {stated}", along, f"{name}, mm")
+        else:
+            style_axes(upper, title, "", f"{name}, mm")
+        style_axes(lower, "", along, f"{name} - fit, µm")
+        upper.tick_params(labelbottom=narrow)
+        if phase.size:
+            _draw_fit(upper, lower, at, values, fitted)
+            if not narrow:
+                add_legend(upper, loc="best", title=stated, title_fontsize=8.6, alignment="left")
+                upper.get_legend().get_title().set_color(INK)
+            elif i == 0:
+                add_legend(upper, loc="best")
+        lower.axhline(0, color=SOFT, linewidth=0.8)
+    u, v = curve.pixel
+    listed = ", ".join(
+        f"{name} {1e3 * rms:.0f} µm" for name, rms in zip("zxy", curve.rms_mm, strict=True)
+    )
+    return finish_figure(
+        drawing,
+        f"Fit of camera pixel ({u}, {v}) to {phase.size} target poses: z as a rational function of"
+        f" the absolute phase of axis {curve.axis}, x and y as lines through the camera's centre."
+        f" {'Beside' if narrow else 'Below'}: the residuals (RMS {listed}).",
+        f"Curves of z over phase, x over z and y over z at camera pixel ({u}, {v}) with residuals;"
+        f" RMS {listed}",
+    )
+
+
+def _draw_fit(
+    upper: Any,
+    lower: Any,
+    at: np.ndarray,
+    values: np.ndarray,
+    fitted: _Fitted,
+) -> None:
+    """Draw values (n,) mm of a pixel over phases or depths (n,) with the function fitted to them
+    into the upper axes, the residuals in um into the lower ones."""
+    margin = 0.06 * (np.ptp(at) or 1.0)
+    line = np.linspace(at.min() - margin, at.max() + margin, 200)
+    upper.plot(line, fitted(line), color=MODELS["pixelwise"], linewidth=1.5, label="fit")
+    style: dict[str, Any] = {"color": DATA, "markeredgewidth": 0}
+    upper.plot(at, values, "o", markersize=4.2, alpha=0.85, label="target poses", **style)
+    residuals = 1e3 * (values - fitted(at))
+    lower.vlines(at, 0, residuals, color=DATA, linewidth=0.9, alpha=0.6)
+    lower.plot(at, residuals, "o", markersize=3.4, **style)
+    reach = 1.25 * max(float(np.abs(residuals).max()), 1.0)
+    lower.set_ylim(-reach, reach)

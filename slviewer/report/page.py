@@ -2,13 +2,11 @@
 script, no network."""
 
 import base64
-import contextlib
 import hashlib
 import html
 import io
 import os
 import re
-import secrets
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer import __version__
-from slviewer.errors import InputError
 from slviewer.printable import escape_controls
 from slviewer.records.table import Mark, Table
-from slviewer.session.atomic import rename
+from slviewer.session.atomic import replace_file
 
 CERTIFICATE = '<template id="certificate">', "</template>"
 """What stands before and after a page's certificate: what it was made from, as escaped JSON;
@@ -110,7 +107,7 @@ def write_page(
     path: Path | str,
     title: str,
     subtitle: str,
-    headlines: Sequence[Headline | tuple[str, str, str]],
+    headlines: Sequence[Headline],
     sections: Sequence[Section],
     certify: Callable[[str], str] | None = None,
     frame: str = "in the camera's frame",
@@ -118,30 +115,13 @@ def write_page(
     """Write the page to ``path``, complete or not at all; every text is shown as typed, never run.
 
     ``frame``: in what coordinates places are; ``certify``: returns the text of the certificate that
-    the page keeps, given its digest. Raises InputError where the file cannot be written.
+    the page keeps, given its digest. Raises SessionError where the file cannot be written.
     """
-    page = _render(
-        title, subtitle, [Headline(*headline) for headline in headlines], sections, frame
-    )
+    page = _render(title, subtitle, headlines, sections, frame)
     if certify is not None:
         kept = html.escape(certify(page_digest(page))).join(CERTIFICATE)
         page = page.replace("</body>", f"{kept}</body>")
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}-{secrets.token_hex(4)}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "xb") as file:
-            file.write(page.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        rename(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be written ({error.strerror}): choose another place or free it"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+    replace_file(Path(path), page.encode())
 
 
 def split_page(page: str, marks: tuple[str, str]) -> tuple[str, str | None, str]:

@@ -1,26 +1,35 @@
-"""Report sections of a session: captures, calibration and verification."""
+"""Report sections of a session: captures, calibration and verification; and the report on many
+parts, with a trend chart of each characteristic."""
 
 import inspect
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.render import format_count
 from slviewer.geometry.lens import Lens
-from slviewer.records.table import Cell, Column, Mark, Table
+from slviewer.geometry.rigid import rotation_angle
+from slviewer.records.acceptance import MARKS, Decision
+from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
+from slviewer.records.table import Cell, Column, Mark, Rows, Table
+from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification
-from slviewer.report.canvas import percentile
-from slviewer.report.data import CalibrationFigures, RecordsView, SessionData
-from slviewer.report.maps import rms_maps
-from slviewer.report.page import Headline, Item, PageNotice, Section
-from slviewer.report.quality import (
-    models_section,
-    verdict_headline,
-    verdict_section,
+from slviewer.report.canvas import (
+    HALF,
+    INK,
+    SOFT,
+    finish_figure,
+    new_figure,
+    percentile,
+    style_axes,
 )
+from slviewer.report.data import CalibrationFigures, ModelsView, RecordsView, SessionData
+from slviewer.report.maps import rms_maps
+from slviewer.report.page import Figure, Headline, Item, PageNotice, Section, write_page
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
-from slviewer.report.tables import format_number
 
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
@@ -40,16 +49,20 @@ def session_title(data: SessionData) -> tuple[str, str]:
 
 
 def session_headlines(data: SessionData) -> list[Headline]:
-    """Headlines: poses used, reprojection error, RMS of the fit, and the best flatness verified."""
-    headlines = [] if data.verdict is None else [verdict_headline(data.verdict)]
-    calibration = data.calibration
-    if calibration is not None:
+    """Headlines: verdict, poses used, reprojection error, RMS of the fit, and the best flatness
+    verified."""
+    headlines = []
+    if data.verdict is not None:
+        mark: Mark = "better" if data.verdict.level == "good" else "worse"
+        count = format_count(len(data.verdict.findings), "finding")
+        headlines.append(Headline(data.verdict.level, "verdict on the calibration", count, mark))
+    if data.calibration is not None:
+        stereo = data.calibration.stereo
         used = sum(row.state == "used" for row in data.captures)
         wanted = sum(row.role == "calibration" for row in data.captures)
-        note = f"boards at {_format_depths(calibration.stereo)}"
+        note = f"boards at {_format_depths(stereo)}"
         headlines.append(Headline(f"{used} of {wanted}", "target poses used", note))
-        rms = calibration.stereo.reprojection_rms_px
-        if rms:
+        if rms := stereo.reprojection_rms_px:
             headlines.append(
                 Headline(
                     f"{rms.get('camera', np.nan):.3f} / {rms.get('projector', np.nan):.3f} px",
@@ -57,43 +70,28 @@ def session_headlines(data: SessionData) -> list[Headline]:
                     f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else "",
                 )
             )
-    fits = [(percentile(fit.rms_mm[0], 50), fit.axis) for fit in data.pixel_fits]
-    fits = [fit for fit in fits if np.isfinite(fit[0])]
-    if fits:
-        rms_z, axis = min(fits)
-        headlines.append(
-            Headline(
-                f"{rms_z:.3f} mm",
-                "pixel-wise fit, RMS in z",
-                f"median over the pixels, axis {axis}",
-            )
-        )
+    fits = [(percentile(rms[0], 50), axis) for axis, rms in data.pixel_fits.items()]
+    if known := [fit for fit in fits if np.isfinite(fit[0])]:
+        rms_z, axis = min(known)
+        note = f"median over the pixels, axis {axis}"
+        headlines.append(Headline(f"{rms_z:.3f} mm", "pixel-wise fit, RMS in z", note))
     return headlines + _plane_headline(data)
 
 
 def _plane_headline(data: SessionData) -> list[Headline]:
     """Headline of the flattest model's mean plane RMS, beside its noise floor and the other
     models'."""
-    fits = [
-        (model, fit)
-        for view in data.records
-        if view.kind is Verification
-        for each in view.records.values()
-        if each.shape == "plane"
-        for model, fit in each.models.items()
-    ]
-    rms = {
-        model: [fit.rms_mm for name, fit in fits if name == model and fit.rms_mm is not None]
-        for model, _ in fits
-    }
+    rms, floors = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
+    for each in (each for view in data.records for each in view.records.values()):
+        if isinstance(each, Verification) and each.shape == "plane":
+            for model, fit in each.models.items():
+                rms[model] += [] if fit.rms_mm is None else [fit.rms_mm]
+                floors[model] += [] if fit.noise_floor_mm is None else [fit.noise_floor_mm]
     means = {model: float(np.mean(values)) for model, values in rms.items() if values}
     if not means:
         return []
     best = min(means, key=lambda model: means[model])
-    floors = [
-        fit.noise_floor_mm for name, fit in fits if name == best and fit.noise_floor_mm is not None
-    ]
-    notes = [f"noise floor {np.mean(floors):.3f} mm"] if floors else []
+    notes = [f"noise floor {np.mean(floors[best]):.3f} mm"] if floors[best] else []
     notes += [f"{other} {mean:.3f} mm" for other, mean in means.items() if other != best]
     mark: Mark = "better" if len(means) > 1 else ""
     return [Headline(f"{means[best]:.3f} mm", f"mean plane RMS, {best}", "; ".join(notes), mark)]
@@ -104,16 +102,21 @@ def session_sections(data: SessionData) -> list[Section]:
     captures."""
     sections = _notice_section(data)
     if data.verdict is not None:
-        sections.append(verdict_section(data.verdict, data.verdict_of_calibration))
+        sections.append(_verdict_section(data.verdict, data.verdict_of_calibration))
     if data.calibration is not None:
         sections += [
             _reprojection_section(data.calibration),
             _parameters_section(data.calibration.stereo),
         ]
     if data.models is not None:
-        sections.append(models_section(data.models))
+        sections.append(_models_section(data.models))
     if data.pixel_fits:
-        sections.append(_pixel_fits_section(data))
+        text = (
+            "Each camera pixel's own rational function from phase to depth, and lines from depth to"
+            " x and y."
+        )
+        maps = [rms_maps(rms, axis) for axis, rms in data.pixel_fits.items()]
+        sections.append(Section("Pixel-wise model", text, maps))
     sections += [_records_section(view) for view in data.records]
     if data.region or data.edits:
         sections.append(_restrictions_section(data))
@@ -139,10 +142,8 @@ def _restrictions_section(data: SessionData) -> Section:
         if data.region
         else ""
     )
-    columns = [Column("scan", align="left"), Column("edit", align="left")]
-    table = Table(
-        columns, [[scan, words] for scan, words in data.edits], "Edits in effect, in their order"
-    )
+    columns = [Column("scan"), Column("edit")]
+    table = Table(columns, data.edits, "Edits in effect, in their order")
     return Section("Region and edits", text, [table] if data.edits else [])
 
 
@@ -151,40 +152,31 @@ def _captures_section(data: SessionData) -> Section:
     used."""
     marks: dict[str, Mark] = {"used": "better", "unused": "worse", "excluded": "worse"}
     columns = [
-        Column("capture", align="left"),
-        Column("role", align="left"),
-        Column("state", align="left"),
-    ]
-    columns += [
-        Column("camera", "px"),
-        Column("projector", "px"),
+        *(Column(title) for title in ("capture", "role", "state")),
+        Column("camera", "px", align="right"),
+        Column("projector", "px", align="right"),
         Column("frames"),
         Column("period", "px", align="centre"),
+        *(Column(title) for title in ("made", "why not used")),
     ]
-    columns += [Column("made", align="left"), Column("why not used", align="left")]
-    rows: list[list[str | Cell]] = [
+    rows: Rows = [
         [
             row.name,
             row.role,
             Cell(row.state, marks.get(row.state, "")),
-            f"{row.camera[0]}x{row.camera[1]}",
-            f"{row.projector[0]}x{row.projector[1]}" if row.projector else "unknown",
-            str(row.frames),
+            "{}x{}".format(*row.camera),
+            "{}x{}".format(*row.projector) if row.projector else "unknown",
+            row.frames,
             ", ".join(f"{axis} {period:g}" for axis, period in row.periods_px.items()),
             row.made,
             row.why,
         ]
         for row in data.captures
     ]
-    filled = [i for i, _ in enumerate(columns) if i < 7 or any(row[i] for row in rows)]
-    table = Table(
-        [columns[i] for i in filled],
-        [[row[i] for i in filled] for row in rows],
-        "Captures of the session",
-    )
-    return Section(
-        "Captures", "" if rows else "The session holds no captures yet.", [table] if rows else []
-    )
+    if not rows:
+        return Section("Captures", "The session holds no captures yet.")
+    table = Table(columns, rows, "Captures of the session").without_empty()
+    return Section("Captures", "", [table])
 
 
 def _reprojection_section(calibration: CalibrationFigures) -> Section:
@@ -232,18 +224,14 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
 def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
     """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
     typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
-    columns = [Column("pose", align="left"), Column("camera", "px"), Column("projector", "px")]
-    rows: list[list[str | Cell]] = []
+    columns = [Column("pose"), Column("camera", "px"), Column("projector", "px")]
+    rows: Rows = []
     for name, values in pose_rms_px.items():
-        high = [value > WORST * usual for value, usual in zip(values, typical, strict=True)]
-        shown = [
-            Cell(f"{v:.3f}", "worse") if h else format_number(v)
-            for v, h in zip(values, high, strict=True)
-        ]
-        rows.append([name, *shown, Cell("look at this pose", "worse") if any(high) else ""])
-    if any(row[3] for row in rows):
-        columns.append(Column("", align="left"))
-    return Table(columns, [row[: len(columns)] for row in rows], "Reprojection RMS of each pose")
+        high = np.array(values) > WORST * typical
+        cells = [Cell(v, "worse" if h else "") for v, h in zip(values, high, strict=True)]
+        rows.append([name, *cells, Cell("look at this pose" if high.any() else "", "worse")])
+    columns.append(Column(""))
+    return Table(columns, rows, "Reprojection RMS of each pose").without_empty()
 
 
 def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
@@ -262,12 +250,9 @@ def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
 
     names = [
         "size",
-        "focal length fx",
-        "focal length fy",
-        "principal point cx",
-        "principal point cy",
+        *("focal length fx", "focal length fy", "principal point cx", "principal point cy"),
+        *("radial k1", "radial k2", "tangential p1", "tangential p2", "radial k3"),
     ]
-    names += ["radial k1", "radial k2", "tangential p1", "tangential p2", "radial k3"]
     sigmas = stereo.focal_sigma_px
     camera = values(stereo.rig.camera, sigmas.get("camera", np.nan))
     projector = values(stereo.rig.projector, sigmas.get("projector", np.nan))
@@ -278,7 +263,7 @@ def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
     """Table rows with the projector's pose in the camera frame as text: (quantity, value with its
     unit)."""
     R, t = stereo.rig.R, np.asarray(stereo.rig.t, float).ravel()
-    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    angle = np.degrees(rotation_angle(R))
     axes = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
     return [
         ("baseline (distance of the two devices)", f"{np.linalg.norm(t):.2f} mm"),
@@ -302,10 +287,10 @@ def _format_depths(stereo: StereoModel) -> str:
 def _parameters_section(stereo: StereoModel) -> Section:
     """The section with the parameters of both lenses and the pose of the projector."""
     columns = [
-        Column("parameter", align="left"),
+        Column("parameter"),
         Column("unit", align="centre"),
-        Column("camera"),
-        Column("projector"),
+        Column("camera", align="right"),
+        Column("projector", align="right"),
     ]
     note = "± is one standard deviation, from the lens's own calibration."
     return Section(
@@ -314,18 +299,8 @@ def _parameters_section(stereo: StereoModel) -> Section:
         " camera's frame.",
         [
             Table(columns, lens_rows(stereo), "Lenses", [note]),
-            Table([Column("quantity", align="left"), Column("value")], rig_rows(stereo), "Rig"),
+            Table([Column("quantity"), Column("value", align="right")], rig_rows(stereo), "Rig"),
         ],
-    )
-
-
-def _pixel_fits_section(data: SessionData) -> Section:
-    """The section about the pixel-wise fits: RMS maps of each axis."""
-    return Section(
-        "Pixel-wise model",
-        "Each camera pixel's own rational function from phase to depth, and lines from depth to x"
-        " and y.",
-        [rms_maps(fit.rms_mm, fit.axis) for fit in data.pixel_fits],
     )
 
 
@@ -337,4 +312,114 @@ def _records_section(view: RecordsView) -> Section:
     ]
     return Section(
         view.kind.title, text, [*notices, *view.kind.tables(view.records), *view.figures]
+    )
+
+
+_LEVELS: dict[str, tuple[str, str]] = {
+    "good": ("Good: no problems detected.", "good"),
+    "doubtful": ("Doubtful: use it with care, or correct the causes first.", "warning"),
+    "rejected": ("Rejected: do not measure with this calibration.", "warning"),
+}
+
+
+def _verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
+    """The section with the verdict's level, and every finding with its remedy."""
+    words, kind = _LEVELS[verdict.level]
+    items: list[Item] = [PageNotice(words, kind)]  # type: ignore[arg-type]
+    for finding in verdict.findings:
+        is_corrected = finding.severity == "note"
+        what = "Already corrected." if is_corrected else f"What to do: {finding.remedy}."
+        items.append(
+            PageNotice(f"{finding.sentence}. {what}", "plain" if is_corrected else "warning")
+        )
+    text = (
+        ""
+        if of_calibration
+        else "This verdict is on the last attempt to calibrate, which gave no calibration."
+    )
+    return Section("Verdict", text, items)
+
+
+def _models_section(models: ModelsView) -> Section:
+    """The section about the model that is used, and corrections of scale."""
+    items: list[Item] = [
+        PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()
+    ]
+    used = f"Measured with {models.used}"
+    used += (
+        "."
+        if models.used == models.recommended
+        else f", as the operator has chosen; recommended: {models.recommended}."
+    )
+    return Section("Model in use", used, items)
+
+
+COLOURS: dict[Decision, str] = {"pass": "#1f9673", "fail": "#c2362e", "undecided": "#c98a12"}
+
+
+def write_parts_page(path: Path, found: Inspection) -> None:
+    """Write the report on parts as one HTML file."""
+    headlines = [Headline(str(len(found.parts)), "parts")]
+    for decision, count in found.count_parts().items():
+        is_marked = decision == "pass" or (decision == "fail" and count)
+        headlines.append(Headline(str(count), decision, "", MARKS[decision] if is_marked else ""))
+    names = [each.part for each in found.parts]
+    charts = [
+        _trend_chart(wanted, names, [each.results[k] for each in found.parts])
+        for k, wanted in enumerate(found.characteristic)
+    ]
+    sections = [
+        Section("Parts and characteristics", "", Inspection.tables({found.plan: found})),
+        Section(
+            "Trends",
+            "Values with U (k = 2) in the order of the parts; lines are the limits.",
+            charts,
+        ),
+    ]
+    subtitle = format_count(len(found.characteristic), "characteristic")
+    frame = "in the camera's frame" if found.alignment == "none" else "in part coordinates"
+    write_page(path, f"Inspection: {found.plan}", subtitle, headlines, sections, frame=frame)
+
+
+def _trend_chart(
+    wanted: Characteristic, names: Sequence[str], results: Sequence[CharacteristicResult]
+) -> Figure:
+    """The values of one characteristic over the parts, with U and the limits."""
+    drawing = new_figure(HALF, 260)
+    axes = drawing.add_subplot()
+    style_axes(axes, wanted.name, "part", f"{wanted.kind}, {wanted.unit}")
+    for decision, colour in COLOURS.items():
+        at = [
+            k
+            for k, each in enumerate(results)
+            if each.value is not None and each.decision == decision
+        ]
+        values, U = ([getattr(results[k], what) for k in at] for what in ("value", "U"))
+        axes.errorbar(
+            np.array(at) + 1,
+            values,
+            U,
+            fmt="o",
+            color=colour,
+            markersize=3.6,
+            linewidth=0.9,
+            capsize=1.5,
+        )
+    for limit, style, colour in (
+        (wanted.lower, "--", INK),
+        (wanted.upper, "--", INK),
+        (wanted.nominal, ":", SOFT),
+    ):
+        if limit is not None:
+            axes.axhline(limit, color=colour, linewidth=0.9, linestyle=style)
+    axes.set_xlim(0.5, len(results) + 0.5)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    listed = ", ".join(
+        f"{k + 1} {names[k]}" for k, each in enumerate(results) if each.decision == "fail"
+    )
+    words = f"Fail: {listed}." if listed else "No part fails."
+    return finish_figure(
+        drawing,
+        f"{wanted.name}. {words}",
+        f"Trend of {wanted.name} over {len(results)} parts. {words}",
     )

@@ -44,13 +44,13 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def rename(source: Path, target: Path, patience_s: float = _PATIENCE_S) -> None:
+def rename(source: Path, target: Path) -> None:
     """Rename a file over another one, or a folder to a name that is free.
 
     Windows refuses while another program has it open, such as a virus scanner, an indexer or a copy
-    of the folder: it is tried again for ``patience_s``.
+    of the folder: it is tried again for some seconds.
     """
-    end = time.monotonic() + patience_s
+    end = time.monotonic() + _PATIENCE_S
     while True:
         try:
             os.replace(source, target) if source.is_file() else os.rename(source, target)
@@ -86,19 +86,11 @@ def replace_json(path: Path, data: Any) -> None:
     replace_file(path, to_json(data))
 
 
-def replace_file(path: Path, data: bytes, patience_s: float = _PATIENCE_S) -> None:
+def replace_file(path: Path, data: bytes) -> None:
     """Replace a file by a new one in one step. Raises SessionError where the disk refuses, or
-    another program still has the old one open after ``patience_s``; the old one then stays."""
-    temporary = _staging_path(path, "tmp")
-    with disk_errors(path.parent, len(data)):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            write_bytes(temporary, data)
-            rename(temporary, path, patience_s)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-        sync_folder(path.parent)
+    another program still has the old one open after some seconds; the old one then stays."""
+    with _arriving(path, len(data)) as temporary:
+        write_bytes(temporary, data)
 
 
 @contextmanager
@@ -117,14 +109,22 @@ def arriving_file(path: Path, needs_bytes: int = 0) -> Iterator[BinaryIO]:
 def arriving_path(path: Path, needs_bytes: int = 0) -> Iterator[Path]:
     """As `arriving_file`, of a file that does not exist yet, for a library that creates it
     itself."""
+    with _arriving(path, needs_bytes) as temporary:
+        _require_space(path.parent, needs_bytes)
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def _arriving(path: Path, needs_bytes: int) -> Iterator[Path]:
+    """Context manager: a path beside ``path`` for a file that is renamed to it at the end, and
+    removed where that fails."""
     temporary = _staging_path(path, "tmp")
     with disk_errors(path.parent, needs_bytes):
         path.parent.mkdir(parents=True, exist_ok=True)
-        _require_space(path.parent, needs_bytes)
         try:
             yield temporary
-            with open(temporary, "rb+") as file:
-                os.fsync(file.fileno())
             rename(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)
@@ -185,9 +185,8 @@ class Together:
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._changes: dict[
-            Path, tuple[Path | None, Path | None]
-        ] = {}  # target: (what replaces it, where it goes)
+        # target: (what replaces it, where it goes)
+        self._changes: dict[Path, tuple[Path | None, Path | None]] = {}
 
     def replace(self, target: Path, folder: Path | None, old_to: Path | None = None) -> None:
         """Let a folder, staged or from the trash, or nothing become ``target``, whose present one
@@ -262,22 +261,21 @@ def _read_changes(decided: Path) -> list[tuple[Path, Path | None, Path | None]]:
     """The changes that a file of `Together` lists; DamagedError where it lists anything but paths
     in its folder."""
 
-    def inside(name: str) -> Path:
+    def inside(name: str | None) -> Path | None:
         """Return the path of a name below the file's folder; raises ValueError for others."""
-        path = decided.parent / name
-        if ".." in path.parts or decided.parent not in path.parents:
+        path = None if name is None else decided.parent / name
+        if path and (".." in path.parts or decided.parent not in path.parents):
             raise ValueError(f"{name} is outside of {decided.parent}")
         return path
 
+    changes = []
     with decoding(decided):
-        return [
-            (
-                inside(target),
-                None if staged is None else inside(staged),
-                None if old_to is None else inside(old_to),
-            )
-            for target, staged, old_to in read_json(decided)["changes"]
-        ]
+        for listed in read_json(decided)["changes"]:
+            target, staged, old_to = map(inside, listed)
+            if target is None:
+                raise ValueError("a change without a target")
+            changes.append((target, staged, old_to))
+    return changes
 
 
 def _check_unlinked(decided: Path) -> None:

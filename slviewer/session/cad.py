@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slviewer.errors import SessionError
-from slviewer.session.isolated import limit_process, run_isolated
+from slviewer.session.reading import limit_process, run_isolated
 
 PACKAGES = {"step": ("cascadio",), "stp": ("cascadio",), "3mf": ("lxml", "networkx")}
 """What reading a format needs."""
@@ -78,6 +78,7 @@ def _parse(file_format: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     mesh = scene.to_mesh()
     if mesh.is_empty:
         raise ValueError("no triangles")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 

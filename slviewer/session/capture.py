@@ -19,13 +19,12 @@ from slviewer.records.plain import from_plain
 from slviewer.session.atomic import to_json, write_bytes, write_synced_json
 from slviewer.session.names import is_safe_name
 from slviewer.session.reading import decoding, read_json
+from slviewer.session.results import Exposure, Size
 from slviewer.session.stack import (
+    FrameStack,
+    check_indices,
     check_stack_array,
-    describe_stack,
     hash_frames,
-    hash_stack,
-    identify_stack,
-    read_stack,
     write_stack,
 )
 
@@ -93,29 +92,24 @@ class Capture:
         have no checksums, only where all are read), SessionError where the capture was replaced
         since it was loaded.
         """
-        path = self.folder / "frames.zarr"
+        stored = FrameStack.open(self.folder / "frames.zarr")
         n, (width, height) = len(self.sequence.frames) * max(1, len(self.exposures_ms)), self.size
-        if (shape := describe_stack(path)[0]) != (n, height, width):
+        if (shape := stored.shape) != (n, height, width):
             raise DamagedError(
                 f"{self.name}: {self.folder} is damaged: its description states {n} frames of"
                 f" {width}x{height} px, and frames.zarr holds {shape[0]} of {shape[2]}x{shape[1]}"
                 " px: restore the folder from a copy, or import or record the capture again"
             )
-        if (indices is None or self.exposures_ms) and (
-            identity := identify_stack(path)
-        ) is not None:
-            _verify_once(self.folder, self.hash, identity)
-        stack = self._merged(path, indices) if self.exposures_ms else read_stack(path, indices)
-        if read_json(self.folder / "capture.json").get("hash") != self.hash:
-            raise SessionError(
-                f"capture {self.name!r} was replaced while it was in use: load it again"
-            )
+        if (indices is None or self.exposures_ms) and not stored.has_checksums:
+            _verify_once(self.folder, self.hash, stored.identify())
+        stack = self._merged(stored, indices) if self.exposures_ms else stored.read(indices)
+        _require_unchanged(self.folder, self.hash)
         return stack
 
     def verify(self) -> list[str]:
         """Read everything; returns the hash of each stored frame. Raises DamagedError unless the
         frames and their description are those that were saved."""
-        content, frames = hash_stack(self.folder / "frames.zarr")
+        content, frames = FrameStack.open(self.folder / "frames.zarr").hash()
         described, exposures_ms = self.meta["sequence"], self.meta.get("exposures_ms")
         if _hash_content(content, described, exposures_ms, self.texture) != self.hash:
             raise DamagedError(
@@ -148,28 +142,18 @@ class Capture:
         exposure."""
         if not self.exposures_ms:
             return None
-        return _choose_exposures(
-            self.folder / "frames.zarr", self.exposures_ms, self.sequence, self.hash
-        )
+        return _choose_exposures(self.folder, self.exposures_ms, self.sequence, self.hash)
 
-    def _merged(self, path: Path, indices: Sequence[int] | None) -> np.ndarray:
+    def _merged(self, stored: FrameStack, indices: Sequence[int] | None) -> np.ndarray:
         """The merged frames (n, h, w) at `indices`; with one frame of each exposure in memory at
         most."""
         n, choice = len(self.sequence.frames), self.exposure_choice
         assert choice is not None
-        wanted = list(range(n)) if indices is None else [int(index) for index in indices]
-        if any(not 0 <= index < n for index in wanted):
-            raise InputError(
-                f"frames {wanted} were requested, {self.name} has {n} frames: count from 0"
-            )
+        wanted = check_indices(self.name, indices, n)
         masks = chosen(choice, len(self.exposures_ms))
-        stack = np.empty((len(wanted), *choice.shape), describe_stack(path)[1])
+        stack = np.empty((len(wanted), *choice.shape), stored.dtype)
         for slot, index in enumerate(wanted):
-            pick(
-                list(read_stack(path, [index + n * e for e in range(len(masks))])),
-                masks,
-                stack[slot],
-            )
+            pick(list(stored.read(range(index, stored.shape[0], n))), masks, stack[slot])
         return stack
 
     @property
@@ -180,29 +164,24 @@ class Capture:
             return None
         from slviewer.session.importers.images import read_image
 
-        fault, shape = "", (self.size[1], self.size[0], 3)
+        shape = (self.size[1], self.size[0], 3)
         try:
             image = read_image(path)
+            if image.shape != shape:
+                raise InputError(f"its shape is {image.shape}, not {shape}")
         except InputError as error:
-            fault = str(error)
-        else:
-            fault = "" if image.shape == shape else f"its shape is {image.shape}, not {shape}"
-        if fault:
             raise DamagedError(
-                f"{self.name}: its texture is damaged ({path}: {fault}): restore this file from a"
+                f"{self.name}: its texture is damaged ({path}: {error}): restore this file from a"
                 " copy, or import or record the capture again"
-            )
+            ) from error
         return np.ascontiguousarray(image[..., ::-1])
-
-
-_Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
 
 
 @dataclass(frozen=True)
 class _Camera:
     """The entry `camera` of `capture.json`."""
 
-    size: tuple[_Extent, _Extent]
+    size: Size
 
 
 @dataclass(frozen=True)
@@ -216,7 +195,7 @@ class _Description:
     source: str = ""
     board: str | None = None
     texture: bool = False
-    exposures_ms: list[Annotated[float, msgspec.Meta(gt=0, lt=1e9)]] = field(default_factory=list)
+    exposures_ms: list[Exposure] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -399,27 +378,33 @@ def _verify_once(folder: Path, content_hash: str, identity: object) -> None:
 
 @lru_cache(maxsize=4)
 def _choose_exposures(
-    path: Path, exposures_ms: tuple[float, ...], sequence: PatternSequence, content_hash: str
+    folder: Path, exposures_ms: tuple[float, ...], sequence: PatternSequence, content_hash: str
 ) -> np.ndarray:
     """(h, w) uint8: the exposure of each pixel, from all frames of the stack; cached by its
     content."""
     n = len(sequence.frames)
 
+    stored = FrameStack.open(folder / "frames.zarr")
+
     def frames(exposure: int) -> Iterator[np.ndarray]:
         """Yield the frames (h, w) of one exposure, a few in memory at a time."""
+        indices = range(exposure * n, (exposure + 1) * n)
         for first in range(0, n, _FRAMES_IN_MEMORY):
-            yield from read_stack(
-                path, range(exposure * n + first, exposure * n + min(first + _FRAMES_IN_MEMORY, n))
-            )
+            yield from stored.read(indices[first : first + _FRAMES_IN_MEMORY])
 
     highest = np.stack([peaks(frames(e)) for e in range(len(exposures_ms))])
     choice = choose_exposure(highest, exposures_ms, sequence.full_scale)
-    if read_json(path.parent / "capture.json").get("hash") != content_hash:
-        raise SessionError(
-            f"capture {path.parent.name!r} was replaced while it was in use: load it again"
-        )
+    _require_unchanged(folder, content_hash)
     choice.flags.writeable = False
     return choice
+
+
+def _require_unchanged(folder: Path, content_hash: str) -> None:
+    """Raise SessionError where the capture in a folder has another hash than when it was loaded."""
+    if read_json(folder / "capture.json").get("hash") != content_hash:
+        raise SessionError(
+            f"capture {folder.name!r} was replaced while it was in use: load it again"
+        )
 
 
 def _encode_png(texture: np.ndarray) -> Any:

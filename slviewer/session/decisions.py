@@ -20,8 +20,8 @@ from slviewer.records.plain import from_plain
 from slviewer.session.atomic import replace_file, replace_json
 from slviewer.session.names import natural_key, new_name
 from slviewer.session.reading import read_json
+from slviewer.session.results import Exposure
 
-_Exposure = Annotated[float, msgspec.Meta(gt=0, lt=1e9)]
 _Millimetres = Annotated[float, msgspec.Meta(gt=-1e6, lt=1e6)]
 _Triple = tuple[_Millimetres, _Millimetres, _Millimetres]
 
@@ -45,7 +45,7 @@ _Decisions = TypedDict(
         "target": str | None,
         "patterns": str | None,
         "levels": list[Annotated[int, msgspec.Meta(ge=0, le=255)]] | None,
-        "exposures": list[_Exposure] | None,
+        "exposures": list[Exposure] | None,
         "exposure": dict[Literal["exposure_ms", "gain"], float | None] | None,
         "sigma_wanted_mm": Annotated[float, msgspec.Meta(ge=0, lt=1e6)] | None,
         "rig": dict[str, Any] | None,

@@ -1,6 +1,7 @@
 """Files for other programs: calibrations for OpenCV and for people, pattern images for any
-projector."""
+projector, float maps as OpenEXR."""
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -114,3 +115,39 @@ def _write_entry(storage: Any, key: str, value: Any) -> None:
         storage.write(
             key, np.ascontiguousarray(column, np.float64 if matrix.dtype.kind == "f" else np.int32)
         )
+
+
+_MAGIC, _VERSION = 20000630, 2
+_FLOAT = 2  # pixel type of 32-bit floats
+
+
+def write_exr(path: Path, values: np.ndarray) -> None:
+    """Write (h, w) float32 as the luminance channel "Y" of an OpenEXR file, NaN included, replacing
+    a file of that name.
+
+    Only the plainest form of the format is written (version 2, scan lines, one channel,
+    uncompressed), which every reader understands. Layout: openexr.com, "OpenEXR File Layout".
+    """
+    if values.ndim != 2 or values.dtype != np.float32:
+        raise ValueError(f"an EXR map must be (h, w) float32, not {values.shape} {values.dtype}")
+    height, width = values.shape
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    attributes = (
+        ("channels", "chlist", b"Y\0" + struct.pack("<i4B2i", _FLOAT, 0, 0, 0, 0, 1, 1) + b"\0"),
+        ("compression", "compression", b"\0"),
+        ("dataWindow", "box2i", window),
+        ("displayWindow", "box2i", window),
+        ("lineOrder", "lineOrder", b"\0"),
+        ("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
+        ("screenWindowCenter", "v2f", struct.pack("<2f", 0.0, 0.0)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1.0)),
+    )
+    header = struct.pack("<2i", _MAGIC, _VERSION)
+    for name, kind, value in attributes:
+        header += f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
+    header += b"\0"
+    lines = np.empty(height, [("row", "<i4"), ("bytes", "<i4"), ("values", "<f4", (width,))])
+    lines["row"], lines["bytes"], lines["values"] = np.arange(height), 4 * width, values
+    first = len(header) + 8 * height
+    offsets = first + lines.itemsize * np.arange(height, dtype="<u8")
+    path.write_bytes(header + offsets.tobytes() + lines.tobytes())

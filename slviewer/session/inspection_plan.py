@@ -8,11 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.inspection.features import Feature
+from slviewer.geometry.vectors import unit_vectors
+from slviewer.inspection.features import MEANINGS, Feature
 from slviewer.inspection.regions import Region
-from slviewer.inspection.relations import MEANINGS
 from slviewer.records.inspection import Characteristic
 from slviewer.records.plain import from_plain, to_plain
+from slviewer.records.record import Matrix4, Vector
 from slviewer.session.atomic import replace_file
 from slviewer.session.reading import read_toml
 from slviewer.session.toml import table_lines
@@ -29,44 +30,6 @@ KINDS: dict[str, int] = {
     **dict.fromkeys((*TO_DATUM, *RELATIONS), 2),
 }
 """The number of features that each kind of characteristic takes; the second is the datum."""
-Vector = tuple[float, float, float]
-Row = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class PlanRegion:
-    """A ball (``size``: radius) or a box (``size``: half sides) in part coordinates, mm; ``axes``:
-    the directions of a box's sides, where they are not the part's axes."""
-
-    kind: Literal["ball", "box"]
-    centre: Vector
-    size: tuple[float, ...]
-    axes: tuple[Vector, Vector, Vector] | None = None
-
-    def __post_init__(self) -> None:
-        wanted = 1 if self.kind == "ball" else 3
-        if len(self.size) != wanted or not all(0 < s < np.inf for s in self.size):
-            raise ValueError(
-                f"a {self.kind} needs {wanted} sizes above 0 mm, not {list(self.size)}"
-            )
-
-    def within(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool: which points (n, 3) mm in part coordinates lie in it."""
-        local = points - np.array(self.centre)
-        if self.axes is not None:
-            local = local @ np.array(self.axes).T
-        return Region(self.kind, np.zeros(3), np.array(self.size)).within(local)
-
-    @classmethod
-    def of(cls, region: Region, T_part_scan: np.ndarray) -> "PlanRegion":
-        """The region of a scan in part coordinates."""
-        centre = T_part_scan[:3, :3] @ region.centre + T_part_scan[:3, 3]
-        directions = (np.eye(3) if region.axes is None else region.axes) @ T_part_scan[:3, :3].T
-        turned = region.kind == "box" and not np.allclose(directions, np.eye(3))
-        x, y, z = (_vector(each, 9) for each in directions)
-        return cls(
-            region.kind, _vector(centre), tuple(region.size.tolist()), (x, y, z) if turned else None
-        )
 
 
 @dataclass(frozen=True)
@@ -77,25 +40,20 @@ class PlanFeature:
 
     name: str
     kind: Literal["plane", "sphere", "cylinder", "surface"]
-    region: PlanRegion
+    region: Region
     place: Vector | None = None
     direction: Vector | None = None
     radius: float | None = None
 
     def nominal(self) -> Feature:
         """The nominal feature. Raises InputError where the plan does not give it."""
-        if (
-            self.kind == "surface"
-            or self.place is None
-            or (self.kind != "sphere" and self.direction is None)
-        ):
+        lacks_direction = self.direction is None and self.kind != "sphere"
+        if self.kind == "surface" or self.place is None or lacks_direction:
             raise InputError(
                 f"The nominal of {self.name} is not known: give place, direction and radius of the"
                 " feature in the plan."
             )
-        direction = None
-        if self.direction is not None:
-            direction = np.array(self.direction) / np.linalg.norm(self.direction)
+        direction = None if self.direction is None else unit_vectors(np.array(self.direction))
         return Feature(self.kind, np.array(self.place), direction, self.radius)
 
 
@@ -109,7 +67,7 @@ class Alignment:
     kind: Literal["none", "best fit", "3-2-1"] = "none"
     nominal: str | None = None
     datums: tuple[str, ...] = ()
-    start: tuple[Row, Row, Row, Row] | None = None
+    start: Matrix4 | None = None
 
     def __post_init__(self) -> None:
         if (self.kind == "best fit") != (self.nominal is not None):
@@ -218,9 +176,3 @@ def plan_toml(plan: Plan) -> str:
 def _entries(record: Any) -> dict[str, Any]:
     """The fields of a record that hold something."""
     return {key: value for key, value in to_plain(record).items() if value not in (None, (), [])}
-
-
-def _vector(values: np.ndarray, digits: int = 6) -> Vector:
-    """Three coordinates (3,) as a tuple of rounded numbers."""
-    x, y, z = (round(float(value), digits) for value in values)
-    return x, y, z

@@ -1,15 +1,21 @@
-"""What makes a folder a session: `session.json` with a schema that this program reads."""
+"""What makes a folder a session: `session.json` with a schema that this program reads; its trash,
+and the exclusive lock of its one writer."""
 
+import contextlib
+import json
+import os
+import socket
 import sys
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from slviewer import __version__
-from slviewer.errors import SessionError
+from slviewer.errors import DamagedError, SessionError
 from slviewer.session.atomic import disk_errors, replace_json
-from slviewer.session.names import safe_path
 from slviewer.session.reading import expand_user, read_json
-from slviewer.session.result_types import RENAMED
 
 _IS_WINDOWS = sys.platform == "win32"
 _LONGEST_FOLDER = 120
@@ -47,25 +53,11 @@ def session_folder(path: str | Path) -> Path:
     return folder
 
 
-def locate_result(root: Path, name: str) -> Path:
-    """Return the folder of a result under ``root``, also of one that an older version named
-    otherwise.
-
-    Raises InputError for an unsafe name.
-    """
-    folder = root / safe_path(name)
-    former = next((root / old for old, today in RENAMED.items() if today == name), folder)
-    return former if former.is_dir() and not folder.is_dir() else folder
-
-
-def new_folder(path: str | Path, is_windows: bool = _IS_WINDOWS) -> tuple[Path, bool]:
+def new_folder(path: str | Path) -> tuple[Path, bool]:
     """A folder that a session may be made in, and whether it was made here, else empty;
-    SessionError otherwise.
-
-    ``is_windows``: paths are limited.
-    """
+    SessionError otherwise."""
     folder = _absolute_path(path)
-    if is_windows and len(str(folder)) > _LONGEST_FOLDER:
+    if _IS_WINDOWS and len(str(folder)) > _LONGEST_FOLDER:
         raise SessionError(
             f"the path of the session has {len(str(folder))} characters, and Windows allows 259 for"
             f" each file in it: choose a place with at most {_LONGEST_FOLDER}"
@@ -152,3 +144,100 @@ def _is_leftover(entry: Path) -> bool:
 def _absolute_path(path: str | Path) -> Path:
     """Return an absolute path, with "~" expanded."""
     return expand_user(path).absolute()
+
+
+_TIME = "%Y%m%dT%H%M%S%f"
+
+
+@dataclass(frozen=True)
+class Trashed:
+    """A capture or result in the trash: its name, when it was deleted, and its folder there."""
+
+    name: str
+    is_capture: bool
+    time: datetime
+    place: Path
+
+
+def trash_place(trash: Path, name: str) -> Path:
+    """Return a new path in the trash for a capture or result of that name."""
+    return trash / f"{name}-{datetime.now(UTC).strftime(_TIME)}"
+
+
+def list_trash(trash: Path) -> list[Trashed]:
+    """Return what is in the trash and complete, the last deleted first."""
+    entries = []
+    for place in trash.glob("*-*") if trash.is_dir() else ():
+        name, _, when = place.name.rpartition("-")
+        is_capture = (place / "capture.json").is_file()
+        with contextlib.suppress(ValueError):
+            time = datetime.strptime(when, _TIME).replace(tzinfo=UTC)
+            if is_capture or (place / "meta.json").is_file():
+                entries.append(
+                    Trashed(
+                        name if is_capture else name.replace("-", "/", 1), is_capture, time, place
+                    )
+                )
+    return sorted(entries, key=lambda each: each.time, reverse=True)
+
+
+_PATIENCE_S = (
+    0.3  # outlasts a reader that holds the lock for the moment it needs to clear leftovers
+)
+
+
+class WriterLock:
+    """The session's lock, released by the system if its holder dies."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        # closed by another thread than opened it
+        self._lock = FileLock(folder / ".lock", thread_local=False)
+        self._holder = folder / ".lock-holder"
+
+    def acquire(self, patience_s: float = _PATIENCE_S) -> None:
+        """Take the lock or raise a SessionError that names the process that holds it."""
+        try:
+            self._lock.acquire(timeout=patience_s, poll_interval=0.02)
+        except Timeout as error:
+            raise SessionError(
+                f"{self._folder} is open for writing in {self._who()}: close it there, or wait"
+                " until it has finished"
+            ) from error
+        except OSError as error:
+            raise SessionError(
+                f"{self._folder} cannot be written ({error}): check its permissions"
+            ) from error
+        with contextlib.suppress(OSError):  # it is only for the message to others
+            self._holder.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
+
+    def release(self) -> None:
+        """Release the lock for the next writer."""
+        if self._lock.is_locked:
+            with contextlib.suppress(OSError):
+                self._holder.unlink(missing_ok=True)
+            self._lock.release()
+
+    def release_and_remove(self) -> None:
+        """Remove the lock's files and release it: a writer that waits for it then begins with a new
+        file.
+
+        Only for a folder that is a session no more.
+        """
+        with contextlib.suppress(OSError):  # Windows removes no open file: an empty one stays
+            self._holder.unlink(missing_ok=True)
+            Path(self._lock.lock_file).unlink()
+        self._lock.release()
+
+    @property
+    def held(self) -> bool:
+        """Whether this object holds the lock."""
+        return self._lock.is_locked
+
+    def _who(self) -> str:
+        """Describe the process that holds the lock."""
+        try:
+            holder = read_json(self._holder)
+            return f"process {holder['pid']} on {holder['host']}"
+        except (DamagedError, KeyError):
+            return "another process"

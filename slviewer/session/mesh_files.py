@@ -215,16 +215,13 @@ def estimated_bytes(
 def _write_xyz(path: Path, points: np.ndarray, colours: np.ndarray | None) -> None:
     """Write points (n, 3) mm, with colours (n, 3) if given, as text, one point a line."""
     columns = np.round(points.astype(np.float64), DECIMALS) + 0.0  # no "-0.000000"
-    lengths = [f"%.{DECIMALS}f"] * 3
+    formats = [f"%.{DECIMALS}f"] * 3
+    if colours is not None:
+        columns, formats = np.hstack([columns, colours]), [*formats, "%d", "%d", "%d"]
     with arriving_file(
         path, estimated_bytes("xyz", len(points), colours=colours is not None)
     ) as file:
-        if colours is None:
-            np.savetxt(file, columns, lengths)
-        else:
-            np.savetxt(
-                file, np.concatenate([columns, colours], axis=1), [*lengths, "%d", "%d", "%d"]
-            )
+        np.savetxt(file, columns, formats)
 
 
 def _write_e57(
@@ -239,13 +236,8 @@ def _write_e57(
         )
     import pye57
 
-    fields = dict(
-        zip(
-            ("cartesianX", "cartesianY", "cartesianZ"),
-            1e-3 * points.T.astype(np.float64),
-            strict=True,
-        )
-    )
+    x, y, z = 1e-3 * points.T.astype(np.float64)
+    fields = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if colours is not None:
         fields |= dict(zip(("colorRed", "colorGreen", "colorBlue"), colours.T, strict=True))
     with arriving_path(

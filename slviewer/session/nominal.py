@@ -13,8 +13,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from slviewer.errors import InputError, SessionError
+from slviewer.geometry.vectors import lengths
 from slviewer.session import cad
-from slviewer.session.reading import expand_user, read_file
+from slviewer.session.reading import expand_user, read_input
 from slviewer.surface.shapes import Mesh
 
 Units = Literal["mm", "cm", "m", "inch"]
@@ -63,28 +64,26 @@ class Nominal:
         return f"{self.name}: {len(self.mesh.faces):,} triangles, {kind}, {size} mm"
 
 
-def read_nominal(
-    path: Path | str, units: Units | None = None, max_triangles: int = MAX_TRIANGLES
-) -> Nominal:
+def read_nominal(path: Path | str, units: Units | None = None) -> Nominal:
     """The model in an STL, PLY or OBJ file, whose numbers are in ``units``, or where none are given
     in mm; or in a STEP or 3MF file, which states its units.
 
     Raises SessionError for a file that cannot be used, with the reason: one that is absent, too
     large, damaged, truncated, of another format, without triangles, or with more than
-    ``max_triangles``.
+    `MAX_TRIANGLES`.
     """
     path = expand_user(path)
     data = _read_bytes(path)
     notes: list[str] = []
     if (form := path.suffix.lower()[1:]) in cad.PACKAGES:
-        vertices, faces = _weld(*cad.load_triangles(path.name, form, data))
-        _check_triangles(path.name, vertices, faces, max_triangles)
+        vertices, faces = cad.load_triangles(path.name, form, data)
+        _check_triangles(path.name, vertices, faces)
         units = "mm"
         if form != "3mf":
             notes.append(f"its surfaces were triangulated within {cad.CHORD_MM:g} mm")
     else:
-        vertices, faces = _load_triangles(path.name, data, max_triangles)
-        _check_triangles(path.name, vertices, faces, max_triangles)
+        vertices, faces = _load_triangles(path.name, data)
+        _check_triangles(path.name, vertices, faces)
         vertices = vertices * MM[units or "mm"]
     if not np.abs(vertices).max() < MAX_COORDINATE_MM:
         raise SessionError(
@@ -115,16 +114,11 @@ def check_size(nominal: Nominal, points: np.ndarray) -> None:
         for name, mm in MM.items()
         if 1 / MATCHING_SIZE_RATIO < ratio / mm < MATCHING_SIZE_RATIO and name != "mm"
     ]
-    many = (
-        f"about {_format_size(ratio)} times larger"
-        if ratio > 1
-        else f"about {_format_size(1 / ratio)} times smaller"
+    times, than = (ratio, "larger") if ratio > 1 else (1 / ratio, "smaller")
+    comparison = (
+        f"{nominal.name} measures {_format_size(model)} mm across if its numbers are mm, and the"
+        f" scan {_format_size(scan)} mm, about {_format_size(times)} times {than}"
     )
-    sizes = (
-        f"{_format_size(model)} mm across if its numbers are mm, and the scan"
-        f" {_format_size(scan)} mm"
-    )
-    comparison = f"{nominal.name} measures {sizes}, {many}"
     if fitting:
         raise InputError(
             f"{comparison}: give --units {' or --units '.join(fitting)} if it is so, else"
@@ -149,22 +143,17 @@ def _read_bytes(path: Path) -> bytes:
             f"{path.name} is not a nominal model that can be read: give an STL, PLY, OBJ, STEP or"
             " 3MF file"
         )
-    try:
-        return read_file(path, MAX_BYTES)
-    except OSError as error:
-        reason = error.strerror or error
-        raise SessionError(
-            f"{path} cannot be read ({reason}): give a file of up to {MAX_BYTES >> 20} MiB"
-        ) from error
+    remedy = f"give a file of up to {MAX_BYTES >> 20} MiB"
+    return read_input(path, MAX_BYTES, remedy, SessionError)
 
 
-def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndarray, np.ndarray]:
+def _load_triangles(name: str, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) float64 and faces (m, 3) int64 of a file, unchanged but for merged
     duplicate vertices."""
     import trimesh
 
     form = name.rpartition(".")[2].lower()
-    data = _simplify(name, form, data, max_triangles)
+    data = _simplify(name, form, data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -173,9 +162,9 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
             mesh: Any = trimesh.load(
                 io.BytesIO(data), file_type=form, force="mesh", skip_materials=True, process=False
             )
-            vertices, faces = _weld(
-                np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-            )
+            mesh.merge_vertices(merge_tex=True, merge_norm=True)
+            vertices = np.asarray(mesh.vertices, np.float64)
+            faces = np.asarray(mesh.faces, np.int64)
     except MemoryError as error:
         raise SessionError(f"{name} does not fit into the memory: decimate it first") from error
     except Exception as error:  # a file from anywhere may make its reader fail in any way
@@ -183,31 +172,23 @@ def _load_triangles(name: str, data: bytes, max_triangles: int) -> tuple[np.ndar
             f"{name} cannot be read ({type(error).__name__}): it is damaged; export the model"
             " again, as triangles"
         ) from error
-    declared = re.search(rb"element face (\d{1,12})\b", data[:65536]) if form == "ply" else None
+    declared = _declared_faces(data) if form == "ply" else 0
     # a text that breaks off is read as far as it goes
-    if declared and len(faces) < int(declared[1]):
+    if len(faces) < declared:
         raise SessionError(
-            f"{name} is truncated: {len(faces):,} of {int(declared[1]):,} triangles were read;"
+            f"{name} is truncated: {len(faces):,} of {declared:,} triangles were read;"
             " export the model again"
         )
     return vertices, faces
 
 
-def _check_triangles(
-    name: str, vertices: np.ndarray, faces: np.ndarray, max_triangles: int
-) -> None:
+def _check_triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise SessionError where vertices and faces are not triangles, too many, or reach beyond what
     is read."""
-    if (
-        vertices.ndim != 2
-        or vertices.shape[1:] != (3,)
-        or faces.ndim != 2
-        or faces.shape[1:] != (3,)
-        or not len(faces)
-    ):
+    if not vertices.shape[1:] == faces.shape[1:] == (3,) or not len(faces):
         raise SessionError(f"{name} holds no triangles, or is damaged: export the model as a mesh")
-    if len(faces) > max_triangles:
-        raise _too_many(name, f"{len(faces):,} triangles", max_triangles)
+    if len(faces) > MAX_TRIANGLES:
+        raise _too_many(name, f"{len(faces):,} triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SessionError(f"{name} has triangles whose points are missing: export the model again")
     if not np.isfinite(vertices).all():
@@ -216,7 +197,7 @@ def _check_triangles(
         )
 
 
-def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
+def _simplify(name: str, form: str, data: bytes) -> bytes:
     """Return a file without what only costs time: the groups of an OBJ, all but one of the sections
     of a text STL.
 
@@ -224,24 +205,21 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
     """
     is_text = form == "obj" or (form == "stl" and _is_text_stl(data))
     if is_text and len(data) > MAX_TEXT_BYTES:
-        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text", max_triangles)
+        raise _too_many(name, f"{len(data) / 1e6:.0f} MB of text")
     if form == "obj":
         data = b"\n".join(
             re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b" "), re.MULTILINE)
         )
-        corners = max(
-            map(len, map(bytes.split, re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE))),
-            default=0,
-        )
+        faces = re.findall(rb"^[ \t]*f[^\n]*", data, re.MULTILINE)
+        corners = max((len(face.split()) for face in faces), default=0)
         if corners > MAX_CORNERS:
             raise SessionError(
                 f"{name} has a face of {corners - 1:,} corners: export the model again, as"
                 " triangles"
             )
-        count = data.count(b"f ") + data.count(b"f\t")
+        count = len(faces)
     elif form == "ply":
-        declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
-        count = int(declared[1]) if declared else 0
+        count = _declared_faces(data)
     elif is_text:
         data = re.sub(rb"(?im)^[ \t]*endsolid[^\n]*\n\s*solid[^\n]*\n", b"", data)
         count = data.lower().count(b"endfacet")
@@ -252,24 +230,15 @@ def _simplify(name: str, form: str, data: bytes, max_triangles: int) -> bytes:
                 f"{name} holds no triangles, or is truncated: it announces {count:,} triangles;"
                 " export the model again"
             )
-    if count > max_triangles:
-        raise _too_many(name, f"{count:,} triangles", max_triangles)
+    if count > MAX_TRIANGLES:
+        raise _too_many(name, f"{count:,} triangles")
     return data
 
 
-def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) without those that repeat others to 8 decimals, and faces (m, 3) with their
-    new indices."""
-    rounded = np.round(vertices, 8) + 0.0  # no negative zeros
-    mixed = np.zeros(len(rounded), np.uint64)
-    for column in rounded.T.copy().view(np.uint64):
-        mixed = (mixed ^ column) * np.uint64(11400714819323198485)
-        mixed ^= mixed >> np.uint64(29)
-    _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-    # two points share a hash: all are kept
-    if not np.array_equal(rounded[first[inverse]], rounded, equal_nan=True):
-        return vertices, faces
-    return vertices[first], inverse[faces]
+def _declared_faces(data: bytes) -> int:
+    """Return the number of faces that the header of a PLY declares; 0 where it declares none."""
+    declared = re.search(rb"element face (\d{1,12})\b", data[:65536])
+    return int(declared[1]) if declared else 0
 
 
 def _is_text_stl(data: bytes) -> bool:
@@ -279,10 +248,10 @@ def _is_text_stl(data: bytes) -> bool:
     return data[:512].lstrip().lower().startswith(b"solid") and not binary
 
 
-def _too_many(name: str, amount: str, max_triangles: int) -> SessionError:
+def _too_many(name: str, amount: str) -> SessionError:
     """Return the error for a model that is too large."""
     return SessionError(
-        f"{name} has {amount}, and at most {max_triangles:,} triangles are read: decimate it first"
+        f"{name} has {amount}, and at most {MAX_TRIANGLES:,} triangles are read: decimate it first"
     )
 
 
@@ -292,8 +261,8 @@ def _drop_degenerate(
     """Vertices and faces without triangles that have no area, and without the vertices that only
     those had."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    sides = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
-    sound = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9 * sides**2
+    sides = np.maximum(lengths(b - a), lengths(c - a))
+    sound = lengths(np.cross(b - a, c - a)) > 1e-9 * sides**2
     flat = len(faces) - int(np.count_nonzero(sound))
     if flat > MAX_DEGENERATE_SHARE * len(faces):
         raise SessionError(
@@ -307,14 +276,13 @@ def _drop_degenerate(
     rolled = np.take_along_axis(
         faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1
     )
-    order = np.lexsort(rolled.T[::-1])
-    repeated = order[1:][(np.diff(rolled[order], axis=0) == 0).all(axis=1)]
-    if len(repeated):
+    first = np.unique(rolled, axis=0, return_index=True)[1]
+    if repeated := len(faces) - len(first):
         notes.append(
-            f"{len(repeated):,} of {len(faces):,} triangles were repetitions of others: they were"
+            f"{repeated:,} of {len(faces):,} triangles were repetitions of others: they were"
             " removed"
         )
-        faces = np.delete(faces, repeated, axis=0)
+        faces = faces[np.sort(first)]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 
@@ -324,21 +292,15 @@ def _orient_faces(
 ) -> tuple[np.ndarray, bool]:
     """Return the faces wound consistently, outwards where the model is closed; and whether it is
     closed."""
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    forward = directed[:, 0] < directed[:, 1]
-    keys = np.where(forward, directed[:, 0], directed[:, 1]) * (len(vertices) + 1) + directed.max(
-        axis=1
-    )
-    order = np.argsort(keys, kind="stable")
-    sides = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(keys[order]) != 0, [True]])))
-    closed, manifold = bool((sides == 2).all()), bool((sides <= 2).all())
-    # of a manifold: the places of each edge that two faces share
-    pair = np.flatnonzero(np.diff(keys[order]) == 0)
-    one, other = order[pair], order[pair + 1]
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices.astype(np.float64), faces, process=False)
+    edge, directed = mesh.edges_unique_inverse, mesh.edges
+    sides = np.bincount(edge)
     # neighbours that turn alike run along their side in opposite directions
-    alike = forward[one] == forward[other]
-    if alike.any():
-        turned = _turn_alike(vertices, faces, one // 3, other // 3, alike) if manifold else None
+    balance = np.bincount(edge, np.sign(directed[:, 1] - directed[:, 0]))
+    if ((balance != 0) & (sides > 1)).any():
+        turned = _turn_alike(mesh) if sides.max() == 2 else None
         if turned is None:
             notes.append(
                 "its triangles do not all turn one way, and cannot be turned: some deviations may"
@@ -347,26 +309,24 @@ def _orient_faces(
             return faces, False
         faces = turned
         notes.append("its triangles did not all turn one way: they were turned")
-    if closed:
-        a, b, c = (
-            vertices[faces[:, k]].astype(np.float64) - vertices.mean(axis=0) for k in range(3)
-        )
-        if float(np.sum(a * np.cross(b, c))) < 0:
-            faces = faces[:, ::-1].copy()
-            notes.append("its triangles faced inwards: they were turned")
-    else:
+    if not (sides == 2).all():
         notes.append("it is open: outside is where its triangles face")
-    return faces, closed
+        return faces, False
+    if trimesh.Trimesh(mesh.vertices, faces, process=False).volume < 0:
+        faces = faces[:, ::-1].copy()
+        notes.append("its triangles faced inwards: they were turned")
+    return faces, True
 
 
-def _turn_alike(
-    vertices: np.ndarray, faces: np.ndarray, one: np.ndarray, other: np.ndarray, alike: np.ndarray
-) -> np.ndarray | None:
-    """Faces (m, 3) turned one way, each part of the surface the way in which most of its area
-    faces; None where that is impossible. ``one``, ``other`` (k,): faces that share an edge,
-    ``alike`` (k,): one of the two has to be turned.
-    """
-    m = len(faces)
+def _turn_alike(mesh: Any) -> np.ndarray | None:
+    """Faces (m, 3) of a manifold turned one way, each part of the surface the way in which most of
+    its area faces; None where that is impossible."""
+    from trimesh.grouping import group_rows
+
+    pairs = group_rows(mesh.edges_sorted, require_count=2)
+    one, other = mesh.edges_face[pairs].T
+    alike = mesh.edges[pairs[:, 0], 0] == mesh.edges[pairs[:, 1], 0]
+    m = len(mesh.faces)
     # a node for each face as it is, and one for it turned: two components a part, which are its two
     # orientations
     start = np.concatenate([one, one + m])
@@ -376,10 +336,8 @@ def _turn_alike(
     as_is, turned = labels[:m], labels[m:]
     if (as_is == turned).any():
         return None
-    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     # area that an orientation leaves as it is
-    kept = np.bincount(as_is, area, int(labels.max()) + 1)
+    kept = np.bincount(as_is, mesh.area_faces, int(labels.max()) + 1)
     wrong = kept[as_is] < kept[turned]
     wrong |= (kept[as_is] == kept[turned]) & (as_is > turned)
-    return np.where(wrong[:, None], faces[:, ::-1], faces)
+    return np.where(wrong[:, None], mesh.faces[:, ::-1], mesh.faces).astype(np.int32)

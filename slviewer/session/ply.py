@@ -5,14 +5,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 
 from slviewer import __version__
 from slviewer.errors import InputError
 from slviewer.printable import escape_controls
 from slviewer.session.atomic import arriving_file
-from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_file
+from slviewer.session.reading import MAX_CLOUD_BYTES, decoding, read_input
 
-COLOURS = ("red", "green", "blue")
+PLACE, NORMAL, COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4"}
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", (3,))])
 UNKNOWN_SIGMA = -1.0
@@ -52,7 +53,7 @@ def write_ply(
     written (an older file of that name stays unchanged).
     """
     points = np.asarray(points)
-    fields = _vertex_fields(points, colours, normals, dict(scalars or {}))
+    fields = _vertex_fields(points, colours, normals, scalars or {})
     # grouped: written faster
     vertex = np.dtype([("+".join(names), code, (len(names),)) for names, code, _ in fields])
     types = {code: name for name, code in TYPES.items()}
@@ -90,12 +91,7 @@ def read_ply(path: str | Path) -> Ply:
     polygons).
     """
     path = Path(path)
-    try:
-        data = read_file(path, MAX_CLOUD_BYTES)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror or error}): check its name."
-        ) from None
+    data = read_input(path, MAX_CLOUD_BYTES, "check its name.")
     end = data.find(b"end_header\n")
     lines = [line.split() for line in data[: max(end, 0)].decode("ascii", "replace").splitlines()]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
@@ -126,7 +122,7 @@ def _parse_ply(path: Path, data: bytes, end: int, lines: list[list[str]]) -> Ply
     vertex = np.dtype(properties)
     start = end + len(b"end_header\n")
     middle = start + counts.get("vertex", 0) * vertex.itemsize
-    if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not {"x", "y", "z"} <= set(
+    if len(data) != middle + counts.get("face", 0) * FACE.itemsize or not set(PLACE) <= set(
         vertex.names or ()
     ):
         raise InputError(
@@ -147,11 +143,9 @@ def to_ascii(note: str) -> str:
 
 def replace_nan(name: str, values: np.ndarray) -> np.ndarray:
     """Replace unknown values of a vertex property by their code in the file: see ``write_ply``."""
-    if values.dtype.kind != "f" or name in ("x", "y", "z"):
+    if values.dtype.kind != "f" or name in PLACE:
         return values
-    return np.where(
-        np.isfinite(values), values, 0.0 if name in ("nx", "ny", "nz") else UNKNOWN_SIGMA
-    )
+    return np.where(np.isfinite(values), values, 0.0 if name in NORMAL else UNKNOWN_SIGMA)
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
@@ -171,32 +165,28 @@ def _parse_content(vertices: np.ndarray, faces: np.ndarray | None) -> Ply:
     """Return points, colours, normals, scalars and faces from the file's vertex and face
     records."""
     names = vertices.dtype.names or ()
-
-    def join(*fields: str) -> np.ndarray | None:
-        """Return the named vertex fields as columns (n, k); None where one is missing."""
-        return (
-            np.stack([vertices[name] for name in fields], axis=1)
-            if set(fields) <= set(names)
-            else None
-        )
-
-    known = {"x", "y", "z", "nx", "ny", "nz", *COLOURS}
+    points, normals, colours = (
+        structured_to_unstructured(vertices[list(fields)], copy=True)
+        if set(fields) <= set(names)
+        else None
+        for fields in (PLACE, NORMAL, COLOURS)
+    )
+    known = {*PLACE, *NORMAL, *COLOURS}
     scalars = {name: vertices[name].copy() for name in names if name not in known}
     for name, values in scalars.items():
         if name.startswith("sigma"):
             values[values == UNKNOWN_SIGMA] = np.nan
-    points, normals = join("x", "y", "z"), join("nx", "ny", "nz")
     assert points is not None
     if normals is not None:
         normals[~normals.any(axis=1)] = np.nan
-    return Ply(points, join(*COLOURS), normals, scalars, faces)
+    return Ply(points, colours, normals, scalars, faces)
 
 
 def _vertex_fields(
     points: np.ndarray,
     colours: np.ndarray | None,
     normals: np.ndarray | None,
-    scalars: dict[str, np.ndarray],
+    scalars: Mapping[str, np.ndarray],
 ) -> list[tuple[tuple[str, ...], str, np.ndarray]]:
     """(names, type, values (n,) or (n, k)) of the properties of a vertex, in the order in which PLY
     lays them out."""
@@ -207,40 +197,38 @@ def _vertex_fields(
         )
     if not np.isfinite(points).all():
         raise InputError("Some points are NaN: select the valid ones first.")
-    fields: list[tuple[tuple[str, ...], str, np.ndarray]] = [(("x", "y", "z"), "<f4", points)]
-    if normals is not None:
-        _check_length(normals.shape == points.shape, "normals", normals, len(points))
-        fields.append((("nx", "ny", "nz"), "<f4", normals))
-    if colours is not None:
-        _check_length(
-            colours.shape in (points.shape, points.shape[:1]), "colours", colours, len(points)
-        )
-        if colours.dtype != np.uint8:
-            raise InputError(f"Colours of {colours.dtype} were given: they must be uint8.")
-        fields.append((COLOURS, "u1", colours))
-    for name, given in scalars.items():
-        values = np.asarray(given)
-        _check_length(values.shape == points.shape[:1], name, values, len(points))
-        if not (name.isascii() and name.isidentifier()) or any(
-            name in names for names, _, _ in fields
-        ):
+    shape, count = points.shape, len(points)
+    given: list[tuple[str, tuple[str, ...], str, np.ndarray | None]] = [
+        ("normals", NORMAL, "<f4", normals),
+        ("colours", COLOURS, "u1", colours),
+        *((name, (name,), "<f4", np.asarray(values)) for name, values in scalars.items()),
+    ]
+    fields: list[tuple[tuple[str, ...], str, np.ndarray]] = [(PLACE, "<f4", points)]
+    for what, names, code, values in given:
+        if values is None:
+            continue
+        shapes = [shape] if names == NORMAL else [shape, (count,)] if code == "u1" else [(count,)]
+        if values.shape not in shapes:
             raise InputError(
-                f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a"
-                " new name."
+                f"{what} of shape {values.shape} do not belong to {count} points: give one for each"
+                " point."
             )
-        if not name.startswith("sigma") and not np.isfinite(values).all():
-            raise InputError(
-                f"{name} is not known of {np.count_nonzero(~np.isfinite(values))} points: leave"
-                " them out."
-            )
-        fields.append(((name,), "<f4", values))
+        if code == "u1" and values.dtype != np.uint8:
+            raise InputError(f"Colours of {values.dtype} were given: they must be uint8.")
+        if len(names) == 1:
+            _check_scalar(what, values, [name for before, _, _ in fields for name in before])
+        fields.append((names, code, values))
     return fields
 
 
-def _check_length(fits: bool, what: str, values: np.ndarray, count: int) -> None:
-    """Raise InputError unless ``fits``: the values do not belong to ``count`` points."""
-    if not fits:
+def _check_scalar(name: str, values: np.ndarray, others: Sequence[str]) -> None:
+    """Raise InputError for a name that no PLY property can have besides others, and for unknown
+    values other than a sigma's."""
+    if not (name.isascii() and name.isidentifier()) or name in others:
         raise InputError(
-            f"{what} of shape {values.shape} do not belong to {count} points: give one for each"
-            " point."
+            f"A scalar named {name!r} cannot be a PLY property: use letters, digits, _, and a new"
+            " name."
         )
+    unknown = np.count_nonzero(~np.isfinite(values))
+    if unknown and not name.startswith("sigma"):
+        raise InputError(f"{name} is not known of {unknown} points: leave them out.")

@@ -3,20 +3,23 @@ numbers.
 
 Only regular files are read (a pipe or a device would never end), and none larger than its kind may
 be. What JSON and TOML hold is limited to what a record needs: `MAX_DEPTH` levels and integers of 64
-bits, so that nothing that walks it later runs out of stack or range.
+bits, so that nothing that walks it later runs out of stack or range. Parsers that a malformed file
+can crash or exhaust run in a process of their own within limits.
 """
 
 import json
 import os
 import re
 import stat
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from slviewer.errors import DamagedError, InputError
+from slviewer.errors import DamagedError, InputError, SlviewerError
 
 MAX_JSON_BYTES = 1 << 24
 MAX_TOML_BYTES = 1 << 20
@@ -68,6 +71,17 @@ def read_file(path: Path, max_bytes: int) -> bytes:
         return file.read(size)  # of a growing file, what it had
 
 
+def read_input(
+    path: Path, max_bytes: int, remedy: str, error: type[SlviewerError] = InputError
+) -> bytes:
+    """Return the content of a regular file; raises ``error``, with the reason and the remedy, where
+    `read_file` raises OSError."""
+    try:
+        return read_file(path, max_bytes)
+    except OSError as fault:
+        raise error(f"{path} cannot be read ({_reason(fault)}): {remedy}") from fault
+
+
 def read_json(
     path: Path, remedy: str = "restore it from a copy, or move its folder away"
 ) -> dict[str, Any]:
@@ -86,14 +100,10 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     """The tables of a TOML file. Raises InputError where it cannot be read, with the reason."""
     path = expand_user(path)
     try:
-        text = read_file(path, MAX_TOML_BYTES).decode()
+        text = read_input(path, MAX_TOML_BYTES, "give the TOML file that is needed here").decode()
         if _DEEP_KEY.search(text):  # which would take the parser hours
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         data: dict[str, Any] = _check_values(tomllib.loads(text))
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({_reason(error)}): give the TOML file that is needed here"
-        ) from error
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{path} is not TOML ({_reason(error)}): correct it there") from error
     return data
@@ -156,3 +166,50 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, OSError):
         return str(error.strerror or error)
     return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+MEMORY_BYTES = 2 << 30
+_PATIENCE_S = 60
+
+
+def run_isolated(
+    module: str, *arguments: str, data: bytes = b"", cpu_s: int = 10
+) -> tuple[int, bytes]:
+    """Run ``python -m module`` with arguments and ``data`` as its input; return its exit status and
+    what it wrote.
+
+    The module limits itself by `limit_process`, to ``cpu_s`` of processor time. Status 1: it raised
+    an exception; any other but 0: it crashed, or needed more memory or time than it may.
+    """
+    paths = os.pathsep.join(filter(None, sys.path))
+    environment = {
+        **os.environ,
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONPATH": paths,
+        "SLVIEWER_CPU_S": str(cpu_s),
+    }
+    sent: dict[str, Any] = {"input": data} if data else {"stdin": subprocess.DEVNULL}
+    try:
+        ran = subprocess.run(
+            [sys.executable, "-m", module, *arguments],
+            **sent,
+            capture_output=True,
+            timeout=_PATIENCE_S + cpu_s,
+            env=environment,
+        )
+    except subprocess.TimeoutExpired:
+        return -1, b""
+    return ran.returncode, ran.stdout
+
+
+def limit_process() -> None:
+    """Limit memory and processor time of this process, where the system can."""
+    if sys.platform == "win32":
+        return
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        seconds = int(os.environ["SLVIEWER_CPU_S"])
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -6,10 +6,12 @@ Results that are made of such points name both as inputs, so that they are stale
 
 import hashlib
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.store import Session
 from slviewer.surface.point_edits import Edit, EditHistory, describe_edit, pack_mask, unpack_mask
@@ -24,24 +26,21 @@ def load_edits(store: Session, scan: str) -> EditHistory:
 
     Raises InputError where there is no such scan, DamagedError where they cannot be read.
     """
-    name, capture = f"{FOLDER}/{scan}", store.load_capture(scan)
-    if not store.has_result(name):
-        return EditHistory()
-    meta, arrays = store.load_result(name)
-    if meta["capture"] != capture.hash:
+    name, capture, meta = f"{FOLDER}/{scan}", store.load_capture(scan), _load_meta(store, scan)
+    if not meta or meta["capture"] != capture.hash:
         return EditHistory()
     try:
         if tuple(meta["size"]) != tuple(capture.size):
             raise InputError(
                 f"they are of {meta['size']} pixels, the capture has {list(capture.size)}"
             )
-        return EditHistory(
-            tuple(
-                _read_edit(i, entry, meta["size"], arrays) for i, entry in enumerate(meta["edits"])
-            ),
-            meta["applied"],
-        )
-    except (InputError, KeyError) as error:
+        arrays = store.load_result(name)[1]
+        edits = [
+            _read_edit(entry, arrays.get(str(i)), capture.size)
+            for i, entry in enumerate(meta["edits"])
+        ]
+        return EditHistory(tuple(edits), meta["applied"])
+    except InputError as error:
         raise DamagedError(
             f"the edits of {scan} are damaged ({error}): restore {store.folder / 'results' / name}"
             " from a copy, or delete it, which forgets them"
@@ -51,8 +50,7 @@ def load_edits(store: Session, scan: str) -> EditHistory:
 def list_edits(store: Session, scan: str) -> tuple[tuple[str, ...], int]:
     """Return (the edits of a scan that are in effect, in words; the number of those that were
     undone)."""
-    name = f"{FOLDER}/{scan}"
-    meta = store.load_result(name, only=())[0] if store.has_result(name) else {}
+    meta = _load_meta(store, scan)
     if not meta or meta["capture"] != store.load_capture(scan).hash:
         return (), 0
     texts = tuple(describe_edit(entry["what"], entry["points"]) for entry in meta["edits"])
@@ -100,15 +98,7 @@ def load_region(store: Session, *, even_if_off: bool = False) -> RegionOfInteres
 
 def save_region(store: Session, region: RegionOfInterest | None, on: bool = True) -> None:
     """Make a box the session's region of interest, in effect or not (``on``); None forgets it."""
-    stored = None
-    if region is not None:
-        stored = {
-            "centre_mm": list(region.centre_mm),
-            "size_mm": list(region.size_mm),
-            "rotation_deg": list(region.rotation_deg),
-            "on": on,
-        }
-    store.decide("region", stored)
+    store.decide("region", None if region is None else {**to_plain(region), "on": on})
 
 
 def restriction_inputs(
@@ -116,48 +106,36 @@ def restriction_inputs(
 ) -> dict[str, str]:
     """Return {input: hash} of the edits of scans, and of the region, for `meta["inputs"]`; "" for
     what there is not."""
-    inputs = {}
-    for scan in scans:
-        name = f"{FOLDER}/{scan}"
-        inputs[name] = (
-            str(store.load_result(name, only=())[0].get("content", ""))
-            if store.has_result(name)
-            else ""
-        )
+    inputs = {f"{FOLDER}/{scan}": str(_load_meta(store, scan).get("content", "")) for scan in scans}
     if with_region:
         inputs[REGION_INPUT] = "".join(store.decision_hashes(REGION_INPUT))
     return inputs
 
 
+def _load_meta(store: Session, scan: str) -> dict[str, Any]:
+    """Return the stored edits of a scan, without pixels; empty where it has none."""
+    name = f"{FOLDER}/{scan}"
+    return store.load_result(name, only=())[0] if store.has_result(name) else {}
+
+
 def _to_plain(edit: Edit) -> dict[str, object]:
     """Return an edit as plain values, without its pixels."""
-    plane = edit.plane
-    return {
-        "kind": edit.kind,
-        "what": edit.what,
-        "points": edit.points,
-        "normal": None if plane is None else list(plane.normal),
-        "offset_mm": None if plane is None else plane.offset_mm,
-        "margin_mm": None if plane is None else plane.margin_mm,
-        "made": edit.made,
-    }
+    plane: dict[str, Any] = dict.fromkeys(("normal", "offset_mm", "margin_mm"))
+    if edit.plane is not None:
+        plane = {**to_plain(edit.plane), "normal": list(edit.plane.normal)}
+    return {"kind": edit.kind, "what": edit.what, "points": edit.points, **plane, "made": edit.made}
 
 
-def _read_edit(
-    index: int, entry: dict[str, object], size: tuple[int, int], arrays: dict[str, np.ndarray]
-) -> Edit:
-    """Return the edit of an entry; InputError, KeyError for one that does not fit the arrays."""
-    what, points = str(entry["what"]), int(entry["points"])  # type: ignore[call-overload]
-    made = str(entry.get("made", ""))
+def _read_edit(entry: dict[str, Any], packed: np.ndarray | None, size: tuple[int, int]) -> Edit:
+    """Return the edit of an entry, and of its ``packed`` pixels; InputError for one that does not
+    fit them."""
+    what, points, made = entry["what"], entry["points"], entry.get("made", "")
     if entry["kind"] == "pixels":
-        return Edit(what, points, unpack_mask(arrays[str(index)], size), made=made)
-    numbers = [*(entry["normal"] or ()), entry["offset_mm"], entry["margin_mm"]]  # type: ignore[misc]
-    values = np.array(numbers, float)
-    if (
-        values.shape != (5,)
-        or not np.isfinite(values).all()
-        or abs(np.linalg.norm(values[:3]) - 1) > 1e-3
-    ):
-        raise InputError(f"the plane of edit {index + 1} has the numbers {numbers}")
-    x, y, z, offset, margin = values.tolist()
-    return Edit(what, points, plane=SupportPlane((x, y, z), offset, margin), made=made)
+        if packed is None:
+            raise InputError(f"the pixels of {what!r} are missing")
+        return Edit(what, points, unpack_mask(packed, size), made=made)
+    plane = from_plain(entry, SupportPlane)
+    numbers = [*plane.normal, plane.offset_mm, plane.margin_mm]
+    if not np.isfinite(numbers).all() or abs(np.linalg.norm(plane.normal) - 1) > 1e-3:
+        raise InputError(f"the plane of {what!r} has the numbers {numbers}")
+    return Edit(what, points, plane=plane, made=made)

@@ -3,19 +3,18 @@
 Zarr's own library writes the array's description. The chunks are raw little-endian frames, each
 followed by its CRC-32C (Zarr's codec `crc32c`), and we move them ourselves: each is hashed, written
 and synced by the same thread, and a missing chunk is an error when read, where Zarr would hand back
-a black frame. Stacks without checksums, of older sessions, are read too: only `hash_stack` tells
-whether they are damaged.
+a black frame. Stacks without checksums, of older sessions, are read too: only `FrameStack.hash`
+tells whether they are damaged.
 """
 
 import hashlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from io import RawIOBase
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Literal
 
 import google_crc32c
 import msgspec
@@ -25,6 +24,7 @@ from slviewer.errors import DamagedError, InputError, SessionError
 from slviewer.records.plain import from_plain
 from slviewer.session.atomic import write_bytes
 from slviewer.session.reading import decoding, read_json
+from slviewer.session.results import Extent
 
 _THREADS = (
     4  # moving and hashing frames releases the interpreter; more threads only queue for the disk
@@ -56,45 +56,6 @@ def write_stack(path: Path, frames: np.ndarray) -> str:
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
-def read_stack(path: Path, indices: Sequence[int] | None = None) -> np.ndarray:
-    """Frames (n, h, w) in the order of `indices` (all of them where None), C-contiguous; reads only
-    these.
-
-    Raises DamagedError where a frame is missing, cut short or differs from its checksum, InputError
-    for an index outside the stack.
-    """
-    stack = _StoredStack.open(path)
-    n = stack.shape[0]
-    wanted = list(range(n)) if indices is None else [int(index) for index in indices]
-    if any(not 0 <= index < n for index in wanted):
-        raise InputError(
-            f"frames {wanted} were requested, {path.parent.name} has {n} frames: count from 0"
-        )
-    for index in wanted:  # before memory is allocated for what the description announces
-        stack.check_size(index)
-    frames = np.empty((len(wanted), *stack.shape[1:]), stack.dtype)
-    with ThreadPoolExecutor(_THREADS) as pool:
-        list(pool.map(stack.read, wanted, frames))
-    return frames if sys.byteorder == "little" else frames.byteswap(inplace=True)
-
-
-def hash_stack(path: Path) -> tuple[str, list[str]]:
-    """Read a whole stack; returns its content hash, as `write_stack` does, and the hash of each
-    frame, BLAKE2b of 160 bits. Raises DamagedError as `read_stack`."""
-    stack = _StoredStack.open(path)
-
-    def digest(index: int) -> bytes:
-        """Read one frame and return its digest."""
-        stack.check_size(index)
-        frame = np.empty(stack.shape[1:], stack.dtype)
-        stack.read(index, frame)
-        return _digest(frame)
-
-    with ThreadPoolExecutor(_THREADS) as pool:
-        digests = list(pool.map(digest, range(stack.shape[0])))
-    return _combine_digests(stack.shape, stack.dtype, digests), [each.hex() for each in digests]
-
-
 def hash_frames(frames: np.ndarray) -> str:
     """Return the content hash that frames (n, h, w), uint8 or uint16, have once they are
     written."""
@@ -105,71 +66,19 @@ def hash_frames(frames: np.ndarray) -> str:
     return _combine_digests(frames.shape, frames.dtype, digests)
 
 
-def identify_stack(path: Path) -> tuple[tuple[int, ...], ...] | None:
-    """Return what changes whenever a frame's file does (number, size, time), or None where every
-    frame has a checksum.
-
-    Raises DamagedError where a file is missing.
-    """
-    stack = _StoredStack.open(path)
-    return (
-        None
-        if stack.has_checksums
-        else tuple(stack.identify(index) for index in range(stack.shape[0]))
-    )
-
-
-def describe_stack(path: Path) -> tuple[tuple[int, int, int], np.dtype]:
-    """Return shape (n, h, w) and type of a stack; SessionError where its layout is not the one
-    written here."""
-    stack = _StoredStack.open(path)
-    return stack.shape, stack.dtype
-
-
-_Extent = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
-
-
-class _ChunkGrid(msgspec.Struct):
-    """The entry `chunk_grid` of `zarr.json`."""
-
-    class Configuration(msgspec.Struct):
-        """Its size of a chunk, frames x rows x columns."""
-
-        chunk_shape: tuple[int, int, int]
-
-    configuration: Configuration
-
-
-class _ChunkKeys(msgspec.Struct):
-    """The entry `chunk_key_encoding` of `zarr.json`."""
-
-    class Configuration(msgspec.Struct):
-        """What stands between the parts of a chunk's name."""
-
-        separator: Literal[".", "/"]
-
-    configuration: Configuration
-
-
-class _Codec(msgspec.Struct):
-    """One of the entry `codecs` of `zarr.json`."""
-
-    name: str
-
-
 class _Description(msgspec.Struct):
     """The entries of `zarr.json` that are read, with their types and ranges."""
 
-    shape: tuple[_Extent, _Extent, _Extent]
+    shape: tuple[Extent, Extent, Extent]
     data_type: Literal["uint8", "uint16"]
-    chunk_grid: _ChunkGrid
-    chunk_key_encoding: _ChunkKeys
-    codecs: list[_Codec]
+    chunk_grid: dict[str, Any]
+    chunk_key_encoding: dict[str, Any]
+    codecs: list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class _StoredStack:
-    """The description of a stack on disk, and access to its chunks."""
+class FrameStack:
+    """The description of a stack on disk, and access to its frames."""
 
     path: Path
     shape: tuple[int, int, int]
@@ -178,32 +87,70 @@ class _StoredStack:
     has_checksums: bool
 
     @classmethod
-    def open(cls, path: Path) -> "_StoredStack":
-        """Read the description of a stack; SessionError for another layout."""
+    def open(cls, path: Path) -> "FrameStack":
+        """Read the description of a stack; SessionError where its layout is not the one written
+        here."""
         with decoding(path / "zarr.json"):
             described = from_plain(read_json(path / "zarr.json"), _Description)
-        n, height, width = described.shape
-        codecs = [codec.name for codec in described.codecs]
-        known = codecs in (["bytes"], ["bytes", "crc32c"])
-        if described.chunk_grid.configuration.chunk_shape != (1, height, width) or not known:
+            codecs = [codec["name"] for codec in described.codecs]
+            chunk = described.chunk_grid["configuration"]["chunk_shape"]
+            separator = described.chunk_key_encoding["configuration"]["separator"]
+        if (
+            chunk != [1, *described.shape[1:]]
+            or separator not in (".", "/")
+            or codecs not in (["bytes"], ["bytes", "crc32c"])
+        ):
             raise SessionError(
                 f"{path} was not laid out by slviewer (one uncompressed chunk a frame): import it"
                 " again"
             )
-        separator = described.chunk_key_encoding.configuration.separator
-        return cls(
-            path, (n, height, width), np.dtype(described.data_type), separator, "crc32c" in codecs
-        )
+        dtype = np.dtype(described.data_type)
+        return cls(path, described.shape, dtype, separator, "crc32c" in codecs)
 
-    def read(self, index: int, frame: np.ndarray) -> None:
+    def read(self, indices: Iterable[int] | None = None) -> np.ndarray:
+        """Frames (n, h, w) in the order of `indices` (all of them where None), C-contiguous; reads
+        only these.
+
+        Raises DamagedError where a frame is missing, cut short or differs from its checksum,
+        InputError for an index outside the stack.
+        """
+        n = self.shape[0]
+        wanted = check_indices(self.path.parent.name, indices, n)
+        for index in wanted:  # before memory is allocated for what the description announces
+            self._check_size(index)
+        frames = np.empty((len(wanted), *self.shape[1:]), self.dtype)
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(self._read_frame, wanted, frames))
+        return frames if sys.byteorder == "little" else frames.byteswap(inplace=True)
+
+    def hash(self) -> tuple[str, list[str]]:
+        """Read the whole stack; returns its content hash, as `write_stack` does, and the hash of
+        each frame, BLAKE2b of 160 bits. Raises DamagedError as `read`."""
+
+        def digest(index: int) -> bytes:
+            """Read one frame and return its digest."""
+            self._check_size(index)
+            frame = np.empty(self.shape[1:], self.dtype)
+            self._read_frame(index, frame)
+            return _digest(frame)
+
+        with ThreadPoolExecutor(_THREADS) as pool:
+            digests = list(pool.map(digest, range(self.shape[0])))
+        return _combine_digests(self.shape, self.dtype, digests), [each.hex() for each in digests]
+
+    def identify(self) -> tuple[tuple[int, ...], ...]:
+        """Return what changes whenever a frame's file does: number, size and time of each. Raises
+        DamagedError where a file is missing."""
+        return tuple(map(self._identify_frame, range(self.shape[0])))
+
+    def _read_frame(self, index: int, frame: np.ndarray) -> None:
         """Read one frame, little-endian, into `frame` (h, w). Raises DamagedError where it is not
         what was saved."""
-        chunk, checksum = self._chunk_path(index), bytearray(_CHECKSUM_BYTES * self.has_checksums)
+        checksum = bytearray(_CHECKSUM_BYTES * self.has_checksums)
         try:
-            with open(chunk, "rb", buffering=0) as file:  # regular, as its size was right
-                whole = _read_into(file, frame.data.cast("B")) and _read_into(
-                    file, memoryview(checksum)
-                )
+            with open(self._chunk_path(index), "rb") as file:  # regular, as its size was right
+                whole = file.readinto(frame.data.cast("B")) == frame.nbytes
+                whole = whole and file.readinto(checksum) == len(checksum)
         except OSError as error:
             raise self._error(index, error) from error
         if not whole:
@@ -211,13 +158,13 @@ class _StoredStack:
         if checksum and checksum != _checksum(frame):
             raise self._damage(index, "differs from its checksum")
 
-    def check_size(self, index: int) -> None:
+    def _check_size(self, index: int) -> None:
         """Raise DamagedError unless a frame's file has the size that the description announces."""
         frame_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
-        if self.identify(index)[1] != frame_bytes + _CHECKSUM_BYTES * self.has_checksums:
+        if self._identify_frame(index)[1] != frame_bytes + _CHECKSUM_BYTES * self.has_checksums:
             raise self._damage(index, "is cut short, or longer than it was")
 
-    def identify(self, index: int) -> tuple[int, ...]:
+    def _identify_frame(self, index: int) -> tuple[int, ...]:
         """Return number, size and time of a frame's file. Raises DamagedError where it is
         missing."""
         try:
@@ -244,11 +191,20 @@ class _StoredStack:
 
     def _damage(self, index: int, fault: str) -> DamagedError:
         """Return the error for a damaged frame, with the capture's name and the remedy."""
-        capture, file = self.path.parent.name, self._chunk_path(index)
         return DamagedError(
-            f"{capture}: frame {index + 1} of {self.shape[0]} is damaged ({file} {fault}): "
+            f"{self.path.parent.name}: frame {index + 1} of {self.shape[0]} is damaged"
+            f" ({self._chunk_path(index)} {fault}): "
             "restore this file from a copy, or import or record the capture again"
         )
+
+
+def check_indices(name: str, indices: Iterable[int] | None, count: int) -> list[int]:
+    """Return the indices of frames of the capture ``name``, all of them where None; InputError for
+    one outside of its ``count``."""
+    wanted = list(range(count) if indices is None else map(int, indices))
+    if any(not 0 <= index < count for index in wanted):
+        raise InputError(f"frames {wanted} were requested, {name} has {count} frames: count from 0")
+    return wanted
 
 
 def check_stack_array(frames: np.ndarray) -> None:
@@ -278,25 +234,13 @@ def _create_array(path: Path, shape: tuple[int, ...], dtype: str) -> None:
         dimension_names=["frame", "v", "u"],
         chunk_key_encoding={"name": "default", "separator": _SEPARATOR},
     )
-    description = path / "zarr.json"
-    with open(description, "rb") as file:
+    with open(path / "zarr.json", "rb") as file:
         os.fsync(file.fileno())
 
 
 def _chunk_path(path: Path, separator: str, index: int) -> Path:
     """Return the file of one frame's chunk."""
     return path / separator.join(("c", str(index), "0", "0"))
-
-
-def _read_into(file: RawIOBase, view: memoryview) -> bool:
-    """Read a file into memory; returns whether it held enough bytes."""
-    done = 0
-    while done < len(view):
-        count = file.readinto(view[done:])
-        if not count:
-            return False
-        done += count
-    return True
 
 
 def _checksum(frame: np.ndarray) -> bytes:

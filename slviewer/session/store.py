@@ -22,18 +22,18 @@ from slviewer.session.capture import (
     write_capture,
 )
 from slviewer.session.decisions import Decisions
-from slviewer.session.lock import WriterLock
+from slviewer.session.layout import Trashed, WriterLock, list_trash, trash_place
 from slviewer.session.names import is_safe_name, natural_key, new_name, safe_name, safe_path
 from slviewer.session.reading import decoding
 from slviewer.session.results import (
     check_place,
     check_result,
     list_results,
+    locate_result,
     read_arrays,
     read_meta,
     write_result,
 )
-from slviewer.session.trash import Trashed, list_trash, trash_place
 
 _MAX_INPUTS_CHAIN = 32
 
@@ -336,7 +336,7 @@ class Session(Decisions):
     def _result_folder(self, name: str) -> Path:
         """Return the folder of a result, where `together` has staged it; InputError for an unsafe
         name."""
-        target = layout.locate_result(self.folder / "results", name)
+        target = locate_result(self.folder / "results", name)
         return target if self._together is None else self._together.folder_for(target)
 
     def result_names(self) -> list[str]:
@@ -456,21 +456,14 @@ class Session(Decisions):
             known[name] = "fresh"
         return known[name]
 
-    def load_fresh(
-        self, name: str, only: Collection[str] | None = None
-    ) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-        """What `load_result` returns for a result that is fresh and whole; None for any other, to
-        be computed again."""
-        return self.decode_fresh(name, lambda meta, arrays: (meta, arrays), only)
-
     def decode_fresh(
         self,
         name: str,
         decode: Callable[[dict[str, Any], dict[str, np.ndarray]], T],
         only: Collection[str] | None = None,
     ) -> T | None:
-        """What `decode_result` returns for a result that is fresh and whole; None for any other, as
-        `load_fresh`."""
+        """What `decode_result` returns for a result that is fresh and whole; None for any other, to
+        be computed again."""
         with contextlib.suppress(DamagedError):
             if self.state_of(name) == "fresh":
                 return self.decode_result(name, decode, only)

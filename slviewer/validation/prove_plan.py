@@ -14,7 +14,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.pipeline.feedback import Progress
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 
 REPEATS = 200

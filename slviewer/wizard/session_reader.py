@@ -32,7 +32,7 @@ from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.stored_records import Stored, captures_of, read_record
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
-from slviewer.records.placement import Placement
+from slviewer.records.merge import Placement
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.session.capture import Capture
 from slviewer.session.inspection_plan import list_plans

@@ -18,8 +18,7 @@ from slviewer.pipeline.stored_records import Stored
 from slviewer.pipeline.suggest_exposure import ExposureSuggestion
 from slviewer.records.calibration import PixelwiseFit, SplinedFit
 from slviewer.records.measurement import Measurement
-from slviewer.records.merge import Merge
-from slviewer.records.placement import Placement
+from slviewer.records.merge import Merge, Placement
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict

@@ -24,7 +24,7 @@ from slviewer.calibration.splined.volume import (
 )
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
-from slviewer.inspection.relations import distance
+from slviewer.inspection.features import distance
 from slviewer.inspection.uncertainty import Spread, splined_shared
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.records.table import render_text

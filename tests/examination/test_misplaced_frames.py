@@ -13,7 +13,7 @@ from slviewer.examination.examine import examine
 from slviewer.fringe.cosines import estimate_roughness
 from slviewer.fringe.presets import complementary, gray, gray_bits, multifrequency, p18, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.session.importers import procam_calibration
+from slviewer.session.importers.layouts import PROCAM_CALIBRATION
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
@@ -236,7 +236,7 @@ def test_roughness_is_the_median_of_third_differences(width: int, highest: int):
 
 @pytest.mark.slow
 def test_photographed_captures(real_data: Path):
-    for recording in procam_calibration.LAYOUT.read(real_data / "kamino_procam_jpg90"):
+    for recording in PROCAM_CALIBRATION.read(real_data / "kamino_procam_jpg90"):
         assert told(recording.sequence, recording.frames) == {}
     for k in (2, 5, 8):
         assert told(recording.sequence, late(recording.frames, k)) == {k: "duplicate-frame"}

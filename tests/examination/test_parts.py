@@ -19,8 +19,7 @@ from slviewer.examination.sample import sample_capture
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis
-from slviewer.records.examination import MOST_WARNINGS, Examination
-from slviewer.records.verdict import Finding
+from slviewer.records.verdict import MOST_WARNINGS, Examination, Finding
 
 pytestmark = pytest.mark.computes
 

@@ -21,10 +21,9 @@ from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.stored_records import Stored
-from slviewer.records.measurement import DECIDED, Measurement
+from slviewer.records.measurement import DECIDED, Measurement, Quantity
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.quantities import Quantity
-from slviewer.report.measurements import section_plot
+from slviewer.report.surfaces import section_plot
 from slviewer.wizard.surfaces import place_at
 
 CENTRE = np.array([10.0, 20.0, 500.0])

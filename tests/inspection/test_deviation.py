@@ -7,11 +7,16 @@ import trimesh
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.inspection import placing
-from slviewer.inspection.colours import EXCLUDED_COLOUR, colour_limit, deviation_colours
-from slviewer.inspection.deviation import Deviation, deviation
+from slviewer.inspection import nominal_surface
+from slviewer.inspection.deviation import (
+    EXCLUDED_COLOUR,
+    Deviation,
+    colour_limit,
+    deviation,
+    deviation_colours,
+    judge_deviation,
+)
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.inspection.tolerance import judge_deviation
 from slviewer.records.measurement import ToleranceVerdict
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.registration.refusal import Refused
@@ -146,7 +151,7 @@ def test_a_bump_of_a_tenth_is_seen_within_5_microns() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computes
-def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
+def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either(monkeypatch) -> None:
     box = trimesh.creation.box((60, 40, 20))
     points, normals = box_scan(0.01)
     z = np.array([-0.5, 0.5, -0.7071])  # the camera sees all three sides
@@ -157,9 +162,10 @@ def test_a_part_that_looks_alike_from_two_sides_is_placed_on_either() -> None:
         normals @ R.T,
         Mesh(box.vertices, box.faces),
     )
-    views = placing.VIEWS[-2:]  # corners; a box has no front
-    start = placing.search_start(
-        scan, facing, NominalSurface(nominal), None, lambda share: None, views
+    # corners; a box has no front
+    monkeypatch.setattr(nominal_surface, "VIEWS", nominal_surface.VIEWS[-2:])
+    start = nominal_surface.search_start(
+        scan, facing, NominalSurface(nominal), None, lambda share: None
     )
     found = deviation(scan, nominal, normals=facing, initial=start.T_reference_scan)
     assert 0.0095 < found.statistics()["rms"] < 0.0125 and found.statistics()["left_out"] < 100
@@ -213,20 +219,22 @@ def test_a_scan_without_points_is_refused(ammonite) -> None:
 
 def test_another_part_is_refused_without_refining_any_pose(ammonite, monkeypatch) -> None:
     monkeypatch.setattr(
-        placing, "register_prepared", lambda *given, **options: pytest.fail("a pose was refined")
+        nominal_surface,
+        "register_prepared",
+        lambda *given, **options: pytest.fail("a pose was refined"),
     )
     _, _, points, normals = ammonite
     seen = np.isfinite(points[..., 0])
     box = trimesh.creation.box((120, 100, 70))
     other = NominalSurface(Mesh(box.vertices, box.faces))
+    monkeypatch.setattr(nominal_surface, "VIEWS", nominal_surface.VIEWS[:2])
     with raises(Refused, "nominal model", "%") as refusal:
-        placing.search_start(
+        nominal_surface.search_start(
             points[seen][::3],
             normals[seen][::3],
             other,
             None,
             lambda share: None,
-            placing.VIEWS[:2],
         )
     assert refusal.value.reason == "overlap"
     with raises(InputError, "triangles"):

@@ -12,8 +12,8 @@ from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature, least_squares
 from slviewer.inspection.uncertainty import scatter_covariance
+from slviewer.records.measurement import Quantity
 from slviewer.records.plain import from_plain
-from slviewer.records.quantities import Quantity
 from slviewer.session.atomic import to_json
 
 pytestmark = pytest.mark.computes

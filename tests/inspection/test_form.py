@@ -5,11 +5,11 @@ import pytest
 from facts import raises
 
 from slviewer.errors import InputError
+from slviewer.inspection.deviation import judge_limits
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
-from slviewer.inspection.tolerance import judge_limits
-from slviewer.records.quantities import Quantity
+from slviewer.records.measurement import Quantity
 from slviewer.validation.prove_plan import CASES
 
 pytestmark = pytest.mark.computes
@@ -92,6 +92,14 @@ def test_position_is_the_diameter_of_the_zone() -> None:
         fit_feature("sphere", points), points, Feature("sphere", np.zeros(3), None, 10.0)
     )
     assert_covers(q, 2 * np.linalg.norm([0.03, 0.02, 0.01]), 0.015)
+
+
+def test_position_of_an_axis_is_that_of_its_ends() -> None:
+    points = cylinder(8, 0.0, tilt=0.004)
+    fit = fit_feature("cylinder", points)
+    nominal = Feature("cylinder", np.zeros(3), np.array([0.0, 0.0, 1.0]), fit.feature.radius)
+    ends = np.abs(points[:, 2]).max()
+    assert_covers(position_error(fit, points, nominal), 2 * 0.004 * ends, 0.03)
 
 
 def test_profile_is_twice_the_largest_deviation() -> None:

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slviewer.inspection.features import KINDS, Feature
-from slviewer.inspection.relations import MEANINGS, distance, relation
+from slviewer.inspection.features import KINDS, MEANINGS, Feature, distance, relation
 from slviewer.inspection.uncertainty import Spread, propagate_covariance
 
 X, Y, Z = np.eye(3)

@@ -1,8 +1,8 @@
 """Stored examinations of sound captures, so that commands need not compute them again."""
 
 from slviewer.pipeline.examination import VERSION
-from slviewer.records.examination import Examination
 from slviewer.records.plain import to_plain
+from slviewer.records.verdict import Examination
 from slviewer.session.store import Session
 
 

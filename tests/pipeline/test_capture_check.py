@@ -18,7 +18,7 @@ from slviewer.pipeline.capture_phases import (
     decode_or_explain,
 )
 from slviewer.pipeline.examination import examine_frames
-from slviewer.records.examination import Examination
+from slviewer.records.verdict import Examination
 from slviewer.simulation.boards import Pose, blank_board
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter

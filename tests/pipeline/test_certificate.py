@@ -15,6 +15,7 @@ import slviewer as sl
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
+from slviewer.inspection.regions import Region
 from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
 from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.relate import relate
@@ -23,7 +24,7 @@ from slviewer.pipeline.run_plan import run_plan
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.records.inspection import Characteristic
 from slviewer.report.page import CERTIFICATE, split_page
-from slviewer.session.inspection_plan import Plan, PlanFeature, PlanRegion, write_plan
+from slviewer.session.inspection_plan import Plan, PlanFeature, write_plan
 from slviewer.session.store import Session
 from slviewer.simulation.plans import letter_plan
 from slviewer.simulation.renderer import Renderer
@@ -77,7 +78,7 @@ def measured_report(folder: Path, model: str) -> Path:
         box = (*(middle - 12).tolist(), *(middle + 12).tolist())
         sl.measure(store, "plane_01", "plane", box=box, axes=turned.tolist())
         relate(store, "m1", "m4")
-        place = PlanRegion("ball", tuple(plane.points[v, u].tolist()), (20.0,))
+        place = Region.ball(plane.points[v, u].astype(float), 20.0)
         features = (PlanFeature("middle", "plane", place),)
         flatness = Characteristic("flatness", "flatness", ("middle",), upper=1.0)
         write_plan(Plan("plate", features, (flatness,)), folder.parent / "plan.toml")

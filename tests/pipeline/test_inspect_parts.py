@@ -11,6 +11,7 @@ from facts import missing_facts, raises
 from slviewer.errors import InputError
 from slviewer.evaluation.capability import process_capability
 from slviewer.geometry.rigid import move_points, transform_from_rvec
+from slviewer.inspection.regions import Region
 from slviewer.pipeline.inspect_parts import FILES, inspect_surfaces, write_inspection
 from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.records.inspection import Characteristic, Inspection
@@ -18,7 +19,6 @@ from slviewer.session.inspection_plan import (
     Alignment,
     Plan,
     PlanFeature,
-    PlanRegion,
     plan_toml,
     read_plan,
     write_plan,
@@ -57,29 +57,33 @@ def synthesised_part(
 
 
 def make_plan(limit: float = TOLERANCE) -> Plan:
-    def box(low: tuple[float, ...], high: tuple[float, ...]) -> PlanRegion:
-        a, b = np.array(low), np.array(high)
-        return PlanRegion("box", tuple((a + b) / 2), tuple((b - a) / 2))
-
     features = (
         PlanFeature(
-            "table", "plane", box((56, 2, -3), (78, 78, 3)), (67.0, 40.0, 0.0), (0.0, 0.0, 1.0)
+            "table",
+            "plane",
+            Region.box((56, 2, -3), (78, 78, 3)),
+            (67.0, 40.0, 0.0),
+            (0.0, 0.0, 1.0),
         ),
         PlanFeature(
-            "left", "plane", box((-3, 2, 3), (3, 78, 18)), (0.0, 40.0, 10.0), (1.0, 0.0, 0.0)
+            "left", "plane", Region.box((-3, 2, 3), (3, 78, 18)), (0.0, 40.0, 10.0), (1.0, 0.0, 0.0)
         ),
         PlanFeature(
-            "front", "plane", box((2, -3, 3), (78, 3, 18)), (40.0, 0.0, 10.0), (0.0, 1.0, 0.0)
+            "front",
+            "plane",
+            Region.box((2, -3, 3), (78, 3, 18)),
+            (40.0, 0.0, 10.0),
+            (0.0, 1.0, 0.0),
         ),
         PlanFeature(
             "ball",
             "sphere",
-            PlanRegion("ball", (40.0, 40.0, 10.0), (12.0,)),
+            Region.ball((40.0, 40.0, 10.0), 12.0),
             (40.0, 40.0, 10.0),
             None,
             10.0,
         ),
-        PlanFeature("nothing", "plane", PlanRegion("ball", (0.0, 0.0, 300.0), (5.0,))),
+        PlanFeature("nothing", "plane", Region.ball((0.0, 0.0, 300.0), 5.0)),
     )
     characteristics = (
         Characteristic("diameter", "diameter", ("ball",), 20.0, 20.0 - limit, 20.0 + limit),
@@ -222,12 +226,12 @@ def test_a_plan_by_best_fit_measures_profiles_from_the_nominal_model(tmp_path: P
         PlanFeature(
             "top",
             "plane",
-            PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0)),
+            Region("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0)),
             (20.0, 0.0, 20.0),
             (0, 0, 1),
         ),
-        PlanFeature("sound", "surface", PlanRegion("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
-        PlanFeature("dented", "surface", PlanRegion("box", (-20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
+        PlanFeature("sound", "surface", Region("box", (20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
+        PlanFeature("dented", "surface", Region("box", (-20.0, 0.0, 20.0), (17.0, 27.0, 3.0))),
     )
     characteristics = (
         Characteristic("sound profile", "profile", ("sound",), upper=0.1),

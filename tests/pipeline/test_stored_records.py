@@ -16,9 +16,8 @@ from slviewer.records.drift import Drift
 from slviewer.records.inspection import Inspection
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import MeasuredRegion, Measurement
-from slviewer.records.merge import Merge
+from slviewer.records.merge import Merge, Placement
 from slviewer.records.model_comparison import ModelComparison
-from slviewer.records.placement import Placement
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verdict import Verdict

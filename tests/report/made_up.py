@@ -14,7 +14,6 @@ from slviewer.report.data import (
     ErrorMaps,
     MergePair,
     PixelCurve,
-    PixelFitView,
     PlaneRow,
     PoseResiduals,
     RecordsView,
@@ -236,7 +235,7 @@ def reproduction_data(width: int = 1600) -> ReproductionData:
             for i, row in enumerate(spheres)
         ],
         plane_outlines=outlines(),
-        clouds=[CloudView(f"object_r{i + 1}", c, note=f"R{i + 1}") for i, c in enumerate(clouds)],
+        clouds=[CloudView(f"object_r{i + 1}", c) for i, c in enumerate(clouds)],
         merged=CloudView(
             "merged",
             merged[known],
@@ -340,7 +339,7 @@ def session_data(width: int = 1600) -> SessionData:
         name="Vase <script>alert(1)</script>",
         captures=captures,
         calibration=CalibrationFigures(stereo, residuals),
-        pixel_fits=[PixelFitView("x", rms_maps(width))],
+        pixel_fits={"x": rms_maps(width)},
         records=[RecordsView(Verification, planes, maps)],
         warnings=[
             "the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"

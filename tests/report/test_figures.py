@@ -13,14 +13,13 @@ from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.report import maps
-from slviewer.report.bars import rms_bars
 from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
-from slviewer.report.clouds import draw_clouds, draw_merged_cloud
-from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CloudView, PixelCurve
+from slviewer.report.maps import pixel_curves
 from slviewer.report.page import Figure
+from slviewer.report.planes import planes_in_space, rms_bars
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
-from slviewer.report.space import planes_in_space
+from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
 
 pytestmark = pytest.mark.computes
 
@@ -113,7 +112,11 @@ def test_nothing_measured_is_drawn_as_nothing() -> None:
     opened(maps.draw_error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
     opened(maps.rms_maps(np.full((3, 60, 80), np.nan)))
     opened(draw_clouds([CloudView("nothing", np.full((60, 80, 3), np.nan, np.float32))]))
-    opened(draw_merged_cloud(CloudView("nothing", np.zeros((0, 3), np.float32))))
+    opened(
+        draw_merged_cloud(
+            CloudView("nothing", *2 * [np.zeros((0, 3), np.float32)], np.zeros(0, int))
+        )
+    )
 
 
 def test_scales_end_at_round_values() -> None:
@@ -162,8 +165,8 @@ def test_reprojection_figures() -> None:
 def test_clouds_are_counted() -> None:
     points = cloud(160, 590)
     count = f"{np.isfinite(points[..., 2]).sum():,} points"
-    figure = draw_clouds([CloudView("scan <1>", points, note="R2")] * 4)
-    assert missing_facts(figure.alt, count, "R2") == []
+    figure = draw_clouds([CloudView("scan <1>", points)] * 4)
+    assert missing_facts(figure.alt, count) == []
     opened(figure)
 
 

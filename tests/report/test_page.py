@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from facts import raises
 
-from slviewer.errors import InputError
+from slviewer.errors import InputError, SessionError
 from slviewer.records.table import Cell, Column, Table
 from slviewer.report.page import Figure, Headline, PageNotice, Section, write_page
 
@@ -18,16 +18,16 @@ EVIL = "<script>alert('x')</script> \"quoted\" & <img src=y onerror=z>"
 
 def table(caption: str = "table") -> Table:
     columns = [
-        Column("pose", align="left"),
+        Column("pose"),
         Column("RMS", "mm", "stereo"),
         Column("RMS", "mm", "pixelwise"),
     ]
     return Table(
         columns,
-        [["1", "0.2", Cell("0.1", "better")]],
+        [["1", 0.2, Cell(0.1, "better")]],
         caption,
         ["a note"],
-        [["mean", "0.2", "0.1"]],
+        [["mean", 0.2, 0.1]],
     )
 
 
@@ -38,7 +38,7 @@ def write(path: Path, text: str = "words") -> str:
         path,
         text,
         text,
-        [(text, text, text), Headline("1 mm", "size")],
+        [Headline(text, text, text), Headline("1 mm", "size")],
         [Section(text, [text, text], items)],
     )
     return path.read_text(encoding="utf-8")
@@ -73,7 +73,7 @@ def test_anchors_lead_to_their_sections(tmp_path: Path) -> None:
 
 def test_who_wins_is_marked_and_groups_span_their_columns(tmp_path: Path) -> None:
     page = write(tmp_path / "report.html")
-    assert re.search(r'class="right better">0\.1<', page)
+    assert re.search(r'class="right better">0\.100<', page)
     assert table().groups == [("", 1), ("stereo", 1), ("pixelwise", 1)]
     assert Table([Column("a", group="g"), Column("b", group="g")], [], "c").groups == [("g", 2)]
     assert Table([Column("a")], [], "c").groups == []
@@ -92,7 +92,7 @@ def test_a_page_is_complete_or_absent(tmp_path: Path, monkeypatch: pytest.Monkey
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError):
+    with pytest.raises(SessionError):
         write(path, "other")
     assert path.read_text(encoding="utf-8") == before
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
@@ -100,5 +100,5 @@ def test_a_page_is_complete_or_absent(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_place_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError):
+    with pytest.raises(SessionError):
         write(tmp_path / "file" / "report.html")

@@ -17,26 +17,21 @@ from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
 from slviewer.records.drift import Drift
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
-from slviewer.records.table import Cell, Table
+from slviewer.records.table import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.data import CalibrationFigures, ModelsView, PlaneRow, RecordsView, SpacingRow
 from slviewer.report.page import Figure, PageNotice, Section, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
+    plane_table,
     reproduction_headlines,
     reproduction_sections,
     reproduction_title,
-)
-from slviewer.report.session import session_headlines, session_sections, session_title
-from slviewer.report.tables import (
-    better_worse,
-    compare_errors,
-    format_number,
-    plane_table,
     spacing_table,
     sphere_table,
 )
+from slviewer.report.session import session_headlines, session_sections, session_title
 
 pytestmark = pytest.mark.computes
 
@@ -47,21 +42,16 @@ def texts(section: Section) -> str:
     words = [section.title, *section.paragraphs]
     for item in section.items:
         if isinstance(item, Table):
-            cells = [c for row in (*item.rows, *item.footer) for c in row]
-            words += [
-                item.caption,
-                *item.notes,
-                *(str(c.value if isinstance(c, Cell) else c) for c in cells),
-            ]
+            lines = item.format([*item.rows, *item.footer])
+            words += [item.caption, *item.notes, *(text for line in lines for _, text, _ in line)]
         else:
             words.append(item.text if isinstance(item, PageNotice) else item.caption)
     return "\n".join(words)
 
 
-def by_title(table: Table, row: int) -> dict[tuple[str, str], str | Cell]:
-    return {
-        (c.group, c.title): cell for c, cell in zip(table.columns, table.rows[row], strict=True)
-    }
+def by_title(table: Table, row: int) -> dict[tuple[str, str], tuple[str, str]]:
+    """Text and mark of each cell of a row."""
+    return {(c.group, c.title): (text, mark) for c, text, mark in table.format(table.rows)[row]}
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +121,13 @@ def test_where_pixelwise_loses_it_is_said(tables: list[Section]) -> None:
     )
     table = next(i for i in planes.items if isinstance(i, Table))
     first, third = by_title(table, 0), by_title(table, 2)
-    assert first["pixelwise", "RMS"] == Cell("0.219", "worse") and first["stereo", "RMS"] == Cell(
-        "0.134", "better"
-    )
-    assert first["pixelwise", "against stereo"] == Cell("1.63 × worse", "worse")
-    assert (
-        third["pixelwise", "RMS"] == Cell("0.076", "better") and third["stereo", "RMS"] == "0.198"
-    )
-    assert third["pixelwise", "floor"] == Cell("0.036", "muted")
-    assert by_title(table, 7)["pixelwise", "against stereo"] == Cell("equal")
+    assert first["pixelwise", "RMS"] == ("0.219", "worse")
+    assert first["stereo", "RMS"] == ("0.134", "better")
+    assert first["pixelwise", "against stereo"] == ("1.63 × worse", "worse")
+    assert third["pixelwise", "RMS"] == ("0.076", "better")
+    assert third["stereo", "RMS"] == ("0.198", "")
+    assert third["pixelwise", "floor"] == ("0.036", "muted")
+    assert by_title(table, 7)["pixelwise", "against stereo"] == ("equal", "")
 
 
 def test_the_ratio_counts_the_planes_inside() -> None:
@@ -177,7 +165,6 @@ def test_an_empty_reproduction_still_makes_a_page() -> None:
         fit_rms_mm={},
         reprojection_rms_px={},
         poses_left_out={"pose_02": "board not found"},
-        notes=["something was odd"],
     )
     sections = reproduction_sections(data)
     assert len(sections) == 4 and len(reproduction_headlines(data)) == 2
@@ -188,8 +175,10 @@ def test_missing_values_are_dashes_not_winners() -> None:
     nan = float("nan")
     row = PlaneRow("p", {}, {"stereo": 0.1, "pixelwise": nan}, {"stereo": nan})
     cells = by_title(plane_table([row], "t"), 0)
-    assert cells["", "R1 / R2 / R3"] == cells["pixelwise", "RMS"] == Cell("–", "muted")
-    assert cells["stereo", "RMS"] == "0.100" and cells["pixelwise", "against stereo"] == Cell(None)
+    unknown = ("–", "muted")
+    assert cells["", "R1 / R2 / R3"] == cells["pixelwise", "RMS"] == unknown
+    assert cells["stereo", "RMS"] == ("0.100", "")
+    assert cells["pixelwise", "against stereo"] == unknown
     assert ("the Letter's rig", "stereo") not in cells
 
 
@@ -197,24 +186,19 @@ def test_verdicts() -> None:
     assert compare_errors(0.1, 0.25) == Cell("2.50 × better", "better")
     assert compare_errors(-0.25, 0.1) == Cell("2.50 × worse", "worse")
     assert compare_errors(0.100, 0.101) == Cell("equal") and better_worse(0.100, 0.101) == ""
-    assert (
-        format_number(-0.5, signed=True) == "−0.500"
-        and format_number(0.5, 1, signed=True) == "+0.5"
-    )
 
 
 def test_spheres_are_judged_by_their_radius_and_spacing() -> None:
     table = sphere_table(sphere_rows(), "t")
     row = by_title(table, 0)
-    assert row["stereo", "error"] == "−0.090" and row["pixelwise", "error"] == Cell(
-        "+0.080", "better"
-    )
+    assert row["stereo", "error"] == ("−0.090", "")
+    assert row["pixelwise", "error"] == ("+0.080", "better")
     assert missing_facts(table.notes[0], "radius", "98.03 mm") == []
     spacing = by_title(
         spacing_table([SpacingRow("a to b", 150.0, {"stereo": 150.5, "pixelwise": 149.9})], "t"), 0
     )
-    assert spacing["pixelwise", "error"] == Cell("−0.100", "better")
-    assert spacing["pixelwise", "against stereo"] == Cell("5.00 × better", "better")
+    assert spacing["pixelwise", "error"] == ("−0.100", "better")
+    assert spacing["pixelwise", "against stereo"] == ("5.00 × better", "better")
 
 
 def test_a_sessions_report(tmp_path: Path) -> None:
@@ -244,7 +228,7 @@ def test_a_sessions_report(tmp_path: Path) -> None:
 
 def test_a_session_with_nothing_in_it() -> None:
     data = dataclasses.replace(
-        session_data(WIDTH), captures=[], calibration=None, pixel_fits=(), records=(), warnings=()
+        session_data(WIDTH), captures=[], calibration=None, pixel_fits={}, records=(), warnings=()
     )
     (section,) = session_sections(data)
     assert missing_facts(texts(section), "captures") == [] and session_headlines(data) == []
@@ -255,7 +239,7 @@ def test_a_calibration_made_elsewhere() -> None:
     assert data.calibration is not None
     bare = CalibrationFigures(StereoModel.from_rig(data.calibration.stereo.rig))
     sections = session_sections(
-        dataclasses.replace(data, calibration=bare, records=(), pixel_fits=())
+        dataclasses.replace(data, calibration=bare, records=(), pixel_fits={})
     )
     assert missing_facts(texts(sections[1]), "elsewhere") == []
 
@@ -391,6 +375,6 @@ def test_how_good_a_calibration_is() -> None:
         "plane_01",
         "recalibrate",
         "the board seems too large",
-        "60.5",
+        "60.500",
     )
     assert missing_facts(words, *facts) == []

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from slviewer.errors import InputError
-from slviewer.report.clouds import _select_mosaic
-from slviewer.report.shaded import BACKGROUND, render_points, view_rotation
+from slviewer.report.surfaces import BACKGROUND, _select_mosaic, render_points, view_rotation
 
 SIZE = (120, 90)
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)

@@ -15,7 +15,7 @@ from facts import raises
 
 from slviewer.errors import SessionError
 from slviewer.session import atomic
-from slviewer.session.lock import WriterLock
+from slviewer.session.layout import WriterLock
 from slviewer.session.store import Session
 
 WRITER = """

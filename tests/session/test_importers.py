@@ -11,8 +11,8 @@ from slviewer.errors import InputError
 from slviewer.fringe import presets
 from slviewer.fringe.sequence import Frame
 from slviewer.session.importers import frames as frames_layout
-from slviewer.session.importers import p18, procam_calibration
 from slviewer.session.importers.imported import check_complete
+from slviewer.session.importers.layouts import P18, PROCAM_CALIBRATION
 
 
 def image(seed: int, dtype=np.uint8) -> np.ndarray:
@@ -44,7 +44,7 @@ def write_procam(capture: Path, count=42) -> list[np.ndarray]:
 
 def test_p18_takes_v_then_h_with_the_texture_once(tmp_path):
     written = {name: write_p18(tmp_path / name) for name in ("pose_10", "pose_2")}
-    found = p18.LAYOUT.read(tmp_path, prefix="planes")
+    found = P18.read(tmp_path, prefix="planes")
     captures = list(found)
     assert [capture.name for capture in captures] == [
         "planes_pose_2",
@@ -65,7 +65,7 @@ def test_p18_takes_v_then_h_with_the_texture_once(tmp_path):
 
 def test_p18_of_one_pose_one_axis_other_capitals_and_depth(tmp_path):
     write_p18(tmp_path / "scan", "h", name="p18_f{:02d}.tif", dtype=np.uint16)
-    (capture,) = p18.LAYOUT.read(tmp_path / "scan", projector=(800, 600))
+    (capture,) = P18.read(tmp_path / "scan", projector=(800, 600))
     assert (
         capture.name == "scan"
         and capture.sequence.axes == ("y",)
@@ -76,13 +76,13 @@ def test_p18_of_one_pose_one_axis_other_capitals_and_depth(tmp_path):
 
 def test_p18_texture_at_f26_or_nowhere_or_twice(tmp_path):
     whole = write_p18(tmp_path / "pose_1", numbers=[*range(25), 26])
-    (capture,) = p18.LAYOUT.read(tmp_path)
+    (capture,) = P18.read(tmp_path)
     np.testing.assert_array_equal(capture.frames[25], whole[25])
     write_p18(tmp_path / "pose_2", numbers=range(25))
     write_p18(tmp_path / "pose_3", numbers=range(25))
     write(tmp_path / "pose_3/V/P18_F25.PNG", np.zeros((12, 16), np.uint8))
     write(tmp_path / "pose_3/V/P18_F26.PNG", np.full((12, 16), 9, np.uint8))
-    found = p18.LAYOUT.read(tmp_path)
+    found = P18.read(tmp_path)
     _, bare, double = found
     assert [frame.kind for frame in bare.sequence.frames].count("texture") == 0 and len(
         bare.frames
@@ -97,7 +97,7 @@ def test_p18_in_colour_keeps_the_texture(tmp_path):
     blue, green, red = (image(seed) for seed in (1, 2, 3))
     write(tmp_path / "pose_1/V/P18_F25.png", np.dstack([blue, green, red]))
     write(tmp_path / "pose_1/V/P18_F03.png", np.dstack([blue, red, green]))
-    (capture,) = p18.LAYOUT.read(tmp_path)
+    (capture,) = P18.read(tmp_path)
     np.testing.assert_array_equal(capture.texture, np.dstack([red, green, blue]))
     np.testing.assert_array_equal(capture.frames[25], green)
     np.testing.assert_array_equal(capture.frames[3], red)
@@ -107,39 +107,39 @@ def test_p18_says_what_is_missing_before_it_reads(tmp_path):
     write_p18(tmp_path / "pose_01")
     write_p18(tmp_path / "pose_03", numbers=[*range(7), *range(9, 26)])
     (tmp_path / "pose_01/V/P18_F00.PNG").write_bytes(b"no image: not looked at yet")
-    found = p18.LAYOUT.read(tmp_path)
+    found = P18.read(tmp_path)
     assert [recording.name for recording in found.recordings] == ["pose_01"]
     (skipped,) = found.skipped
     assert skipped.name == "pose_03" and missing_facts(skipped.reason, "V", "P18_F07, 08") == []
     with raises(InputError, "pose_03", "V", "P18_F07, 08"):
-        p18.LAYOUT.read(tmp_path / "pose_03")
+        P18.read(tmp_path / "pose_03")
 
 
 def test_p18_refuses_extra_and_double_frames_and_warns_of_strangers(tmp_path):
     write_p18(tmp_path / "pose_1")
     (tmp_path / "pose_1/V/Thumbs.db").touch()
     (tmp_path / "notes").mkdir()
-    found = p18.LAYOUT.read(tmp_path)
+    found = P18.read(tmp_path)
     assert missing_facts(found.warnings[0], "notes") == [] and len(found.warnings) == 2
     assert missing_facts(found.warnings[1], "pose_1/V", "Thumbs.db") == []
     write(tmp_path / "pose_1/H/P18_F31.PNG", image(0))
     with raises(InputError, "pose_1", "H", "P18_F31.PNG"):
-        p18.LAYOUT.read(tmp_path)
+        P18.read(tmp_path)
     (tmp_path / "pose_1/H/P18_F31.PNG").unlink()
     write(tmp_path / "pose_1/H/P18_F03.bmp", image(0))
     with raises(InputError, "P18_F03.PNG", "P18_F03.bmp"):
-        p18.LAYOUT.read(tmp_path)
+        P18.read(tmp_path)
 
 
 def test_p18_folders_without_poses(tmp_path):
     with pytest.raises(InputError):
-        p18.LAYOUT.read(tmp_path)
+        P18.read(tmp_path)
     with pytest.raises(InputError):
-        p18.LAYOUT.read(tmp_path / "absent")
+        P18.read(tmp_path / "absent")
     write_p18(tmp_path / "pose_1")
     (tmp_path / "pose_2" / "V").mkdir(parents=True)
     write_p18(tmp_path / "my pose")
-    found = p18.LAYOUT.read(tmp_path)
+    found = P18.read(tmp_path)
     assert [recording.name for recording in found.recordings] == ["pose_1"]
     assert [each.name for each in found.skipped] == ["pose_2", "my pose"]
     assert "my pose" in found.skipped[1].reason
@@ -149,7 +149,7 @@ def test_an_error_states_each_reason_once(tmp_path):
     for n in range(5):
         write_procam(tmp_path / f"capture_{n}", count=40 if n < 3 else 39)
     with pytest.raises(InputError) as refused:
-        procam_calibration.LAYOUT.read(tmp_path)
+        PROCAM_CALIBRATION.read(tmp_path)
     message = str(refused.value)
     assert message.count("40 images") == message.count("39 images") == 1
     assert missing_facts(message, "5 captures", "capture_0, capture_1, capture_2") == []
@@ -157,9 +157,9 @@ def test_an_error_states_each_reason_once(tmp_path):
 
 def test_p18_seven_bits_cannot_number_every_projector(tmp_path):
     write_p18(tmp_path / "pose_1", "V")
-    assert len(p18.LAYOUT.read(tmp_path, projector=(2304, 4000))) == 1  # only x is there
+    assert len(P18.read(tmp_path, projector=(2304, 4000))) == 1  # only x is there
     with raises(InputError, 2304, 2305, "x"):
-        p18.LAYOUT.read(tmp_path, projector=(2305, 100))
+        P18.read(tmp_path, projector=(2305, 100))
 
 
 # procam-calibration
@@ -167,7 +167,7 @@ def test_p18_seven_bits_cannot_number_every_projector(tmp_path):
 
 def test_procam_calibration(tmp_path):
     written = [write_procam(tmp_path / f"capture_{n}") for n in range(2)]
-    captures = list(procam_calibration.LAYOUT.read(tmp_path))
+    captures = list(PROCAM_CALIBRATION.read(tmp_path))
     assert [capture.name for capture in captures] == ["capture_0", "capture_1"]
     np.testing.assert_array_equal(captures[1].frames, np.stack(written[1]))
     sequence = captures[0].sequence
@@ -179,14 +179,14 @@ def test_procam_calibration(tmp_path):
 
 def test_procam_calibration_counts(tmp_path):
     write_procam(tmp_path / "capture_0")
-    assert len(procam_calibration.LAYOUT.read(tmp_path, projector=(800, 600))) == 1
+    assert len(PROCAM_CALIBRATION.read(tmp_path, projector=(800, 600))) == 1
     with raises(InputError, "42 images", "1920x1080", 46):
-        procam_calibration.LAYOUT.read(tmp_path, projector=(1920, 1080))
+        PROCAM_CALIBRATION.read(tmp_path, projector=(1920, 1080))
     with raises(InputError, "42 images", "512x512", 38):
-        procam_calibration.LAYOUT.read(tmp_path, projector=(512, 512))
+        PROCAM_CALIBRATION.read(tmp_path, projector=(512, 512))
     (tmp_path / "capture_0/graycode_17.png").unlink()
     with raises(InputError, "capture_0", "graycode_17"):
-        procam_calibration.LAYOUT.read(tmp_path)
+        PROCAM_CALIBRATION.read(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_missing_images_are_named_as_the_others(form, first, missing, named):
 
 
 def test_procam_calibration_of_a_real_rig(real_data):
-    found = procam_calibration.LAYOUT.read(real_data / "kamino_procam_jpg90")
+    found = PROCAM_CALIBRATION.read(real_data / "kamino_procam_jpg90")
     assert len(found) == 5
     capture = next(iter(found))
     assert capture.frames.shape == (42, 1024, 1280) and capture.frames.dtype == np.uint8

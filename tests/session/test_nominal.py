@@ -186,15 +186,18 @@ def test_files_that_a_model_names_are_not_opened(tmp_path: Path) -> None:
     assert len(read_nominal(tmp_path / "m.obj").mesh.faces) == 1
 
 
-def test_size_and_triangles_are_limited_before_anything_is_loaded(tmp_path: Path) -> None:
+def test_size_and_triangles_are_limited_before_anything_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with open(tmp_path / "large.stl", "wb") as file:
         file.truncate(nominal.MAX_BYTES + 1)  # sparse
     with raises(SessionError, "large.stl", "268 MB"):
         read_nominal(tmp_path / "large.stl")
+    monkeypatch.setattr(nominal, "MAX_TRIANGLES", 100)
     for name in ("many.stl", "many.ply", "many.obj"):
         BALL.export(tmp_path / name)
         with raises(SessionError, name, 320, 100):
-            read_nominal(tmp_path / name, max_triangles=100)
+            read_nominal(tmp_path / name)
 
 
 @pytest.mark.parametrize(

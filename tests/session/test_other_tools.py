@@ -12,7 +12,7 @@ from facts import raises
 from slviewer.errors import InputError
 from slviewer.fringe.decode import decode
 from slviewer.session.capture import NewCapture
-from slviewer.session.importers import layouts, opencv_graycode, slstudio, sltk
+from slviewer.session.importers import layouts
 
 COLUMNS, ROWS = 640, 120
 SIZE = (COLUMNS, ROWS)
@@ -70,7 +70,7 @@ def test_slstudio_codecs_give_the_projectors_pixels(tmp_path, codec, least, most
     for number, pattern in enumerate(slstudio_frames(codec)):
         write(tmp_path / "scan" / f"frameSeq_{number}.bmp", pattern)
     assert layouts.detect_layout(tmp_path) == "slstudio"
-    (capture,) = slstudio.LAYOUT.read(tmp_path, projector=SIZE, codec=codec)
+    (capture,) = layouts.SLSTUDIO.read(tmp_path, projector=SIZE, codec=codec)
     assert capture.sequence.axes == (("x",) if codec in "34" else ("x", "y"))
     assert capture.sequence.sign("x") == -1
     error = decoded_error(capture, "x")
@@ -83,20 +83,20 @@ def test_slstudio_frames_that_fit_several_codecs_need_its_name(tmp_path):
     for number, pattern in enumerate(slstudio_frames("2x3")):
         write(tmp_path / f"frameSeq_{number:02d}.bmp", pattern)
     with raises(InputError, "12 frames", "2x3", "nstep", "gray", "--codec"):
-        slstudio.LAYOUT.read(tmp_path, projector=SIZE)
+        layouts.SLSTUDIO.read(tmp_path, projector=SIZE)
     with raises(InputError, "--projector"):
-        slstudio.LAYOUT.read(tmp_path, codec="2x3")
+        layouts.SLSTUDIO.read(tmp_path, codec="2x3")
     for number in range(3):
         write(tmp_path / "three" / f"frameSeq_{number}.bmp", cosines(3, COLUMNS, U)[number])
     with raises(InputError, "3 frames", "2p1", "--codec"):
-        slstudio.LAYOUT.read(tmp_path / "three", projector=SIZE)
+        layouts.SLSTUDIO.read(tmp_path / "three", projector=SIZE)
     (tmp_path / "frameSeq_07.bmp").unlink()
     with raises(InputError, "frameSeq_07"):
-        slstudio.LAYOUT.read(tmp_path, projector=SIZE)
+        layouts.SLSTUDIO.read(tmp_path, projector=SIZE)
     for number in (8, 9, 10, 11):
         (tmp_path / f"frameSeq_{number:02d}.bmp").unlink()
     with raises(InputError, "7 frames", "--codec"):
-        slstudio.LAYOUT.read(tmp_path, projector=SIZE)
+        layouts.SLSTUDIO.read(tmp_path, projector=SIZE)
 
 
 @pytest.mark.computes
@@ -112,31 +112,31 @@ def test_opencv_generates_columns_then_rows_each_with_its_inverse(tmp_path, shad
     for number, pattern in enumerate(patterns, 1):
         write(tmp_path / "scan" / f"pattern_cam1_im{number}.png", pattern)
     assert layouts.detect_layout(tmp_path) == "opencv-graycode"
-    (capture,) = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
+    (capture,) = layouts.OPENCV_GRAYCODE.read(tmp_path, projector=SIZE)
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
     if shadow:
         for number, pattern in enumerate([*patterns[:-2], *patterns[:-3:-1]], 1):
             write(tmp_path / "black_first" / f"pattern_cam1_im{number}.png", pattern)
-        (other,) = opencv_graycode.LAYOUT.read(tmp_path / "black_first", projector=SIZE)
+        (other,) = layouts.OPENCV_GRAYCODE.read(tmp_path / "black_first", projector=SIZE)
         assert other.frames[-2].mean() > 2 * other.frames[-1].mean()
         for number, pattern in enumerate([*patterns[:-2:2], *patterns[1:-2:2], *patterns[-2:]], 1):
             write(tmp_path / "block" / f"pattern_cam1_im{number}.png", pattern)
         with raises(InputError, *(f"pattern_cam1_im{n}.png" for n in (1, 2, 18)), "--guess"):
-            opencv_graycode.LAYOUT.read(tmp_path / "block", projector=SIZE)
+            layouts.OPENCV_GRAYCODE.read(tmp_path / "block", projector=SIZE)
         shutil.rmtree(tmp_path / "black_first")
         shutil.rmtree(tmp_path / "block")
     write(tmp_path / "scan" / "pattern_cam2_im1.png", U / COLUMNS)
     with raises(InputError, "pattern_cam1_imN", "pattern_cam2_imN", '--files "pattern_cam1_im'):
-        opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE)
-    found = opencv_graycode.LAYOUT.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
+        layouts.OPENCV_GRAYCODE.read(tmp_path, projector=SIZE)
+    found = layouts.OPENCV_GRAYCODE.read(tmp_path, projector=SIZE, files="pattern_cam1_*")
     assert len(found) == 1 and "pattern_cam2_im1.png" in found.warnings[0]
     # as many images as another projector without, or with them
     other = (2000, ROWS) if shadow else (COLUMNS, 60)
     with pytest.raises(InputError):
-        opencv_graycode.LAYOUT.read(tmp_path, projector=other, files="pattern_cam1_*")
+        layouts.OPENCV_GRAYCODE.read(tmp_path, projector=other, files="pattern_cam1_*")
     with raises(InputError, f"{len(patterns)} images", "4000x120", 40):
-        opencv_graycode.LAYOUT.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
+        layouts.OPENCV_GRAYCODE.read(tmp_path, projector=(4000, ROWS), files="pattern_cam1_*")
 
 
 @pytest.mark.computes
@@ -152,14 +152,14 @@ def test_sltk_names_say_axis_bit_and_negative(tmp_path):
                 number += 1
     write(tmp_path / "scan" / "preview.png", U / COLUMNS)
     assert layouts.detect_layout(tmp_path) == "sltk"
-    found = sltk.LAYOUT.read(tmp_path, projector=SIZE)
+    found = layouts.SLTK.read(tmp_path, projector=SIZE)
     (capture,) = found
     assert "preview.png" in found.warnings[0]
     for axis in ("x", "y"):
         assert np.abs(decoded_error(capture, axis)).max() < 0.5
     next((tmp_path / "scan").glob("*[[]00-05-01*")).unlink()
     with raises(InputError, "4 of 10"):
-        sltk.LAYOUT.read(tmp_path, projector=SIZE)
+        layouts.SLTK.read(tmp_path, projector=SIZE)
 
 
 def test_a_layout_is_detected_or_the_known_ones_are_listed(tmp_path):
@@ -180,7 +180,7 @@ def test_a_layout_is_detected_or_the_known_ones_are_listed(tmp_path):
 def test_sltk_captures_of_a_real_rig(real_data):
     source = real_data / "sltk_shells"
     assert layouts.detect_layout(source) == "sltk"
-    found = sltk.LAYOUT.read(source, projector=(1280, 800))
+    found = layouts.SLTK.read(source, projector=(1280, 800))
     assert [recording.name for recording in found.recordings] == ["scan_0020", "scan_0021"]
     sequence, files = found.recordings[0].sequence, found.recordings[0].files
     assert len(files) == 44 and [frame.axis for frame in sequence.frames] == ["x"] * 22 + ["y"] * 22

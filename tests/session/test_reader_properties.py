@@ -35,7 +35,7 @@ from slviewer.session.inspection_plan import read_plan
 from slviewer.session.nominal import read_nominal
 from slviewer.session.ply import read_ply, write_ply
 from slviewer.session.reading import read_toml
-from slviewer.session.stack import describe_stack
+from slviewer.session.stack import FrameStack
 from slviewer.session.store import Session
 from slviewer.session.toml import format_value
 from slviewer.simulation.assets import asset
@@ -238,9 +238,9 @@ def test_a_stack_is_never_larger_than_its_files(full: Session, data: Any) -> Non
     path = full.folder / "captures/scan/frames.zarr/zarr.json"
     sound = path.read_text()
     path.write_text(json.dumps({**json.loads(sound), **(data if isinstance(data, dict) else {})}))
-    described = _read(lambda: describe_stack(path.parent))
+    described = _read(lambda: FrameStack.open(path.parent))
     path.write_text(sound)
-    assert described is None or all(1 <= extent <= 1 << 16 for extent in described[0])
+    assert described is None or all(1 <= extent <= 1 << 16 for extent in described.shape)
 
 
 def _asset(name: str) -> dict[str, Any]:

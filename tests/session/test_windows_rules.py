@@ -100,10 +100,12 @@ def test_a_file_that_another_program_has_open_for_a_moment_is_waited_for(
         monkeypatch.setattr(
             time, "sleep", lambda seconds: pauses.append(seconds) or len(pauses) < 3 or held.close()
         )
-        replace_file(path, b"new", patience_s=60.0)
+        monkeypatch.setattr("slviewer.session.atomic._PATIENCE_S", 60.0)
+        replace_file(path, b"new")
     assert path.read_bytes() == b"new" and len(pauses) == 3
+    monkeypatch.setattr("slviewer.session.atomic._PATIENCE_S", 0.0)
     with open(path, "rb"), raises(SessionError, "table.csv"):
-        replace_file(path, b"never", patience_s=0.0)
+        replace_file(path, b"never")
     assert path.read_bytes() == b"new" and [each.name for each in tmp_path.iterdir()] == [
         "table.csv"
     ]
@@ -146,10 +148,11 @@ def test_names_that_differ_in_case_alone_are_refused(session, sequence, frames) 
     session.save_capture("Part", "scan", sequence, frames, source="test", force=True)
 
 
-def test_a_session_s_path_leaves_room_for_its_files(tmp_path) -> None:
+def test_a_session_s_path_leaves_room_for_its_files(tmp_path, monkeypatch) -> None:
     long = tmp_path / ("x" * 120)
-    with raises(SessionError, len(str(long)), 259, 120):
-        new_folder(long, is_windows=True)
+    with monkeypatch.context() as patch, raises(SessionError, len(str(long)), 259, 120):
+        patch.setattr("slviewer.session.layout._IS_WINDOWS", True)
+        new_folder(long)
     assert not long.exists()
     Session.create(long).close()
 

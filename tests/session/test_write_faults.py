@@ -22,7 +22,7 @@ from slviewer.pipeline.inspect import inspect
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.session import atomic, store
 from slviewer.session.capture import NewCapture
-from slviewer.session.lock import WriterLock
+from slviewer.session.layout import WriterLock
 from slviewer.session.store import Session
 
 

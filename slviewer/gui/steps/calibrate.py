@@ -31,9 +31,8 @@ from slviewer.gui.widgets import (
 from slviewer.pipeline.report import calibration_view
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Finding, Verdict
-from slviewer.report.curves import pixel_curves
 from slviewer.report.data import CalibrationFigures, PixelCurve
-from slviewer.report.maps import rms_maps
+from slviewer.report.maps import pixel_curves, rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
 from slviewer.report.session import lens_rows, rig_rows

@@ -24,23 +24,23 @@ _DRIVE = re.compile("[A-Za-z]:")
 _EXTRACTED_SUFFIXES = IMAGE_SUFFIXES | {".toml"}
 
 
-def unpacked_size(archive: IO[bytes], max_bytes: int = MOST_BYTES) -> int:
+def unpacked_size(archive: IO[bytes]) -> int:
     """Bytes that the images and TOMLs of a zip take. Raises InputError as `unpack` does."""
     with _open_zip(archive) as zipped:
-        return sum(info.file_size for info in _select_members(zipped, max_bytes)[0])
+        return sum(info.file_size for info in _select_members(zipped)[0])
 
 
 def unpack(
-    archive: IO[bytes], folder: Path, progress: Callable[[float], None], max_bytes: int = MOST_BYTES
+    archive: IO[bytes], folder: Path, progress: Callable[[float], None]
 ) -> tuple[Path, list[str]]:
     """Write the images and TOMLs of a zip into an empty folder; returns the folder that holds the
     captures, and a warning that names the files that are none of these.
 
-    Raises InputError for what is not a zip, is damaged or encrypted, takes more than ``max_bytes``,
+    Raises InputError for what is not a zip, is damaged or encrypted, takes more than `MOST_BYTES`,
     or names a place outside of itself.
     """
     with _open_zip(archive) as zipped:
-        members, others = _select_members(zipped, max_bytes)
+        members, others = _select_members(zipped)
         total, done = sum(info.file_size for info in members), 0
         for info in members:
             target = folder.joinpath(*PurePosixPath(info.filename).parts)
@@ -76,9 +76,7 @@ def _open_zip(archive: IO[bytes]) -> zipfile.ZipFile:
         ) from error
 
 
-def _select_members(
-    zipped: zipfile.ZipFile, max_bytes: int
-) -> tuple[list[zipfile.ZipInfo], list[str]]:
+def _select_members(zipped: zipfile.ZipFile) -> tuple[list[zipfile.ZipInfo], list[str]]:
     """Return the members of a zip to unpack, and the names of all others."""
     members, others = [], []
     for info in zipped.infolist():
@@ -105,10 +103,10 @@ def _select_members(
             )
         members.append(info)
     total = sum(info.file_size for info in members)
-    if total > max_bytes or len(members) > MOST_FILES:
+    if total > MOST_BYTES or len(members) > MOST_FILES:
         raise InputError(
             f"the zip holds {len(members)} files of {format_bytes(total)} together: {MOST_FILES}"
-            f" files and {format_bytes(max_bytes)} are allowed; import the folder by its path on"
+            f" files and {format_bytes(MOST_BYTES)} are allowed; import the folder by its path on"
             " the server instead"
         )
     if not members:

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.session.isolated import limit_process, run_isolated
-from slviewer.session.reading import read_file
+from slviewer.session.reading import limit_process, read_input, run_isolated
 
 _MAX_BYTES = 1 << 24
 _MAX_NUMBERS = 10_000
@@ -43,16 +42,7 @@ class Storage:
 
 def read_storage(path: Path) -> Storage:
     """The matrices of an OpenCV FileStorage file; InputError where it cannot be read."""
-    if not path.is_file():
-        raise InputError(
-            f"{path} is not a file: give an OpenCV FileStorage file (.yml, .xml or .json)"
-        )
-    try:
-        read_file(path, _MAX_BYTES)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error}): give an OpenCV FileStorage file"
-        ) from error
+    read_input(path, _MAX_BYTES, "give an OpenCV FileStorage file (.yml, .xml or .json)")
     status, output = run_isolated(__name__, str(path.absolute()))
     if status != 0:
         reason = "is no" if status == 1 else "makes OpenCV's parser fail, as it is too large or no"

@@ -68,28 +68,226 @@ exposure that did not saturate it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
+
+import msgspec
 
 from slviewer.errors import InputError
-from slviewer.fringe.sequence import SEQUENCE_KEYS, PatternSequence, parse_size
-from slviewer.session.importers.frame_groups import (
-    FrameGroup,
-    has_wildcard,
-    images_by_name,
-    read_groups,
-)
+from slviewer.fringe.sequence import SEQUENCE_KEYS, Axis, Frame, Kind, PatternSequence, parse_size
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
     Imports,
     collect_captures,
+    has_wildcard,
+    images_by_name,
+    match_files,
     unknown_files_warning,
 )
 from slviewer.session.names import join_names
 from slviewer.session.reading import read_toml
 
 _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
+
+
+_Period = Annotated[float, msgspec.Meta(gt=0)]
+_Exposure = _Period | None
+
+
+class _Group(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """The entries of a `[[frames]]` table; `files` are checked by `_file_names`."""
+
+    kind: Kind
+    axis: Axis | None = None
+    files: Any = None
+    exposure_ms: _Exposure = None
+
+    def frames(self) -> list[Frame]:
+        """Return the frames that the group's images show: one, unless the kind defines several."""
+        return [Frame(self.kind, self.axis)]
+
+
+class _Phase(_Group):
+    """Phase-shifted fringes of one or several periods, ``steps`` images each."""
+
+    steps: Annotated[int, msgspec.Meta(ge=3, le=1000)]
+    period_px: _Period | list[_Period]
+
+    def frames(self) -> list[Frame]:
+        """Return the phase steps of all periods, period by period."""
+        periods = self.period_px if isinstance(self.period_px, list) else [self.period_px]
+        return [
+            Frame("phase", self.axis, step=k, steps=self.steps, period_px=float(period))
+            for period in periods
+            for k in range(self.steps)
+        ]
+
+
+class _Inverse(_Group):
+    """Inverse images of a Gray code's bits, listed apart from the bits."""
+
+    bits: Annotated[int, msgspec.Meta(ge=1, le=30)]
+    msb_first: bool = True
+
+    def frames(self) -> list[Frame]:
+        """Return the frames in the order of the bits."""
+        return self.list_bits("inverse")
+
+    def list_bits(self, *kinds: Kind) -> list[Frame]:
+        """Return the frames of these kinds of each bit, in the order of the bits."""
+        bits = range(self.bits) if self.msb_first else reversed(range(self.bits))
+        return [Frame(kind, self.axis, bit=bit, bits=self.bits) for bit in bits for kind in kinds]
+
+
+class _Gray(_Inverse):
+    """Images of a Gray code's bits, optionally with inverse and complementary ones."""
+
+    inverse: bool = False
+    complementary: bool = False
+
+    def frames(self) -> list[Frame]:
+        """Return the frames of the bits in their order, each followed by its inverse if there is
+        one."""
+        frames = self.list_bits("gray", "inverse") if self.inverse else self.list_bits("gray")
+        extra = [Frame("complementary", self.axis)] if self.complementary else []
+        return frames + extra if self.msb_first else extra + frames
+
+
+_GROUPS: dict[str, type[_Group]] = {"phase": _Phase, "gray": _Gray, "inverse": _Inverse}
+"""Kinds of groups with entries of their own."""
+
+
+@dataclass(frozen=True)
+class FrameGroup:
+    """One or more images that follow each other: the frames that they show, and how their files are
+    named.
+
+    `files`: names relative to the capture's folder, or patterns in which * and ? are wildcards and
+    all else, brackets too, is literal. A single pattern stands for all frames of the group, in
+    natural order of the names. None: the TOML orders the files by name.
+    """
+
+    where: str
+    frames: tuple[Frame, ...]
+    files: tuple[str, ...] | None
+    exposure_ms: float | None
+
+    def select(self, folder: Path) -> list[Path]:
+        """The group's files in a capture's folder, in order; fewer or more than its frames where
+        some are missing."""
+        assert self.files is not None
+        if len(self.files) == 1 and has_wildcard(self.files[0]):
+            return match_files(folder, self.files[0])
+        files: list[Path] = []
+        for name in self.files:
+            if not has_wildcard(name):
+                files += [folder / name] if (folder / name).is_file() else []
+                continue
+            matches = match_files(folder, name)
+            if len(matches) > 1:
+                names = join_names([file.name for file in matches])
+                raise InputError(f'{self.where}: "{name}" matches {names}: name one file')
+            files += matches
+        return files
+
+
+def read_groups(name: str, data: Mapping[str, Any]) -> tuple[FrameGroup, ...]:
+    """The `[[frame]]` or the `[[frames]]` tables of the TOML `name`. Raises InputError, saying
+    which is wrong."""
+    single, groups = data.get("frame"), data.get("frames")
+    if single is not None and groups is not None:
+        raise InputError(
+            f"{name} has [[frame]] and [[frames]] tables, and so no order: use one of the two"
+        )
+    ordered = data.get("order")
+    if ordered not in (None, "name"):
+        raise InputError(f'{name}: order is {ordered!r}: use "name", or give each entry its files')
+    key, entries, read = (
+        ("frames", groups, _read_group) if single is None else ("frame", single, _read_frame)
+    )
+    if not isinstance(entries, list) or not entries:
+        raise InputError(
+            f"{name} names no frames: add a [[frame]] table for each image, or [[frames]] for"
+            " several"
+        )
+    parsed = []
+    for number, entry in enumerate(entries, 1):
+        where = f"{name}, [[{key}]] {number}"
+        if not isinstance(entry, Mapping):
+            raise InputError(f"{where} is not a table: write [[{key}]] above its entries")
+        parsed.append(read(where, entry, ordered is not None))
+    return tuple(parsed)
+
+
+def _read_frame(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGroup:
+    """Read a `[[frame]]` table: one image."""
+    if "files" in entry:
+        raise InputError(
+            f"{where}: files belongs to [[frames]]: name the one file of a [[frame]] with file"
+        )
+    files = _file_names(where, entry.get("file"), ordered)
+    where = f"{where} ({files[0]})" if files else where
+    for key in ("kind", "axis"):
+        if not isinstance(entry.get(key, ""), str):
+            raise InputError(f"{where}: {key} must be a word in quotes, not {entry[key]!r}")
+    try:
+        exposure: float | None = msgspec.convert(entry.get("exposure_ms"), _Exposure)
+        frame = Frame.from_dict(
+            {key: value for key, value in entry.items() if key != "exposure_ms"}
+        )
+    except msgspec.ValidationError as error:
+        raise InputError(f"{where}: exposure_ms: {error}") from error
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    return FrameGroup(where, (frame,), files, exposure)
+
+
+def _read_group(where: str, entry: Mapping[str, Any], ordered: bool) -> FrameGroup:
+    """Read a `[[frames]]` table: all images of one kind and axis."""
+    words = " ".join(str(entry[key]) for key in ("kind", "axis") if key in entry)
+    where = f"{where} ({words})" if words else where
+    try:
+        group = msgspec.convert(entry, _GROUPS.get(str(entry.get("kind")), _Group))
+        frames = tuple(group.frames())
+    except (msgspec.ValidationError, InputError) as error:
+        raise InputError(f"{where}: {error}") from error
+    files = _file_names(where, group.files, ordered)
+    if (
+        files is not None
+        and not (len(files) == 1 and has_wildcard(files[0]))
+        and len(files) != len(frames)
+    ):
+        raise InputError(
+            f"{where} names {len(files)} files and describes {len(frames)} images: correct one of"
+            " them"
+        )
+    return FrameGroup(where, frames, files, group.exposure_ms)
+
+
+def _file_names(where: str, named: Any, ordered: bool) -> tuple[str, ...] | None:
+    """Return the checked file names of a group; None where the order of names determines them."""
+    if ordered:
+        if named is not None:
+            raise InputError(
+                f'{where} names files, and order = "name" takes them in order of their names:'
+                " use one"
+            )
+        return None
+    names = [named] if isinstance(named, str) else named
+    if (
+        not isinstance(names, list)
+        or not names
+        or not all(isinstance(name, str) and name for name in names)
+    ):
+        raise InputError(
+            f'{where} names no file: add its name in quotes, or order = "name" at the top'
+        )
+    if outside := [name for name in names if Path(name).is_absolute() or ".." in Path(name).parts]:
+        raise InputError(
+            f'{where}: "{outside[0]}" lies outside of the capture\'s folder: name files inside it'
+        )
+    return tuple(names)
 
 
 @dataclass(frozen=True)
@@ -208,7 +406,11 @@ def read_description(toml: Path, projector: tuple[int, int] | None = None) -> De
             f"{toml.name}: channel is {data['channel']!r}: use one of"
             f" {', '.join(get_args(Channel))}"
         )
-    _check_projector(toml, data, projector)
+    if projector and parse_size(data.get("projector", projector)) != tuple(projector):
+        raise InputError(
+            f"{toml.name} says that the projector is {data['projector']}, and"
+            f" {projector[0]}x{projector[1]} was given: correct the one that is wrong"
+        )
     groups = read_groups(toml.name, data)
     try:
         exposures, order = _list_exposures(groups)
@@ -247,21 +449,6 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
             )
         order += [there[frame] for frame in wanted]
     return exposures, order
-
-
-def _check_projector(
-    toml: Path, data: Mapping[str, Any], projector: tuple[int, int] | None
-) -> None:
-    """Raise InputError where the TOML and the option state different projector sizes."""
-    if (
-        "projector" in data
-        and projector is not None
-        and parse_size(data["projector"]) != tuple(projector)
-    ):
-        raise InputError(
-            f"{toml.name} says that the projector is {data['projector']}, and"
-            f" {projector[0]}x{projector[1]} was given: correct the one that is wrong"
-        )
 
 
 LAYOUT = FolderLayout(

@@ -6,11 +6,9 @@ from pathlib import Path
 
 from slviewer.errors import InputError
 from slviewer.examination.guess import Guess, guess_sequence
-from slviewer.session.importers.frame_groups import images_by_name
 from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
-from slviewer.session.importers.imported import visible
+from slviewer.session.importers.imported import images_by_name, list_folders
 from slviewer.session.names import join_names
-from slviewer.session.reading import expand_user
 from slviewer.session.toml import format_value, table_lines
 
 
@@ -32,7 +30,7 @@ def guess_toml(
     Of a folder of captures, the first is read. Raises InputError where there are no images, or they
     cannot belong to one capture (other sizes, damaged).
     """
-    folder = _capture_folder(expand_user(folder))
+    folder = _capture_folder(folder)
     files = images_by_name(folder)
     images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
     guess = guess_sequence(images.stack, projector)
@@ -49,10 +47,7 @@ def guess_toml(
 def _capture_folder(source: Path) -> Path:
     """Return the source or its first inner folder with three images or more; InputError without
     one."""
-    if not source.is_dir():
-        raise InputError(f"{source} is not a folder: give the folder of a capture")
-    folders = [source, *(entry for entry in visible(source) if entry.is_dir())]
-    for folder in folders:
+    for folder in list_folders(source):
         if len(images_by_name(folder)) >= 3:
             return folder
     raise InputError(

@@ -1,9 +1,10 @@
 """Image files into one stack, and none of them believed without a look: OpenCV decodes half a file
 without a word."""
 
+import io
 import re
 import struct
-import zlib
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import clip_level
-from slviewer.session.reading import MAX_IMAGE_BYTES, read_file
+from slviewer.session.reading import MAX_IMAGE_BYTES, read_file, read_input
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
@@ -24,6 +26,10 @@ DEFAULT_CHANNEL: Channel = "green"
 
 MAX_PIXELS = 160_000_000
 _THREADS = 4  # decoding releases the interpreter
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
+# Pillow reads headers alone here: `MAX_PIXELS` limits what is decoded, and faults are reported
+Image.MAX_IMAGE_PIXELS = None
+warnings.filterwarnings("ignore", module=r"PIL\.")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _NETPBM = re.compile(
@@ -77,7 +83,7 @@ def read_frames(
             stack[index] = image
             return
         stack[index] = reduce_channels(image, channel, full_scale)
-        in_colour[index] = not _is_grey(image)
+        in_colour[index] = (image != image[..., :1]).any()
         if index == colour_frame and in_colour[index]:
             texture.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
@@ -129,15 +135,20 @@ def reduce_channels(
 def read_image(path: Path) -> np.ndarray:
     """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly
     an image."""
-    try:
-        data = read_file(path, MAX_IMAGE_BYTES)
-    except OSError as error:
-        raise InputError(
-            f"{_short_path(path)} cannot be read ({error.strerror or error}): check the file"
-        ) from error
+    data = read_input(path, MAX_IMAGE_BYTES, "check the file")
     if fault := _describe_fault(data):
         raise InputError(f"{_short_path(path)} is {fault}: copy or record it again")
-    width, height = _announced_size(data)
+    width = height = 0
+    try:
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as header:
+            width, height = header.size
+            if data.startswith(_PNG):
+                header.verify()
+    except Exception as error:  # a malformed file may make Pillow fail in any way
+        if data.startswith(_PNG):  # OpenCV decodes what is there of others, or nothing
+            raise InputError(
+                f"{_short_path(path)} is damaged or cut short ({error}): copy or record it again"
+            ) from error
     if width * height > MAX_PIXELS:
         raise InputError(
             f"{_short_path(path)} is {width}x{height} px, and images of up to"
@@ -180,72 +191,14 @@ def _describe_fault(data: bytes) -> str | None:
     """Describe a fault of the file as a whole that the decoder would not report."""
     if not data:
         return "empty"
-    if data.startswith(_PNG):
-        return _describe_png_fault(data)
     if data.startswith(_JPEG):
         return None if _jpeg_ends(data) else "cut short (its end-of-image marker is missing)"
     if data.startswith(b"BM") and len(data) >= 54:
-        data_start, width, height, bits, packed = (
-            *struct.unpack_from("<I", data, 10),
-            *struct.unpack_from("<ii", data, 18),
-            *struct.unpack_from("<HI", data, 28),
-        )
+        start, width, height, bits, packed = struct.unpack_from("<I4xii2xHI", data, 10)
         row = (abs(width) * bits + 31) // 32 * 4
-        return (
-            "cut short" if packed in (0, 3) and len(data) < data_start + row * abs(height) else None
-        )
+        if packed in (0, 3) and len(data) < start + row * abs(height):
+            return "cut short"
     return None
-
-
-def _describe_png_fault(data: bytes) -> str | None:
-    """Describe a fault in the chunks of a PNG: each states its length and carries a checksum, and
-    the last is IEND."""
-    at, view = len(_PNG), memoryview(data)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        end = at + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-            return "damaged (a PNG checksum is wrong)"
-        if data[at + 4 : at + 8] == b"IEND":
-            return None
-        at = end
-    return "cut short (its PNG end is missing)"
-
-
-def _announced_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) px that the header of an image announces, (0, 0) where it has none
-    that is known."""
-    if data.startswith(_PNG) and len(data) >= 24:
-        return struct.unpack_from(">II", data, 16)  # type: ignore[return-value]
-    if data.startswith(b"BM") and len(data) >= 26:
-        width, height = struct.unpack_from("<ii", data, 18)
-        return abs(width), abs(height)
-    if netpbm := _NETPBM.match(data[:1000]):
-        return int(netpbm[1]), int(netpbm[2])
-    if data.startswith((b"II*\0", b"MM\0*")) and len(data) >= 8:
-        return _tiff_size(data)
-    at = 2
-    while data.startswith(_JPEG) and at + 9 <= len(data) and data[at] == 0xFF:
-        marker, (length,) = data[at + 1], struct.unpack_from(">H", data, at + 2)
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        at += 1 if marker == 0xFF else 2 + length
-    return 0, 0
-
-
-def _tiff_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) px of the first image of a TIFF file, (0, 0) where it states none."""
-    order, size = "<" if data.startswith(b"II") else ">", {}
-    (at,) = struct.unpack_from(f"{order}I", data, 4)
-    (entries,) = struct.unpack_from(f"{order}H", data, at) if at + 2 <= len(data) else (0,)
-    for entry in range(at + 2, min(at + 2 + 12 * entries, len(data) - 11), 12):
-        tag, form = struct.unpack_from(f"{order}HH", data, entry)
-        if tag in (256, 257) and form in (3, 4):
-            (size[tag],) = struct.unpack_from(order + ("H" if form == 3 else "I"), data, entry + 8)
-    return size.get(256, 0), size.get(257, 0)
 
 
 def _jpeg_ends(data: bytes) -> bool:
@@ -263,14 +216,6 @@ def _jpeg_ends(data: bytes) -> bool:
         else:
             at += 2 + length
     return False
-
-
-def _is_grey(image: np.ndarray) -> bool:
-    """Return whether the three channels of an image (h, w, 3) are equal."""
-    return bool(
-        np.array_equal(image[..., 0], image[..., 1])
-        and np.array_equal(image[..., 1], image[..., 2])
-    )
 
 
 def _format_size(image: np.ndarray) -> str:

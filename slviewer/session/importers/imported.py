@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import translate
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,10 @@ class ImportableRecording:
         """The capture with its frames; InputError where an image cannot be used.
         `settings["channel"]` states which channel of colour frames was taken."""
         channel = self.channel or DEFAULT_CHANNEL
-        shown, middle = (
-            _colour_frame(self.sequence),
-            len(self.exposures_ms) // 2 * len(self.sequence.frames),
-        )
+        kinds = [frame.kind for frame in self.sequence.frames]
+        # the frame that shows the scene's colours, in the middle one of several exposures
+        shown = next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), None)
+        middle = len(self.exposures_ms) // 2 * len(kinds)
         colour_frame = None if shown is None else shown + middle
         images = read_frames(self.files, colour_frame, channel, self.sequence.full_scale)
         settings = {**self.settings, "channel": channel} if images.in_colour else self.settings
@@ -148,6 +149,28 @@ def define_layout(
     return FolderLayout(name, holds, read, is_capture, default)
 
 
+def has_wildcard(name: str) -> bool:
+    """Return whether a name contains the wildcards * or ?."""
+    return "*" in name or "?" in name
+
+
+def match_files(folder: Path, pattern: str) -> list[Path]:
+    """The images in a folder, or in the inner folder that the pattern names, whose name matches, in
+    natural order."""
+    *inner, last = pattern.split("/")
+    folder = folder.joinpath(*inner)
+    if not folder.is_dir():
+        return []
+    matches = re.compile(translate(last.replace("[", "[[]"))).match
+    return [file for file in images_by_name(folder) if matches(file.name)]
+
+
+def images_by_name(folder: Path) -> list[Path]:
+    """The images of a folder in natural order of their names: 2 before 10."""
+    images = [entry for entry in visible(folder) if entry.suffix.lower() in IMAGE_SUFFIXES]
+    return sorted(images, key=lambda file: natural_key(file.name))
+
+
 def match_images(
     folder: Path, pattern: re.Pattern[str]
 ) -> tuple[dict[tuple[int, ...], Path], list[Path]]:
@@ -219,12 +242,25 @@ def collect_captures(
     and has nothing of one inside is skipped too. Raises InputError where the source holds no
     captures (they should look like `looks_like`), or none can be used.
     """
-    folders, empty, warnings = _capture_folders(source, is_capture, looks_like)
-    recordings, skipped = (
-        [],
-        [Skipped(folder.name, f"it holds no frames ({looks_like})") for folder in empty],
-    )
-    for folder in folders:
+    source, *inner = list_folders(source)
+    captures = [source] if is_capture(source) else list(filter(is_capture, inner))
+    if not captures:
+        raise InputError(
+            f"{source} holds no captures: {looks_like} was looked for in it and in the folders"
+            " inside"
+        )
+    recordings, warnings, skipped = [], [], []
+    stems = {_name_pattern(folder) for folder in captures}
+    for folder in inner if captures != [source] else ():
+        if folder in captures:
+            continue
+        if _name_pattern(folder) in stems:
+            skipped.append(Skipped(folder.name, f"it holds no frames ({looks_like})"))
+        else:
+            warnings.append(
+                f"folder {folder.name} was left aside: it holds no capture ({looks_like})"
+            )
+    for folder in captures:
         try:
             recording, more = describe(folder, capture_name(folder, prefix))
         except InputError as error:
@@ -260,33 +296,15 @@ def none_usable(skipped: Sequence[Skipped]) -> InputError:
     )
 
 
-def _capture_folders(
-    source: Path, is_capture: Callable[[Path], bool], looks_like: str
-) -> tuple[list[Path], list[Path], list[str]]:
-    """Capture folders in counting order, folders that are only named like these, and warnings about
-    all others."""
+def list_folders(source: Path) -> list[Path]:
+    """The folder, and those right inside it in counting order. InputError where it is none."""
     source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     if not source.is_dir():
         raise InputError(
             f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
         )
-    if is_capture(source):
-        return [source], [], []
-    inner = sorted(
-        (entry for entry in visible(source) if entry.is_dir()),
-        key=lambda entry: natural_key(entry.name),
-    )
-    captures = [folder for folder in inner if is_capture(folder)]
-    if not captures:
-        raise InputError(
-            f"{source} holds no captures: {looks_like} was looked for in it and in the folders"
-            " inside"
-        )
-    stems = {_name_pattern(folder) for folder in captures}
-    others = [folder for folder in inner if folder not in captures]
-    empty = [folder for folder in others if _name_pattern(folder) in stems]
-    return captures, empty, [f"folder {f.name} was left aside: it holds no capture ({looks_like})"
-                             for f in others if f not in empty]  # fmt: skip
+    inner = [entry for entry in visible(source) if entry.is_dir()]
+    return [source, *sorted(inner, key=lambda entry: natural_key(entry.name))]
 
 
 def capture_name(folder: Path, prefix: str | None) -> str:
@@ -317,9 +335,3 @@ def unknown_files_warning(folder: Path, files: Sequence[Path]) -> list[str]:
 def _name_pattern(folder: Path) -> str:
     """Return a folder's name in lower case with every number replaced by "#"."""
     return re.sub(r"\d+", "#", folder.name.lower())
-
-
-def _colour_frame(sequence: PatternSequence) -> int | None:
-    """Return the index of the frame for the scene's colours: the texture, else white."""
-    kinds = [frame.kind for frame in sequence.frames]
-    return next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), None)

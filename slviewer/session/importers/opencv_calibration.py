@@ -7,6 +7,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.rig import LARGEST_BASELINE_MM
+from slviewer.geometry.rigid import nearest_rotation
 from slviewer.session.importers.filestorage import Storage
 
 ENTRIES = ("K_camera", "D_camera", "K_projector", "D_projector", "R", "T")
@@ -15,32 +16,28 @@ _ROTATION_TOLERANCE = 1e-4  # a matrix written with five digits still passes
 _SHORTEST_BASELINE_MM = 1.0
 _NAMED = 30
 
-_SPELLINGS: tuple[tuple[str, ...], ...] = (
-    ENTRIES,
-    ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),  # sltk
-    ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),  # SLStudio
-    # procam-calibration, as it spells it
-    (
-        "cam_int",
-        "cam_dist",
-        "proj_int",
-        "proj_dist",
-        "roration",
-        "translation",
-    ),
-    ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
-    ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
-    ("K_cam", "D_cam", "K_proj", "D_proj", "R", "T"),
-    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "R", "T"),
-    ("camera_matrix", "camera_distortion", "projector_matrix", "projector_distortion", "R", "T"),
-    ("cameraMatrix", "distCoeffs", "projectorMatrix", "projectorDistCoeffs", "R", "T"),
-    ("M1", "D1", "M2", "D2", "R", "T"),  # OpenCV's stereo_calib
-    ("K1", "D1", "K2", "D2", "R", "T"),
-    ("K1", "dist1", "K2", "dist2", "R", "T"),
+_INTRINSICS = (
+    ENTRIES[:4],
+    ("cam_K", "cam_kc", "pro_K", "pro_kc"),  # sltk
+    ("Kc", "kc", "Kp", "kp"),  # SLStudio
+    ("cam_int", "cam_dist", "proj_int", "proj_dist"),  # procam-calibration
+    ("cam_K", "cam_kc", "proj_K", "proj_kc"),
+    ("K_cam", "D_cam", "K_proj", "D_proj"),
+    ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
+    ("camera_matrix", "camera_distortion", "projector_matrix", "projector_distortion"),
+    ("cameraMatrix", "distCoeffs", "projectorMatrix", "projectorDistCoeffs"),
+    ("M1", "D1", "M2", "D2"),  # OpenCV's stereo_calib
+    ("K1", "D1", "K2", "D2"),
+    ("K1", "dist1", "K2", "dist2"),
 )
-"""Common names of the entries, each row in the order of `ENTRIES`; a file is taken to use one row
-as a whole, but for R and T."""
-_TRANSFORMS = ("R", "T"), ("rotation", "translation"), ("rot", "trans")
+_TRANSFORMS = (
+    ENTRIES[4:],
+    ("Rp", "Tp"),  # SLStudio
+    ("roration", "translation"),  # procam-calibration, as it spells it
+    ("rotation", "translation"),
+    ("rot", "trans"),
+)
+"""Common names, in the order of `ENTRIES`; a file is taken to use one row of each."""
 _SIZES = {
     "camera": ("camera_size", "cam_size", "image_size", "imageSize", ("frameWidth", "frameHeight")),
     "projector": ("projector_size", "pro_size", "proj_size", ("screenResX", "screenResY")),
@@ -66,10 +63,10 @@ def read_matrices(storage: Storage, keys: Sequence[str] | None = None) -> dict[s
         raise InputError(
             f"{storage.name} has no {', '.join(missing)}: its keys are {_list_keys(storage)}"
         )
-    matrices = {}
-    for entry, key in zip(ENTRIES, keys, strict=True):
-        matrices[entry] = _CHECKS[entry[0]](storage.matrix(key), f"{storage.name}: {key}")
-    return matrices
+    return {
+        entry: _CHECKS[entry[0]](storage.matrix(key), f"{storage.name}: {key}")
+        for entry, key in zip(ENTRIES, keys, strict=True)
+    }
 
 
 def identify_keys(storage: Storage) -> tuple[str, ...]:
@@ -77,12 +74,8 @@ def identify_keys(storage: Storage) -> tuple[str, ...]:
 
     Raises InputError where they are none of these, or where several would do.
     """
-    rows = [
-        (*row[:4], *transform)
-        for row in _SPELLINGS
-        for transform in dict.fromkeys((row[4:], *_TRANSFORMS))
-    ]
-    matches = list(dict.fromkeys(row for row in rows if set(row) <= set(storage.entries)))
+    rows = [(*lenses, *transform) for lenses in _INTRINSICS for transform in _TRANSFORMS]
+    matches = [row for row in rows if set(row) <= set(storage.entries)]
     if len(matches) == 1:
         return matches[0]
     remedy = f"name those of {' '.join(ENTRIES)} with --keys; its keys are {_list_keys(storage)}"
@@ -137,23 +130,18 @@ def _check_intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
 def _check_distortion(matrix: np.ndarray, where: str) -> np.ndarray:
     """Return the distortion (5,) k1 k2 p1 p2 k3; InputError for other non-zero coefficients."""
     coefficients = matrix.ravel()
-    if max(matrix.shape, default=0) != coefficients.size or coefficients.size not in (
-        4,
-        5,
-        8,
-        12,
-        14,
-    ):
+    size = coefficients.size
+    if max(matrix.shape, default=0) != size or size not in (4, 5, 8, 12, 14):
         raise InputError(
             f"{where} has shape {matrix.shape}: OpenCV's distortion has 4, 5, 8, 12 or 14"
             " coefficients"
         )
     if np.any(coefficients[5:]):
         raise InputError(
-            f"{where} has {coefficients.size} coefficients with rational, prism or tilt terms,"
+            f"{where} has {size} coefficients with rational, prism or tilt terms,"
             " which k1 k2 p1 p2 k3 cannot represent: calibrate with five coefficients"
         )
-    return np.concatenate([coefficients[:5], np.zeros(max(0, 5 - coefficients.size))])
+    return np.concatenate([coefficients[:5], np.zeros(max(0, 5 - size))])
 
 
 def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
@@ -162,10 +150,9 @@ def _check_rotation(matrix: np.ndarray, where: str) -> np.ndarray:
         raise InputError(
             f"{where} has shape {matrix.shape}: the rotation from camera to projector is 3x3"
         )
-    U, _, Vt = np.linalg.svd(matrix)
-    nearest = U @ Vt
+    nearest = nearest_rotation(matrix)
     error = np.abs(matrix - nearest).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
+    if error > _ROTATION_TOLERANCE:
         raise InputError(
             f"{where} is not a rotation (off by {error:.2g}, determinant"
             f" {np.linalg.det(matrix):.3g}): check it"
