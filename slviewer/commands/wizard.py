@@ -1,10 +1,11 @@
 """The wizard in the browser."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
+
+from slviewer.commands.command import Work
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def wizard(
     rig: str = "",
     address: Address = Address(),
     no_browser: bool = False,
-) -> Callable[[], None]:
+) -> Work:
     """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does
     the same.
 

@@ -138,10 +138,11 @@ def _reconstruct(
         mesh=task.do == "mesh",
         accept_rejected=task.accept_rejected,
     )
-    result = reconstruct_capture(Job(store, warn=warnings.append), settings)
-    name = f"{capture}_{result.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
-    result.ply.rename(made / name)
-    sigma = float(np.median(result.cloud.sigma_z[result.cloud.mask]))
+    with reconstruct_capture(Job(store, warn=warnings.append), settings) as result:
+        cloud = result.cloud
+    name = f"{capture}_{cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
+    result.found.files[0].rename(made / name)
+    sigma = float(np.median(cloud.sigma_z[cloud.mask]))
     return TaskResult("", "", {"points": result.points, "noise mm": sigma, "file": name})
 
 

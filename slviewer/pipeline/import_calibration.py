@@ -72,17 +72,14 @@ def import_opencv_calibration(
                 "replace it with --force (it goes to the session's trash)"
             )
         captures = store.captures()
+        captures = store.captures()
+        projectors = {capture.sequence.projector_size for capture in captures} - {None}
         sizes = {
-            "camera": _resolve_size(
-                path, "camera", camera, stated, {capture.size for capture in captures}
-            ),
-            "projector": _resolve_size(
-                path,
-                "projector",
-                projector,
-                stated,
-                {capture.sequence.projector_size for capture in captures} - {None},
-            ),
+            device: _resolve_size(path, device, given, stated, captured)
+            for device, given, captured in (
+                ("camera", camera, {capture.size for capture in captures}),
+                ("projector", projector, projectors),
+            )
         }
         for device, size in sizes.items():  # raises what a lens cannot have
             Lens(matrices[f"K_{device}"], matrices[f"D_{device}"], size or (1, 1))

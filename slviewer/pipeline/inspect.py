@@ -9,9 +9,11 @@ import numpy as np
 from slviewer.errors import DamagedError, SlviewerError
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.measurements import describe_measurement, load_measurements
+from slviewer.pipeline.measure import describe_measurement
 from slviewer.pipeline.models import available_models, load_stereo, preferred_model
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.stored_records import list_records
+from slviewer.records.measurement import Measurement
 from slviewer.session.capture import Capture
 from slviewer.session.results import verify_result
 from slviewer.session.store import Session
@@ -37,9 +39,10 @@ def inspect(
             f"  {name} was complete, and not yet in its place: it is now"
             for name in store.recovered
         ]
+        models = available_models(store)
         parts: list[Callable[[], Iterable[str]]] = [
             partial(_describe_captures, store, captures),
-            *(partial(_describe_calibration, store, name) for name in available_models(store)),
+            *(partial(_describe_calibration, store, name) for name in models),
             partial(_describe_verdict, store),
             partial(_describe_measurements, store),
         ]
@@ -48,7 +51,7 @@ def inspect(
                 lines += part()
             except SlviewerError as error:  # one damaged file hides nothing else
                 damage.append(str(error))
-        if not available_models(store):
+        if not models:
             lines.append("no calibration yet: run `slviewer calibrate` with the --target in use")
         lines += [f"damaged: {fault}" for fault in dict.fromkeys(damage)]
     return "\n".join(lines)
@@ -59,9 +62,7 @@ def _check(store: Session, progress: Progress) -> str:
     damaged, if anything."""
     (captures, faults), results = store.read_captures(), store.result_names()
     damage = [*faults.values(), *store.decision_faults()]
-    checks: list[tuple[str, Callable[[], object]]] = [
-        (capture.name, capture.verify) for capture in captures
-    ]
+    checks: list[tuple[str, Callable[[], object]]] = [(each.name, each.verify) for each in captures]
     checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
     for i, (name, verify) in enumerate(checks):
         progress(i / len(checks), f"checking {name}")
@@ -91,11 +92,10 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
     state = store.state_of(f"calibration/{name}")
     meta = store.load_result(f"calibration/{name}", only=())[0]
     mark = ", the default" if name == preferred_model(store) else ""
-    made = (
-        f"imported from {meta['source']}"
-        if "imported" in meta
-        else f"from {len(meta['inputs'])} poses"
-    )
+    if "imported" in meta:
+        made = f"imported from {meta['source']}"
+    else:
+        made = f"from {len(meta['inputs'])} poses"
     lines = [f"calibration {name}: {made}, {state}{mark}"]
     if "imported" in meta:
         lines += _describe_imported_calibration(meta)
@@ -113,7 +113,7 @@ def _describe_verdict(store: Session) -> list[str]:
 
 def _describe_measurements(store: Session) -> list[str]:
     """The measurements, a line each."""
-    measured = load_measurements(store)
+    measured = list_records(store, Measurement)
     heading = f"{len(measured)} measurement{'s' * (len(measured) != 1)}:"
     return [heading, *(f"  {describe_measurement(each)}" for each in measured)] if measured else []
 

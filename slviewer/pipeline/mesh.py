@@ -134,12 +134,11 @@ def mesh(settings: MeshSettings) -> MeshResult:
     ``merge/`` alone is the session's last merge. The points of merged scans are written next to the
     mesh.
     """
-    sources, texture = settings.sources, settings.texture
-    progress, warn, accept_rejected = settings.progress, settings.warn, settings.accept_rejected
-    plan = settings.plan or MeshingPlan()
+    sources, texture, progress = settings.sources, settings.texture, settings.progress
+    warn, accept_rejected = settings.warn, settings.accept_rejected
+    plan, merged = settings.plan or MeshingPlan(), None
     if texture is not None and plan.triangles is None:
         plan = replace(plan, triangles=TEXTURED_TRIANGLES)
-    merged = None
     with opened(settings.session) as store:
         check_accepted(store, accept_rejected)
         gains = measure_white(store, settings.white) if settings.white else None
@@ -154,8 +153,8 @@ def mesh(settings: MeshSettings) -> MeshResult:
                 sources, sources[0], path.with_name(f"{path.stem}_points.ply"), settings.model,
                 settings.start, settings.angle, roi=settings.roi, accept_rejected=accept_rejected,
             )  # fmt: skip
-            merged = merge_scans(Job(store, before, warn), merging)
-            shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
+            with merge_scans(Job(store, before, warn), merging) as merged:
+                shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGED):
             refuse_region(sources[0], settings.roi)
             name = merge_name(store, sources[0].removeprefix(MERGED))
@@ -170,26 +169,24 @@ def mesh(settings: MeshSettings) -> MeshResult:
         if texture is not None:
             clouds, poses = _textured_scans(store, settings, shape, merged)
             rig = load_stereo(store).rig
-    made = None if merged is None else show_found(merged.found)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
     notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
     textured = None
-    if texture is None:
-        progress(0.95, f"writing {path.name}")
-        write_shape(path, meshed.mesh, notes=notes)
-    else:
+    if texture is not None:
         if gains is not None:
             clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
-        projector, painting = (
-            -rig.R.T @ rig.t,
-            stage(progress, 0.6, 0.95, "projecting the scans onto the mesh"),
-        )
+        painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
+        light = -rig.R.T @ rig.t
         textured = texture_mesh(
-            meshed.mesh, clouds, poses, size=texture, light=projector, progress=painting
+            meshed.mesh, clouds, poses, size=texture, light=light, progress=painting
         )
-        progress(0.95, f"writing {path.name}")
+    progress(0.95, f"writing {path.name}")
+    if textured is None:
+        write_shape(path, meshed.mesh, notes=notes)
+    else:
         write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
+    made = None if merged is None else show_found(merged.found)
     return MeshResult(meshed, sources, path, made, textured)
 
 
@@ -199,17 +196,14 @@ def _textured_scans(
     """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's
     frame."""
     if merged is not None:
-        return {
-            name: merged.clouds[name] for name in merged.fused.names
-        }, merged.alignment.T_reference_scan
+        clouds = {name: merged.clouds[name] for name in merged.fused.names}
+        return clouds, merged.alignment.T_reference_scan
     (source,) = settings.sources
     if isinstance(shape, Cloud):
         return {source: shape}, {source: np.eye(4)}
     made = load_record(store, Merge, merge_name(store, source.removeprefix(MERGED)))
-    placed = {
-        name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()
-    }
-    placed |= {made.reference: np.eye(4)}
+    placed = {made.reference: np.eye(4)}
+    placed |= {name: np.array(pair.T_reference_scan) for name, pair in made.pairs.items()}
     used = made.model or settings.model
     clouds = {  # what lies outside of the region still hides the surface from a scan
         name: scan_cloud(

@@ -178,13 +178,13 @@ class Operation(Generic[P, S, R]):
 def plain_settings(settings: Any) -> dict[str, Any]:
     """Return the settings that are not the default as plain values, but those that its
     ``UNRECORDED`` names, which do not influence what is found."""
-    kept = [
-        each for each in fields(settings) if each.name not in getattr(settings, "UNRECORDED", ())
-    ]
-    values = {each.name: getattr(settings, each.name) for each in kept}
-    return to_plain(
-        {each.name: values[each.name] for each in kept if values[each.name] != each.default}
-    )  # type: ignore[no-any-return]
+    unrecorded = getattr(settings, "UNRECORDED", ())
+    chosen = {
+        each.name: value
+        for each in fields(settings)
+        if each.name not in unrecorded and (value := getattr(settings, each.name)) != each.default
+    }
+    return to_plain(chosen)  # type: ignore[no-any-return]
 
 
 OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}

@@ -10,12 +10,12 @@ from slviewer.inspection.datums import datum_frame
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.inspect_parts import fit_to_nominal
+from slviewer.pipeline.measure import load_feature
 from slviewer.pipeline.measured_surface import load_surface
-from slviewer.pipeline.measurements import load_measurements
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.part_inspection import fit_to_nominal
-from slviewer.pipeline.relate import load_feature
-from slviewer.pipeline.stored_records import Stored
+from slviewer.pipeline.operation import Job
+from slviewer.pipeline.stored_records import Stored, list_records
 from slviewer.records.inspection import Characteristic
 from slviewer.records.measurement import Measurement
 from slviewer.records.plain import from_plain, to_plain
@@ -69,9 +69,9 @@ def plan(
         )
     if datums and nominal is not None:
         raise UsageError("--datums and --nominal were given: choose one way to align")
-    made = make_plan(
-        session, tolerance, datums or (), nominal, Path(out).stem, progress=progress, warn=warn
-    )
+    with opened(session) as store:
+        job = Job(store, progress, warn)
+        made = make_plan(job, tolerance, Path(out).stem, datums or (), nominal)
     write_plan(made, out)
     return (
         f"{len(made.characteristic)} characteristics of {len(made.feature)} features -> {out}; set"
@@ -80,21 +80,13 @@ def plan(
 
 
 def make_plan(
-    session: SessionLike,
-    tolerance: float,
-    datums: Sequence[str] = (),
-    nominal: Path | None = None,
-    name: str = "plan",
-    *,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
+    job: Job, tolerance: float, name: str, datums: Sequence[str] = (), nominal: Path | None = None
 ) -> Plan:
     """The plan of a session's fitted planes, spheres and cylinders, and of the relations between
     them."""
-    with opened(session) as store:
-        measured = load_measurements(store)
-        fits = _select_fits(measured, warn)
-        features = {identity: load_feature(store, each)[0] for identity, each in fits.items()}
+    measured = list_records(job.store, Measurement)
+    fits = _select_fits(measured, job.warn)
+    features = {identity: load_feature(job.store, each)[0] for identity, each in fits.items()}
     names, T, alignment = _distinct_names(fits), np.eye(4), Alignment()
     if datums:
         if missing := [each for each in datums if each not in fits]:
@@ -106,9 +98,7 @@ def make_plan(
         alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
     elif nominal is not None:
         ideal, source = read_nominal(nominal), next(iter(fits.values())).record
-        surface = load_surface(
-            session, source.source, model=source.model, progress=progress, warn=warn
-        )
+        surface = load_surface(job, source.source, source.model)
         T = fit_to_nominal(surface, ideal).T_nominal_scan
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
@@ -118,7 +108,7 @@ def make_plan(
         if each.record.what not in (*FORM_OF, "relation") or each.stale
     ]
     if left_out:
-        warn(
+        job.warn(
             f"a plan holds fits and their relations that are not stale: {', '.join(left_out)} are"
             " not in it"
         )
@@ -176,11 +166,9 @@ def _plan_feature(
     """A fitted feature with its region, in part coordinates."""
     region = PlanRegion.of(from_plain(to_plain(measured.record.region), Region), T)
     place = tuple((T[:3, :3] @ feature.place + T[:3, 3]).round(6).tolist())
-    direction = (
-        None
-        if feature.direction is None
-        else tuple((T[:3, :3] @ feature.direction).round(9).tolist())
-    )
+    direction = None
+    if feature.direction is not None:
+        direction = tuple((T[:3, :3] @ feature.direction).round(9).tolist())
     return PlanFeature(name, feature.kind, region, place, direction, feature.radius)  # type: ignore[arg-type]
 
 

@@ -15,7 +15,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measurements import section_lines
+from slviewer.pipeline.measure import section_lines
 from slviewer.pipeline.models import (
     available_models,
     load_model,
@@ -106,11 +106,6 @@ def report(
 def _collect_data(store: Session) -> SessionData:
     """Collect everything that a report shows of a session."""
     stereo = load_stereo_if_complete(store)
-    observations = (
-        {o.name: o for o in load_observations(store, list(stereo.poses))}
-        if stereo and stereo.poses
-        else {}
-    )
     stale = [
         f"The {name} calibration was made from target poses that have since changed: run calibrate"
         " again."
@@ -125,8 +120,8 @@ def _collect_data(store: Session) -> SessionData:
     return SessionData(
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
-        calibration=None if stereo is None else _load_calibration(store, stereo, observations),
-        pixel_fits=[] if stereo is None else _load_pixel_fits(store),
+        calibration=None if stereo is None else calibration_view(store),
+        pixel_fits=_load_pixel_fits(store),
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
@@ -229,22 +224,13 @@ def calibration_view(store: Session) -> CalibrationFigures:
 
     Raises InputError where there is none.
     """
-    stereo = load_stereo(store)
-    return _load_calibration(
-        store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))}
-    )
-
-
-def _load_calibration(
-    store: Session, stereo: StereoModel, observations: Mapping[str, Observation]
-) -> CalibrationFigures:
-    """Return the stereo model with the residuals px of each pose that has an observation."""
-    residuals = {}
-    for name, r in load_residuals(store).items():
-        if name in observations:
-            o = observations[name]
-            residuals[name] = PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
-    return CalibrationFigures(stereo, residuals)
+    stereo, residuals = load_stereo(store), load_residuals(store)
+    views = {
+        o.name: PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
+        for o in load_observations(store, list(stereo.poses))
+        if (r := residuals.get(o.name)) is not None
+    }
+    return CalibrationFigures(stereo, views)
 
 
 def curve_at(

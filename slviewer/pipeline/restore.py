@@ -34,15 +34,12 @@ def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
                 for each in trashed
             ]
             return render(rows)
-        latest = {each.name: each for each in reversed(trashed)} | {
-            each.place.name: each for each in trashed
-        }
+        latest = {each.name: each for each in reversed(trashed)}
+        latest |= {each.place.name: each for each in trashed}
         found = match_names(list(latest), names, "item of the trash", InputError)
-        chosen = list(
-            dict.fromkeys(
-                latest[name] for name in found if name in names or name == latest[name].name
-            )
-        )
+        # patterns match no folders
+        chosen = [latest[name] for name in found if name in names or name == latest[name].name]
+        chosen = list(dict.fromkeys(chosen))
         store.restore(chosen)
         return "\n".join(
             f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen

@@ -48,11 +48,10 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
     Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
     bench = _set_up_devices(choice, board, pages)
-    if "turntable" not in choice:
-        return bench
-    return replace(
-        bench, rig=replace(bench.rig, turntable=_set_up_turntable(choice["turntable"], bench.world))
-    )
+    if "turntable" in choice:
+        table = _set_up_turntable(choice["turntable"], bench.world)
+        bench = replace(bench, rig=replace(bench.rig, turntable=table))
+    return bench
 
 
 def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable:
@@ -94,20 +93,19 @@ def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | N
                     " projector"
                 )
             rig = chosen.rig(**options)
-            return RigSetup(replace(rig, settle_ms=settle_ms or rig.settle_ms), focal_px=focal)
-        camera, projector = (dict(options.pop(which)) for which in ("camera", "projector"))
-        camera_driver, projector_driver = (
-            driver(camera.pop("driver")),
-            driver(projector.pop("driver")),
-        )
-        if camera_driver.camera is None or projector_driver.projector is None:
-            raise InputError("one of the drivers offers no such device: choose others")
-        if camera_driver.page:
-            camera["page"] = pages and pages.camera
-        if projector_driver.page:
-            projector["page"] = pages and pages.projector
-        devices = camera_driver.camera(**camera), projector_driver.projector(**projector)
-        rig = Rig(str(choice.get("name", "rig")), *devices, settle_ms)
+            rig = replace(rig, settle_ms=settle_ms or rig.settle_ms)
+        else:
+            devices: list[Any] = []
+            for part in ("camera", "projector"):
+                given = dict(options.pop(part))
+                chosen = driver(given.pop("driver"))
+                make = getattr(chosen, part)
+                if make is None:
+                    raise InputError("one of the drivers offers no such device: choose others")
+                if chosen.page:
+                    given["page"] = pages and getattr(pages, part)
+                devices.append(make(**given))
+            rig = Rig(str(choice.get("name", "rig")), devices[0], devices[1], settle_ms)
         return RigSetup(rig, focal_px=focal)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
@@ -117,11 +115,9 @@ def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | N
 
 def list_needed_pages(choice: Choice) -> tuple[PageRole, ...]:
     """Return which of a choice's devices are pages in a browser."""
-    parts = {role: choice.get(role) for role in PAGE_ROLES}
-    names = {
-        role: str(part.get("driver")) for role, part in parts.items() if isinstance(part, Mapping)
-    }
-    return tuple(role for role, name in names.items() if name in drivers() and drivers()[name].page)
+    parts = {role: part for role in PAGE_ROLES if isinstance(part := choice.get(role), Mapping)}
+    named = {role: drivers().get(str(part.get("driver"))) for role, part in parts.items()}
+    return tuple(role for role, named_driver in named.items() if named_driver and named_driver.page)
 
 
 def rig_factory(driver: Driver) -> Callable[..., Any] | None:

@@ -52,14 +52,12 @@ def presets(session: Session | None = None) -> list[Preset]:
     return [_read_preset_or_problem(name, path) for name, path in {**own, **shipped}.items()]
 
 
-def rigs(session: Session | None = None) -> str:
+def rigs() -> str:
     """List the rigs that can be chosen by name, as text."""
     lines = ["rigs:"]
-    for preset in presets(session):
-        lines.append(
-            f"  {preset.name}: {preset.what}"
-            + (f" (not here: {preset.problem})" if preset.problem else "")
-        )
+    for preset in presets():
+        problem = f" (not here: {preset.problem})" if preset.problem else ""
+        lines.append(f"  {preset.name}: {preset.what}{problem}")
     return "\n".join(lines)
 
 
@@ -96,9 +94,8 @@ def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Pre
     """Save a choice in the session under a name, in place of an older one. Raises InputError for an
     invalid one."""
     check_choice(choice, f"the rig {name}")
-    return _read_preset(
-        name, session.save_rig(name, to_toml({"what": what, **choice} if what else choice))
-    )
+    content = {"what": what, **choice} if what else choice
+    return _read_preset(name, session.save_rig(name, to_toml(content)))
 
 
 def check_choice(choice: Choice, where: str) -> None:
@@ -107,8 +104,7 @@ def check_choice(choice: Choice, where: str) -> None:
     for key, largest in _LARGEST.items():
         value = choice.get(key, 1)
         if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
+            type(value) not in (int, float)
             or not 0 <= value <= largest
             or (not value and key != "settle_ms")
         ):
@@ -164,10 +160,9 @@ def _read_preset_or_problem(name: str, path: Path) -> Preset:
     """Return the preset in a file, with its `problem` where it cannot be used."""
     try:
         preset = _read_preset(name, path)
-        needed = (
-            drivers()[driver_name] for driver_name in dict.fromkeys(_driver_names(preset.choice))
-        )
-        return replace(preset, problem="; ".join(each.missing for each in needed if each.missing))
+        names = dict.fromkeys(_driver_names(preset.choice))
+        problems = filter(None, (drivers()[name].missing for name in names))
+        return replace(preset, problem="; ".join(problems))
     except InputError as error:
         return Preset(name, "", {}, path, str(error))
 
@@ -175,9 +170,7 @@ def _read_preset_or_problem(name: str, path: Path) -> Preset:
 def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
     """Raise InputError unless the driver exists, offers the part, and accepts the options."""
     if name not in drivers():
-        offering = sorted(
-            d.name for d in drivers().values() if _driver_factory(d, part) is not None
-        )
+        offering = sorted(d.name for d in drivers().values() if _driver_factory(d, part))
         why = DRIVER_PLUGINS.explain_missing(name)
         raise InputError(
             f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}{why}"
@@ -185,39 +178,28 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     make = _driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
-    parameters = inspect.signature(make, eval_str=True).parameters.values()
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
+    parameters = inspect.signature(make, eval_str=True).parameters
     # the program supplies these; they are not entries of a file
     provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
-    known = [parameter for parameter in parameters if parameter.name not in provided]
-    accepted = [parameter.name for parameter in known]
-    unknown = sorted(set(options) - set(accepted))
-    if unknown:
-        use = f"use {', '.join(accepted)}" if accepted else "it takes none"
-        raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
-    required = [p.name for p in known if p.default is p.empty and p.name not in options]
-    if required:
-        raise InputError(f"{where}: the driver {name} needs {required[0]}: add it")
-    for parameter in known:
-        _check_type(parameter, options, where)
-
-
-def _check_type(parameter: inspect.Parameter, options: Mapping[str, Any], where: str) -> None:
-    """Raise InputError where an option is not of the type of the driver's parameter, or no number
-    that is finite."""
-    value = options.get(parameter.name, parameter.default)
-    if isinstance(value, float) and not isfinite(value):
-        raise InputError(f"{where}: {parameter.name} = {value!r} is not a number: correct it")
-    if parameter.name not in options or parameter.annotation is parameter.empty:
-        return
+    known = [each for each in parameters.values() if each.name not in provided]
     try:
-        with suppress(TypeError):  # a path, which the driver checks itself
-            msgspec.convert(value, parameter.annotation)
-    except msgspec.ValidationError as error:
+        inspect.Signature(known).bind(**options)
+    except TypeError as error:
+        accepted = ", ".join(each.name for each in known) or "none"
         raise InputError(
-            f"{where}: {parameter.name} = {value!r} is of the wrong type ({error}): correct it"
+            f"{where}: the driver {name} {error}: correct it; its options are {accepted}"
         ) from error
+    for key, value in options.items():
+        if isinstance(value, float) and not isfinite(value):
+            raise InputError(f"{where}: {key} = {value!r} is not a number: correct it")
+        if key in parameters and parameters[key].annotation is not inspect.Parameter.empty:
+            try:
+                with suppress(TypeError):  # a path, which the driver checks itself
+                    msgspec.convert(value, parameters[key].annotation)
+            except msgspec.ValidationError as error:
+                raise InputError(
+                    f"{where}: {key} = {value!r} is of the wrong type ({error}): correct it"
+                ) from error
 
 
 def _driver_factory(driver: Driver, part: str) -> Any:
@@ -229,12 +211,8 @@ def _driver_factory(driver: Driver, part: str) -> Any:
 def _driver_names(choice: Choice) -> list[str]:
     """Return the drivers of a choice: that of the whole rig, or those of camera and projector, and
     of a turntable."""
-    whole = [str(choice["driver"])] if "driver" in choice else []
-    return whole + [
-        str(choice[part]["driver"])
-        for part in ("camera", "projector", "turntable")
-        if part in choice
-    ]
+    parts = [choice, *(choice.get(part, {}) for part in ("camera", "projector", "turntable"))]
+    return [str(part["driver"]) for part in parts if "driver" in part]
 
 
 def _list_names(session: Session | None) -> str:

@@ -1,22 +1,22 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
-from slviewer.pipeline.edit import edit_scan, set_region
-from slviewer.pipeline.export import export
-from slviewer.pipeline.inspect import inspect
-from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.operations import (
+from slviewer.pipeline import (
     accept,
     align,
     calibrate,
     check,
     compare,
+    inspect_parts,
     measure,
     merge,
     reconstruct,
-    run_plan,
     validate,
     verify,
 )
+from slviewer.pipeline.edit import edit_scan, set_region
+from slviewer.pipeline.export import export
+from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.plan import plan
 from slviewer.pipeline.report import report
 from slviewer.pipeline.stored_records import load_arrays
@@ -49,7 +49,7 @@ class SessionOperations(Session):
     plan = plan
     reconstruct = reconstruct.reconstruct
     report = report
-    run_plan = run_plan.run_plan
+    run_plan = inspect_parts.run_plan
     set_region = set_region
     validate = validate.validate
     verify = verify.verify

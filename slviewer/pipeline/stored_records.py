@@ -104,10 +104,10 @@ def next_name(store: Session, kind: type[Record]) -> str:
 def name_records(found: Sequence[Stored[R]]) -> dict[str, R]:
     """Return records by their labels, with the name beside a label that several have."""
     counts = Counter(each.label for each in found)
-    names = (
-        each.label if counts[each.label] == 1 else f"{each.label} ({each.name})" for each in found
-    )
-    return {name: each.record for name, each in zip(names, found, strict=True)}
+    return {
+        each.label if counts[each.label] == 1 else f"{each.label} ({each.name})": each.record
+        for each in found
+    }
 
 
 def is_up_to_date(store: Session, result: str) -> bool:

@@ -25,12 +25,11 @@ from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.reconstruct import (
     ReconstructSettings,
     cloud_record,
-    illuminated_pixels,
     masked_share,
-    reconstruct_models,
     segment_board,
 )
 from slviewer.pipeline.scale import scale_factor
+from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.capture import Capture
@@ -127,24 +126,24 @@ def compare_captures(
         decode_captures(store, names, job.warn, check=settings.check)
     ):
         job.progress(i / len(names), f"measuring {shot.name}")
-        clouds = reconstruct_models(
-            store,
-            chosen,
-            shot,
-            phases,
-            settings.axis,
-            accept_rejected=settings.accept_rejected,
-            warn=job.warn,
-        )
+        clouds: dict[str, Cloud] = {}
+        axis = settings.axis  # of the first, so that all can be compared pixel by pixel
+        accepts = settings.accept_rejected
+        for model, fitted in chosen.items():
+            clouds[model] = capture_cloud(
+                store, fitted, shot, phases, axis=axis, accept_rejected=accepts, warn=job.warn
+            )
+            axis = axis or clouds[model].axis
+        assert axis is not None
+        phase = phases[axis]
         region: np.ndarray | None = None
         if settings.shape == "plane" and shot.role == "calibration":
             region = segment_board(store, shot, capture_texture(shot, frames), job.warn)
-        lit = illuminated_pixels(phases, clouds)
         try:
             found = fit_clouds(
                 settings.shape,
                 clouds,
-                lit,
+                phase.illuminated,
                 region=region,
                 depth_range=depths,
                 radius=settings.radius,
@@ -153,11 +152,8 @@ def compare_captures(
             raise InputError(f"{shot.name}: {error}") from error
         for message in found.warnings:
             job.warn(f"{shot.name}: {message}")
-        phase = phases[next(iter(clouds.values())).axis]
-        shares = {
-            model: masked_share(fitted, phase, found.region) for model, fitted in chosen.items()
-        }
-        masked = {model: share for model, share in shares.items() if share is not None}
+        shares = {name: masked_share(each, phase, found.region) for name, each in chosen.items()}
+        masked = {name: share for name, share in shares.items() if share is not None}
         yield ComparedCapture(shot, frames, phases, found, masked)
     job.progress(1.0, "measured")
 
@@ -179,17 +175,10 @@ def _reconstruct_best(
     """Return the cloud of a capture as `reconstruct` stores it."""
     shot, found = each.capture, each.found
     texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
+    axis, accepts = settings.axis, settings.accept_rejected
     cloud = capture_cloud(
-        store,
-        model,
-        shot,
-        each.phases,
-        axis=settings.axis,
-        texture=texture,
-        accept_rejected=settings.accept_rejected,
+        store, model, shot, each.phases, axis=axis, texture=texture, accept_rejected=accepts
     )
     region = None if found.is_searched else found.region
-    as_reconstructed = ReconstructSettings(
-        shot.name, axis=settings.axis, accept_rejected=settings.accept_rejected
-    )
+    as_reconstructed = ReconstructSettings(shot.name, axis=axis, accept_rejected=accepts)
     return cloud_record(store, as_reconstructed, model, cloud, each.phases[cloud.axis], region)

@@ -34,14 +34,14 @@ def measure_white(store: Session, reference: str) -> np.ndarray:
             "the target poses have no colours, so that the board's white is unknown: capture them"
             " with a colour camera and a white image, or name a capture of a grey card"
         )
-    gains, why = list[np.ndarray](), ""
+    gains, refusals = list[np.ndarray](), list[str]()
     for capture in captures:
         try:
             gains.append(_measure_gains(store, capture))
         except InputError as error:
-            why = why or str(error)
+            refusals.append(str(error))
     if not gains:
-        raise InputError(why)
+        raise InputError(refusals[0])
     middle = np.median(gains, axis=0)
     return np.asarray(middle / middle.max())
 

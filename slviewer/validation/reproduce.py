@@ -74,16 +74,19 @@ def reproduce(
     )
     round_ = VerifySettings(spheres, "sphere", radius=letter.SPHERE_RADIUS_MM)
     balls = _compare_models(session, round_, part(progress, 0.75, 0.82), warn)
-    with Session.open(session) as store:
-        settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
-        merged = merge_scans(Job(store, part(progress, 0.82, 0.9)), settings)
+    settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
+    with (
+        Session.open(session) as store,
+        merge_scans(Job(store, part(progress, 0.82, 0.9)), settings) as merged,
+    ):
+        spacings = _compare_spacings(session, balls)
     result = Reproduction(
         quick=quick,
         stereo=stereo,
         pixelwise=pixelwise,
         planes=flat,
         spheres=balls,
-        spacings_mm=_compare_spacings(session, balls),
+        spacings_mm=spacings,
         merged=merged,
         report=out / "report.html",
     )

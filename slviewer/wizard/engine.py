@@ -374,7 +374,7 @@ class Engine:
             self.publisher.mark_changed(session=True)
 
         poses = read_stored_poses(
-            session, [capture.name], Board.parse(target), Smoothing(), True, plan_next
+            session, [capture.name], Board.parse(target), Smoothing(), plan_next
         )
         judged = next(poses)
         if judged.observation is None:

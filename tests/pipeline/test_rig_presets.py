@@ -152,4 +152,3 @@ def test_a_rig_that_cannot_be_used_is_listed_with_its_problem(fake: None, sessio
     listed = {preset.name: preset for preset in presets(session)}
     assert listed["far"].what == "Far away." and "pip install it" in listed["far"].problem
     assert "TOML" in listed["broken"].problem and listed["simulated"].problem == ""
-    assert "far: Far away." in rigs(session) and "no_such_package" in rigs(session)
