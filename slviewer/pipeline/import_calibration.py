@@ -86,7 +86,14 @@ def import_opencv_calibration(
         witnessed = _is_confirmed_by_captures(store, matrices, sizes, warn)
         for device, size in sizes.items():
             if size is not None and not witnessed:
-                _check_principal_point(device, matrices[f"K_{device}"], size, warn)
+                (width, height), (cx, cy) = size, matrices[f"K_{device}"][:2, 2]
+                if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+                    warn(
+                        f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its"
+                        f" {width}x{height} px: the lens is shifted, or the calibration was made at"
+                        " another pixel scale; import a capture with patterns along both axes, and"
+                        " the calibration after it: the patterns then tell"
+                    )
         with store.together():
             trash_models(store, there)
             save_imported_stereo(store, matrices, source=str(file), **sizes)
@@ -160,16 +167,3 @@ def _is_confirmed_by_captures(
         if check.agreement is not None:
             return True
     return False
-
-
-def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], warn: Warn) -> None:
-    """Warn where the optical axis is outside of the image: a shifted lens, or another pixel
-    scale."""
-    (width, height), (cx, cy) = size, K[:2, 2]
-    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
-        warn(
-            f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its"
-            f" {width}x{height} px: the lens is shifted, or the calibration was made at another"
-            " pixel scale; import a capture with patterns along both axes, and the calibration"
-            " after it: the patterns then tell"
-        )

@@ -1,8 +1,7 @@
 """What a session holds, in words, and whether it is what was saved."""
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -40,17 +39,22 @@ def inspect(
             for name in store.recovered
         ]
         models = available_models(store)
-        parts: list[Callable[[], Iterable[str]]] = [
-            partial(_describe_captures, store, captures),
-            *(partial(_describe_calibration, store, name) for name in models),
-            partial(_describe_verdict, store),
-            partial(_describe_measurements, store),
-        ]
-        for part in parts:
-            try:
-                lines += part()
-            except SlviewerError as error:  # one damaged file hides nothing else
-                damage.append(str(error))
+        with _collecting(damage):
+            excluded = store.valid_decision("excluded") or {}
+            for capture in captures:
+                why = excluded.get(capture.name)
+                note = f"  [excluded: {why}]" if why else ""
+                lines.append(f"  {summarise_capture(capture)}{note}")
+        for name in models:
+            with _collecting(damage):
+                lines += _describe_calibration(store, name)
+        with _collecting(damage):
+            if (verdict := load_last_verdict(store)) is not None:
+                lines.append(verdict.text())
+        with _collecting(damage):
+            if measured := list_records(store, Measurement):
+                lines.append(f"{len(measured)} measurement{'s' * (len(measured) != 1)}:")
+                lines += [f"  {describe_measurement(each)}" for each in measured]
         if not models:
             lines.append("no calibration yet: run `slviewer calibrate` with the --target in use")
         lines += [f"damaged: {fault}" for fault in dict.fromkeys(damage)]
@@ -62,14 +66,15 @@ def _check(store: Session, progress: Progress) -> str:
     damaged, if anything."""
     (captures, faults), results = store.read_captures(), store.result_names()
     damage = [*faults.values(), *store.decision_faults()]
-    checks: list[tuple[str, Callable[[], object]]] = [(each.name, each.verify) for each in captures]
-    checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
-    for i, (name, verify) in enumerate(checks):
-        progress(i / len(checks), f"checking {name}")
-        try:
-            verify()
-        except SlviewerError as error:
-            damage.append(str(error))
+    everything: list[Capture | str] = [*captures, *results]
+    for i, each in enumerate(everything):
+        name = each if isinstance(each, str) else each.name
+        progress(i / len(everything), f"checking {name}")
+        with _collecting(damage):
+            if isinstance(each, str):
+                verify_result(store.folder / "results" / each)
+            else:
+                each.verify()
     progress(1.0, "checked")
     counts = f"{len(captures)} captures and {len(results)} results"
     if damage:
@@ -79,11 +84,14 @@ def _check(store: Session, progress: Progress) -> str:
     return f"{store.folder}: {counts} are what was saved"
 
 
-def _describe_captures(store: Session, captures: Iterable[Capture]) -> list[str]:
-    """A line for each capture."""
-    excluded = store.valid_decision("excluded") or {}
-    notes = {name: f"  [excluded: {why}]" for name, why in excluded.items()}
-    return [f"  {summarise_capture(capture)}{notes.get(capture.name, '')}" for capture in captures]
+@contextmanager
+def _collecting(damage: list[str]) -> Iterator[None]:
+    """Context manager: an error of slviewer ends the block and is added; one damaged file hides
+    nothing else."""
+    try:
+        yield
+    except SlviewerError as error:
+        damage.append(str(error))
 
 
 def _describe_calibration(store: Session, name: str) -> list[str]:
@@ -92,35 +100,13 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
     state = store.state_of(f"calibration/{name}")
     meta = store.load_result(f"calibration/{name}", only=())[0]
     mark = ", the default" if name == preferred_model(store) else ""
-    if "imported" in meta:
-        made = f"imported from {meta['source']}"
-    else:
-        made = f"from {len(meta['inputs'])} poses"
-    lines = [f"calibration {name}: {made}, {state}{mark}"]
-    if "imported" in meta:
-        lines += _describe_imported_calibration(meta)
-    elif name == "stereo":
-        rms = load_stereo(store).reprojection_rms_px
-        lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms.items()))
-    return lines
-
-
-def _describe_verdict(store: Session) -> list[str]:
-    """The verdict on the last attempt to calibrate, where there was one."""
-    verdict = load_last_verdict(store)
-    return [] if verdict is None else [verdict.text()]
-
-
-def _describe_measurements(store: Session) -> list[str]:
-    """The measurements, a line each."""
-    measured = list_records(store, Measurement)
-    heading = f"{len(measured)} measurement{'s' * (len(measured) != 1)}:"
-    return [heading, *(f"  {describe_measurement(each)}" for each in measured)] if measured else []
-
-
-def _describe_imported_calibration(meta: Mapping[str, Any]) -> list[str]:
-    """Sizes, lenses and baseline of a calibration that was imported."""
-    lines = []
+    if "imported" not in meta:
+        lines = [f"calibration {name}: from {len(meta['inputs'])} poses, {state}{mark}"]
+        if name == "stereo":
+            rms = load_stereo(store).reprojection_rms_px.items()
+            lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms))
+        return lines
+    lines = [f"calibration {name}: imported from {meta['source']}, {state}{mark}"]
     for device in ("camera", "projector"):
         K, size = np.array(meta["imported"][f"K_{device}"]), meta[device]
         size_text = f"{size[0]}x{size[1]} px" if size else "size not stated (the captures' is used)"

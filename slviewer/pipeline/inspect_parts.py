@@ -219,7 +219,11 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
     stops no other.
     """
     store = job.store
-    plan = _use_own_nominal(store, read_plan(settings.plan))
+    plan = read_plan(settings.plan)
+    if plan.alignment.nominal is not None:
+        own = store.folder / NOMINALS / Path(plan.alignment.nominal).name
+        if own.is_file():
+            plan = replace(plan, alignment=replace(plan.alignment, nominal=str(own)))
     sources = [
         (name, _part_loader(store, name, settings, job.warn))
         for name in match_parts(store, settings.scans)
@@ -230,16 +234,6 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
         files = tuple(store.exports / name for name in FILES)
         number, notes = next_number(store, Inspection.kind), tuple(f"-> {path}" for path in files)
         yield Found(str(number), found, files=files, notes=notes)
-
-
-def _use_own_nominal(store: Session, plan: Plan) -> Plan:
-    """Return the plan with the session's own nominal model in place of one of the same file
-    name."""
-    if plan.alignment.nominal is not None:
-        own = store.folder / NOMINALS / Path(plan.alignment.nominal).name
-        if own.is_file():
-            return replace(plan, alignment=replace(plan.alignment, nominal=str(own)))
-    return plan
 
 
 def inspect_part(
@@ -303,10 +297,6 @@ class AlignedPart:
     def definition(self, name: str) -> PlanFeature:
         """The feature's definition in the plan."""
         return self._features[name]
-
-    def region_points(self, name: str) -> np.ndarray:
-        """(n, 3) mm: the points of a feature's region, in part coordinates."""
-        return np.asarray(self.points[self._features[name].region.within(self.points)])
 
     def profile(self, name: str) -> Quantity:
         """The profile of a region against the nominal model. Raises InputError without one."""
@@ -397,11 +387,12 @@ def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantit
     kind, (name, *others) = wanted.kind, wanted.features
     if kind == "profile":
         return part.profile(name)
-    fit, points = part.feature(name), part.region_points(name)
+    fit, planned = part.feature(name), part.definition(name)
+    points = part.points[planned.region.within(part.points)]
     if kind in FORMS:
         return form_error(kind, fit, points, part.shared)  # type: ignore[arg-type]
     if kind == "position":
-        return position_error(fit, points, part.definition(name).nominal(), part.spread)
+        return position_error(fit, points, planned.nominal(), part.spread)
     if kind in SIZES:
         quantities = fit.quantities()
     else:

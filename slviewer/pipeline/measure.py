@@ -282,8 +282,14 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
                 f"{each.label} is stale, what it was measured on has changed: measure it again"
             )
     features = (*load_feature(store, first), *load_feature(store, second))
-    _check_frames(store, first, second)
     a, b = first.record, second.record
+    # scans are in one frame only while camera and calibration are the same; a merge has its own
+    scans = {a.source, b.source} <= set(store.capture_names())
+    if a.source != b.source and (a.model != b.model or not scans):
+        raise InputError(
+            f"{first.label} was measured on {a.source} with {a.model}, {second.label} on {b.source}"
+            f" with {b.model}: they do not lie in one frame; measure both on one surface"
+        )
     record = Measurement(
         what="relation",
         name=f"{first.label} – {second.label}",
@@ -310,19 +316,6 @@ def load_feature(store: Session, measured: Stored[Measurement]) -> tuple[Feature
     shared = None if shared is None else shared.astype(np.float64)
     spread = Spread(np.array(found.scatter), shared, found.calibration)
     return from_plain(to_plain(found), Feature), spread
-
-
-def _check_frames(store: Session, a: Stored[Measurement], b: Stored[Measurement]) -> None:
-    """Two scans are in one frame only while camera and calibration are the same; a merged surface
-    has its own."""
-    one, other = a.record, b.record
-    if one.source == other.source:
-        return
-    if one.model != other.model or not {one.source, other.source} <= set(store.capture_names()):
-        raise InputError(
-            f"{a.label} was measured on {one.source} with {one.model}, {b.label} on {other.source}"
-            f" with {other.model}: they do not lie in one frame; measure both on one surface"
-        )
 
 
 def section_lines(session: SessionLike, name: str) -> tuple[CutPlane, list[np.ndarray]]:

@@ -18,7 +18,6 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Warn, stage
 from slviewer.pipeline.models import (
-    Model,
     ModelName,
     check_accepted,
     frame_of,
@@ -56,7 +55,6 @@ from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
-from slviewer.surface.region_of_interest import RegionOfInterest
 
 MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than
@@ -200,7 +198,14 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     region = resolve_region(store, settings.roi)
     restrictions = restriction_notes(store, names, region)
     inputs = restriction_inputs(store, names, with_region=not settings.roi)
-    clouds = _reconstruct_scans(job, settings, fitted, region)
+    clouds, accepts = dict[str, Cloud](), settings.accept_rejected
+    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
+        job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
+        texture = capture_texture(shot, frames, stretch=False)
+        cloud = capture_cloud(
+            store, fitted, shot, phases, texture=texture, accept_rejected=accepts, warn=warn
+        )
+        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
     if settings.start == "markers" or table_deg is not None:
         markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
         if table_deg is None:
@@ -230,22 +235,6 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")
-
-
-def _reconstruct_scans(
-    job: Job, settings: MergeSettings, fitted: Model, region: RegionOfInterest | None
-) -> dict[str, Cloud]:
-    """Return the cloud of each scan without what edits and region remove."""
-    store, names, clouds = job.store, settings.names, {}
-    accepts = settings.accept_rejected
-    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn)):
-        job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
-        texture = capture_texture(shot, frames, stretch=False)
-        cloud = capture_cloud(
-            store, fitted, shot, phases, texture=texture, accept_rejected=accepts, warn=job.warn
-        )
-        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
-    return clouds
 
 
 @contextmanager

@@ -19,7 +19,6 @@ from slviewer.pipeline.stored_records import Stored, list_records
 from slviewer.records.inspection import Characteristic
 from slviewer.records.measurement import Measurement
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.quantities import Quantity
 from slviewer.session.inspection_plan import (
     KINDS,
     Alignment,
@@ -147,17 +146,16 @@ def _list_characteristics(
         features = (names[each.name],) if form else tuple(names[i] for i in each.record.of)
         for quantity in each.record.quantities:
             if quantity.name in (("diameter",) if form else KINDS):
-                yield _around(quantity, features, tolerance)
+                nominal = round(quantity.value, _DECIMALS)
+                lower, upper = (
+                    round(nominal + each, _DECIMALS) for each in (-tolerance, tolerance)
+                )
+                name = f"{' – '.join(features)} {quantity.name}"
+                yield Characteristic(
+                    name, quantity.name, features, nominal, lower, upper, quantity.unit
+                )
         if form:
             yield Characteristic(f"{features[0]} {form}", form, features, upper=tolerance)
-
-
-def _around(quantity: Quantity, features: tuple[str, ...], tolerance: float) -> Characteristic:
-    """A characteristic with a tolerance around its measured value."""
-    nominal = round(quantity.value, _DECIMALS)
-    lower, upper = round(nominal - tolerance, _DECIMALS), round(nominal + tolerance, _DECIMALS)
-    name = f"{' – '.join(features)} {quantity.name}"
-    return Characteristic(name, quantity.name, features, nominal, lower, upper, quantity.unit)
 
 
 def _plan_feature(

@@ -1,8 +1,7 @@
 """Recorded captures as a rig: those of a session, or of a folder that can be imported, one after
 another."""
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +12,24 @@ from slviewer.errors import InputError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
+from slviewer.session.capture import Capture
 from slviewer.session.importers.imported import ImportableRecording
 from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 
-Shot = tuple[np.ndarray, PatternSequence]
+Recorded = Capture | ImportableRecording
 
 
 class Reel:
     """A rig that replays recorded captures; it has only the `sequence` of the current one until it
     is wound on."""
 
-    def __init__(self, shots: dict[str, Callable[[], Shot]]) -> None:
-        """`shots` read the frames (n, h, w) and the sequence of one capture each, by name, in
-        order."""
-        self.names = list(shots)
-        self._shots, self._at = shots, 0
-        self._recording = Recording(*shots[self.names[0]]())
+    def __init__(self, recorded: Sequence[Recorded]) -> None:
+        """Play these captures in order."""
+        self.names = [each.name for each in recorded]
+        self._recorded, self._at = recorded, 0
+        self._recording = Recording(*_read_shot(recorded[0]))
         self.rig: Rig = recording_rig(self._recording)
 
     @property
@@ -48,7 +47,15 @@ class Reel:
         same rig."""
         self._at = (self._at + 1) % len(self.names)
         if len(self.names) > 1:
-            self._recording.play(*self._shots[self.names[self._at]]())
+            self._recording.play(*_read_shot(self._recorded[self._at]))
+
+
+def _read_shot(recorded: Recorded) -> tuple[np.ndarray, PatternSequence]:
+    """Read the frames (n, h, w) and the sequence of a recorded capture."""
+    if isinstance(recorded, Capture):
+        return recorded.frames, recorded.sequence
+    imported = check_imported_capture(recorded.read(), ignore_warnings)
+    return imported.frames, imported.sequence
 
 
 def reel(
@@ -64,38 +71,19 @@ def reel(
     `sequence` is the TOML of the layout frames, `projector` its size, such as "912x1140", where it
     is not the layout's own. Raises InputError, SessionError.
     """
-    folder = expand_user(source)
+    folder, recorded = expand_user(source), list[Recorded]()
     if layout == "session" or (layout is None and is_session(folder)):
-        shots = _read_recorded(folder)
+        with Session.open(folder) as store:
+            recorded += store.captures()
     else:
-        shots = _read_imported(folder, layout, sequence, projector)
-    if capture is not None and capture not in shots:
+        layout = layout or "detect"
+        recorded += find_captures(folder, layout, sequence, projector=projector).recordings
+    names = [each.name for each in recorded]
+    if capture is not None and capture not in names:
         raise InputError(
             f"there is no capture {capture!r} in {folder}: the captures are"
-            f" {', '.join(shots) or 'none'}"
+            f" {', '.join(names) or 'none'}"
         )
-    chosen = shots if capture is None else {capture: shots[capture]}
-    if not chosen:
+    if not recorded:
         raise InputError(f"{folder} holds no capture to play back: name a folder that does")
-    return Reel(chosen)
-
-
-def _read_recorded(folder: Path) -> dict[str, Callable[[], Shot]]:
-    """Return {name: function that reads frames and sequence} of a session's captures."""
-    with Session.open(folder) as store:
-        captures = store.captures()
-    return {capture.name: lambda shot=capture: (shot.frames, shot.sequence) for capture in captures}  # type: ignore[misc]
-
-
-def _read_imported(
-    folder: Path, layout: str | None, sequence: Path | str | None, projector: str | None
-) -> dict[str, Callable[[], Shot]]:
-    """Return {name: function that reads frames and sequence} of a folder of imported captures."""
-
-    def read(recording: ImportableRecording) -> Shot:
-        """Return the frames (n, h, w) and the sequence of a recording."""
-        capture = check_imported_capture(recording.read(), ignore_warnings)
-        return capture.frames, capture.sequence
-
-    recordings = find_captures(folder, layout or "detect", sequence, projector=projector).recordings
-    return {recording.name: partial(read, recording) for recording in recordings}
+    return Reel([each for each in recorded if capture in (None, each.name)])

@@ -113,7 +113,15 @@ def _collect_data(store: Session) -> SessionData:
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     excluded = store.excluded()
-    verdict = load_last_verdict(store)
+    verdict, there = load_last_verdict(store), available_models(store)
+    pixel_fits, models = list[PixelFitView](), None
+    if "pixelwise" in there:
+        pixelwise = load_model(store, "pixelwise")
+        assert isinstance(pixelwise, PixelwiseModel)
+        pixel_fits = [PixelFitView(axis, fit.rms_mm) for axis, fit in pixelwise.fits.items()]
+    if there:
+        scales = {name: words for name in there if (words := describe_scale(store, name))}
+        models = ModelsView(preferred_model(store), recommended_model(store), scales)
     judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
     records, outdated = _collect_records(store)
     region = load_region(store)
@@ -121,39 +129,18 @@ def _collect_data(store: Session) -> SessionData:
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
         calibration=None if stereo is None else calibration_view(store),
-        pixel_fits=_load_pixel_fits(store),
+        pixel_fits=pixel_fits,
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
         verdict_of_calibration=verdict is not None and verdict == judged,
-        models=_load_models(store),
+        models=models,
         region="" if region is None else region.text(),
         edits=[
             (scan, words)
             for scan in store.capture_names("scan")
             for words in list_edits(store, scan)[0]
         ],
-    )
-
-
-def _load_pixel_fits(store: Session) -> list[PixelFitView]:
-    """Return the pixel-wise fits by axis; none where there is no such calibration."""
-    if "pixelwise" not in available_models(store):
-        return []
-    model = load_model(store, "pixelwise")
-    assert isinstance(model, PixelwiseModel)
-    return [PixelFitView(axis, fit.rms_mm) for axis, fit in model.fits.items()]
-
-
-def _load_models(store: Session) -> ModelsView | None:
-    """Return which of the session's calibrations is used; None where there is no calibration."""
-    there = available_models(store)
-    if not there:
-        return None
-    return ModelsView(
-        used=preferred_model(store),
-        recommended=recommended_model(store),
-        scales={name: words for name in there if (words := describe_scale(store, name))},
     )
 
 

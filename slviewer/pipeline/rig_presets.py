@@ -49,7 +49,16 @@ def presets(session: Session | None = None) -> list[Preset]:
     shipped = {
         path.stem: path for path in sorted(asset(FOLDER).glob("*.toml")) if path.stem not in own
     }
-    return [_read_preset_or_problem(name, path) for name, path in {**own, **shipped}.items()]
+    listed = []
+    for name, path in {**own, **shipped}.items():
+        try:
+            preset = _read_preset(name, path)
+            missing = [drivers()[each].missing for each in _driver_names(preset.choice)]
+            problem = "; ".join(filter(None, dict.fromkeys(missing)))
+            listed.append(replace(preset, problem=problem))
+        except InputError as error:
+            listed.append(Preset(name, "", {}, path, str(error)))
+    return listed
 
 
 def rigs() -> str:
@@ -154,17 +163,6 @@ def _read_preset(name: str, path: Path) -> Preset:
         raise InputError(f"{path}: what = {what!r} is not text: correct it")
     check_choice(choice, str(path))
     return Preset(name, what, choice, path)
-
-
-def _read_preset_or_problem(name: str, path: Path) -> Preset:
-    """Return the preset in a file, with its `problem` where it cannot be used."""
-    try:
-        preset = _read_preset(name, path)
-        names = dict.fromkeys(_driver_names(preset.choice))
-        problems = filter(None, (drivers()[name].missing for name in names))
-        return replace(preset, problem="; ".join(problems))
-    except InputError as error:
-        return Preset(name, "", {}, path, str(error))
 
 
 def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:

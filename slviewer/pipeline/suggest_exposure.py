@@ -163,7 +163,15 @@ class _Bracket:
         self._frame = np.empty((height, width), rig.camera.dtype)
         self._largest = 0
         self._stride = max(1, math.ceil(math.sqrt(width * height / _PIXELS)))
-        self._inside = _mask_region(region, (width, height))[:: self._stride, :: self._stride]
+        x, y, across, down = region or (0, 0, width, height)
+        if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
+            raise InputError(
+                f"the region {x} {y} {across} {down} is outside of the image of {width}x{height}"
+                " px: give x, y, width and height in px"
+            )
+        inside = np.zeros((height, width), bool)
+        inside[y : y + down, x : x + across] = True
+        self._inside = inside[:: self._stride, :: self._stride]
         self._overhead_ms = math.inf
         self._looks: dict[float, _Look] = {}
         rig.projector.load(sequence)
@@ -422,21 +430,6 @@ def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
     # or its layout would have been refused
     assert layout.white is not None and layout.black is not None
     return (layout.white, layout.black), False
-
-
-def _mask_region(region: Region | None, size: tuple[int, int]) -> Mask:
-    """(height, width) bool, True inside of the region x, y, width, height; InputError where it is
-    outside."""
-    width, height = size
-    inside = np.zeros((height, width), bool)
-    x, y, across, down = region or (0, 0, width, height)
-    if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
-        raise InputError(
-            f"the region {x} {y} {across} {down} is outside of the image of {width}x{height} px: "
-            "give x, y, width and height in px"
-        )
-    inside[y : y + down, x : x + across] = True
-    return inside
 
 
 def _tabulate_values(grid: Values, low: Values, high: Values) -> tuple[Values, Values]:

@@ -102,11 +102,14 @@ def verify(
     store = job.store
     chosen = load_models(store, settings.models)
     for each in compare_captures(job, settings, chosen):
-        name = each.capture.name
+        name, models = each.capture.name, tuple(each.found.results)
+        record = each.found.record(
+            each.masked,
+            scales={model: scale_factor(store, model) for model in models},
+            inputs=store.input_hashes(name, *(f"calibration/{model}" for model in models)),
+        )
         yield Found(
-            name,
-            _make_record(store, each),
-            {f"error_{m}": r.error_map for m, r in each.found.results.items()},
+            name, record, {f"error_{m}": r.error_map for m, r in each.found.results.items()}
         )
         if store.is_writable and (best := chosen.get(preferred_model(store))) is not None:
             # by its own best axis, as reconstruct
@@ -156,17 +159,6 @@ def compare_captures(
         masked = {name: share for name, share in shares.items() if share is not None}
         yield ComparedCapture(shot, frames, phases, found, masked)
     job.progress(1.0, "measured")
-
-
-def _make_record(store: Session, each: ComparedCapture) -> Verification:
-    """Return the record of a comparison, with the scales and the hashes of what it was made
-    from."""
-    models = tuple(each.found.results)
-    return each.found.record(
-        each.masked,
-        scales={model: scale_factor(store, model) for model in models},
-        inputs=store.input_hashes(each.capture.name, *(f"calibration/{model}" for model in models)),
-    )
 
 
 def _reconstruct_best(

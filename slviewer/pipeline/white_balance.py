@@ -1,7 +1,5 @@
 """The white balance of a colour camera, from the white of the board or a grey card."""
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 
@@ -60,7 +58,13 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
             f"{capture.name} has no colours: name a capture of a colour camera with a white image"
         )
     texture = to_eight_bits(texture, capture.sequence.full_scale)
-    pixels = texture[_reference_mask(store, capture, texture)].astype(np.float64)
+    if observed := load_observations(store, [capture.name]):  # a target pose: its board
+        hull = cv2.convexHull(np.rint(observed[0].camera).astype(np.int32))
+        mask = cv2.fillConvexPoly(np.zeros(texture.shape[:2], np.uint8), hull, 1) == 1
+    else:  # what is lit
+        levels = texture.max(axis=2)
+        mask = levels >= 0.5 * np.quantile(levels, 0.99)
+    pixels = texture[mask].astype(np.float64)
     brightness = pixels.max(axis=1)
     white = pixels[brightness >= np.quantile(brightness, 1 - WHITE_SHARE)]
     usable = white[white.max(axis=1) < SATURATED]
@@ -77,13 +81,3 @@ def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
             f" it so that each has {DARKEST} or more, none {MAX_GAIN:g} times another"
         )
     return np.asarray(colour.min() / colour)
-
-
-def _reference_mask(store: Session, capture: Capture, texture: np.ndarray) -> np.ndarray:
-    """Mask (h, w) of the reference: the detected board of a target pose, else what is lit."""
-    observed: Sequence = load_observations(store, [capture.name])
-    if not observed:
-        brightness = texture.max(axis=2)
-        return np.asarray(brightness >= 0.5 * np.quantile(brightness, 0.99))
-    hull = cv2.convexHull(np.rint(observed[0].camera).astype(np.int32))
-    return np.asarray(cv2.fillConvexPoly(np.zeros(texture.shape[:2], np.uint8), hull, 1) == 1)
