@@ -236,10 +236,8 @@ def _cut(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
         vertices, faces = triangulate_near(on.points, on.normals, plane)
     lines = section(vertices, faces, plane)
     drawn = np.concatenate(lines)
-    quantities = [
-        Quantity("length along", float(np.ptp(drawn[:, 0])), "mm"),
-        Quantity("height range", float(np.ptp(drawn[:, 1])), "mm"),
-    ]
+    spans = zip(("length along", "height range"), np.ptp(drawn, axis=0).tolist(), strict=True)
+    quantities = [Quantity(name, span, "mm") for name, span in spans]
     lengths = np.array([len(line) for line in lines], np.int32)
     fields = {"quantities": quantities, "plane": from_plain(to_plain(plane), SectionPlane)}
     return fields, {"lines": drawn.astype(np.float32), "lengths": lengths}

@@ -85,11 +85,6 @@ class MergedScans:
         """The figures of the merge."""
         return self.found.record
 
-    @property
-    def out(self) -> Path:
-        """The file of the surface."""
-        return self.found.files[0]
-
 
 @dataclass(frozen=True, eq=False)
 class MergeSettings:

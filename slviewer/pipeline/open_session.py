@@ -89,16 +89,13 @@ def match_names(
     return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
-def numbered_results(store: Session, kind: str) -> list[str]:
-    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., in the order of
-    their numbers."""
-    return sorted(
-        (name for name in store.result_names() if name.startswith(f"{kind}/")), key=natural_key
-    )
+def numbered_names(store: Session, kind: str) -> list[str]:
+    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., without it, in the
+    order of their numbers."""
+    names = (name for name in store.result_names() if name.startswith(f"{kind}/"))
+    return sorted((name.removeprefix(f"{kind}/") for name in names), key=natural_key)
 
 
 def next_number(store: Session, kind: str) -> int:
     """Return the number of the next result of a kind."""
-    return 1 + max(
-        (int(name.removeprefix(f"{kind}/")) for name in numbered_results(store, kind)), default=0
-    )
+    return 1 + max(map(int, numbered_names(store, kind)), default=0)

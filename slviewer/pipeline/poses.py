@@ -229,27 +229,26 @@ def gather_evidence(
     None where they could not be read, for the reason ``refused``; ``examination``: of its frames.
     """
     sequence, frames, board = pose.sequence, pose.frames, pose.board
-    on_board = board_mask(board, detection, pose.texture.shape) if detection is not None else None
+    grid, on_board, moved_px = None, None, np.nan
+    if detection is None:
+        grid = detect_grid_size(board, pose.texture)
+    else:
+        on_board = board_mask(board, detection, pose.texture.shape)
+        pitch = float(np.median(pitch_px(board, detection)))
+        moved_px = measure_motion_px(sequence, frames, detection.pixels, pitch)
+    turn = None
+    if observation is not None:
+        turn = fit_mean_turn(observation.camera, observation.projector)
     return PoseEvidence(
         name=pose.name,
         refused=refused,
-        grid=detect_grid_size(board, pose.texture) if detection is None else None,
+        grid=grid,
         axes={
             axis: measure_axis(sequence, frames, phase, on_board)
             for axis, phase in pose.phases.items()
         },
         findings=examination.findings,
         displaced=measure_white_delay(sequence, frames),
-        moved_px=(
-            np.nan
-            if detection is None
-            else measure_motion_px(
-                sequence, frames, detection.pixels, float(np.median(pitch_px(board, detection)))
-            )
-        ),
-        turn=(
-            None
-            if observation is None
-            else fit_mean_turn(observation.camera, observation.projector)
-        ),
+        moved_px=moved_px,
+        turn=turn,
     )

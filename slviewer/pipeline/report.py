@@ -105,16 +105,15 @@ def report(
 
 def _collect_data(store: Session) -> SessionData:
     """Collect everything that a report shows of a session."""
-    stereo = load_stereo_if_complete(store)
+    stereo, there = load_stereo_if_complete(store), available_models(store)
     stale = [
         f"The {name} calibration was made from target poses that have since changed: run calibrate"
         " again."
-        for name in available_models(store)
+        for name in there
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     excluded = store.excluded()
-    verdict, there = load_last_verdict(store), available_models(store)
-    pixel_fits, models = list[PixelFitView](), None
+    verdict, pixel_fits, models = load_last_verdict(store), list[PixelFitView](), None
     if "pixelwise" in there:
         pixelwise = load_model(store, "pixelwise")
         assert isinstance(pixelwise, PixelwiseModel)

@@ -79,24 +79,23 @@ def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
     """
     if isinstance(rig, Mapping):
         return dict(rig)
-    path = expand_user(rig)
-    if path.suffix.lower() == ".toml" or path.is_file():
-        if not path.is_file():
+    name, path = str(rig), expand_user(rig)
+    if not path.is_file():
+        named = {preset.name: preset.source for preset in presets(session)}
+        if path.suffix.lower() == ".toml":
             raise InputError(
                 f"there is no file {path}: name a TOML file that describes a rig, or one of"
-                f" {_list_names(session)}"
+                f" {', '.join(named)}"
             )
-        preset = _read_preset(path.stem, path)
-    else:
-        named = {preset.name: preset for preset in presets(session)}
-        if str(rig) not in named:
+        if name not in named:
             raise InputError(
-                f"no rig is called {str(rig)!r}: use {_list_names(session)}, or name a TOML file"
+                f"no rig is called {name!r}: use {', '.join(named)}, or name a TOML file"
             )
-        preset = _read_preset(str(rig), named[str(rig)].source)
-    for name in _driver_names(preset.choice):
-        driver(name)  # raises where it cannot be used
-    return dict(preset.choice)
+        path = named[name]
+    choice = _read_preset(name, path).choice
+    for each in _driver_names(choice):
+        driver(each)  # raises where it cannot be used
+    return dict(choice)
 
 
 def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Preset:
@@ -211,8 +210,3 @@ def _driver_names(choice: Choice) -> list[str]:
     of a turntable."""
     parts = [choice, *(choice.get(part, {}) for part in ("camera", "projector", "turntable"))]
     return [str(part["driver"]) for part in parts if "driver" in part]
-
-
-def _list_names(session: Session | None) -> str:
-    """Return the names of all presets, separated by commas."""
-    return ", ".join(preset.name for preset in presets(session))

@@ -295,8 +295,12 @@ class _Bracket:
 
     def _examine(self, current_ms: Sequence[float | None]) -> tuple[Values, Values, Mask]:
         """Look at the present exposures, at shorter ones until nothing is saturated, and at longer
-        ones until all is or time allows for no more. Returns the `_limits`, and (h, w) the pixels
-        of the region that see the patterns.
+        ones until all is or time allows for no more.
+
+        Returns (h, w) each, in ms: the shortest exposure at which a pixel is modulated enough,
+        infinite where it sees no patterns, and the longest at which it is not saturated, from the
+        longest exposure that did not saturate it; and the pixels of the region that see the
+        patterns.
         """
         for exposure in current_ms:
             self._look(exposure)
@@ -315,29 +319,18 @@ class _Bracket:
                 if (following.exposure_ms - look.exposure_ms) * (factor - 1) <= 0:
                     break
                 look = following
-        low, high = self._limits()
-        return low, high, np.isfinite(low) & self._inside
-
-    def _limits(self) -> tuple[Values, Values]:
-        """(h, w) ms each: the shortest exposure at which a pixel is modulated enough, infinite
-        where it sees no patterns, and the longest at which it is not saturated. From the longest
-        exposure that did not saturate it.
-        """
         variance = self._noise()
-        shape = self._inside.shape
-        low, high = np.full(shape, np.inf), np.zeros(shape)
-        for exposure in sorted(self._looks):
-            look = self._looks[exposure]
-            free = (look.peak < self._clip) | (exposure == min(self._looks))
-            with np.errstate(divide="ignore"):
-                longest = exposure * _HEADROOM * self._full / np.maximum(look.peak, 1)
-                longest[look.peak >= self._clip] = 0.5 * exposure  # how far beyond is not known
+        low, high = np.full(self._inside.shape, np.inf), np.zeros(self._inside.shape)
+        for exposure, look in sorted(self._looks.items()):
+            clipped = look.peak >= self._clip
+            free = ~clipped | (exposure == min(self._looks))
+            longest = exposure * _HEADROOM * self._full / np.maximum(look.peak, 1)
+            longest[clipped] = 0.5 * exposure  # how far beyond is not known
             shortest = exposure * self._required_factor(look, variance)
-            # of what is saturated in all, to be counted
-            shortest[look.peak >= self._clip] = exposure
+            shortest[clipped] = exposure  # of what is saturated in all, to be counted
             low[free] = np.where(shortest > _BEYOND * exposure, np.inf, shortest)[free]
             high[free] = longest[free]
-        return low, high
+        return low, high, np.isfinite(low) & self._inside
 
     def _noise(self) -> tuple[float, float]:
         """Variance of a grey level: at none, and its increase with each."""
@@ -349,8 +342,7 @@ class _Bracket:
         mean, square = np.concatenate(means), np.concatenate(squares)
         if mean.size < 100:
             return 1.0, 0.0
-        order = np.argsort(mean)
-        groups = [order[part] for part in np.array_split(np.arange(mean.size), 12)]
+        groups = np.array_split(np.argsort(mean), 12)
         level = np.array([mean[group].mean() for group in groups])
         spread = np.array(
             [np.mean(np.sort(square[group])[: max(1, int(0.99 * group.size))]) for group in groups]
@@ -385,12 +377,9 @@ class _Bracket:
             chosen = int(values[sets, following].sum(1).argmax())
             measured = float(counts[sets[chosen], following[chosen]].sum())
             best.append((measured, tuple(grid[sets[chosen]].tolist())))
-        if not best:
-            return ()
-        largest = max(measured for measured, _ in best)
-        return next(
-            exposures for measured, exposures in best if measured >= largest - _WORTH * low.size
-        )
+        largest = max((measured for measured, _ in best), default=0.0)
+        good = (each for measured, each in best if measured >= largest - _WORTH * low.size)
+        return next(good, ())
 
     def _classify(self, exposures_ms: Sequence[float], lit: Mask) -> Image:
         """State (h, w) of each pixel if it is used from the longest of these exposures that does

@@ -227,22 +227,19 @@ def next_turn(store: Session) -> str:
 
 def recorded_steps(store: Session, name: str) -> list[TurnStep]:
     """List the captured steps of a turn, in their order."""
-    steps = (capture.turn_step for capture in store.captures("scan"))
-    return sorted(
-        (step for step in steps if step is not None and step.turn == name),
-        key=lambda step: step.step,
-    )
+    steps = [capture.turn_step for capture in store.captures("scan")]
+    turned = [step for step in steps if step is not None and step.turn == name]
+    return sorted(turned, key=lambda step: step.step)
 
 
 def missing_steps(store: Session, name: str | None = None) -> list[TurnStep]:
     """Return the steps of a turn, by default of the last one, that are not captured. Raises
     InputError if none is."""
-    turned = [capture for capture in store.captures("scan") if capture.turn_step is not None]
-    if name is None and turned:
-        last = max(turned, key=lambda capture: str(capture.meta.get("created", ""))).turn_step
-        assert last is not None
-        name = last.turn
-    recorded = recorded_steps(store, name) if name is not None else []
+    if name is None:
+        captures = sorted(store.captures("scan"), key=lambda each: str(each.meta.get("created")))
+        turns = [step.turn for each in captures if (step := each.turn_step) is not None]
+        name = turns[-1] if turns else ""
+    recorded = recorded_steps(store, name)
     if not recorded:
         raise InputError(f"there is no turn {name or 'yet'} to resume: begin a new one")
     first, taken = recorded[0], set(store.taken_names())
