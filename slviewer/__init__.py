@@ -72,12 +72,11 @@ if TYPE_CHECKING:
     from slviewer.pipeline.merge import merge
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
-    from slviewer.pipeline.reconstruct import reconstruct
+    from slviewer.pipeline.reconstruct import reconstruct, verify
     from slviewer.pipeline.report import report
     from slviewer.pipeline.session_operations import SessionOperations as Session
     from slviewer.pipeline.simulate import simulate
     from slviewer.pipeline.stored_records import load_arrays
-    from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct_cloud
     from slviewer.records.measurement import Measurement
@@ -144,6 +143,7 @@ _EXPORTS = {
     "save_calibration": "pipeline.calibrate",
     "simulated_rig": "devices.simulated",
     "texture": "fringe.decode",
+    "verify": "pipeline.reconstruct",
     "write_ply": "session.ply",
 }
 """{public name: module}, or module:name where it has another name there, or module:* for the module

@@ -108,7 +108,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     "region": _define_command("pipeline.edit:set_region"),
     "edit": _define_command("pipeline.edit:edit_scan", "scan", options=JSON),
     "verify": _define_command(
-        "pipeline.verify:verify",
+        "pipeline.reconstruct:verify",
         "captures",
         options=JSON,
         names={"models": "model", "depth_range": "range"},
@@ -125,7 +125,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     "compare": _define_command("pipeline.compare:compare", "scan", "nominal", options=JSON),
     "measure": _define_command("pipeline.measure:measure", "scan", "what", options=JSON),
     "measurements": _define_command("pipeline.measure:edit_measurements"),
-    "plan": _define_command("pipeline.plan:plan"),
+    "plan": _define_command("pipeline.inspect_parts:plan"),
     "inspect-parts": _define_command(
         "pipeline.inspect_parts:inspect_parts",
         "plan",

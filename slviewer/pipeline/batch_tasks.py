@@ -17,8 +17,12 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.batch_storage import export_folder, fetch_session
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.operation import Findings, Job
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.records.plain import to_plain
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.atomic import write_bytes

@@ -11,6 +11,5 @@ from slviewer.pipeline import (  # noqa: F401 (each registers its own)
     merge,
     reconstruct,
     validate,
-    verify,
 )
 from slviewer.pipeline.operation import OPERATIONS as OPERATIONS

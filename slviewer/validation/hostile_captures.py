@@ -19,8 +19,12 @@ from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.operation import Job
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.verification import Shape
 from slviewer.session.store import Session

@@ -19,8 +19,8 @@ from slviewer.pipeline.merge import MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_models, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.pipeline.verify import VerifySettings, compare_captures
 from slviewer.records.verification import centre_distances_mm
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session

@@ -11,7 +11,7 @@ from slviewer.errors import InputError
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.compare import CompareSettings, compare
-from slviewer.pipeline.inspect_parts import RunPlanSettings, run_plan
+from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
 from slviewer.pipeline.measure import (
     MeasureSettings,
     RelateSettings,
@@ -25,7 +25,6 @@ from slviewer.pipeline.measure import (
 )
 from slviewer.pipeline.measured_surface import LoadSurface, MeasuredSurface, Place
 from slviewer.pipeline.operation import Job
-from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
 from slviewer.records.measurement import MeasuredRegion
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.session import atomic
