@@ -170,7 +170,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     "report": _define_command("pipeline.report:report"),
     "verify-report": _define_command("pipeline.certificate:verify_report", "report", options=JSON),
     "inspect": _define_command("pipeline.inspect:inspect"),
-    "restore": _define_command("pipeline.restore:restore", "names"),
+    "restore": _define_command("pipeline.inspect:restore", "names"),
     "bench": _define_command("validation.bench:bench", options=JSON),
 }
 """The commands by name, each made when it is used: that reads the source of its function."""

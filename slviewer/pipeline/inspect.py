@@ -1,16 +1,17 @@
-"""What a session holds, in words, and whether it is what was saved."""
+"""What a session holds, in words, and whether it is what was saved; and what is in its trash."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 
-from slviewer.errors import DamagedError, SlviewerError
+from slviewer.errors import DamagedError, InputError, SlviewerError
+from slviewer.evaluation.render import render
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measure import describe_measurement
 from slviewer.pipeline.models import available_models, load_stereo, preferred_model
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, match_names, opened
 from slviewer.pipeline.stored_records import list_records
 from slviewer.records.measurement import Measurement
 from slviewer.session.capture import Capture
@@ -136,3 +137,42 @@ def summarise_capture(capture: Capture) -> str:
     if capture.exposures_ms:
         line += f", exposures {', '.join(f'{exposure:g}' for exposure in capture.exposures_ms)} ms"
     return line + (", colour" if capture.meta.get("texture") else "")
+
+
+def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
+    """List what is in a session's trash, or bring back what is named.
+
+    Captures and results that were deleted or replaced are in the trash. What has a restored name
+    now goes there in exchange, in one step.
+
+    Args:
+        session: Session folder.
+        names: What to bring back: names, the last deleted of each, or patterns such as
+            'calibration/*', or the name of one folder in the trash; without any, the trash is
+            listed.
+    """
+    with opened(session, write=bool(names)) as store:
+        trashed = store.trashed()
+        if not names:
+            if not trashed:
+                return f"nothing is in the trash of {store.folder}"
+            rows = [
+                {
+                    "name": each.name,
+                    "kind": "capture" if each.is_capture else "result",
+                    "deleted (UTC)": f"{each.time:%Y-%m-%d %H:%M:%S}",
+                    "folder in the trash": each.place.name,
+                }
+                for each in trashed
+            ]
+            return render(rows)
+        latest = {each.name: each for each in reversed(trashed)}
+        latest |= {each.place.name: each for each in trashed}
+        found = match_names(list(latest), names, "item of the trash", InputError)
+        # patterns match no folders
+        chosen = [latest[name] for name in found if name in names or name == latest[name].name]
+        chosen = list(dict.fromkeys(chosen))
+        store.restore(chosen)
+        return "\n".join(
+            f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen
+        )

@@ -1,29 +1,46 @@
-"""From what the operator chose to devices: a choice is a plain mapping, as the session keeps it.
+"""Rigs: from what the operator chose to devices, and choices by name.
 
-``{"driver": "simulated", "scale": 0.5, "seed": 0}`` for a rig that one driver makes, or ``{"name":
-"bench", "camera": {"driver": …}, "projector": {"driver": …}}``; all other keys but `ABOUT` go to
-the driver.
+A choice is a plain mapping, as the session keeps it: ``{"driver": "simulated", "scale": 0.5,
+"seed": 0}`` for a rig that one driver makes, or ``{"name": "bench", "camera": {"driver": …},
+"projector": {"driver": …}}``; all other keys but `COMMON_KEYS` go to the driver.
+
+Choices with a name are TOML files, shipped in ``assets/rigs`` or the operator's own in the session.
+A file holds what `set_up` takes, and `what`, a sentence about it. The content of a file is checked
+before a device is touched, so that a mistyped option is named and not ignored.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import isfinite
+from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
-from slviewer.devices.drivers import Driver, driver, drivers
+from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, driver, drivers
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError
 from slviewer.pipeline.replay import Reel, reel
+from slviewer.session.reading import expand_user, read_toml
+from slviewer.session.store import Session
+from slviewer.session.toml import to_toml
+from slviewer.simulation.assets import asset
 from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
 Choice = Mapping[str, Any]
-
 COMMON_KEYS = ("name", "settle_ms", "focal_px", "exposure_ms", "gain", "turntable")
 """Keys that a choice may hold for any rig: its name, the delay of its light, the nominal focal
 length of its lens in camera px, what its camera is set to by default, and its turntable."""
+RigLike = Mapping[str, Any] | Path | str
+"""A choice of devices, a TOML file that holds one, or the name of a preset."""
+FOLDER = "rigs"
+_LARGEST = {"settle_ms": 60_000, "focal_px": 1e6, "exposure_ms": 600_000, "gain": 1e6}
 
 
 @dataclass(frozen=True)
@@ -120,11 +137,11 @@ def list_needed_pages(choice: Choice) -> tuple[PageRole, ...]:
     return tuple(role for role, named_driver in named.items() if named_driver and named_driver.page)
 
 
-def rig_factory(driver: Driver) -> Callable[..., Any] | None:
-    """Return the function that builds the whole rig of a driver from its options; None if it drives
-    no whole rig."""
-    own: dict[str, Callable[..., Any]] = {"simulated": _simulated_setup, "replay": reel}
-    return own.get(driver.name, driver.rig)
+def driver_factory(driver: Driver, part: str) -> Callable[..., Any] | None:
+    """Return the driver's function that makes the part (camera, projector, turntable or rig) from
+    its options; None where it has none."""
+    own = {"simulated": _simulated_setup, "replay": reel} if part == "rig" else {}
+    return own.get(driver.name, getattr(driver, part))
 
 
 def _simulated_setup(
@@ -143,3 +160,180 @@ def _simulated_setup(
     if thing != "board":
         world.place(thing)
     return RigSetup(simulated_rig(world), world, rig.camera.focal_px[0] * scale)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A rig with a name: `what` it is in a sentence, the `choice` it stands for, its file, and
+    `problem`, why it cannot be used here and how to correct that, empty if it can.
+    """
+
+    name: str
+    what: str
+    choice: Mapping[str, Any]
+    source: Path
+    problem: str = ""
+
+
+def presets(session: Session | None = None) -> list[Preset]:
+    """List the session's own rigs, then those that are shipped; a session's hides a shipped one of
+    the same name."""
+    own = {} if session is None else session.rigs()
+    shipped = {
+        path.stem: path for path in sorted(asset(FOLDER).glob("*.toml")) if path.stem not in own
+    }
+    listed = []
+    for name, path in {**own, **shipped}.items():
+        try:
+            preset = _read_preset(name, path)
+            missing = [drivers()[each].missing for each in _driver_names(preset.choice)]
+            problem = "; ".join(filter(None, dict.fromkeys(missing)))
+            listed.append(replace(preset, problem=problem))
+        except InputError as error:
+            listed.append(Preset(name, "", {}, path, str(error)))
+    return listed
+
+
+def rigs() -> str:
+    """List the rigs that can be chosen by name, as text."""
+    lines = ["rigs:"]
+    for preset in presets():
+        problem = f" (not here: {preset.problem})" if preset.problem else ""
+        lines.append(f"  {preset.name}: {preset.what}{problem}")
+    return "\n".join(lines)
+
+
+def load_rig(rig: RigLike, session: Session | None = None) -> dict[str, Any]:
+    """Load the checked choice in a TOML file, or of the preset of that name; a mapping is returned
+    as it is.
+
+    Raises InputError for a file or a name that does not exist, an unknown key or driver,
+    DeviceError where a package is missing.
+    """
+    if isinstance(rig, Mapping):
+        return dict(rig)
+    name, path = str(rig), expand_user(rig)
+    if not path.is_file():
+        named = {preset.name: preset.source for preset in presets(session)}
+        if path.suffix.lower() == ".toml":
+            raise InputError(
+                f"there is no file {path}: name a TOML file that describes a rig, or one of"
+                f" {', '.join(named)}"
+            )
+        if name not in named:
+            raise InputError(
+                f"no rig is called {name!r}: use {', '.join(named)}, or name a TOML file"
+            )
+        path = named[name]
+    choice = _read_preset(name, path).choice
+    for each in _driver_names(choice):
+        driver(each)  # raises where it cannot be used
+    return dict(choice)
+
+
+def save_rig(session: Session, name: str, choice: Choice, what: str = "") -> Preset:
+    """Save a choice in the session under a name, in place of an older one. Raises InputError for an
+    invalid one."""
+    check_choice(choice, f"the rig {name}")
+    content = {"what": what, **choice} if what else choice
+    return _read_preset(name, session.save_rig(name, to_toml(content)))
+
+
+def check_choice(choice: Choice, where: str) -> None:
+    """Raise InputError, which names the place `where`, unless `choice` names devices and only
+    options they know."""
+    for key, largest in _LARGEST.items():
+        value = choice.get(key, 1)
+        if (
+            type(value) not in (int, float)
+            or not 0 <= value <= largest
+            or (not value and key != "settle_ms")
+        ):
+            raise InputError(
+                f"{where}: {key} = {value!r} is not a number above 0, up to {largest:g}: correct it"
+            )
+    name = choice.get("name", "")
+    if not isinstance(name, str) or not name.isprintable():
+        raise InputError(f"{where}: name = {name!r} is not text that can be printed: correct it")
+    if "turntable" in choice:
+        _check_device(choice, "turntable", where)
+    if "driver" in choice:
+        given = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
+        if {"camera", "projector"} & set(given):
+            raise InputError(
+                f"{where} names a driver of a whole rig and a camera or a projector: remove one of"
+                " both"
+            )
+        _check_options(str(choice["driver"]), "rig", given, where)
+        return
+    unknown = sorted(set(choice) - {*COMMON_KEYS, "camera", "projector"})
+    if unknown:
+        raise InputError(
+            f"{where} has the unknown key {unknown[0]!r}: use camera, projector,"
+            f" {', '.join(COMMON_KEYS)}"
+        )
+    for part in ("camera", "projector"):
+        _check_device(choice, part, where)
+
+
+def _check_device(choice: Choice, part: str, where: str) -> None:
+    """Raise InputError unless a choice names a driver of the part (camera, projector or turntable)
+    and its options."""
+    device = choice.get(part)
+    if not isinstance(device, Mapping) or "driver" not in device:
+        rather = "" if part == "turntable" else ", or a driver of a rig"
+        raise InputError(f'{where} names no {part}: add [{part}] with driver = "…"{rather}')
+    options = {key: value for key, value in device.items() if key != "driver"}
+    _check_options(str(device["driver"]), part, options, f"{where}, {part}")
+
+
+def _read_preset(name: str, path: Path) -> Preset:
+    """Read and check a preset's TOML; InputError where it is invalid."""
+    choice = read_toml(path)
+    what = choice.pop("what", "")
+    if not isinstance(what, str):
+        raise InputError(f"{path}: what = {what!r} is not text: correct it")
+    check_choice(choice, str(path))
+    return Preset(name, what, choice, path)
+
+
+def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
+    """Raise InputError unless the driver exists, offers the part, and accepts the options."""
+    if name not in drivers():
+        offering = sorted(d.name for d in drivers().values() if driver_factory(d, part))
+        why = DRIVER_PLUGINS.explain_missing(name)
+        raise InputError(
+            f"{where}: no driver is called {name!r}: use one of {', '.join(offering)}{why}"
+        )
+    make = driver_factory(drivers()[name], part)
+    if make is None:
+        raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
+    parameters = inspect.signature(make, eval_str=True).parameters
+    # the program supplies these; they are not entries of a file
+    provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
+    known = [each for each in parameters.values() if each.name not in provided]
+    try:
+        inspect.Signature(known).bind(**options)
+    except TypeError as error:
+        accepted = ", ".join(each.name for each in known) or "none"
+        raise InputError(
+            f"{where}: the driver {name} {error}: correct it; its options are {accepted}"
+        ) from error
+    for key, value in options.items():
+        if isinstance(value, float) and not isfinite(value):
+            raise InputError(f"{where}: {key} = {value!r} is not a number: correct it")
+        if key in parameters and parameters[key].annotation is not inspect.Parameter.empty:
+            try:
+                with suppress(TypeError):  # a path, which the driver checks itself
+                    msgspec.convert(value, parameters[key].annotation)
+            except msgspec.ValidationError as error:
+                raise InputError(
+                    f"{where}: {key} = {value!r} is of the wrong type ({error}): correct it"
+                ) from error
+
+
+def _driver_names(choice: Choice) -> list[str]:
+    """Return the drivers of a choice: that of the whole rig, or those of camera and projector, and
+    of a turntable."""
+    parts = [choice, *(choice.get(part, {}) for part in ("camera", "projector", "turntable"))]
+    return [str(part["driver"]) for part in parts if "driver" in part]

@@ -9,8 +9,7 @@ from facts import raises
 
 from slviewer.devices.drivers import Driver, drivers
 from slviewer.errors import DeviceError, InputError
-from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.rig_presets import check_choice, load_rig, presets, rigs, save_rig
+from slviewer.pipeline.rig_choice import check_choice, load_rig, presets, rigs, save_rig, set_up
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 
