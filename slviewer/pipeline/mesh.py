@@ -18,10 +18,9 @@ from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.operation import Findings, Job, show_found
+from slviewer.pipeline.operation import Callbacks, Findings, Job, show_found, takes_settings
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
-from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge

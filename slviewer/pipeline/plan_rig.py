@@ -23,7 +23,7 @@ from slviewer.evaluation.rig_plan import (
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.settings import Callbacks, takes_settings
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose, blank_board

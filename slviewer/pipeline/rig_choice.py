@@ -1,4 +1,4 @@
-"""Rigs: from what the operator chose to devices, and choices by name.
+"""Rigs: from what the operator chose to devices, choices by name, and recorded captures as a rig.
 
 A choice is a plain mapping, as the session keeps it: ``{"driver": "simulated", "scale": 0.5,
 "seed": 0}`` for a rig that one driver makes, or ``{"name": "bench", "camera": {"driver": …},
@@ -10,7 +10,7 @@ before a device is touched, so that a mistyped option is named and not ignored.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -18,14 +18,21 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
 from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, driver, drivers
 from slviewer.devices.protocols import Rig, Turntable
+from slviewer.devices.replay import Recording, recording_rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
 from slviewer.errors import InputError
-from slviewer.pipeline.replay import Reel, reel
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.feedback import ignore_warnings
+from slviewer.pipeline.import_captures import check_imported_capture, find_captures
+from slviewer.session.capture import Capture
+from slviewer.session.importers.imported import ImportableRecording
+from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user, read_toml
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
@@ -34,6 +41,7 @@ from slviewer.simulation.rig import letter
 from slviewer.target.board import Board
 
 Choice = Mapping[str, Any]
+Recorded = Capture | ImportableRecording
 COMMON_KEYS = ("name", "settle_ms", "focal_px", "exposure_ms", "gain", "turntable")
 """Keys that a choice may hold for any rig: its name, the delay of its light, the nominal focal
 length of its lens in camera px, what its camera is set to by default, and its turntable."""
@@ -41,6 +49,74 @@ RigLike = Mapping[str, Any] | Path | str
 """A choice of devices, a TOML file that holds one, or the name of a preset."""
 FOLDER = "rigs"
 _LARGEST = {"settle_ms": 60_000, "focal_px": 1e6, "exposure_ms": 600_000, "gain": 1e6}
+
+
+class Reel:
+    """A rig that replays recorded captures; it has only the `sequence` of the current one until it
+    is wound on."""
+
+    def __init__(self, recorded: Sequence[Recorded]) -> None:
+        """Play these captures in order."""
+        self.names = [each.name for each in recorded]
+        self._recorded, self._at = recorded, 0
+        self._recording = Recording(*_read_shot(recorded[0]))
+        self.rig: Rig = recording_rig(self._recording)
+
+    @property
+    def sequence(self) -> PatternSequence:
+        """The patterns of the capture that is played."""
+        return self._recording.played[1]
+
+    @property
+    def has_dark(self) -> bool:
+        """Whether that capture holds a dark frame."""
+        return any(frame.kind == "black" for frame in self.sequence.frames)
+
+    def wind_on(self) -> None:
+        """Play the next capture; the first after the last. Raises InputError where it is not of the
+        same rig."""
+        self._at = (self._at + 1) % len(self.names)
+        if len(self.names) > 1:
+            self._recording.play(*_read_shot(self._recorded[self._at]))
+
+
+def _read_shot(recorded: Recorded) -> tuple[np.ndarray, PatternSequence]:
+    """Read the frames (n, h, w) and the sequence of a recorded capture."""
+    if isinstance(recorded, Capture):
+        return recorded.frames, recorded.sequence
+    imported = check_imported_capture(recorded.read(), ignore_warnings)
+    return imported.frames, imported.sequence
+
+
+def reel(
+    source: Path | str,
+    capture: str | None = None,
+    layout: str | None = None,
+    sequence: Path | str | None = None,
+    projector: str | None = None,
+) -> Reel:
+    """Read the captures in `source`, or the one of that name, for a replayed rig.
+
+    `layout` is session or one of `layouts.layouts()`, by default what `source` looks like;
+    `sequence` is the TOML of the layout frames, `projector` its size, such as "912x1140", where it
+    is not the layout's own. Raises InputError, SessionError.
+    """
+    folder, recorded = expand_user(source), list[Recorded]()
+    if layout == "session" or (layout is None and is_session(folder)):
+        with Session.open(folder) as store:
+            recorded += store.captures()
+    else:
+        layout = layout or "detect"
+        recorded += find_captures(folder, layout, sequence, projector=projector).recordings
+    names = [each.name for each in recorded]
+    if capture is not None and capture not in names:
+        raise InputError(
+            f"there is no capture {capture!r} in {folder}: the captures are"
+            f" {', '.join(names) or 'none'}"
+        )
+    if not recorded:
+        raise InputError(f"{folder} holds no capture to play back: name a folder that does")
+    return Reel([each for each in recorded if capture in (None, each.name)])
 
 
 @dataclass(frozen=True)

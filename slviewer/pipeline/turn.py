@@ -37,9 +37,8 @@ from slviewer.pipeline.mesh import MeshResult
 from slviewer.pipeline.mesh import mesh as mesh_merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
 from slviewer.pipeline.open_session import opened_or_made
-from slviewer.pipeline.operation import Findings
+from slviewer.pipeline.operation import Findings, takes_settings
 from slviewer.pipeline.rig_choice import RigLike, RigSetup, load_rig
-from slviewer.pipeline.settings import takes_settings
 from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused
