@@ -384,28 +384,29 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     make = driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
-    parameters = inspect.signature(make, eval_str=True).parameters
+    parameters = inspect.signature(make, eval_str=True).parameters.values()
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return
     # the program supplies these; they are not entries of a file
     provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
-    known = [each for each in parameters.values() if each.name not in provided]
-    try:
-        inspect.Signature(known).bind(**options)
-    except TypeError as error:
-        accepted = ", ".join(each.name for each in known) or "none"
-        raise InputError(
-            f"{where}: the driver {name} {error}: correct it; its options are {accepted}"
-        ) from error
+    known = {each.name: each for each in parameters if each.name not in provided}
+    if unknown := sorted(options.keys() - known.keys()):
+        use = f"use {', '.join(known)}" if known else "it takes none"
+        raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
+    for key, each in known.items():
+        if key not in options and each.default is each.empty:
+            raise InputError(f"{where}: the driver {name} needs {key}: add it")
     for key, value in options.items():
         if isinstance(value, float) and not isfinite(value):
             raise InputError(f"{where}: {key} = {value!r} is not a number: correct it")
-        if key in parameters and parameters[key].annotation is not inspect.Parameter.empty:
-            try:
-                with suppress(TypeError):  # a path, which the driver checks itself
-                    msgspec.convert(value, parameters[key].annotation)
-            except msgspec.ValidationError as error:
-                raise InputError(
-                    f"{where}: {key} = {value!r} is of the wrong type ({error}): correct it"
-                ) from error
+        kind = known[key].annotation
+        try:
+            with suppress(TypeError):  # a path, which the driver checks itself
+                msgspec.convert(value, Any if kind is inspect.Parameter.empty else kind)
+        except msgspec.ValidationError as error:
+            raise InputError(
+                f"{where}: {key} = {value!r} is of the wrong type ({error}): correct it"
+            ) from error
 
 
 def _driver_names(choice: Choice) -> list[str]:
