@@ -91,41 +91,40 @@ class PlannedRig:
 
     def advice(self) -> list[str]:
         """Return what to change, a sentence each."""
-        plan, found = self.plan, []
+        plan, (least_deg, most_deg) = self.plan, _ANGLES_DEG
         ratio = plan.camera_px / plan.projector_px
-        if plan.coverage < _MIN_COVERAGE:
-            wide = (
-                plan.projector_field[0] < plan.camera_field[0]
-                or plan.projector_field[1] < plan.camera_field[1]
-            )
-            change = (
-                "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
-            )
-            found.append(
+        wide = any(np.less(plan.projector_field, plan.camera_field))
+        change = (
+            "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
+        )
+        rules = (
+            (
+                plan.coverage < _MIN_COVERAGE,
                 f"the projector lights {100 * plan.coverage:.0f} % of what the camera sees: choose"
-                f" {change}"
-            )
-        if ratio > 1.5:
-            found.append(
+                f" {change}",
+            ),
+            (
+                ratio > 1.5,
                 f"a camera pixel covers {ratio:.1f} projector columns: choose a longer lens or more"
-                " camera pixels"
-            )
-        if plan.angle_deg < _ANGLES_DEG[0]:
-            found.append(
+                " camera pixels",
+            ),
+            (
+                plan.angle_deg < least_deg,
                 f"the angle of {plan.angle_deg:.0f} degrees is small: a longer baseline lowers the"
-                " noise"
-            )
-        if plan.angle_deg > _ANGLES_DEG[1]:
-            found.append(
+                " noise",
+            ),
+            (
+                plan.angle_deg > most_deg,
                 f"the angle of {plan.angle_deg:.0f} degrees is large: much of a part will be hidden"
-                " from one"
-            )
-        if plan.modulation < 20:
-            found.append(
+                " from one",
+            ),
+            (
+                plan.modulation < 20,
                 f"a modulation of {plan.modulation:.0f} grey levels is weak: expose longer, or"
-                " darken the room"
-            )
-        return found
+                " darken the room",
+            ),
+        )
+        return [advice for applies, advice in rules if applies]
 
 
 @dataclass(frozen=True)
