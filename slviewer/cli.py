@@ -134,10 +134,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
         names={"scans": "scan"},
     ),
     "run-plan": _define_command(
-        "pipeline.inspect_parts:run_plan",
-        "plan",
-        options=JSON,
-        names={"scans": "scan"},
+        "pipeline.inspect_parts:run_plan", "plan", options=JSON, names={"scans": "scan"}
     ),
     "export": _define_command(
         "pipeline.export:export",
@@ -150,16 +147,8 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     "batch": _define_command("pipeline.batch:batch", "sessions", options=JSON),
     "check": _define_command("pipeline.check:check", "capture", options=JSON),
     "accept": _define_command("pipeline.accept:accept", options=JSON),
-    "fetch": _define_command(
-        "pipeline.datasets:fetch",
-        "name",
-        "folder",
-        run=_run_fetch,
-    ),
-    "simulate": _define_command(
-        "pipeline.simulate:simulate",
-        run=_run_simulate,
-    ),
+    "fetch": _define_command("pipeline.datasets:fetch", "name", "folder", run=_run_fetch),
+    "simulate": _define_command("pipeline.simulate:simulate", run=_run_simulate),
     "reproduce": _define_command("validation.reproduce:reproduce", options=JSON),
     "prove": _define_command("validation.prove:prove", options=JSON, names={"cases": "case"}),
     "patterns": _define_command("pipeline.printouts:patterns"),

@@ -78,10 +78,7 @@ def _load(entry: EntryPoint, kind: type) -> tuple[Any, str]:
     if not isinstance(value, kind):
         return None, f"{entry.value} is a {type(value).__name__}, not a {kind.__name__}"
     if name != entry.name:
-        return (
-            None,
-            f"{entry.value} is called {name!r}: use the same name for the entry point",
-        )
+        return (None, f"{entry.value} is called {name!r}: use the same name for the entry point")
     return value, ""
 
 

@@ -14,11 +14,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import (
-    available_models,
-    save_imported_stereo,
-    trash_models,
-)
+from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
 from slviewer.session.capture import Capture

@@ -31,12 +31,7 @@ from slviewer.pipeline.open_session import SessionLike, match_names, next_number
 from slviewer.pipeline.operation import Findings, Found, Job, operation
 from slviewer.pipeline.stored_records import Stored, list_records
 from slviewer.printable import format_csv
-from slviewer.records.inspection import (
-    Characteristic,
-    CharacteristicResult,
-    Inspection,
-    PartResult,
-)
+from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection, PartResult
 from slviewer.records.measurement import Measurement
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.quantities import Quantity

@@ -17,13 +17,7 @@ from slviewer.pipeline.align import load_places
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Warn, stage
-from slviewer.pipeline.models import (
-    ModelName,
-    check_accepted,
-    frame_of,
-    load_model,
-    warn_if_stale,
-)
+from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
 from slviewer.pipeline.open_session import next_number, placed_file
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scale import describe_scale, scale_factor

@@ -12,12 +12,7 @@ from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected, InputError, UsageError
-from slviewer.evaluation.crossvalidation import (
-    FOLDS,
-    gather_results,
-    measure_held_out,
-    split_folds,
-)
+from slviewer.evaluation.crossvalidation import FOLDS, gather_results, measure_held_out, split_folds
 from slviewer.geometry.rigid import move_points
 from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.models import (
