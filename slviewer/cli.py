@@ -57,8 +57,8 @@ def _run_meshing(function: Function, arguments: Arguments) -> None:
     """Call a function that takes a `MeshingPlan`, and show what it returns."""
     from slviewer.surface.meshing import MeshingPlan
 
-    plan = take_options(arguments, MeshingPlan)
-    show_result(function, {**arguments, "plan": plan})
+    arguments["plan"] = take_options(arguments, MeshingPlan)
+    show_result(function, arguments)
 
 
 CONFIG = (
@@ -170,8 +170,7 @@ def make_command(name: str) -> Function | None:
     whose settings without defaults are positional; None where there is none."""
     if name in COMMANDS:
         return COMMANDS[name]()
-    registry = sys.modules.get("slviewer.pipeline.operation")
-    operation = getattr(registry, "OPERATIONS", {}).get(name)
+    operation = getattr(sys.modules.get("slviewer.pipeline.operation"), "OPERATIONS", {}).get(name)
     if operation is None:
         return None
     required = [each.name for each in fields(operation.settings) if each.default is MISSING]

@@ -53,7 +53,6 @@ def wizard(
         from slviewer.gui.app import run
         from slviewer.server.secure import Serving
 
-        serving = Serving(*vars(address).values())
-        run(session, rig, serving, open_browser=not no_browser)
+        run(session, rig, Serving(*vars(address).values()), open_browser=not no_browser)
 
     return start

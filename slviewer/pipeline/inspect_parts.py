@@ -345,8 +345,7 @@ class AlignedPart:
         for _ in range(DATUM_ROUNDS):
             fits = [self._fit(name, as_planned=True) for name in datums]
             self.T_part_scan = datum_frame([fit.feature for fit in fits]) @ self.T_part_scan
-        turned = self.T_part_scan[:3, :3] @ first[:3, :3].T
-        if np.trace(turned) < 1.0:
+        if np.trace(self.T_part_scan[:3, :3] @ first[:3, :3].T) < 1.0:
             raise InputError(
                 "The datums turn the part by more than 90 degrees: place it as the plan's own part"
                 " lay."
@@ -487,8 +486,7 @@ def make_plan(
         alignment = Alignment("3-2-1", None, tuple(names[each] for each in datums), start)  # type: ignore[arg-type]
     elif nominal is not None:
         ideal, source = read_nominal(nominal), next(iter(fits.values())).record
-        surface = load_surface(job, source.source, source.model)
-        T = fit_to_nominal(surface, ideal).T_nominal_scan
+        T = fit_to_nominal(load_surface(job, source.source, source.model), ideal).T_nominal_scan
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
     left_out = [

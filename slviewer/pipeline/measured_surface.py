@@ -169,8 +169,7 @@ def surface_from_cloud(
     if (applied := load_scale_correction(store, fitted.name)) is not None:
         names.append(f"scale/{fitted.name}")
         scale, sigma = float(applied["factor"]), 1e-6 * float(applied["U_ppm"]) / 2
-    restrictions = restriction_inputs(store, [scan], with_region=with_region)
-    inputs = store.input_hashes(*names) | restrictions
+    inputs = store.input_hashes(*names) | restriction_inputs(store, [scan], with_region=with_region)
     shared = None
     if isinstance(fitted, SplinedModel):
         shared = splined_shared(fitted.bundle, cloud.axis, scale, sigma)

@@ -185,9 +185,8 @@ def mesh(settings: MeshSettings) -> MeshResult:
         if gains is not None:
             clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
         painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
-        light = -rig.R.T @ rig.t
         textured = texture_mesh(
-            meshed.mesh, clouds, poses, size=texture, light=light, progress=painting
+            meshed.mesh, clouds, poses, size=texture, light=-rig.R.T @ rig.t, progress=painting
         )
     progress(0.95, f"writing {path.name}")
     if textured is None:

@@ -90,13 +90,12 @@ def report(
         title, subtitle = session_title(data)
         progress(0.7, "reading the frames")
         certificate = make_certificate(store)
-        sections = [*session_sections(data), certificate_section(certificate)]
         write_page(
             out,
             title,
             subtitle,
             session_headlines(data),
-            sections,
+            [*session_sections(data), certificate_section(certificate)],
             partial(certify_page, certificate),
         )
     progress(1.0, "written")

@@ -263,8 +263,7 @@ def presets(session: Session | None = None) -> list[Preset]:
         try:
             preset = _read_preset(name, path)
             missing = [drivers()[each].missing for each in _driver_names(preset.choice)]
-            problem = "; ".join(filter(None, dict.fromkeys(missing)))
-            listed.append(replace(preset, problem=problem))
+            listed.append(replace(preset, problem="; ".join(filter(None, dict.fromkeys(missing)))))
         except InputError as error:
             listed.append(Preset(name, "", {}, path, str(error)))
     return listed

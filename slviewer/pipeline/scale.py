@@ -66,7 +66,6 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
             f" {LARGEST_FACTOR:g}): check the certificate's length, temperature and expansion, and"
             " that its captures show this artefact"
         )
-    calibration = f"calibration/{acceptance.model}"
     meta = {
         "factor": factor,
         "ppm": acceptance.scale.ppm,
@@ -76,7 +75,7 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
         "certificate": acceptance.artefact.certificate,
         "captures": [position.capture for position in acceptance.positions],
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "inputs": store.input_hashes(calibration),
+        "inputs": store.input_hashes(f"calibration/{acceptance.model}"),
     }
     store.save_result(f"scale/{acceptance.model}", meta, {})
     return factor
