@@ -84,10 +84,10 @@ def run_preflight(check_rig: Function, arguments: Arguments) -> None:
         raise UsageError(
             "give --rig to check a rig, or --capture SESSION NAME to check the frames of a capture"
         )
-    with _serve_pages(arguments) as set_up:
-        if recorded is not None:
-            checked = call(check_recorded_rig, session=recorded[0], capture=recorded[1])
-        else:
+    if recorded is not None:
+        checked = call(check_recorded_rig, session=recorded[0], capture=recorded[1])
+    else:
+        with _serve_pages(arguments) as set_up:
             checked = call(check_rig, rig=rig, set_up=set_up, **arguments)
     write_json(json_file, checked.to_dict())
     terminal.print_result(checked.text())

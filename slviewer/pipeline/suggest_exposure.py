@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +28,7 @@ Values = NDArray[np.float64]
 Levels = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-PixelState = Literal["unlit", "measured", "saturated", "dark"]
-STATES: tuple[PixelState, ...] = ("unlit", "measured", "saturated", "dark")
+STATES = ("unlit", "measured", "saturated", "dark")
 """States of a pixel, by their numbers in `ExposureSuggestion.state`."""
 
 _PIXELS = 150_000
