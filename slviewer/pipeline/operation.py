@@ -112,20 +112,20 @@ class Operation(Generic[P, S, R]):
     def __init__(
         self,
         name: str,
-        function: Callable[[Job, S], Iterator[Found[Any]]],
         record: type[R],
         settings: Callable[P, S],
+        function: Callable[[Job, S], Iterator[Found[Any]]],
     ) -> None:
         update_wrapper(self, function)
         self.name, self.function, self.record, self.settings = name, function, record, settings
-        parameters = inspect.signature(settings).parameters.values()
-        session = inspect.Parameter(
-            "session", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=SessionLike
-        )
+        kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        session = inspect.Parameter("session", kind, annotation=SessionLike)
         self.__signature__ = inspect.Signature(
-            [session, *parameters], return_annotation=Findings[R]
+            [session, *inspect.signature(settings).parameters.values()],
+            return_annotation=Findings[R],
         )
         self.__doc__ = describe(function, settings)
+        OPERATIONS[name] = self
 
     def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:
         """Run the operation on a session with these settings, and return what it found."""
@@ -196,13 +196,7 @@ def operation(
 ) -> Callable[[Callable[[Job, S], Iterator[Found[Any]]]], Operation[P, S, R]]:
     """Return a decorator that makes a function the operation of that name, which finds records with
     settings."""
-
-    def register(function: Callable[[Job, S], Iterator[Found[Any]]]) -> Operation[P, S, R]:
-        """Return the function's operation."""
-        OPERATIONS[name] = made = Operation(name, function, record, settings)
-        return made
-
-    return register
+    return partial(Operation, name, record, settings)
 
 
 @dataclass(frozen=True, kw_only=True)
