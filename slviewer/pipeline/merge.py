@@ -240,8 +240,9 @@ def _write_merge(
     comments = (scans, f"calibration {model}", *record.restrictions)
     number = next_number(store, "merge") if settings.out is None else 0
     with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
-        points, colours, normals = surface.points, surface.colours, surface.normals
-        write_ply(written, points, colours, normals, scalars, notes=comments)
+        write_ply(
+            written, surface.points, surface.colours, surface.normals, scalars, notes=comments
+        )
         r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
         notes = [
             f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)",

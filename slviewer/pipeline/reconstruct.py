@@ -21,6 +21,7 @@ from slviewer.pipeline.models import (
     ModelName,
     check_accepted,
     frame_of,
+    load_model,
     load_models,
     load_stereo,
     preferred_model,
@@ -180,9 +181,15 @@ def _write_files(
     notes = (f"scan {capture}, frame: {frame_of(store, cloud.model)}", *notes)
     name = f"{capture}_{cloud.model}{'_mesh' if settings.mesh else ''}.ply"
     with placed_file(store, settings.out, name) as (path, written):
-        colours, directions = cloud.texture[mask], normals(points)[mask]
-        chosen, sigmas = choose_pixels(points, mask), cloud.sigmas(mask)
-        write_ply(written, chosen, colours, directions, sigmas, faces, notes)
+        write_ply(
+            written,
+            choose_pixels(points, mask),
+            cloud.texture[mask],
+            normals(points)[mask],
+            cloud.sigmas(mask),
+            faces,
+            notes,
+        )
         if settings.grid is not None:
             grid = Path(settings.grid)
             grid.parent.mkdir(parents=True, exist_ok=True)
@@ -326,8 +333,7 @@ def verify(
     that is compared.
     """
     store = job.store
-    chosen = load_models(store, settings.models)
-    for each in compare_captures(job, settings, chosen):
+    for each in compare_captures(job, settings):
         name, models = each.capture.name, tuple(each.found.results)
         record = each.found.record(
             each.masked,
@@ -337,16 +343,15 @@ def verify(
         yield Found(
             name, record, {f"error_{m}": r.error_map for m, r in each.found.results.items()}
         )
-        if store.is_writable and (best := chosen.get(preferred_model(store))) is not None:
+        if store.is_writable and (best := preferred_model(store)) in models:
             # by its own best axis, as reconstruct
-            yield _reconstruct_best(store, best, each, settings)
+            yield _reconstruct_best(store, load_model(store, best), each, settings)
 
 
-def compare_captures(
-    job: Job, settings: VerifySettings, chosen: Mapping[str, Model]
-) -> Iterator[ComparedCapture]:
+def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
     """Yield the comparison of models on each capture."""
     store, names = job.store, settings.captures
+    chosen = load_models(store, settings.models)
     check_accepted(store, settings.accept_rejected)
     warn_if_stale(store, job.warn)
     check_capture_sizes(store, names)

@@ -16,7 +16,7 @@ from slviewer.evaluation.compare import Comparison
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergeSettings, merge_scans
-from slviewer.pipeline.models import load_model, load_models, load_stereo
+from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
@@ -103,9 +103,7 @@ def _compare_models(
     """Return the comparison of the models on each capture, in the Letter's depth ranges."""
     settings = replace(settings, models=MODELS, depth_range=letter.DEPTH_RANGE_MM)
     with Session.open(session) as store:
-        compared = compare_captures(
-            Job(store, progress, warn), settings, load_models(store, MODELS)
-        )
+        compared = compare_captures(Job(store, progress, warn), settings)
         return {each.capture.name: each.found for each in compared}
 
 
