@@ -163,11 +163,16 @@ def inspect_surfaces(
             inputs |= surface.inputs
             if surface.organised:
                 scales[surface.model] = surface.scale
-            parts.append(inspect_part(name, plan, surface, nominal))
+            try:
+                aligned = AlignedPart(plan, surface, nominal)
+            except SlviewerError as error:
+                raise InputError(f"not aligned: {error}") from error
+            results = tuple(_measure(each, aligned) for each in plan.characteristic)
         except SlviewerError as error:
             if error.exit_status == 130:  # cancelled
                 raise
-            parts.append(fail_part(name, plan, str(error)))
+            results = tuple(_undecided(each, str(error)) for each in plan.characteristic)
+        parts.append(PartResult(name, results))
     capability = []
     for k, wanted in enumerate(plan.characteristic):
         values = [value for each in parts if (value := each.results[k].value) is not None]
@@ -254,23 +259,6 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
         yield Found(str(number), found, files=files, notes=notes)
 
 
-def inspect_part(
-    part: str, plan: Plan, surface: MeasuredSurface, nominal: Nominal | None
-) -> PartResult:
-    """Measure and judge all characteristics of a plan on a part; what cannot be measured has its
-    reason."""
-    try:
-        aligned = AlignedPart(plan, surface, nominal)
-    except SlviewerError as error:
-        return fail_part(part, plan, f"not aligned: {error}")
-    return PartResult(part, tuple(_measure(each, aligned) for each in plan.characteristic))
-
-
-def fail_part(part: str, plan: Plan, reason: str) -> PartResult:
-    """The result of a part of which nothing could be measured."""
-    return PartResult(part, tuple(_undecided(each, reason) for each in plan.characteristic))
-
-
 def _undecided(wanted: Characteristic, reason: str) -> CharacteristicResult:
     """The result of a characteristic that could not be measured."""
     return CharacteristicResult(wanted.name, None, None, "undecided", reason)
@@ -285,7 +273,7 @@ class AlignedPart:
     """
 
     def __init__(self, plan: Plan, surface: MeasuredSurface, nominal: Nominal | None) -> None:
-        self._features = {each.name: each for each in plan.feature}
+        self.features = {each.name: each for each in plan.feature}
         self._fits: dict[str, FeatureFit] = {}
         self._surface = surface
         self._scan_points = surface.points[surface.measured].astype(np.float64)
@@ -312,10 +300,6 @@ class AlignedPart:
             self._fits[name] = self._fit(name)
         return self._fits[name]
 
-    def definition(self, name: str) -> PlanFeature:
-        """The feature's definition in the plan."""
-        return self._features[name]
-
     def profile(self, name: str) -> Quantity:
         """The profile of a region against the nominal model. Raises InputError without one."""
         if self._nominal_surface is None:
@@ -323,7 +307,7 @@ class AlignedPart:
                 "A profile needs the nominal model: give its file as `nominal` of the plan's"
                 " alignment."
             )
-        within = self._features[name].region.within(self.points)
+        within = self.features[name].region.within(self.points)
         away, towards = self._nominal_surface.signed(self.points[within])
         away[np.abs(away) > self._reach] = np.nan
         return profile_error(self.points[within], away, towards, self.spread, self.shared)
@@ -356,7 +340,7 @@ class AlignedPart:
     def _fit(self, name: str, as_planned: bool = False) -> FeatureFit:
         """Fit a feature to the part as it lies now; a plane faces the camera, or the side that it
         has ``as_planned``."""
-        feature, T = self._features[name], self.T_part_scan
+        feature, T = self.features[name], self.T_part_scan
         if feature.kind == "surface":
             raise InputError(
                 f"{name} is a surface, which has a profile alone: choose a fitted feature."
@@ -404,7 +388,7 @@ def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantit
     kind, (name, *others) = wanted.kind, wanted.features
     if kind == "profile":
         return part.profile(name)
-    fit, planned = part.feature(name), part.definition(name)
+    fit, planned = part.feature(name), part.features[name]
     points = part.points[planned.region.within(part.points)]
     if kind in FORMS:
         return form_error(kind, fit, points, part.shared)  # type: ignore[arg-type]
