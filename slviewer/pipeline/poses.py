@@ -97,7 +97,7 @@ def read_pose(
     return Judged(name, None if refused else observation, refused, evidence)
 
 
-def _read_stored_pose(
+def read_stored_pose(
     store: Session,
     capture: Capture,
     frames: np.ndarray,
@@ -182,7 +182,7 @@ def read_stored_poses(
         if judged is None:
             capture, frames = next(ahead)
             try:
-                judged = _read_stored_pose(
+                judged = read_stored_pose(
                     store, capture, frames.result(), board, smoothing, observed
                 )
             except DamagedError as error:
