@@ -9,7 +9,13 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.gui.measure_drawing import drawn, label, lifted
-from slviewer.gui.panel import NO_SESSION, Choice, PanelPart, StepPanel, scan_labels
+from slviewer.gui.panel import (
+    NO_SESSION,
+    Choice,
+    PanelPart,
+    StepPanel,
+    scan_labels,
+)
 from slviewer.gui.widgets import (
     DECISION_TONES,
     PLOT_PX,
@@ -31,7 +37,7 @@ from slviewer.inspection.section import (
     nearest_on_section,
     radius_through,
 )
-from slviewer.pipeline.measurements import section_lines
+from slviewer.pipeline.measure import section_lines
 from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
 from slviewer.records.measurement import Measurement, list_quantities
 from slviewer.report.canvas import finish_figure, new_figure, style_axes

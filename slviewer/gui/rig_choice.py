@@ -10,8 +10,7 @@ from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError
 from slviewer.gui.panel import PanelPart, Setting
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, note, paragraph, to_html
-from slviewer.pipeline.rig_choice import Choice
-from slviewer.pipeline.rig_presets import Preset, check_choice, presets
+from slviewer.pipeline.rig_choice import Choice, Preset, check_choice, presets
 from slviewer.server.viser_internals import make_private
 from slviewer.wizard.snapshot import RigView, SessionView, Snapshot
 

@@ -24,10 +24,10 @@ from slviewer.pipeline.feedback import part
 from slviewer.pipeline.models import (
     Model,
     ModelName,
-    best_model,
     check_accepted,
     load_model,
     load_stereo,
+    preferred_model,
     warn_if_stale,
 )
 from slviewer.pipeline.open_session import match_names, next_number
@@ -75,7 +75,7 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
     store, still = job.store, settings.still
     certified = read_artefact(settings.artefact)
     check_accepted(store)
-    name = settings.model or best_model(store)
+    name = settings.model or preferred_model(store)
     chosen, factor = load_model(store, name), scale_factor(store, name)
     warn_if_stale(store, job.warn)
     if settings.apply_scale and certified.kind == "plane":

@@ -26,7 +26,7 @@ from slviewer.pipeline.batch_tasks import (
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.settings import Callbacks, takes_settings
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.records.verification import Shape, Verification
 
 INSTALL_COMMAND = "pip install 'slviewer[batch]'"

@@ -17,8 +17,12 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.batch_storage import export_folder, fetch_session
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.operation import Findings, Job
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.records.plain import to_plain
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.atomic import write_bytes
@@ -138,10 +142,11 @@ def _reconstruct(
         mesh=task.do == "mesh",
         accept_rejected=task.accept_rejected,
     )
-    result = reconstruct_capture(Job(store, warn=warnings.append), settings)
-    name = f"{capture}_{result.cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
-    result.ply.rename(made / name)
-    sigma = float(np.median(result.cloud.sigma_z[result.cloud.mask]))
+    with reconstruct_capture(Job(store, warn=warnings.append), settings) as result:
+        cloud = result.cloud
+    name = f"{capture}_{cloud.model}{'_mesh' if task.do == 'mesh' else ''}.ply"
+    result.found.files[0].rename(made / name)
+    sigma = float(np.median(cloud.sigma_z[cloud.mask]))
     return TaskResult("", "", {"points": result.points, "noise mm": sigma, "file": name})
 
 

@@ -36,8 +36,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, match_names, opened_or_made
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.pose_evidence import DecodedPose
-from slviewer.pipeline.poses import Judged, read_pose
+from slviewer.pipeline.poses import DecodedPose, Judged, read_pose
 from slviewer.pipeline.stored_records import load_record
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.verdict import Verdict
@@ -192,7 +191,7 @@ def calibrate_frames(
             pose = DecodedPose(
                 name, sequence, frames, phases, texture_8bit(sequence, frames), board
             )
-            yield read_pose(pose, settings.step_2, examine=True)
+            yield read_pose(pose, settings.step_2)
 
     diagnosed = calibrate_poses_with_evidence(
         read(), len(poses), sequence, board, {}, part(progress, 0, 0.65)

@@ -31,7 +31,7 @@ def calibrate_with_evidence(
     """Read and examine the target poses, calibrate stereo from them, and judge it. ``excluded``:
     {pose: why}."""
     sequence = store.load_capture(names[0]).sequence
-    poses = read_stored_poses(store, names, board, smoothing, examine=True)
+    poses = read_stored_poses(store, names, board, smoothing)
     return calibrate_poses_with_evidence(poses, len(names), sequence, board, excluded, progress)
 
 

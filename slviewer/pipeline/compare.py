@@ -100,7 +100,10 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         raise InputError(f"{path.name} is not the nominal model that it was: it has changed since")
     for note in nominal.notes:
         job.warn(f"{nominal.name}: {note}")
-    on = _load_surface(job, settings)
+    loading = replace(job, progress=part(job.progress, 0.0, 0.4))
+    on = load_surface(
+        loading, settings.scan, settings.model, "", settings.accept_rejected, settings.load
+    )
     points = on.points[on.measured].astype(np.float64)
     check_size(nominal, points)
     result = _measure_deviation(job, settings.reach, on, nominal)
@@ -140,20 +143,6 @@ def _find_nominal(store: Session, nominal: Path | str) -> Path:
     own = store.folder / nominal
     is_own = Path(nominal).parts[:1] == (NOMINALS,) and own.is_file()
     return own if is_own else Path(nominal)
-
-
-def _load_surface(job: Job, settings: CompareSettings) -> MeasuredSurface:
-    """Return the surface to compare: the one at hand, or that of the scan."""
-    if settings.load is not None:
-        return settings.load(job.store)
-    return load_surface(
-        job.store,
-        settings.scan,
-        model=settings.model,
-        accept_rejected=settings.accept_rejected,
-        progress=part(job.progress, 0.0, 0.4),
-        warn=job.warn,
-    )
 
 
 def _measure_deviation(

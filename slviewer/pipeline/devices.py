@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from slviewer.devices.drivers import Driver, available
 from slviewer.errors import SlviewerError
-from slviewer.pipeline.rig_presets import rigs
+from slviewer.pipeline.rig_choice import rigs
 
 
 @dataclass(frozen=True)

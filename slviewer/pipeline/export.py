@@ -16,9 +16,9 @@ from slviewer.pipeline.export_shapes import DescribedShape, merge_name, merge_sh
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scan_edits import refuse_region
-from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import (
     IN_WORDS,

@@ -12,7 +12,7 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.models import frame_of, load_model
-from slviewer.pipeline.open_session import numbered_results
+from slviewer.pipeline.open_session import numbered_names
 from slviewer.pipeline.scale import describe_scale
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.pipeline.stored_records import is_up_to_date
@@ -126,7 +126,7 @@ def _whole_cloud(
 def merge_name(store: Session, name: str) -> str:
     """The merge of that number, or the last one where none is named; raises InputError where it
     does not exist."""
-    there = [result.removeprefix("merge/") for result in numbered_results(store, "merge")]
+    there = numbered_names(store, "merge")
     if not there:
         raise InputError("there is no merge yet: merge scans first")
     if name and name not in there:

@@ -32,8 +32,12 @@ from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.operation import Job
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.verification import Shape
 from slviewer.session.store import Session
@@ -302,14 +306,16 @@ class HostileBench:
         shape: Shape = "plane" if name.startswith("plane") else "sphere"
         with Session.open(run.session) as store:
             job, out = Job(store, warn=run.warnings.append), self.folder / "cloud.ply"
-            done = reconstruct_capture(job, ReconstructSettings(name, self.models[-1], out=out))
+            used = ReconstructSettings(name, self.models[-1], out=out)
+            with reconstruct_capture(job, used) as made:
+                cloud = made.cloud
             try:
                 radius = SPHERE_RADIUS_MM if shape == "sphere" else None
                 settings = VerifySettings([name], shape, self.models, radius=radius)
                 verify.run(store, settings, warn=job.warn)
             except SlviewerError as error:
                 run.warnings.append(str(error))
-        return _match_with_truth(done.cloud, *truth)
+        return _match_with_truth(cloud, *truth)
 
 
 def _match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:

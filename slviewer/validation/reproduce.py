@@ -20,12 +20,12 @@ from slviewer.evaluation.render import Row, render
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
-from slviewer.pipeline.models import load_model, load_models, load_stereo
+from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.pipeline.verify import VerifySettings, compare_captures
 from slviewer.records.plain import to_plain
 from slviewer.records.verification import Shape, centre_distances_mm
 from slviewer.report.data import (
@@ -200,19 +200,19 @@ def reproduce(
                     letter.DEPTH_RANGE_MM,
                     letter.SPHERE_RADIUS_MM,
                 ),
-                load_models(store, MODELS),
             )
             comparisons.append({each.capture.name: each.found for each in compared})
         planes, spheres = comparisons
         settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
-        merged = merge_scans(Job(store, part(progress, 0.82, 0.9)), settings)
+        with merge_scans(Job(store, part(progress, 0.82, 0.9)), settings) as merged:
+            spacings = _compare_spacings(session, spheres)
     result = Reproduction(
         quick=quick,
         stereo=stereo,
         pixelwise=pixelwise,
         planes=planes,
         spheres=spheres,
-        spacings_mm=_compare_spacings(session, spheres),
+        spacings_mm=spacings,
         merged=merged,
         report=out / "report.html",
     )
