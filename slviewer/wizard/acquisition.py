@@ -67,11 +67,12 @@ class CaptureRequest:
 
 @dataclass(frozen=True)
 class _Task:
-    """Work with the open rig other than a capture."""
+    """Work with the open rig; `frames`: of a capture, 0 for other work."""
 
     name: str
     work: Callable[[Rig, Progress], Any]
     done: Callable[[Any], None]
+    frames: int = 0
 
 
 class Acquisition:
@@ -95,7 +96,7 @@ class Acquisition:
         self._notices, self._changed, self._offer = notices, changed, offer
         self._retry_s, self._preview_s, self._clock = retry_s, 1 / previews_per_s, clock
         self._condition = threading.Condition()
-        self._requests: deque[CaptureRequest | _Task] = deque()
+        self._requests: deque[_Task] = deque()
         self._wanted: Rig | None = None
         self._settings: CameraSettings | None = None
         self._light: tuple[str, PatternSequence | None] = ("white", None)
@@ -125,7 +126,7 @@ class Acquisition:
             self._requests.clear()
             self._cancel = self._view.capture is not None
             self._light = ("white", None)  # a pattern is made for one projector
-            self._view = RigView(light="white", capture=self._view.capture)
+            self._view = RigView(capture=self._view.capture)
             if rig is not None:
                 self._view = replace(
                     self._view, state="opening", name=rig.name, camera=rig.camera.size,
@@ -170,7 +171,17 @@ class Acquisition:
 
     def capture(self, request: CaptureRequest) -> None:
         """Queue a capture. Raises DeviceError where no rig is open."""
-        self._queue_request(request)
+
+        def work(rig: Rig, _: Progress) -> None:
+            """Capture the frames, and save them."""
+            out = self._get_buffer(rig, request.frames)
+            request.save(
+                capture_with_texture(
+                    rig, request.sequence, request.exposures_ms, out, self._report_frame
+                )
+            )
+
+        self._queue(_Task(request.name, work, lambda _: request.saved(), request.frames))
 
     def run_task(
         self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]
@@ -182,7 +193,7 @@ class Acquisition:
         progress appears in `view().capture`, and raises Cancelled. What the task raises is reported
         like a capture's fault. Raises DeviceError where no rig is open.
         """
-        self._queue_request(_Task(name, task, done))
+        self._queue(_Task(name, task, done))
 
     def stream(self, stream: Stream) -> None:
         """Show and grab a stream repeatedly, in place of previews, until it is stopped.
@@ -245,16 +256,13 @@ class Acquisition:
         if self._thread is not None:
             self._thread.join(5.0)
 
-    def _queue_request(self, request: CaptureRequest | _Task) -> None:
-        """Append a capture or task to the queue, and end the stream. Raises DeviceError where no
-        rig is open."""
+    def _queue(self, task: _Task) -> None:
+        """Append a task to the queue, and end the stream. Raises DeviceError where no rig is
+        open."""
         with self._condition:
             if self._view.state != "open":
-                raise DeviceError(
-                    f"{request.name} is not possible: {self._view.fault or _NOT_OPEN}"
-                )
-            self._requests.append(request)
-            self._condition.notify_all()
+                raise DeviceError(f"{task.name} is not possible: {self._view.fault or _NOT_OPEN}")
+            self._requests.append(task)
         self.stop_stream()
 
     # on the thread
@@ -271,8 +279,8 @@ class Acquisition:
                 if self._is_open and self._rig is self._wanted and self._requests:
                     request = self._requests.popleft()
                     self._cancel = False
-                    n = request.frames if isinstance(request, CaptureRequest) else 0
-                    self._view = replace(self._view, capture=CaptureProgress(request.name, 0, n, 0))
+                    progress = CaptureProgress(request.name, 0, request.frames, 0)
+                    self._view = replace(self._view, capture=progress)
                 wanted, stream = self._wanted, self._stream
             rig = self._rig
             try:
@@ -385,31 +393,21 @@ class Acquisition:
             self._next_preview = self._clock() + 1 / STREAM_PREVIEWS_PER_S
             self._offer(white, stated_full_scale(rig.camera))
 
-    def _serve_request(self, rig: Rig, request: CaptureRequest | _Task) -> None:
-        """Execute a queued capture or task and report how it ended; a DeviceError is raised to the
-        caller."""
+    def _serve_request(self, rig: Rig, task: _Task) -> None:
+        """Execute a queued task and report how it ended; a DeviceError is raised to the caller."""
         try:
             self._prepare_devices(rig)
-            self._shown = None  # the request shows and sets its own from here on
-            if isinstance(request, CaptureRequest):
-                out = self._get_buffer(rig, request.frames)
-                request.save(
-                    capture_with_texture(
-                        rig, request.sequence, request.exposures_ms, out, self._report_frame
-                    )
-                )
-                request.saved()
-            else:
+            self._shown = None  # the task shows and sets its own from here on
+            if not task.frames:
                 self._applied = None
-                request.done(request.work(rig, self._report_stage))
+            task.done(task.work(rig, self._report_stage))
         except Cancelled:
-            self._notices.add("info", f"{request.name}: cancelled")
-        except TurntableError as error:  # camera and projector work without it
-            self._notices.add("error", f"{request.name}: {error}")
-        except DeviceError:
-            raise
-        except SlviewerError as error:  # the disk or the patterns, not the devices
-            self._notices.add("error", f"{request.name}: {error}")
+            self._notices.add("info", f"{task.name}: cancelled")
+        except SlviewerError as error:
+            # the disk, the patterns or the turntable: camera and projector work without these
+            if isinstance(error, DeviceError) and not isinstance(error, TurntableError):
+                raise
+            self._notices.add("error", f"{task.name}: {error}")
         finally:
             with self._condition:
                 self._view = replace(self._view, capture=None)  # whichever rig is wanted by now

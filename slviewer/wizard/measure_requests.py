@@ -29,15 +29,15 @@ from slviewer.session.atomic import rename
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
+from slviewer.wizard.engine import Engine, request
 from slviewer.wizard.jobs import Reporter
-from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import Surfaces
 
 TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
-class MeasureRequests(RequestHandler):
+class MeasureRequests(Engine):
     """Requests that measure on a scan or a merge, on the worker, and edit the list of
     measurements."""
 
@@ -46,7 +46,7 @@ class MeasureRequests(RequestHandler):
     def surface(self, name: str) -> MeasuredSurface:
         """Load a scan or merge to measure on, which is slow. Raises InputError where it cannot be
         measured on."""
-        return self._surfaces.load(self._engine.store, name)
+        return self._surfaces.load(self._store, name)
 
     @request(MEASURING)
     def measure(
@@ -108,7 +108,7 @@ class MeasureRequests(RequestHandler):
     ) -> None:
         """Save an uploaded file in a folder of the session, if ``read`` can read it, which
         describes it."""
-        store, plain = self._engine.store, plain_name(name)
+        store, plain = self._store, plain_name(name)
 
         def work(report: Reporter) -> str:
             """Write the upload to its place if it can be read; returns its description."""
@@ -129,7 +129,7 @@ class MeasureRequests(RequestHandler):
     def run_plan(self, plan: str, *surfaces: str) -> None:
         """Inspect surfaces, each a part, by a plan of `SessionView.plans`; also writes the report
         into the exports."""
-        store = self._engine.store
+        store = self._store
         if plan not in list_plans(store.folder):
             raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
         if not surfaces:
@@ -148,7 +148,7 @@ class MeasureRequests(RequestHandler):
     ) -> None:
         """Measure a surface's deviation from one of the session's nominal models after best fit;
         also writes a PLY."""
-        path = self._engine.store.folder / NOMINALS / safe_name(nominal)
+        path = self._store.folder / NOMINALS / safe_name(nominal)
         if not path.is_file():
             raise InputError(
                 f"there is no nominal model {nominal!r} in the session: upload it first"
@@ -157,29 +157,29 @@ class MeasureRequests(RequestHandler):
 
         def failed(error: BaseException) -> None:
             """Report why, in the words of the panel."""
-            self._engine.notices.add_failure(COMPARING, _reword(error))
+            self._notices.add_failure(COMPARING, _reword(error))
 
         self._run(COMPARING, compare, settings, "measurements", failed)
 
     @request("Renaming")
     def relabel_measurement(self, identity: str, name: str) -> None:
         """Rename a measurement; an empty name restores its original name."""
-        rename_measurement(self._engine.store, identity, name)
+        rename_measurement(self._store, identity, name)
 
     @request("Deleting")
     def delete_measurement(self, identity: str) -> None:
         """Move a measurement to the trash; results made from it are stale until it is restored."""
-        trash_measurement(self._engine.store, identity)
+        trash_measurement(self._store, identity)
 
     @request("Restoring")
     def undo_delete(self) -> None:
         """Restore the measurement that was deleted last."""
-        restore_measurement(self._engine.store)
+        restore_measurement(self._store)
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:
         """Write all measurements as CSV into the exports."""
-        store = self._engine.store
+        store = self._store
 
         def work(report: Reporter) -> str:
             """Write the CSV into the exports; returns a sentence with the number of
@@ -195,7 +195,7 @@ class MeasureRequests(RequestHandler):
     def make_inspection_plan(self) -> None:
         """Write an inspection plan of the fits and relations into the exports, to repeat them on
         other scans."""
-        store = self._engine.store
+        store = self._store
 
         def work(report: Reporter) -> str:
             """Write the plan into the exports; returns a sentence with what to do with it."""

@@ -18,6 +18,7 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.pipeline.calibration_verdict import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
+    POSES_FOR_PIXELWISE,
     accepts_rejected,
     available_models,
     explain_board,
@@ -40,12 +41,12 @@ from slviewer.session.names import join_names, natural_key
 from slviewer.session.scan_edits import list_edits, load_region, restriction_inputs
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard.export_files import list_exports
 from slviewer.wizard.notices import describe_failure
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import PlanInput, PoseFeatures, PosePlan
 from slviewer.wizard.snapshot import (
     CalibrationView,
+    ExportView,
     PoseState,
     PoseView,
     RigView,
@@ -53,7 +54,6 @@ from slviewer.wizard.snapshot import (
     SessionView,
 )
 from slviewer.wizard.surfaces import list_nominals
-from slviewer.wizard.tasks import missing_for_splined
 
 MOST_CACHED = 500
 T = TypeVar("T")
@@ -81,15 +81,10 @@ class SessionReader:
         self._planner = planner
         self._cache: dict[Any, Any] = {}
         self._lock = threading.Lock()
-        self._thumbnails: dict[str, bytes] = {}
+        self.thumbnails: dict[str, bytes] = {}  # by the content hash of a capture
         self._unreadable: dict[tuple[str, str, str], str] = {}  # by name, content hash and target
         self._features: dict[tuple[str, str], PoseFeatures] = {}  # of poses that are not judged yet
         self._faults: list[str] = []  # what could not be read this time
-
-    def add_thumbnail(self, capture: Capture, jpeg: bytes) -> None:
-        """Store the thumbnail of a capture."""
-        with self._lock:
-            self._thumbnails[capture.hash] = jpeg
 
     def add_features(self, capture: Capture, target: str, observation: Observation) -> None:
         """Store the features of a pose whose frames are still being examined, for the plan of the
@@ -113,10 +108,6 @@ class SessionReader:
     def patterns(self) -> str:
         """Return the name of the pattern sequence."""
         return str(self.session.valid_decision("patterns") or DEFAULT_PATTERNS)
-
-    def has_thumbnail(self, capture: Capture) -> bool:
-        """Whether a thumbnail of the capture is stored."""
-        return capture.hash in self._thumbnails
 
     def needs_judging(self, capture: Capture, target: str) -> bool:
         """Whether this is a target pose whose features were not read with this target yet."""
@@ -189,7 +180,11 @@ class SessionReader:
             ),
             nominals=list_nominals(session.folder),
             plans=list_plans(session.folder),
-            exports=list_exports(session),
+            exports=tuple(
+                ExportView(each.name, each, each.stat().st_size)
+                for each in sorted((session.folder / "exports").glob("[!.]*"))
+                if each.is_file()
+            ),
             exposures_ms=self.exposures_ms(),
             is_linear=self.levels() is not None,
             aligns_scans=bool(session.valid_decision("align_scans")),
@@ -322,7 +317,7 @@ class SessionReader:
                 if calibration and state == "used"
                 else None
             ),
-            thumbnail=self._thumbnails.get(pose.hash, b""),
+            thumbnail=self.thumbnails.get(pose.hash, b""),
         )
 
     def _determine_pose_state(
@@ -498,7 +493,7 @@ class SessionReader:
             created=str(capture.meta.get("created", "")),
             cloud="absent" if found is None else "stale" if found.stale else "fresh",
             figures=Reconstruction() if found is None else found.record,
-            thumbnail=self._thumbnails.get(capture.hash, b""),
+            thumbnail=self.thumbnails.get(capture.hash, b""),
             placement=place.record if place is not None and not place.stale else None,
             turn_step=capture.turn_step,
             edits=edits,
@@ -550,3 +545,19 @@ def _make_features(
 def _has_changed(used: Mapping[str, object], now: Mapping[str, object]) -> bool:
     """Whether any name of `used` is missing from `now` or has another value there."""
     return any(now.get(name) != value for name, value in used.items())
+
+
+def missing_for_splined(session: Session) -> str:
+    """Describe what the poses lack for the splined model; empty where they allow it."""
+    excluded = session.excluded()
+    poses = [capture for capture in session.captures("calibration") if capture.name not in excluded]
+    both = sum(len(capture.sequence.axes) == 2 for capture in poses)
+    if both >= POSES_FOR_PIXELWISE:
+        return ""
+    needed = f"it needs {POSES_FOR_PIXELWISE} target poses with patterns along both axes"
+    if len(poses) < POSES_FOR_PIXELWISE:
+        return f"{needed}, and there are {both}: capture more"
+    return (
+        f"{needed}, and only {both} of {len(poses)} have them: choose patterns of both axes, and"
+        " capture more"
+    )

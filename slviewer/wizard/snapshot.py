@@ -323,16 +323,16 @@ class Snapshot:
     """Everything at one moment; `version` grows with each change. `session` is None until one is
     open."""
 
-    version: int
-    session: SessionView | None
-    rig: RigView
-    world: WorldView | None  # None for real devices
-    job: JobView | None
-    notices: tuple[Notice, ...]
-    steps: tuple[StepView, ...]
-    space: Space | None
-    hands_free: bool
-    autopilot: str  # what it does now; empty where it is off
+    version: int = 0
+    session: SessionView | None = None
+    rig: RigView = RigView()
+    world: WorldView | None = None  # None for real devices
+    job: JobView | None = None
+    notices: tuple[Notice, ...] = ()
+    steps: tuple[StepView, ...] = ()
+    space: Space | None = None
+    hands_free: bool = False
+    autopilot: str = ""  # what it does now; empty where it is off
     preflight: Preflight | None = None  # result of the last check of the rig in use
     exposure_change: ExposureChange | None = (
         None  # the last suggestion for the rig in use, unless it was undone

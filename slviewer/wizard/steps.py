@@ -5,7 +5,7 @@ Everything here follows from the session's files and the rig.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from slviewer.calibration.soundness import MIN_POSES
 from slviewer.evaluation.render import format_count
@@ -32,9 +32,9 @@ COVERED, MANY_POSES = 0.75, 15
 class Facts:
     """State that the steps depend on; `session` is None until one is open."""
 
-    session: SessionView | None
-    rig: RigView
-    space: Space | None
+    session: SessionView | None = None
+    rig: RigView = field(default_factory=RigView)
+    space: Space | None = None
     brightness: Brightness = ""
 
     @property
