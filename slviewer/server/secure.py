@@ -3,9 +3,8 @@ to change."""
 
 import ipaddress
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from slviewer.errors import UsageError
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
-from slviewer.server.binding import RESOLVE_SECONDS, listen, network_address
-from slviewer.server.connection import REQUEST_SECONDS, STALL_SECONDS, Connection, quiet_logger
+from slviewer.server.binding import listen, network_address
+from slviewer.server.connection import REQUEST_SECONDS, Connection, quiet_logger
 from slviewer.server.credentials import (
     TlsCertificate,
     load_tokens,
@@ -27,7 +26,7 @@ from slviewer.server.credentials import (
 )
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
-from slviewer.server.limits import CONNECTIONS, Admissions, limit_log, raise_descriptor_limit
+from slviewer.server.limits import Admissions, limit_log, raise_descriptor_limit
 from slviewer.server.uploads import UploadBudget
 from slviewer.server.viser_internals import ViserClient
 
@@ -111,9 +110,9 @@ class SafeServer:
         """A link for the operator's browser that can be opened once, soon."""
         return f"{self.origin}/#{self.access.issue_one_time_token()}"
 
-    def renew_links(self, client_id: int, leaving_s: float = LEAVING_SECONDS) -> None:
+    def renew_links(self, client_id: int) -> None:
         """Replace all tokens, close all connections, and lead the operator's client that requested
-        it to its new page, for which it has `leaving_s`.
+        it to its new page, for which it has LEAVING_SECONDS.
 
         Raises OSError where the tokens come from a file that cannot be replaced; they are replaced
         here nevertheless.
@@ -123,7 +122,9 @@ class SafeServer:
         self.access.renew()
         viser_internals.call_soon(self.viser, 0.0, self.admissions.close_all, leaving)
         client.navigate(f"/#{self.access.issue_one_time_token()}")
-        viser_internals.call_soon(self.viser, leaving_s, self.admissions.close_all, None, leaving)
+        viser_internals.call_soon(
+            self.viser, LEAVING_SECONDS, self.admissions.close_all, None, leaving
+        )
         if self.serving.token_file is not None:
             save_tokens(
                 self.serving.token_file,
@@ -173,15 +174,8 @@ def serve(
     *,
     label: str | None = None,
     upload_limit: int = 256 * 10**6,
-    request_s: float = REQUEST_SECONDS,
-    stall_s: float = STALL_SECONDS,
-    resolve_s: float = RESOLVE_SECONDS,
-    connections: Mapping[Role, int] = CONNECTIONS,
 ) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
-
-    A browser has `request_s` to send its request, the reader of a file `stall_s` to take some of
-    it, and a name server `resolve_s` to answer; `connections` bounds the open ones by role.
 
     Raises SlviewerError within two seconds where the address can't be served, where viser is not
     the pinned one, and where tokens or certificate cannot be used.
@@ -196,11 +190,11 @@ def serve(
     context = certificate.context() if certificate else None
     limit_log()
     raise_descriptor_limit()
-    sock = listen(serving.host, serving.port, resolve_s)
+    sock = listen(serving.host, serving.port)
     address, port = sock.getsockname()[:2]
     try:
         access = Access(port, tokens, serving.names, tls=certificate is not None)
-        admissions = Admissions(sock, connections)
+        admissions = Admissions(sock)
         device_pages: dict[Role, DevicePage] = {}
         downloads = Downloads()
         is_trusted = certificate is not None and not certificate.self_made
@@ -232,7 +226,7 @@ def serve(
             options.update(
                 sock=sock,
                 process_request=middleware.answer,
-                create_connection=partial(Connection, request_s=request_s, stall_s=stall_s),
+                create_connection=Connection,
                 max_size=MESSAGE_LIMIT,
                 server_header=None,
                 # of a crowd: a browser whose request does not fit in tries again after a second
@@ -241,7 +235,7 @@ def serve(
                 logger=quiet_logger(),
             )
             if context is not None:
-                options.update(ssl=context, ssl_handshake_timeout=request_s)
+                options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
             return serve_websockets(handle, **options)
 
         server = viser_internals.start(serve_viser, address, port, label)

@@ -16,7 +16,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.capture import check_space, depth_axis, save_frames
-from slviewer.pipeline.feedback import Progress
+from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.import_captures import Role, describe_import, import_captures
 from slviewer.pipeline.turn import (
     FULL_TURN_DEG,
@@ -288,7 +288,8 @@ class CaptureRequests(RigRequests, ResultRequests):
 
         def work(report: Reporter) -> list[str]:
             """Import the folder's captures; returns their names."""
-            return self._import(store, expand_user(path), layout, role, report, options)
+            guarded = store.guarded(report.saving)
+            return self._import(guarded, expand_user(path), layout, role, report, options)
 
         self._submit(IMPORTING, work, partial(describe_import, role=role))
 
@@ -314,14 +315,12 @@ class CaptureRequests(RigRequests, ResultRequests):
                 folder = staged / _make_capture_name(Path(name).stem)
                 folder.mkdir()
                 try:
-                    unpacking = report.within(0, 0.2)
+                    unpacking = part(report, 0, 0.2)
                     source, warnings = unpack(archive, folder, lambda done: unpacking(done, words))
                     for warning in warnings:
                         self._warner("frames")(warning)
-                    importing = report.within(0.2, 1)
-                    return self._import(
-                        store, source, layout, role, importing, {"origin": name, **options}
-                    )
+                    guarded, origin = store.guarded(report.saving), {"origin": name, **options}
+                    return self._import(guarded, source, layout, role, part(report, 0.2, 1), origin)
                 finally:
                     atomic.discard(staged)
 
@@ -333,13 +332,13 @@ class CaptureRequests(RigRequests, ResultRequests):
         source: Path,
         layout: str,
         role: Role,
-        report: Reporter,
+        progress: Progress,
         options: dict[str, Any],
     ) -> list[str]:
         """Import the captures in a folder, and queue their processing; returns their names."""
         names = import_captures(
-            source, store.guarded(report.saving), layout, role=role, progress=report,
-            warn=self._warner("frames"), **options,
+            source, store, layout, role=role, progress=progress, warn=self._warner("frames"),
+            **options,
         )  # fmt: skip
         self._queue_processing()
         return names

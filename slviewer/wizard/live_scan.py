@@ -41,6 +41,7 @@ from slviewer.wizard.snapshot import LiveView
 REPORTS_PER_S = 3.0
 # rates are averages over this time, or over the last two clouds where these came more slowly
 _AVERAGED_S = 2.0
+_MOST_EVENTS = 1000  # whose times are remembered
 _RELOAD_S = 1.0  # between two checks whether the calibration has changed
 _RELEASE_S = 30.0  # between two releases of freed memory
 
@@ -80,8 +81,9 @@ class LiveScan:
         self._publish, self._changed = publish, changed
         self.stream = Stream(sequence, changed)
         self._lock = threading.Lock()
-        self._made: deque[float] = deque()
-        self._sent: deque[tuple[float, float]] = deque()
+        # time and latency, s, of the latest clouds
+        self._made: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
+        self._sent: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
         self._points, self._number, self._reported = 0, 0, 0.0
         self._model: LiveCalibration | None = None
         self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
@@ -90,8 +92,9 @@ class LiveScan:
         """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
         usable calibration."""
         self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
+        self._model.current()
         self._acquisition.stream(self.stream)
-        self._made.append(time.monotonic())  # the first cloud has a rate too
+        self._made.append((time.monotonic(), 0.0))  # the first cloud has a rate too
         self._thread.start()
 
     @property
@@ -104,20 +107,15 @@ class LiveScan:
         now = time.monotonic()
         with self._lock:
             self._sent.append((now, now - cloud.begun))
-            _drop_old(self._sent, now)
 
     def figures(self) -> LiveView:
         """Return the rates and the median latency of the last seconds."""
         now = time.monotonic()
         with self._lock:
-            _drop_old(self._made, now)
-            _drop_old(self._sent, now)
-            latency_s = float(np.median([late for _, late in self._sent])) if self._sent else None
+            rates = _compute_rate(self._made, now), _compute_rate(self._sent, now)
+            late_s = [late for _, late in self._sent]
             return LiveView(
-                clouds_per_s=_compute_rate(self._made, now),
-                shown_per_s=_compute_rate([at for at, _ in self._sent], now),
-                latency_ms=None if latency_s is None else 1e3 * latency_s,
-                points=self._points,
+                *rates, 1e3 * float(np.median(late_s)) if late_s else None, self._points
             )
 
     def _serve(self) -> None:
@@ -133,8 +131,7 @@ class LiveScan:
                 return
             now = time.monotonic()
             with self._lock:
-                self._made.append(now)
-                _drop_old(self._made, now)
+                self._made.append((now, now - shot.begun))
             if not self.is_running:
                 return
             self._publish(cloud)
@@ -187,7 +184,9 @@ class LiveModel:
                 "the live scan", (width, height), self.sequence.projector_size, self.calibrated
             )
         if self._fast is not None:
-            scan = self._fast.run(frames, out=self._reuse_workspace())
+            before = self._before  # whose other arrays are used again
+            out = None if before is None else replace(before, points=np.empty_like(before.points))
+            scan = self._fast.run(frames, out=out)
             self._before, points = scan, scan.points
             phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
         else:
@@ -199,11 +198,6 @@ class LiveModel:
             points *= np.float32(self.factor)
         return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
 
-    def _reuse_workspace(self) -> PassResult | None:
-        """Return the previous result with new points, to reuse its other arrays; None at first."""
-        before = self._before
-        return None if before is None else replace(before, points=np.empty_like(before.points))
-
 
 class LiveCalibration:
     """The session's preferred calibration, loaded again when it changes."""
@@ -212,20 +206,15 @@ class LiveCalibration:
         self._store, self._sequence, self._axis = store, sequence, axis
         self._key: tuple[object, ...] = ()
         self._loaded = 0.0
-        self._current = self._load()
+        self._current: LiveModel | None = None
 
     def current(self) -> LiveModel:
         """Return the model, checked for changes at most a second ago. Raises SlviewerError where
         none is usable."""
-        if time.monotonic() - self._loaded > _RELOAD_S:
-            self._current = self._load()
-        return self._current
-
-    def _load(self) -> LiveModel:
-        """Load the session's preferred model and its scale, or return the current one where neither
-        has changed."""
-        store = self._store
-        self._loaded = time.monotonic()
+        now, store = time.monotonic(), self._store
+        if self._current is not None and now - self._loaded <= _RELOAD_S:
+            return self._current
+        self._loaded = now
         name = preferred_model(store)
         factor = scale_factor(store, name)
         key = (
@@ -234,7 +223,7 @@ class LiveCalibration:
             accepts_rejected(store),
             *sorted(store.input_hashes(f"calibration/{name}").items()),
         )
-        if key == self._key:
+        if self._current is not None and key == self._key:
             return self._current
         check_accepted(store, accepts_rejected(store))
         model = load_model(store, name)
@@ -243,25 +232,17 @@ class LiveCalibration:
                 f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture"
                 " a scan"
             )
-        self._key = key
-        return LiveModel(self._sequence, self._axis, model, factor, load_stereo(store).rig)
+        self._key, rig = key, load_stereo(store).rig
+        self._current = LiveModel(self._sequence, self._axis, model, factor, rig)
+        return self._current
 
 
-def _compute_rate(times: "deque[float] | list[float]", now: float) -> float:
-    """Return the rate per second of sorted times in s, less where none has come for long; 0 for
-    fewer than two."""
-    return (
-        (len(times) - 1) / max(times[-1] - times[0], now - times[-1], 1e-6)
-        if len(times) > 1
-        else 0.0
-    )
-
-
-def _drop_old(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
-    """Remove entries whose time in s is older than the averaging window from the front of a deque,
-    but the last two."""
-    while (
-        len(times) > 2
-        and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S
-    ):
-        times.popleft()
+def _compute_rate(events: deque[tuple[float, float]], now: float) -> float:
+    """Return the rate per second of events, (time in s, latency), less where none has come for
+    long; 0 for fewer than two. Those before the averaging window are removed, but the last two."""
+    while len(events) > 2 and now - events[0][0] > _AVERAGED_S:
+        events.popleft()
+    if len(events) < 2:
+        return 0.0
+    first, last = events[0][0], events[-1][0]
+    return (len(events) - 1) / max(last - first, now - last, 1e-6)

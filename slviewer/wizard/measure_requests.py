@@ -3,6 +3,7 @@ model."""
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.compare import CompareSettings, compare
 from slviewer.pipeline.measure import MeasureSettings, What, measure
-from slviewer.pipeline.measured_surface import LoadSurface, MeasuredSurface, Place
+from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.measurements import (
     export_measurements,
     rename_measurement,
@@ -57,32 +58,19 @@ class MeasureRequests(Engine):
             {} if region is None else from_plain(to_plain(region), MeasuredRegion).to_settings()
         )
         chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
-        self._run(
-            MEASURING,
-            measure,
-            MeasureSettings(on, what, **chosen, load=self._loader(on)),
-            "measurements",
-        )
+        settings = MeasureSettings(on, what, **chosen, load=partial(self._surfaces.load, name=on))
+        self._run(MEASURING, measure, settings, "measurements")
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:
         """Measure angles and distances between two points or fits, by their ids."""
         self._run(MEASURING, relate, RelateSettings(a, b), "measurements")
 
-    def _loader(self, on: str) -> LoadSurface:
-        """Return what loads a surface, unless it is the last one that was."""
-        return lambda store: self._surfaces.load(store, on)
-
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
         """Save an uploaded nominal model in the session, if it can be read."""
-        self._save_upload(
-            "Reading the nominal model",
-            NOMINALS,
-            name,
-            content,
-            lambda path: read_nominal(path).text(),
-        )
+        title = "Reading the nominal model"
+        self._save_upload(title, NOMINALS, name, content, lambda path: read_nominal(path).text())
 
     @request("Reading the plan")
     def upload_plan(self, name: str, content: bytes) -> None:
@@ -134,13 +122,8 @@ class MeasureRequests(Engine):
             raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
         if not surfaces:
             raise InputError("no scan to inspect: reconstruct one in the step Scan first")
-
-        self._run(
-            "Running the plan",
-            run_plan,
-            RunPlanSettings(store.folder / plan, surfaces),
-            "measurements",
-        )
+        settings = RunPlanSettings(store.folder / plan, surfaces)
+        self._run("Running the plan", run_plan, settings, "measurements")
 
     @request(COMPARING)
     def compare_nominal(
@@ -153,7 +136,8 @@ class MeasureRequests(Engine):
             raise InputError(
                 f"there is no nominal model {nominal!r} in the session: upload it first"
             )
-        settings = CompareSettings(on, path, tolerance_mm, units, load=self._loader(on))
+        load = partial(self._surfaces.load, name=on)
+        settings = CompareSettings(on, path, tolerance_mm, units, load=load)
 
         def failed(error: BaseException) -> None:
             """Report why, in the words of the panel."""
@@ -181,37 +165,41 @@ class MeasureRequests(Engine):
         """Write all measurements as CSV into the exports."""
         store = self._store
 
-        def work(report: Reporter) -> str:
-            """Write the CSV into the exports; returns a sentence with the number of
-            measurements."""
-            with store.guarded(report.saving).staged_export(TABLE) as path:
-                count = export_measurements(store, path)
-            report(1.0, "written")
-            return f"{TABLE} is ready to download: {count} measurement{'s' * (count != 1)}"
+        def write(path: Path) -> str:
+            """Write the CSV; returns the number of measurements in words."""
+            return format_count(export_measurements(store, path), "measurement")
 
-        self._submit("Writing the table", work, str)
+        self._submit_export("Writing the table", TABLE, write)
 
     @request("Making the plan")
     def make_inspection_plan(self) -> None:
         """Write an inspection plan of the fits and relations into the exports, to repeat them on
         other scans."""
-        store = self._store
+        store, warn = self._store, self._warner("measurements")
 
-        def work(report: Reporter) -> str:
-            """Write the plan into the exports; returns a sentence with what to do with it."""
-            made = make_plan(
-                store, TOLERANCE_MM, name=store.folder.name, warn=self._warner("measurements")
-            )
-            with store.guarded(report.saving).staged_export(PLAN) as path:
-                write_plan(made, path)
-            report(1.0, "written")
+        def write(path: Path) -> str:
+            """Write the plan; returns what to do with it."""
+            made = make_plan(store, TOLERANCE_MM, name=store.folder.name, warn=warn)
+            write_plan(made, path)
             return (
-                f"{PLAN} is ready to download:"
-                f" {format_count(len(made.characteristic), 'characteristic')}; set its limits, then"
+                f"{format_count(len(made.characteristic), 'characteristic')}; set its limits, then"
                 f" upload it below, or run slviewer inspect-parts {PLAN} SESSION..."
             )
 
-        self._submit("Making the plan", work, str)
+        self._submit_export("Making the plan", PLAN, write)
+
+    def _submit_export(self, title: str, name: str, write: Callable[[Path], str]) -> None:
+        """Queue the writing of a file into the exports; ``write`` returns words about it."""
+        store = self._store
+
+        def work(report: Reporter) -> str:
+            """Write the file; returns a sentence about it."""
+            with store.guarded(report.saving).staged_export(name) as path:
+                words = write(path)
+            report(1.0, "written")
+            return f"{name} is ready to download: {words}"
+
+        self._submit(title, work, str)
 
 
 def _reword(error: BaseException) -> BaseException:

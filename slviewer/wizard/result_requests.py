@@ -11,7 +11,7 @@ from slviewer.pipeline.align import AlignSettings, align, remove_placement
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, redo_next, undo_last
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
-from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergeSettings, Picked, StartKind, merge
 from slviewer.pipeline.mesh import mesh
@@ -216,11 +216,13 @@ class ResultRequests(Engine):
         def work(report: Reporter) -> tuple[Findings[Merge], str]:
             """Merge and mesh; returns the merge, and a sentence about the mesh."""
             settings = MergeSettings(names, names[0], accept_rejected=accepts_rejected(store))
-            merged = merge_turn(store.guarded(report.saving), settings, report.within(0, 0.7), warn)
+            guarded = store.guarded(report.saving)
+            merged = merge_turn(guarded, settings, part(report, 0, 0.7), warn)
             (number,) = merged
-            meshing = report.within(0.7, 1)
             try:
-                words = _export_file(store, "merged-mesh", number, "ply", WATERTIGHT, meshing, warn)
+                words = _export_file(
+                    guarded, "merged-mesh", number, "ply", WATERTIGHT, part(report, 0.7, 1), warn
+                )
             except Cancelled:
                 raise
             except SlviewerError as error:
@@ -386,14 +388,19 @@ class ResultRequests(Engine):
             path = store.exports / default_file_name(what, name, chosen)
             made = mesh(
                 store, [source], path, plan=plan, texture=texture, white=white,
-                accept_rejected=accepts_rejected(store), progress=report.within(0, 0.98), warn=warn,
+                accept_rejected=accepts_rejected(store), progress=part(report, 0, 0.98), warn=warn,
             )  # fmt: skip
             assert made.textured is not None
             report(1.0, "exported")
             words = made.meshed.text().splitlines()[0]
             return f"{path.name} is ready to download: {words}; {made.textured.text()}"
 
-        write = partial(_export_file, store, what, name, chosen, plan, warn=warn)
+        def write(report: Reporter) -> str:
+            """Write any other file, as `_export_file` does."""
+            return _export_file(
+                store.guarded(report.saving), what, name, chosen, plan, report, warn
+            )
+
         self._submit("Exporting", write if texture is None else write_textured, str)
 
     def report(self) -> bool:
@@ -417,16 +424,16 @@ def _export_file(
     name: str,
     file_format: str,
     plan: MeshingPlan | None,
-    report: Reporter,
+    progress: Progress,
     warn: Warn,
 ) -> str:
     """Write one file, as `pipeline.export.export` does; returns a sentence that begins with the
     file's name."""
     file_name = default_file_name(what, name, file_format)
-    with session.guarded(report.saving).staged_export(file_name) as path:
+    with session.staged_export(file_name) as path:
         exported = export(
             session, what, name, out=path, plan=plan, accept_rejected=accepts_rejected(session),
-            progress=report.within(0, 0.98), warn=warn,
+            progress=part(progress, 0, 0.98), warn=warn,
         )  # fmt: skip
-    report(1.0, "exported")
+    progress(1.0, "exported")
     return f"{file_name} is ready to download: {exported.words}"

@@ -273,6 +273,11 @@ class SessionView:
         is_judged = all(pose.state != "judging" for pose in self.poses)
         return is_judged and self.plan is not None and self.plan.reaches(self.wanted_mm)
 
+    @property
+    def good_poses(self) -> int:
+        """Number of poses that a calibration can use."""
+        return sum(pose.state in ("good", "used", "unused") for pose in self.poses)
+
     def list_records(self, kind: type[R]) -> list[Stored[R]]:
         """Return the session's records of a kind."""
         return [each for each in self.records if isinstance(each.record, kind)]

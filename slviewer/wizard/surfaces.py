@@ -17,13 +17,11 @@ from slviewer.pipeline.measured_surface import (
 )
 from slviewer.pipeline.models import load_model
 from slviewer.pipeline.scale import scale_factor
-from slviewer.pipeline.scan_edits import restrict_cloud
-from slviewer.reconstruction.cloud import Cloud
 from slviewer.session.nominal import NOMINALS
-from slviewer.session.scan_edits import load_region, restriction_inputs
+from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 from slviewer.surface.selection import ViewCamera, select_connected, select_in_outline
-from slviewer.wizard.result_views import nearest
+from slviewer.wizard.result_views import load_scan_cloud, nearest
 
 
 class Surfaces:
@@ -54,24 +52,14 @@ class Surfaces:
         key = (str(store.folder), result, str(meta["hash"]), cut)
         with self._lock:
             if self._key != key or self._cached is None:
-                self._cached = (
-                    load_merged_surface(store, name) if result == name else _load_scan(store, name)
-                )
+                if result == name:
+                    self._cached = load_merged_surface(store, name)
+                else:
+                    cloud = load_scan_cloud(store, name)
+                    model = load_model(store, cloud.model)
+                    self._cached = surface_from_cloud(store, name, cloud, model)
                 self._key = key
             return self._cached
-
-
-def _load_scan(store: Session, name: str) -> MeasuredSurface:
-    """Load the cloud of a scan as a surface, with its uncertainties and the model that it was made
-    by."""
-    meta, arrays = store.load_result(f"clouds/{name}")
-    systematic = arrays.get("sigma_calibration")
-    points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
-    cloud = Cloud(
-        points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges")
-    )
-    cloud = restrict_cloud(store, name, cloud, load_region(store))
-    return surface_from_cloud(store, name, cloud, load_model(store, meta["model"]))
 
 
 def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:
