@@ -170,10 +170,7 @@ class SafeServer:
 
 
 def serve(
-    serving: Serving,
-    *,
-    label: str | None = None,
-    upload_limit: int = 256 * 10**6,
+    serving: Serving, *, label: str | None = None, upload_limit: int = 256 * 10**6
 ) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
 

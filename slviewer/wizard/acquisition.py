@@ -400,7 +400,11 @@ class Acquisition:
             self._shown = None  # the task shows and sets its own from here on
             if not task.frames:
                 self._applied = None
-            task.done(task.work(rig, self._report_stage))
+            task.done(
+                task.work(
+                    rig, lambda share, stage: self._report_frame(round(100 * share), 100, stage)
+                )
+            )
         except Cancelled:
             self._notices.add("info", f"{task.name}: cancelled")
         except SlviewerError as error:
@@ -424,7 +428,8 @@ class Acquisition:
         return self._buffer
 
     def _report_frame(self, frame: int, frames: int, stage: str = "") -> None:
-        """Publish the progress of the running capture. Raises Cancelled once it was cancelled."""
+        """Publish the progress of the running capture, or the percent of a task and its stage.
+        Raises Cancelled once it was cancelled."""
         if self._cancel:
             raise Cancelled("cancelled")
         with self._condition:
@@ -433,11 +438,6 @@ class Acquisition:
                 progress = replace(now, frame=frame, frames=frames, stage=stage)
                 self._view = replace(self._view, capture=progress)
         self._changed()
-
-    def _report_stage(self, share: float, stage: str) -> None:
-        """Publish the progress of a task, `share` 0 ... 1, as percent. Raises Cancelled once it was
-        cancelled."""
-        self._report_frame(round(100 * share), 100, stage)
 
     def _handle_fault(self, error: Exception) -> None:
         """Report a device fault, close the devices, drop waiting requests and end the stream."""

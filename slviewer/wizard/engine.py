@@ -37,12 +37,7 @@ from slviewer.wizard.pose_plan import plan_next_pose
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.session_reader import SessionReader
-from slviewer.wizard.snapshot import (
-    Brightness,
-    PreviewView,
-    Snapshot,
-    WorldView,
-)
+from slviewer.wizard.snapshot import Brightness, PreviewView, Snapshot, WorldView
 from slviewer.wizard.steps import Facts, views
 
 READ_ATTEMPTS = 20
@@ -348,10 +343,7 @@ class Engine:
             rig = replace(rig, state="lost", fault=self._rig_fault)
         world = bench.world if bench is not None else None
         rig = replace(
-            rig,
-            simulated=world is not None,
-            choice=choice,
-            pages=list_needed_pages(choice or {}),
+            rig, simulated=world is not None, choice=choice, pages=list_needed_pages(choice or {})
         )
         live = self._live
         return replace(

@@ -157,10 +157,7 @@ def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
         guidance = suggest_poses(
             GuidanceModel(rig, given.board, expected), list(spread.poses.values()), trials
         )
-    except (
-        InputError,
-        np.linalg.LinAlgError,
-    ):
+    except (InputError, np.linalg.LinAlgError):
         # devices that share no view: better coverage may repair it
         guidance = None
     if guidance is None:

@@ -102,9 +102,8 @@ class Watcher:
         self._watch = Watch()
         self._result: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
         self._stillness = Stillness()
-        self._searched: tuple[Board | None, np.ndarray] | None = (
-            None  # the board, and a thumbnail of the last image
-        )
+        # the board, and a thumbnail of the last image
+        self._searched: tuple[Board | None, np.ndarray] = (None, np.zeros((0, 0), np.uint8))
         self._detected: tuple[Detection | None, str] = (None, "")
         self._number, self._rate, self._last = 0, 0.0, 0.0
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
@@ -155,15 +154,14 @@ class Watcher:
         image, scale, time_s = item
         watch, board = self._watch, None
         thumbnail = reduced(image, _THUMBNAIL_PX)[0]
+        board_before, before = self._searched
         if (
-            self._searched is None
-            or self._searched[0] != watch.board
-            or _differs(thumbnail, self._searched[1])
+            board_before != watch.board
+            or before.shape != thumbnail.shape
+            or float(np.percentile(cv2.absdiff(thumbnail, before), 99)) >= _UNCHANGED
         ):
-            self._searched, self._detected = (
-                (watch.board, thumbnail),
-                detect_in_preview(watch.board, image),
-            )
+            self._searched = watch.board, thumbnail
+            self._detected = detect_in_preview(watch.board, image)
         detection, missing = self._detected
         if detection is not None and watch.board is not None:
             # centres of reduced pixels to those of the camera's
@@ -215,14 +213,6 @@ def reduced(
     return to_eight_bits(small, full_scale, int(frame.max(initial=0))), scale
 
 
-def _differs(image: np.ndarray, before: np.ndarray) -> bool:
-    """Whether anything has moved between two thumbnails (h, w) uint8."""
-    return (
-        image.shape != before.shape
-        or float(np.percentile(cv2.absdiff(image, before), 99)) >= _UNCHANGED
-    )
-
-
 def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float, float, np.ndarray]:
     """Return (share of saturated pixels, 99.5th percentile as a share of the range, histogram (64,)
     of shares)."""
@@ -272,10 +262,6 @@ class HandsFree:
             None  # when the last capture was, until the board is detected after it
         )
         self._begun: float | None = None
-
-    def switch(self, on: bool) -> None:
-        """Switch hands-free capture on or off."""
-        self.is_on = on
 
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Return the seconds until the capture, 0 or less when it is due; None where none is

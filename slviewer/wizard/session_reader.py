@@ -212,11 +212,7 @@ class SessionReader:
         return None
 
     def _read_poses(
-        self,
-        target: str,
-        calibration: CalibrationView | None,
-        rig: RigView,
-        focal_px: float | None,
+        self, target: str, calibration: CalibrationView | None, rig: RigView, focal_px: float | None
     ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
         """Return (the poses, the plan after them, the input of the final plan where this one is
         interim)."""

@@ -16,13 +16,7 @@ from slviewer.records.merge import MIN_OVERLAP
 from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
 from slviewer.session.names import join_names
-from slviewer.wizard.snapshot import (
-    Brightness,
-    RigView,
-    SessionView,
-    StepState,
-    StepView,
-)
+from slviewer.wizard.snapshot import Brightness, RigView, SessionView, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""

@@ -16,7 +16,7 @@ from slviewer.pipeline.measured_surface import (
     surface_from_cloud,
 )
 from slviewer.pipeline.models import load_model
-from slviewer.pipeline.scale import scale_factor
+from slviewer.pipeline.stored_records import is_up_to_date
 from slviewer.session.nominal import NOMINALS
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
@@ -41,13 +41,10 @@ class Surfaces:
         result = name if name.startswith(MERGED) else f"clouds/{name}"
         if not store.has_result(result):
             raise InputError(f"{name} is not reconstructed: reconstruct it in the step Scan first")
-        meta = store.load_result(result, only=())[0]
         again = "merge again" if result == name else "reconstruct it again in the step Scan"
-        scaled = all(
-            scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items()
-        )
-        if store.state_of(result) == "stale" or not scaled:
+        if not is_up_to_date(store, result):
             raise InputError(f"the inputs of {name} have changed: {again}, then measure")
+        meta = store.load_result(result, only=())[0]
         cut = "" if result == name else str(restriction_inputs(store, [name]))
         key = (str(store.folder), result, str(meta["hash"]), cut)
         with self._lock:
