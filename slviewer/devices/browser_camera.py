@@ -128,7 +128,7 @@ class BrowserCamera(Openable):
     def notes(self) -> tuple[str, ...]:
         """Warnings about the settings, a sentence each."""
         page, unlocked = self._page, ""
-        if page is not None and page.facts.automatic:
+        if page and page.facts.automatic:
             unlocked = (
                 f"its browser does not lock {' and '.join(page.facts.automatic)}: nothing may move"
                 " or change its brightness during a capture; Chrome on Android locks most"
@@ -201,6 +201,6 @@ class BrowserCamera(Openable):
         """Return the page that was locked when the camera was opened. Raises DeviceError where it
         was reloaded."""
         self.check_open()
-        assert self._page is not None
+        assert self._page
         self._page.check()
         return self._page

@@ -194,7 +194,7 @@ class BrowserProjector(Openable):
         check_index(self, self._sequence, index)
         page = self._page
         try:
-            assert page is not None
+            assert page
             page.request("show", index=index)
             if page.changes != self._changes:
                 raise DeviceError(

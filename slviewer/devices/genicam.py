@@ -337,7 +337,7 @@ class GenicamCamera(Openable):
         """Release the camera, in free-running mode."""
         super().close()
         link, self._link = self._link, None
-        if link is not None:
+        if link:
             link.stop()
             with contextlib.suppress(Exception):
                 Features(link.node_map, self.name).release()
@@ -384,7 +384,7 @@ class GenicamCamera(Openable):
         """Yield an image whose exposure began after the call; after an error the stream is
         stopped."""
         link = self._link
-        assert link is not None
+        assert link
         try:
             if not link.streaming:
                 link.start()
@@ -406,7 +406,7 @@ class GenicamCamera(Openable):
 
     def _get_features(self) -> Features:
         """Return the features of the open camera."""
-        assert self._link is not None
+        assert self._link
         return Features(self._link.node_map, self.name)
 
 

@@ -212,7 +212,7 @@ def open_node_map(camera: ListedCamera) -> Iterator[Any]:
     has already."""
     with LOCK:
         link = _LINKS.get(camera)
-    if link is not None:
+    if link:
         yield link.node_map
         return
     link = Link(camera)

@@ -364,7 +364,7 @@ class OpenCVCamera(Openable):
     def _start(self) -> None:
         """Start reading. Raises DeviceError where the source does not answer, or its frames have
         another size."""
-        if self._reader is not None:
+        if self._reader:
             # it may hang in a call, the device still in its hands
             self._reader.join(self.timing.opening_s)
         self._reader = Reader(self.name, self._connect, self.timing)
@@ -375,7 +375,7 @@ class OpenCVCamera(Openable):
 
     def close(self) -> None:
         """Release the source, if necessary once it returns from a blocking call."""
-        if self._reader is not None:
+        if self._reader:
             self._reader.close()
         if _IN_USE.get(self.source) is self:
             del _IN_USE[self.source]
@@ -408,12 +408,12 @@ class OpenCVCamera(Openable):
         """Set the exposure; what could not be set is in `notes`."""
         dialect, ms = self._dialect, settings.exposure_ms
         reader = self._require_reader()
-        if dialect is not None and ms is not None:
+        if dialect and ms is not None:
             self._notices["exposure"] = reader.do(
                 lambda capture: set_exposure(capture, dialect, ms)
             )
             self._unsettled = SETTLING
-        if dialect is not None and settings.gain is not None:
+        if dialect and settings.gain is not None:
             self._notices["gain"] = (
                 "its gain has units of its own: set it in the rig's file, as the camera's gain"
             )
@@ -422,7 +422,7 @@ class OpenCVCamera(Openable):
     def _require_reader(self) -> Reader:
         """Return the reader. Raises DeviceError unless the camera is open."""
         self.check_open()
-        assert self._reader is not None
+        assert self._reader
         return self._reader
 
     def _prepare(self, capture: cv2.VideoCapture) -> None:

@@ -206,7 +206,7 @@ class PageChannel(ABC, Generic[Facts]):
         first = self._decode(hello, Hello[self.facts])  # type: ignore[name-defined]
         with self._condition:
             before = self._page
-            if before is not None:
+            if before:
                 is_same = first.window == before.window
                 if not is_same and not first.take:
                     return None

@@ -75,7 +75,7 @@ class ViserGate:
         """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not
         allowed."""
         client = self._client
-        assert client is not None
+        assert client
         _check(type(message) in MESSAGES[self._role], "not for this link", correct=True)
         _check(_is_finite(vars(message)), "numbers that are none")
         match message:
@@ -124,7 +124,7 @@ class ViserGate:
 
     def _require_input(self, uuid: str) -> Any:
         """Return the visible, enabled input with this id; raises MessageRefused otherwise."""
-        assert self._client is not None
+        assert self._client
         handle = self._client.gui_input(uuid)
         _check(handle is not None, "nothing visible there")
         _check(not getattr(handle, "disabled", False), "disabled", correct=True)
@@ -132,7 +132,7 @@ class ViserGate:
 
     def _send_refusal(self, message: Any, refused: MessageRefused) -> None:
         """Notify the client that its upload was refused, or send it the true value of an input."""
-        assert self._client is not None
+        assert self._client
         if isinstance(message, messages.FileTransferStartUpload):
             self._client.refuse_upload(
                 message.source_component_uuid, message.transfer_uuid, message.size_bytes
@@ -148,7 +148,7 @@ class ViserGate:
         waiting."""
         # viser handles what passed in tasks of its own, in their order: after those that are
         # waiting.
-        assert self._client is not None
+        assert self._client
         asyncio.get_running_loop().call_soon(self._client.forget_upload, transfer)
 
 

@@ -83,7 +83,7 @@ class Listener(socket.socket):
         Returns it; None where it is not among them.
         """
         accepted = self._unauthenticated.pop(peer, None)
-        if accepted is not None:
+        if accepted:
             self._counts[accepted.group] -= 1
             self._counts += Counter()  # without addresses that have none
         return accepted
@@ -99,7 +99,7 @@ class Listener(socket.socket):
         oldest = self.admit(
             next(peer for peer, one in self._unauthenticated.items() if one.group == busiest)
         )
-        assert oldest is not None
+        assert oldest
         self._closing[oldest.peer] = time.monotonic()
         with contextlib.suppress(OSError):  # it is closed as soon as its transport reads the end
             oldest.shutdown(socket.SHUT_RDWR)

@@ -231,7 +231,7 @@ def serve(
                 open_timeout=None,  # Connection limits the request alone
                 logger=quiet_logger(),
             )
-            if context is not None:
+            if context:
                 options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
             return serve_websockets(handle, **options)
 

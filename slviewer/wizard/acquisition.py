@@ -127,13 +127,13 @@ class Acquisition:
             self._cancel = self._view.capture is not None
             self._light = ("white", None)  # a pattern is made for one projector
             self._view = RigView(capture=self._view.capture)
-            if rig is not None:
+            if rig:
                 self._view = replace(
                     self._view, state="opening", name=rig.name, camera=rig.camera.size,
                     projector=rig.projector.size,
-                    turntable=rig.turntable.name if rig.turntable is not None else "",
+                    turntable=rig.turntable.name if rig.turntable else "",
                 )  # fmt: skip
-            if self._thread is None and rig is not None:
+            if self._thread is None and rig:
                 self._thread = threading.Thread(
                     target=self._serve, name="slviewer acquisition", daemon=True
                 )
@@ -141,7 +141,7 @@ class Acquisition:
             self._condition.notify_all()
         for name in dropped:
             self._notices.add("info", f"{name}: not captured, another rig was chosen")
-        if stream is not None:
+        if stream:
             stream.end()
         self._changed()
 
@@ -156,7 +156,7 @@ class Acquisition:
         """Set the delay between showing and grabbing, from the next capture on; the devices stay
         open."""
         with self._condition:
-            if self._wanted is not None:
+            if self._wanted:
                 settled = replace(self._wanted, settle_ms=settle_ms)
                 self._rig = settled if self._rig is self._wanted else self._rig
                 self._wanted = settled
@@ -204,11 +204,11 @@ class Acquisition:
         with self._condition:
             if self._view.state != "open":
                 raise DeviceError(self._view.fault or _NOT_OPEN)
-            if self._requests or self._view.capture is not None:
+            if self._requests or self._view.capture:
                 raise DeviceError("a capture is running: wait for it, or cancel it")
             before, self._stream = self._stream, stream
             self._condition.notify_all()
-        if before is not None:
+        if before:
             before.end()
 
     def stop_stream(self) -> None:
@@ -216,7 +216,7 @@ class Acquisition:
         with self._condition:
             stream, self._stream = self._stream, None
             self._condition.notify_all()
-        if stream is not None:
+        if stream:
             stream.end()
 
     def cancel(self) -> None:
@@ -253,7 +253,7 @@ class Acquisition:
             self._requests.clear()
             self._condition.notify_all()
         self.stop_stream()
-        if self._thread is not None:
+        if self._thread:
             self._thread.join(5.0)
 
     def _queue(self, task: _Task) -> None:
@@ -289,13 +289,13 @@ class Acquisition:
                     self._rig, self._next_try = wanted, 0.0
                 elif rig is None:
                     pass
-                elif request is not None:
+                elif request:
                     self._serve_request(rig, request)
                     next_preview = 0.0
                 elif not self._is_open:
                     if self._clock() >= self._next_try:
                         self._open_devices(rig)
-                elif stream is not None:
+                elif stream:
                     self._serve_stream(rig, stream)
                 elif self._clock() >= next_preview:
                     next_preview = self._clock() + self._preview_s
@@ -311,7 +311,7 @@ class Acquisition:
         with self._condition:
             if self._closing or self._requests or self._rig is not self._wanted:
                 return
-            if self._is_open and self._stream is not None:
+            if self._is_open and self._stream:
                 return
             until = next_preview if self._is_open else self._next_try
             pause = self._retry_s if self._rig is None else until - self._clock()
@@ -434,7 +434,7 @@ class Acquisition:
             raise Cancelled("cancelled")
         with self._condition:
             now = self._view.capture
-            if now is not None:
+            if now:
                 progress = replace(now, frame=frame, frames=frames, stage=stage)
                 self._view = replace(self._view, capture=progress)
         self._changed()
@@ -453,13 +453,13 @@ class Acquisition:
         if first:
             dropped = f"; {waiting} waiting capture{'s' * (waiting > 1)} dropped" if waiting else ""
             self._notices.add("error", text + dropped)
-        if stream is not None:
+        if stream:
             stream.end()
         self._changed()
 
     def _close_devices(self) -> None:
         """Close the open devices; what they raise is logged."""
-        if self._rig is not None and self._is_open:
+        if self._rig and self._is_open:
             self._is_open = False
             try:
                 self._rig.close()

@@ -134,7 +134,7 @@ class CaptureRequests(RigRequests, ResultRequests):
             self._queue_processing()
             follow(name)
             self._publisher.mark_changed(session=True)
-            if reel is not None:
+            if reel:
                 # the next recording may lack these
                 if self._acquisition.view().light in ("dark", "pattern"):
                     self._acquisition.set_light("white")
@@ -163,7 +163,7 @@ class CaptureRequests(RigRequests, ResultRequests):
         fault."""
         calibration = self._require_calibration("a live scan needs a calibration")
         bench = self._require_bench()
-        if bench.reel is not None:
+        if bench.reel:
             raise InputError(
                 "a recording holds only its own patterns: choose a real rig or the simulated one"
             )
@@ -186,7 +186,7 @@ class CaptureRequests(RigRequests, ResultRequests):
         """Save the frames of the latest live cloud as a scan, and reconstruct it; the live scan
         goes on."""
         live = self._live
-        shot = live.stream.copy_latest() if live is not None and live.is_running else None
+        shot = live.stream.copy_latest() if live and live.is_running else None
         if live is None or shot is None:
             raise InputError("no live scan runs: start one, and wait for a cloud")
         name = self._next_name("scan")
@@ -214,7 +214,7 @@ class CaptureRequests(RigRequests, ResultRequests):
 
     def count_live_shown(self, cloud: LiveCloud) -> None:
         """Record that a cloud was sent to the browsers, which ends its latency."""
-        if self._live is not None:
+        if self._live:
             self._live.count_shown(cloud)
 
     # all round

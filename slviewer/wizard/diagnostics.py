@@ -106,12 +106,12 @@ def write_bundle(
                 described = {"damaged": str(error)}
             bundle.writestr(f"session/results/{result}.json", to_json(described))
         report(0.8, "previews")
-        if snapshot.session is not None:
+        if snapshot.session:
             thumbnails = {pose.name: pose.thumbnail for pose in snapshot.session.poses}
             thumbnails |= {scan.name: scan.thumbnail for scan in snapshot.session.scans}
             for each, jpeg in thumbnails.items():
                 bundle.writestr(f"previews/{each}.jpg", jpeg)
-        if preview is not None:
+        if preview:
             bundle.writestr("previews/now.jpg", bytes(cv2.imencode(".jpg", preview.image)[1]))
     report(1.0, "collected")
     return name

@@ -17,7 +17,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from slviewer.calibration.guidance import pose_selection
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
-from slviewer.pipeline.capture import measure_space, warn_of_captured
+from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
 from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.models import accepts_rejected
@@ -37,7 +37,14 @@ from slviewer.wizard.pose_plan import plan_next_pose
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.session_reader import SessionReader
-from slviewer.wizard.snapshot import Brightness, PreviewView, Snapshot, WorldView
+from slviewer.wizard.snapshot import (
+    Brightness,
+    PreviewView,
+    RigView,
+    SessionView,
+    Snapshot,
+    WorldView,
+)
 from slviewer.wizard.steps import Facts, views
 
 READ_ATTEMPTS = 20
@@ -164,7 +171,7 @@ class Engine:
         ):
             part.close()
         with self._lock:
-            if self.session is not None:
+            if self.session:
                 self.session.close()
 
     def _show(self, **changes: Any) -> None:
@@ -321,27 +328,13 @@ class Engine:
     def _build_snapshot(self, version: int, session_changed: bool) -> Snapshot:
         """Build the current snapshot without changing any state (publisher's thread)."""
         reader, bench, choice = self._session_reader, self._bench, self._choice
-        rig, before = self._acquisition.view(), self._publisher.latest
-        session, space, read_failure = before.session, None, before.read_failure
-        if reader is None:
-            session = None
-        else:
-            if session is None or session.folder != reader.session.folder:
-                session, session_changed = None, True
-            if session_changed:
-                try:
-                    focal_px = bench.focal_px if bench is not None else None
-                    session, read_failure = reader.read(rig, focal_px), ""
-                except Exception as error:  # most likely files were being changed
-                    read_failure = describe_failure("Reading the session", error)
-            try:
-                camera = bench.rig.camera if bench is not None and rig.camera is not None else None
-                space = measure_space(reader.session, camera, reader.count_frames(rig))
-            except (SlviewerError, OSError) as error:
-                read_failure = read_failure or describe_failure("Reading the session", error)
+        rig = self._acquisition.view()
+        session, space, read_failure = None, None, ""
+        if reader:
+            session, space, read_failure = self._read_session(reader, rig, session_changed)
         if self._rig_fault:
             rig = replace(rig, state="lost", fault=self._rig_fault)
-        world = bench.world if bench is not None else None
+        world = bench.world if bench else None
         rig = replace(
             rig, simulated=world is not None, choice=choice, pages=list_needed_pages(choice or {})
         )
@@ -359,9 +352,31 @@ class Engine:
             steps=views(Facts(session, rig, space, self._brightness)),
             space=space,
             hands_free=self._hands_free.is_on,
-            live=live.figures() if live is not None and live.is_running else None,
+            live=live.figures() if live and live.is_running else None,
             read_failure=read_failure,
         )
+
+    def _read_session(
+        self, reader: SessionReader, rig: RigView, changed: bool
+    ) -> tuple[SessionView | None, Space | None, str]:
+        """Return (the session, its space, why reading failed); a session that cannot be read stays
+        as it was."""
+        before, bench, space = self._publisher.latest, self._bench, None
+        session, failure = before.session, before.read_failure
+        if session is None or session.folder != reader.session.folder:
+            session, changed = None, True
+        try:
+            if changed:
+                failure = ""
+                session = reader.read(rig, bench.focal_px if bench else None)
+        except Exception as error:  # most likely files were being changed
+            failure = describe_failure("Reading the session", error)
+        try:
+            camera = bench.rig.camera if bench and rig.camera is not None else None
+            space = measure_space(reader.session, camera, reader.count_frames(rig))
+        except (SlviewerError, OSError) as error:
+            failure = failure or describe_failure("Reading the session", error)
+        return session, space, failure
 
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
@@ -378,14 +393,13 @@ class Engine:
             self._reported_faults |= set(new_faults)
             for fault in new_faults:
                 self._notices.add("error", fault)
-        if session is None or not session.target:
-            self._watcher.watch(preview_watcher.Watch())
-        else:
-            lens = session.plan.lens if session.plan else None
-            self._watcher.watch(preview_watcher.Watch(Board.parse(session.target), lens))
+        self._watcher.watch = preview_watcher.Watch()
         if session is None:
             return
-        if session.pending_plan is not None:
+        if session.target:
+            lens = session.plan.lens if session.plan else None
+            self._watcher.watch = preview_watcher.Watch(Board.parse(session.target), lens)
+        if session.pending_plan:
             self._planner.request(session.pending_plan)
             return
         reached, self._reached = self._reached, (session.folder, session.enough)

@@ -135,7 +135,7 @@ class Jobs:
     def cancel(self) -> None:
         """Cancel the running foreground job, else the first waiting one; other jobs continue."""
         with self._condition:
-            if self._running is not None and not self._running.background:
+            if self._running and not self._running.background:
                 self._running.reporter.cancel()
                 self._condition.notify_all()
             elif requested := [job for job in self._waiting if not job.background]:
@@ -147,7 +147,7 @@ class Jobs:
         """Cancel the running job and drop the waiting ones, background work too."""
         with self._condition:
             self._waiting.clear()
-            if self._running is not None:
+            if self._running:
                 self._running.reporter.cancel()
             self._condition.notify_all()
 
@@ -229,11 +229,11 @@ class Jobs:
         ):
             if not job.background:
                 self._notices.add("info", f"{job.name}: cancelled")
-        elif job.error is not None and job.failed is not None:
+        elif job.error and job.failed:
             job.failed(job.error)
-        elif job.error is not None:
+        elif job.error:
             self._notices.add_failure(job.name, job.error)
-        elif job.done is not None:
+        elif job.done:
             job.done(job.result)
 
     def _execute_job(self, job: _Job) -> None:

@@ -112,5 +112,5 @@ class Stream:
 
     def _recycle(self, shot: LiveCapture | None) -> None:
         """Return the buffer of a capture, if there is one, to the free list."""
-        if shot is not None:
+        if shot:
             self._free.append(shot.frames)

@@ -144,7 +144,7 @@ class LiveScan:
 
     def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
         """Reconstruct a capture with the current calibration."""
-        assert self._model is not None
+        assert self._model
         points, texture = self._model.current().cloud(shot.frames)
         self._number += 1
         self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
@@ -178,12 +178,12 @@ class LiveModel:
         As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for
         frames of another sequence or camera.
         """
-        if self.calibrated is not None:
+        if self.calibrated:
             height, width = frames.shape[1:]
             check_sizes(
                 "the live scan", (width, height), self.sequence.projector_size, self.calibrated
             )
-        if self._fast is not None:
+        if self._fast:
             before = self._before  # whose other arrays are used again
             out = None if before is None else replace(before, points=np.empty_like(before.points))
             scan = self._fast.run(frames, out=out)
@@ -212,7 +212,7 @@ class LiveCalibration:
         """Return the model, checked for changes at most a second ago. Raises SlviewerError where
         none is usable."""
         now, store = time.monotonic(), self._store
-        if self._current is not None and now - self._loaded <= _RELOAD_S:
+        if self._current and now - self._loaded <= _RELOAD_S:
             return self._current
         self._loaded = now
         name = preferred_model(store)
@@ -223,7 +223,7 @@ class LiveCalibration:
             accepts_rejected(store),
             *sorted(store.input_hashes(f"calibration/{name}").items()),
         )
-        if self._current is not None and key == self._key:
+        if self._current and key == self._key:
             return self._current
         check_accepted(store, accepts_rejected(store))
         model = load_model(store, name)

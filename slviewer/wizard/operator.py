@@ -81,7 +81,7 @@ class Operator(CaptureRequests, MeasureRequests):
         another snapshot.
         """
         removals = [self._publisher.listeners.add(callback)]
-        if preview is not None:
+        if preview:
             removals.append(self._preview_listeners.add(preview))
 
         def stop() -> None:
@@ -124,7 +124,7 @@ class Operator(CaptureRequests, MeasureRequests):
     @request("Cancelling")
     def cancel(self) -> None:
         """Cancel the running capture, else the running job; an autopilot stops too."""
-        if self._autopilot is not None:
+        if self._autopilot:
             self._autopilot.stop()
         if not self._acquisition.idle:
             self._acquisition.cancel()
@@ -135,7 +135,7 @@ class Operator(CaptureRequests, MeasureRequests):
     def start_autopilot(self, autopilot: AutopilotLike) -> None:
         """Start an autopilot, which sends requests until it is done or `cancel` stops it."""
         with self._lock:
-            if self._autopilot is not None and self._autopilot.running:
+            if self._autopilot and self._autopilot.running:
                 raise InputError("an autopilot is running already: cancel it first")
             self._autopilot = autopilot
             autopilot.start()
@@ -155,7 +155,7 @@ class Operator(CaptureRequests, MeasureRequests):
 
     def close(self) -> None:
         """Stop everything and close the session; captures are saved already."""
-        if self._autopilot is not None:
+        if self._autopilot:
             self._autopilot.stop()
         super().close()
 

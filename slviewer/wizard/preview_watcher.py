@@ -99,8 +99,8 @@ class Watcher:
 
     def __init__(self, analysed: Callable[[PreviewView], None]) -> None:
         self._analysed = analysed
-        self._watch = Watch()
-        self._result: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
+        self.watch = Watch()  # what to detect from now on
+        self._result: tuple[Watch, BoardSeen | None, str] = (self.watch, None, "")
         self._stillness = Stillness()
         # the board, and a thumbnail of the last image
         self._searched: tuple[Board | None, np.ndarray] = (None, np.zeros((0, 0), np.uint8))
@@ -113,10 +113,6 @@ class Watcher:
         """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what
         the camera states."""
         self._viewer.offer((frame, full_scale))
-
-    def watch(self, target: Watch) -> None:
-        """Set the board to detect from now on."""
-        self._watch = target
 
     def close(self) -> None:
         """End both threads."""
@@ -132,14 +128,14 @@ class Watcher:
         now = time.monotonic()
         frame, full_scale = item
         image, scale = reduced(frame, full_scale=full_scale)
-        if self._watch.board is not None:
+        if self.watch.board:
             self._detector.offer((image, scale, now))
         if self._last:
             self._rate += 0.2 * (1 / max(now - self._last, 1e-3) - self._rate)
         self._last = now
         self._number += 1
         watch, board, missing = self._result
-        if watch.board != self._watch.board:
+        if watch.board != self.watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
         light = brightness(frame, full_scale)
@@ -152,7 +148,7 @@ class Watcher:
         An image in which nothing has moved is not searched again.
         """
         image, scale, time_s = item
-        watch, board = self._watch, None
+        watch, board = self.watch, None
         thumbnail = reduced(image, _THUMBNAIL_PX)[0]
         board_before, before = self._searched
         if (
@@ -163,7 +159,7 @@ class Watcher:
             self._searched = watch.board, thumbnail
             self._detected = detect_in_preview(watch.board, image)
         detection, missing = self._detected
-        if detection is not None and watch.board is not None:
+        if detection and watch.board:
             # centres of reduced pixels to those of the camera's
             detection = replace(detection, pixels=(detection.pixels + 0.5) / scale - 0.5)
             still = self._stillness.update(
@@ -266,12 +262,7 @@ class HandsFree:
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Return the seconds until the capture, 0 or less when it is due; None where none is
         coming."""
-        if (
-            self._requested is not None
-            and not busy
-            and board is not None
-            and board.time_s > self._requested
-        ):
+        if self._requested is not None and not busy and board and board.time_s > self._requested:
             self._captured, self._requested = board.outline, None
         held = self.is_on and self._requested is None and board is not None and not busy
         if (

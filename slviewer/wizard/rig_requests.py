@@ -57,7 +57,7 @@ class RigRequests(Engine):
                     " session"
                 )
             before = self.session
-            if before is not None and expand_user(path).resolve() == before.folder.resolve():
+            if before and expand_user(path).resolve() == before.folder.resolve():
                 if rig:
                     self._restore_rig(before, rig)
                 return
@@ -66,7 +66,7 @@ class RigRequests(Engine):
             self._jobs.cancel_all()
             self._session_reader, self._queued = SessionReader(store, self._planner), set()
             self._show(merge_failure="")
-            if before is not None:
+            if before:
                 before.close()
             for name in store.recovered:
                 self._notices.add(
@@ -110,12 +110,12 @@ class RigRequests(Engine):
         """
         with self._lock:
             store, exposure = self.session, None
-            known = dict((store.valid_decision("rig") if store is not None else None) or {})
+            known = dict((store.valid_decision("rig") if store else None) or {})
             same = {**known, "settle_ms": None} == {**choice, "settle_ms": None}
             if same:
                 choice = {**known, **choice}
             bench = self._set_up(choice, self._parse_board())
-            if store is not None:
+            if store:
                 if known != dict(choice):
                     _remember(store, rig=dict(choice))
                 if not same:  # those of another camera do not apply
@@ -247,7 +247,7 @@ class RigRequests(Engine):
             if result.settle_ms is not None and self._choice is not None:
                 self._choice = {**self._choice, "settle_ms": result.settle_ms}
                 self._acquisition.set_delay(result.settle_ms)
-                if self.session is not None:
+                if self.session:
                     self.session.decide("rig", dict(self._choice))
             return True
 
@@ -280,7 +280,7 @@ class RigRequests(Engine):
         if light not in (*LIGHTS, "pattern"):
             raise InputError(f"there is no light {light!r}: choose {', '.join(LIGHTS)} or pattern")
         reel = self._bench.reel if self._bench else None
-        if light == "dark" and reel is not None and not reel.has_dark:
+        if light == "dark" and reel and not reel.has_dark:
             raise InputError("the recording has no dark frame: choose another light")
         self._acquisition.set_light(light, self._pose_sequence() if light == "pattern" else None)
 
@@ -301,7 +301,7 @@ class RigRequests(Engine):
         """Apply the current target: print it on the simulated board, and queue the evaluation of
         the poses by it."""
         board, world = self._parse_board(), self._bench.world if self._bench else None
-        if board is not None and world is not None and board != world.board:
+        if board and world and board != world.board:
             world.print_board(board)
         self._queue_processing()
         self._publisher.mark_changed(session=True)
@@ -393,7 +393,7 @@ class RigRequests(Engine):
             "a capture cannot be measured without a calibration"
         )
         sequence = self._pose_sequence()
-        if self._require_bench().reel is not None:
+        if self._require_bench().reel:
             return sequence
         return one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
 

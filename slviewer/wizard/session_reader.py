@@ -217,21 +217,7 @@ class SessionReader:
         """Return (the poses, the plan after them, the input of the final plan where this one is
         interim)."""
         poses = [pose for pose in self._captures.values() if pose.role == "calibration"]
-        excluded = self.session.valid_decision("excluded") or {}
-        states, features = {}, {}
-        for pose in poses:
-            meta = self._load_judgement(pose, target)
-            state, why = self._determine_pose_state(pose, target, meta, calibration)
-            if pose.name in excluded:
-                state, why = "excluded", excluded[pose.name]
-            states[pose.name] = state, why
-            if state not in ("excluded", "refused"):
-                seen = self._features.get((pose.hash, target))  # early, until the pose is judged
-                if meta is not None:
-                    load = partial(self._load_features, pose.name, meta)
-                    seen = self._attempt(f"the features of {pose.name}", load, None)
-                if seen is not None:
-                    features[pose.name] = seen
+        states, features = self._judge_poses(poses, target, calibration)
         camera, projector = rig.camera, rig.projector
         if poses:
             camera, projector = poses[0].size, poses[0].sequence.projector_size
@@ -239,7 +225,7 @@ class SessionReader:
         if target and camera is not None and projector is not None:
             stereo = None if calibration is None or calibration.refused else calibration.stereo
             hashes = [(name, self._captures[name].hash) for name in features]
-            if stereo is not None:
+            if stereo:
                 hashes.append(("", self._load_meta("calibration/stereo")["hash"]))
             given = PlanInput(
                 Board.parse(target),
@@ -257,7 +243,9 @@ class SessionReader:
         views = []
         for pose in poses:
             state, why = states[pose.name]
-            T = plan.poses.get(pose.name) if plan else None
+            T = board_px = None
+            if plan and (T := plan.poses.get(pose.name)) is not None:
+                board_px = outline_px(Board.parse(target), plan.lens, T)
             views.append(
                 PoseView(
                     name=pose.name,
@@ -266,14 +254,35 @@ class SessionReader:
                     created=str(pose.meta.get("created", "")),
                     T_camera_board=T,
                     calibrated=state == "used",
-                    board_px=None
-                    if plan is None or T is None
-                    else outline_px(Board.parse(target), plan.lens, T),
+                    board_px=board_px,
                     rms_px=rms_px.get(pose.name) if state == "used" else None,
                     thumbnail=self.thumbnails.get(pose.hash, b""),
                 )
             )
         return tuple(views), plan, given
+
+    def _judge_poses(
+        self, poses: Sequence[Capture], target: str, calibration: CalibrationView | None
+    ) -> tuple[dict[str, tuple[PoseState, str]], dict[str, PoseFeatures]]:
+        """Return {pose: its state and the reason}, and the features of those that count, early ones
+        until a pose is judged."""
+        excluded = self.session.valid_decision("excluded") or {}
+        states: dict[str, tuple[PoseState, str]] = {}
+        features = {}
+        for pose in poses:
+            meta = self._load_judgement(pose, target)
+            states[pose.name] = self._determine_pose_state(pose, target, meta, calibration)
+            if pose.name in excluded:
+                states[pose.name] = "excluded", excluded[pose.name]
+            if states[pose.name][0] in ("excluded", "refused"):
+                continue
+            seen = self._features.get((pose.hash, target))
+            if meta is not None:
+                load = partial(self._load_features, pose.name, meta)
+                seen = self._attempt(f"the features of {pose.name}", load, None)
+            if seen:
+                features[pose.name] = seen
+        return states, features
 
     def _determine_pose_state(
         self,
@@ -290,7 +299,7 @@ class SessionReader:
             return "judging", ""
         if meta["refused"]:
             return "refused", str(meta["refused"])
-        if calibration is not None:
+        if calibration:
             if self._load_meta("calibration/stereo").get("inputs", {}).get(pose.name) == pose.hash:
                 return "used", ""
             why = calibration.stereo.excluded.get(pose.name, "")
@@ -422,7 +431,7 @@ class SessionReader:
             cloud="absent" if found is None else "stale" if found.stale else "fresh",
             figures=Reconstruction() if found is None else found.record,
             thumbnail=self.thumbnails.get(capture.hash, b""),
-            placement=place.record if place is not None and not place.stale else None,
+            placement=place.record if place and not place.stale else None,
             turn_step=capture.turn_step,
             edits=edits,
             undone_edits=undone,

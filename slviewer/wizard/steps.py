@@ -84,7 +84,7 @@ def _device_problems(facts: Facts) -> Iterator[str]:
         )
     elif facts.rig.state == "lost":
         yield f"The connection to the rig is lost: {facts.rig.fault}. Retrying every two seconds."
-    if facts.space is not None and not facts.space.enough:
+    if facts.space and not facts.space.enough:
         needs, free = (
             format_bytes(facts.space.capture_bytes or 0),
             format_bytes(facts.space.free_bytes),
@@ -149,9 +149,9 @@ def _poses_instruction(facts: Facts) -> str:
         if session.enough:
             return f"{n} good poses are enough ({predicted}): calibrate."
         return f"{n} good poses cover the view ({predicted}): add more, or calibrate."
-    if session.pending_plan is not None:
+    if session.pending_plan:
         action = "Computing the best next pose; or hold the board in any new place, and capture"
-    elif session.suggestion is not None:
+    elif session.suggestion:
         action = f"{session.suggestion.sentence}, and capture"
     else:
         action = "Hold the board and capture"
@@ -171,7 +171,7 @@ def _calibrate_blocked(facts: Facts) -> str:
     empty."""
     if facts.session is None:
         return _no_session(facts)
-    if facts.content.calibration is not None:
+    if facts.content.calibration:
         return ""
     if not facts.session.target:
         return "Choose the target first."
@@ -210,7 +210,7 @@ def _calibrate_problems(facts: Facts) -> Iterator[str]:
     """Yield why to calibrate again, and a warning where there are poses for the stereo model
     only."""
     session = facts.content
-    if session.calibration is not None:
+    if session.calibration:
         if session.calibration.stale:
             yield f"The calibration is out of date: {session.calibration.stale}."
         elif added := sum(pose.state == "good" for pose in session.poses):
@@ -245,7 +245,7 @@ def _no_usable_calibration(facts: Facts) -> str:
 def _capture_problems(facts: Facts) -> Iterator[str]:
     """Yield device problems, and whether the calibration is out of date."""
     yield from _device_problems(facts)
-    if facts.content.calibration is not None and facts.content.calibration.stale:
+    if facts.content.calibration and facts.content.calibration.stale:
         yield f"The calibration is out of date: {facts.content.calibration.stale}."
 
 
