@@ -216,11 +216,11 @@ class SessionReader:
     ) -> tuple[tuple[PoseView, ...], PosePlan | None, PlanInput | None]:
         """Return (the poses, the plan after them, the input of the final plan where this one is
         interim)."""
-        poses = [pose for pose in self._captures.values() if pose.role == "calibration"]
-        states, features = self._judge_poses(poses, target, calibration)
+        states, features = self._judge_poses(target, calibration)
         camera, projector = rig.camera, rig.projector
-        if poses:
-            camera, projector = poses[0].size, poses[0].sequence.projector_size
+        if states:
+            first = self._captures[next(iter(states))]
+            camera, projector = first.size, first.sequence.projector_size
         plan = given = None
         if target and camera is not None and projector is not None:
             stereo = None if calibration is None or calibration.refused else calibration.stereo
@@ -241,35 +241,36 @@ class SessionReader:
             given = None if is_final else given
         rms_px = calibration.stereo.pose_rms_px if calibration else {}
         views = []
-        for pose in poses:
-            state, why = states[pose.name]
-            T = board_px = None
-            if plan and (T := plan.poses.get(pose.name)) is not None:
+        for name, (state, why) in states.items():
+            pose, T, board_px = self._captures[name], None, None
+            if plan and (T := plan.poses.get(name)) is not None:
                 board_px = outline_px(Board.parse(target), plan.lens, T)
             views.append(
                 PoseView(
-                    name=pose.name,
+                    name=name,
                     state=state,
                     why=why,
                     created=str(pose.meta.get("created", "")),
                     T_camera_board=T,
                     calibrated=state == "used",
                     board_px=board_px,
-                    rms_px=rms_px.get(pose.name) if state == "used" else None,
+                    rms_px=rms_px.get(name) if state == "used" else None,
                     thumbnail=self.thumbnails.get(pose.hash, b""),
                 )
             )
         return tuple(views), plan, given
 
     def _judge_poses(
-        self, poses: Sequence[Capture], target: str, calibration: CalibrationView | None
+        self, target: str, calibration: CalibrationView | None
     ) -> tuple[dict[str, tuple[PoseState, str]], dict[str, PoseFeatures]]:
         """Return {pose: its state and the reason}, and the features of those that count, early ones
         until a pose is judged."""
         excluded = self.session.valid_decision("excluded") or {}
         states: dict[str, tuple[PoseState, str]] = {}
         features = {}
-        for pose in poses:
+        for pose in self._captures.values():
+            if pose.role != "calibration":
+                continue
             meta = self._load_judgement(pose, target)
             states[pose.name] = self._determine_pose_state(pose, target, meta, calibration)
             if pose.name in excluded:
