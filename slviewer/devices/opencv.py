@@ -354,7 +354,14 @@ class OpenCVCamera(Openable):
         self._next: np.ndarray | None = None  # the video's picture that was read to learn its size
         self._read, self._unsettled = 0, 0
         self._notices: dict[str, str] = {}
-        self.size = wanted or self._probe_size()
+        if wanted is None:
+            reader = Reader(self.name, self._connect, self.timing)
+            try:
+                height, width = reader.first().shape[:2]
+                wanted = width, height
+            finally:
+                reader.close()
+        self.size = wanted
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -479,15 +486,6 @@ class OpenCVCamera(Openable):
                 f"{self.name} gives {image.dtype} and not 8 bits: switch it to an 8-bit format"
             )
         return image
-
-    def _probe_size(self) -> tuple[int, int]:
-        """Return the source's default size (width, height) px."""
-        reader = Reader(self.name, self._connect, self.timing)
-        try:
-            height, width = reader.first().shape[:2]
-            return width, height
-        finally:
-            reader.close()
 
 
 def _check_source(source: int | str) -> int | str:

@@ -86,15 +86,18 @@ class SafeServer:
 
     @property
     def origin(self) -> str:
-        """Scheme, host and port of its address."""
-        return self._format_origin(self._format_host())
+        """Scheme, host and port of its address, in brackets for IPv6; loopback if all are open."""
+        address = self._address
+        if address.is_unspecified:
+            return self._format_origin("127.0.0.1" if address.version == 4 else "[::1]")
+        return self._format_origin(f"[{address}]" if address.version == 6 else str(address))
 
     @property
     def shared_origin(self) -> str:
         """Scheme, host and port for other devices: the address in the network, where all addresses
         are open."""
         found = network_address() if self._address.is_unspecified else None
-        return self._format_origin(found or self._format_host())
+        return self._format_origin(found) if found else self.origin
 
     def link(self, role: Role = "operate", origin: str | None = None) -> str:
         """The link of a role, with its token behind the #, which browsers do not send; as secret as
@@ -159,14 +162,6 @@ class SafeServer:
     def _address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
         """The IP address that the server listens at, without an IPv6 zone."""
         return ipaddress.ip_address(self.viser.get_host().partition("%")[0])
-
-    def _format_host(self) -> str:
-        """The host part of links: the address, in brackets for IPv6; loopback if all addresses are
-        open."""
-        address = self._address
-        if address.is_unspecified:
-            return "127.0.0.1" if address.version == 4 else "[::1]"
-        return f"[{address}]" if address.version == 6 else str(address)
 
 
 def serve(

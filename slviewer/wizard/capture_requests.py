@@ -133,7 +133,7 @@ class CaptureRequests(RigRequests, ResultRequests):
             recording."""
             self._queue_processing()
             follow(name)
-            self._publisher.mark_changed(session=True)
+            self._note_change()
             if reel:
                 # the next recording may lack these
                 if self._acquisition.view().light in ("dark", "pattern"):

@@ -89,7 +89,7 @@ def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], 
                 self._notices.add_failure(action, error)
                 return False
             finally:
-                self._publisher.mark_changed(session=True)
+                self._note_change()
             return True
 
         return handle
@@ -128,7 +128,7 @@ class Engine:
         self._notices = Notices(changed)
         self._jobs = Jobs(self._notices, changed)
         compute = partial(plan_next_pose, trials=timing.trials)
-        self._planner = Planner(partial(changed, session=True), compute)
+        self._planner = Planner(self._note_change, compute)
         self._watcher = preview_watcher.Watcher(self._handle_preview)
         self._acquisition = acquisition.Acquisition(
             self._notices,
@@ -174,6 +174,10 @@ class Engine:
             if self.session:
                 self.session.close()
 
+    def _note_change(self) -> None:
+        """Request a snapshot: the session's files have changed."""
+        self._publisher.mark_changed(session=True)
+
     def _show(self, **changes: Any) -> None:
         """Change fields of the next snapshots."""
         with self._lock:
@@ -203,12 +207,12 @@ class Engine:
             )
             if text := describe(result):
                 self._notices.add("good" if is_good else "warning", text)
-            self._publisher.mark_changed(session=True)
+            self._note_change()
 
         def end_badly(error: BaseException) -> None:
             """Report why the job failed; what it has saved before is to be seen."""
             (failed or partial(self._notices.add_failure, name))(error)
-            self._publisher.mark_changed(session=True)
+            self._note_change()
 
         self._jobs.submit(name, work, done, failed=end_badly)
 
@@ -253,7 +257,7 @@ class Engine:
             self._jobs.submit(
                 f"Processing {capture.name}",
                 partial(self._process_capture, reader, capture),
-                lambda _: self._publisher.mark_changed(session=True),
+                lambda _: self._note_change(),
                 failed=partial(self._handle_processing_failure, reader, capture),
                 background=True,
             )
@@ -265,7 +269,7 @@ class Engine:
             return  # deleted since
         if capture.hash not in reader.thumbnails:
             reader.thumbnails[capture.hash] = make_thumbnail(capture)
-            self._publisher.mark_changed(session=True)
+            self._note_change()
         session = reader.session.guarded(report.saving)
         report(0.0, f"reading {capture.name}")
         is_new = load_examination(session, capture.name) is None
@@ -286,7 +290,7 @@ class Engine:
         def plan_next(observation: Observation) -> None:
             """Let the next pose be planned from the features, before the frames are examined."""
             reader.add_features(capture, target, observation)
-            self._publisher.mark_changed(session=True)
+            self._note_change()
 
         poses = read_stored_poses(
             session, [capture.name], Board.parse(target), Smoothing(), True, plan_next
@@ -294,7 +298,7 @@ class Engine:
         judged = next(poses)
         if judged.observation is None:
             self._warner("target-poses")(f"{capture.name} cannot be used: {judged.refused}")
-        self._publisher.mark_changed(session=True)
+        self._note_change()
 
     def _handle_processing_failure(
         self, reader: SessionReader, capture: Capture, error: BaseException
@@ -303,7 +307,7 @@ class Engine:
         self._notices.add_failure(f"Processing {capture.name}", error)
         if isinstance(error, InputError | DamagedError):
             reader.add_unreadable(capture, str(error))
-        self._publisher.mark_changed(session=True)
+        self._note_change()
 
     # previews
 
@@ -388,7 +392,7 @@ class Engine:
         self._reported_faults &= set(faults)
         self._failed_reads = self._failed_reads + 1 if new_faults else 0
         if 0 < self._failed_reads < READ_ATTEMPTS:
-            self._publisher.mark_changed(session=True)
+            self._note_change()
         elif new_faults:  # each is reported once, until it can be read again
             self._reported_faults |= set(new_faults)
             for fault in new_faults:

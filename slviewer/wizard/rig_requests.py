@@ -195,7 +195,7 @@ class RigRequests(Engine):
                     {"exposure_ms": exposures[0], "gain": suggestion.gain},
                     exposures if len(exposures) > 1 else (),
                 )
-            self._publisher.mark_changed(session=True)
+            self._note_change()
             self._notices.add("good", suggestion.text())
 
         self._acquisition.run_task("Suggesting the exposure", work, done)
@@ -304,7 +304,7 @@ class RigRequests(Engine):
         if board and world and board != world.board:
             world.print_board(board)
         self._queue_processing()
-        self._publisher.mark_changed(session=True)
+        self._note_change()
 
     def _parse_board(self) -> Board | None:
         """Return the board of the session's target; None where none is chosen."""
