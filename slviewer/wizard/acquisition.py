@@ -8,7 +8,6 @@ is queued among the captures, and ends and fails as they do. A stream replaces t
 anything else is requested.
 """
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -30,6 +29,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.notices import Notices, describe_failure
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import CaptureProgress, RigView
 
 RETRY_S = 2.0
@@ -75,7 +75,7 @@ class _Task:
     frames: int = 0
 
 
-class Acquisition:
+class Acquisition(Service):
     """Owns the devices and the queue of requests. Every method may be called from any thread, and
     returns at once.
 
@@ -93,9 +93,9 @@ class Acquisition:
         previews_per_s: float = PREVIEWS_PER_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        super().__init__("slviewer acquisition")
         self._notices, self._changed, self._offer = notices, changed, offer
         self._retry_s, self._preview_s, self._clock = retry_s, 1 / previews_per_s, clock
-        self._condition = threading.Condition()
         self._requests: deque[_Task] = deque()
         self._wanted: Rig | None = None
         self._settings: CameraSettings | None = None
@@ -103,8 +103,6 @@ class Acquisition:
         self._view = RigView()
         self._stream: Stream | None = None
         self._cancel = False
-        self._closing = False
-        self._thread: threading.Thread | None = None
         # the thread's own:
         self._rig: Rig | None = None
         self._is_open = False
@@ -133,10 +131,7 @@ class Acquisition:
                     projector=rig.projector.size,
                     turntable=rig.turntable.name if rig.turntable else "",
                 )  # fmt: skip
-            if self._thread is None and rig:
-                self._thread = threading.Thread(
-                    target=self._serve, name="slviewer acquisition", daemon=True
-                )
+            if rig and not self._thread.ident:
                 self._thread.start()
             self._condition.notify_all()
         for name in dropped:
@@ -249,12 +244,10 @@ class Acquisition:
     def close(self) -> None:
         """End a running capture, close the devices and join the thread."""
         with self._condition:
-            self._closing, self._cancel = True, True
+            self._cancel = True
             self._requests.clear()
-            self._condition.notify_all()
         self.stop_stream()
-        if self._thread:
-            self._thread.join(5.0)
+        super().close()
 
     def _queue(self, task: _Task) -> None:
         """Append a task to the queue, and end the stream. Raises DeviceError where no rig is

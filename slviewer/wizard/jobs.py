@@ -23,6 +23,7 @@ from typing import Any
 
 from slviewer.errors import Cancelled
 from slviewer.wizard.notices import Notices, log
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import JobView
 
 PATIENCE_S = 0.5
@@ -97,18 +98,16 @@ class _Job:
     error: BaseException | None = None
 
 
-class Jobs:
+class Jobs(Service):
     """A worker thread with a foreground and a background queue. Every method may be called from any
     thread."""
 
     def __init__(self, notices: Notices, changed: Callable[[], None]) -> None:
+        super().__init__("slviewer worker")
         self._notices, self._changed = notices, changed
-        self._condition = threading.Condition()
         self._waiting: list[_Job] = []
         self._running: _Job | None = None
-        self._closing = False
-        self._worker = threading.Thread(target=self._serve, name="slviewer worker", daemon=True)
-        self._worker.start()
+        self._thread.start()
 
     def submit(
         self,
@@ -178,10 +177,8 @@ class Jobs:
 
     def close(self) -> None:
         """Cancel everything and end the worker; returns within a second or so."""
-        with self._condition:
-            self._closing = True
         self.cancel_all()
-        self._worker.join(4 * PATIENCE_S)
+        super().close()
 
     def _serve(self) -> None:
         """Run the worker loop until closing: take the next job, foreground jobs first, and run

@@ -22,6 +22,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 from slviewer.target.planar import fit_homography, to_image
 from slviewer.wizard.notices import log
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
 
 Item = TypeVar("Item")
@@ -49,15 +50,13 @@ class Watch:
     lens: Lens | None = None
 
 
-class LatestWorker(Generic[Item]):
+class LatestWorker(Service, Generic[Item]):
     """A thread that calls `work(item)` with the latest item offered, and drops earlier ones."""
 
     def __init__(self, name: str, work: Callable[[Item], None], rest: float = 0.0) -> None:
+        super().__init__(name)
         self._work, self._rest = work, rest
-        self._condition = threading.Condition()
         self._item: Item | None = None
-        self._closing = False
-        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         self._thread.start()
 
     def offer(self, item: Item) -> None:
@@ -65,13 +64,6 @@ class LatestWorker(Generic[Item]):
         with self._condition:
             self._item = item
             self._condition.notify_all()
-
-    def close(self) -> None:
-        """End the thread."""
-        with self._condition:
-            self._closing = True
-            self._condition.notify_all()
-        self._thread.join(2.0)
 
     def _serve(self) -> None:
         """Process the latest item until closing, pausing `rest` times its duration; failures are
