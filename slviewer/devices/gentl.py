@@ -229,6 +229,8 @@ class Link:
     def __init__(self, camera: ListedCamera) -> None:
         """Claim the camera. Raises DeviceError where it is not connected or in use by another
         program."""
+        from harvesters.core import ParameterKey, ParameterSet
+
         self.name = f"the camera {camera}"
         self._camera = camera
         self._acquirer: Any = None
@@ -248,10 +250,11 @@ class Link:
                     raise DeviceError(
                         f"{self.name} is not connected: plug it in, and wait until it has started"
                     )
+                # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which
+                # costs the buffer.
+                options = ParameterSet({ParameterKey.ENABLE_AUTO_CHUNK_DATA_UPDATE: False})
                 with as_device_error(self.name), _preserve_sigint_handler():
-                    self._acquirer = self._harvester.create(
-                        listed[0], config=_make_acquirer_options()
-                    )
+                    self._acquirer = self._harvester.create(listed[0], config=options)
                 if len(self._acquirer.data_streams) != 1:
                     raise DeviceError(
                         f"{self.name} sends {len(self._acquirer.data_streams)} streams: use one"
@@ -386,15 +389,6 @@ def _make_event_counter() -> Any:
             self.count += 1
 
     return Counter()
-
-
-def _make_acquirer_options() -> Any:
-    """Return the options of harvesters' acquirers: chunk data is not parsed."""
-    from harvesters.core import ParameterKey, ParameterSet
-
-    # Unused chunks are not parsed: the chunks of a damaged buffer cannot be, which costs the
-    # buffer.
-    return ParameterSet({ParameterKey.ENABLE_AUTO_CHUNK_DATA_UPDATE: False})
 
 
 @contextlib.contextmanager

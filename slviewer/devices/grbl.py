@@ -164,7 +164,7 @@ class GcodeTurntable(Openable):
                 " it, and check the port; `slviewer devices` lists those that are connected"
             ) from error
         self._buffer, self._unreadable = b"", 0
-        self._is_marlin = self._probe() == "marlin"
+        self._probe()
         self.position_deg()  # raises where it is locked
 
     def close(self) -> None:
@@ -224,9 +224,9 @@ class GcodeTurntable(Openable):
             raise
         time.sleep(self.settle_ms / 1000)
 
-    def _probe(self) -> Dialect:
-        """Ask who is there until the controller answers. Raises TurntableError where it does not,
-        or not readably."""
+    def _probe(self) -> None:
+        """Ask who is there, GRBL or Marlin, until it answers. Raises TurntableError where it does
+        not, or not readably."""
         end = self._clock() + self.boot_s
         while self._clock() < end:
             for question, dialect, answer in (
@@ -242,7 +242,8 @@ class GcodeTurntable(Openable):
                     refused = dialect == "grbl" and line.startswith("error:")
                     if answer in line or refused:
                         self._drain()
-                        return "grbl" if dialect == "grbl" else "marlin"
+                        self._is_marlin = dialect == "marlin"
+                        return
                     if line.startswith(("ok", "error:")):
                         break
         if self._unreadable:

@@ -17,7 +17,7 @@ import numpy as np
 from slviewer.errors import InputError
 
 _NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG)|RGBa?|BGRa?)(8|10|12|14|16)(p|Packed)?")
-_ORDERS = {"RGB": (0, 1, 2), "RGBa": (0, 1, 2), "BGR": (2, 1, 0), "BGRa": (2, 1, 0)}
+_COLOURS = ("RGB", "RGBa", "BGR", "BGRa")
 _DEMOSAIC = {
     "BayerRG": cv2.COLOR_BayerRGGB2RGB,
     "BayerGR": cv2.COLOR_BayerGRBG2RGB,
@@ -49,7 +49,7 @@ class PixelFormat:
     @property
     def samples(self) -> int:
         """Samples per pixel."""
-        return len(self.kind) if self.kind in _ORDERS else 1
+        return len(self.kind) if self.kind in _COLOURS else 1
 
     def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
         """Return the bytes of an image (width, height) px whose rows end with `padding` bytes;
@@ -98,9 +98,8 @@ class PixelFormat:
     def rgb(self, samples: np.ndarray) -> np.ndarray:
         """Convert the result of `view_samples` to (h, w, 3) RGB; a Bayer mosaic is interpolated
         linearly."""
-        if self.kind in _ORDERS:
-            reverse = _ORDERS[self.kind] == (2, 1, 0)
-            return samples[..., 2::-1] if reverse else samples[..., :3]
+        if self.kind in _COLOURS:
+            return samples[..., 2::-1] if self.kind.startswith("BGR") else samples[..., :3]
         if self.kind in _DEMOSAIC:
             return cv2.cvtColor(samples, _DEMOSAIC[self.kind])
         raise InputError(f"{self.name} tells no colours: choose a colour format")
@@ -112,7 +111,7 @@ def pixel_format(name: str) -> PixelFormat | None:
     if match is None:
         return None
     kind, bits, packing = match[1], int(match[2]), match[3] or ""
-    if kind in _ORDERS:
+    if kind in _COLOURS:
         packing = packing.replace("Packed", "")  # RGB8Packed is the old name of RGB8
         known = bits == 8 and not packing
     else:

@@ -124,7 +124,7 @@ class Access:
     def __init__(
         self,
         port: int,
-        tokens: Mapping[Role, str] | None = None,
+        tokens: Mapping[Role, str] = MappingProxyType({}),
         names: tuple[str, ...] = (),
         tls: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -133,7 +133,7 @@ class Access:
         self._clock = clock
         self.tls = tls
         self.names = frozenset(name.lower() for name in names)
-        given = [] if tokens is None else list(tokens.values())
+        given = list(tokens.values())
         if not all(map(_TOKEN.fullmatch, given)):
             raise UsageError(
                 "A token has 16 or more letters, digits, - and _: leave it out and slviewer makes"
@@ -142,7 +142,7 @@ class Access:
         if len(set(given)) < len(given):
             raise UsageError("Two roles have the same token: choose different ones.")
         self._wrong: dict[str, list[float]] = {}
-        self.renew(tokens or {})
+        self.renew(tokens)
 
     def renew(self, tokens: Mapping[Role, str] = MappingProxyType({})) -> None:
         """Replace all tokens, by those given, else random ones: the links given out so far open

@@ -60,6 +60,54 @@ class LiveCloud:
     begun: float
 
 
+@dataclass(eq=False)
+class LiveModel:
+    """Reconstructs short captures: a sequence, a calibration, and the scale applied to it. For one
+    thread at a time.
+
+    ``calibrated``: the rig whose sizes the frames must have.
+    """
+
+    sequence: PatternSequence
+    axis: Axis
+    model: Model
+    factor: float = 1.0
+    calibrated: StereoRig | None = None
+    _fast: OnePass | None = field(init=False, repr=False, default=None)
+    _before: PassResult | None = field(init=False, repr=False, default=None)
+
+    def __post_init__(self) -> None:
+        if has_pass(self.model):
+            self._fast = one_pass(self.sequence, self.model, self.axis)
+
+    def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w) uint8), both
+        new arrays.
+
+        As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for
+        frames of another sequence or camera.
+        """
+        if self.calibrated:
+            height, width = frames.shape[1:]
+            check_sizes(
+                "the live scan", (width, height), self.sequence.projector_size, self.calibrated
+            )
+        if self._fast:
+            before = self._before  # whose other arrays are used again
+            out = None if before is None else replace(before, points=np.empty_like(before.points))
+            scan = self._fast.run(frames, out=out)
+            self._before, points = scan, scan.points
+            phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
+        else:
+            decoded = decode(self.sequence, frames, self.axis)
+            points = self.model.points(decoded)
+            phase, modulation, noise = decoded.phase, decoded.modulation, decoded.noise
+        mask_motion(self.sequence, frames, self.axis, phase, modulation, noise, points)
+        if self.factor != 1.0:
+            points *= np.float32(self.factor)
+        return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
+
+
 class LiveScan:
     """A live scan, from its start to its end.
 
@@ -85,14 +133,15 @@ class LiveScan:
         self._made: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
         self._sent: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
         self._points, self._number, self._reported = 0, 0, 0.0
-        self._model: LiveCalibration | None = None
+        self._model: LiveModel | None = None  # of the calibration of this key, checked at that time
+        self._key: tuple[object, ...] = ()
+        self._loaded = 0.0
         self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
     def start(self) -> None:
         """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
         usable calibration."""
-        self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
-        self._model.current()
+        self._load_model()
         self._acquisition.stream(self.stream)
         self._made.append((time.monotonic(), 0.0))  # the first cloud has a rate too
         self._thread.start()
@@ -144,76 +193,17 @@ class LiveScan:
 
     def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
         """Reconstruct a capture with the current calibration."""
-        assert self._model
-        points, texture = self._model.current().cloud(shot.frames)
+        points, texture = self._load_model().cloud(shot.frames)
         self._number += 1
         self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
         return LiveCloud(self._number, points, texture, shot.begun)
 
-
-@dataclass(eq=False)
-class LiveModel:
-    """Reconstructs short captures: a sequence, a calibration, and the scale applied to it. For one
-    thread at a time.
-
-    ``calibrated``: the rig whose sizes the frames must have.
-    """
-
-    sequence: PatternSequence
-    axis: Axis
-    model: Model
-    factor: float = 1.0
-    calibrated: StereoRig | None = None
-    _fast: OnePass | None = field(init=False, repr=False, default=None)
-    _before: PassResult | None = field(init=False, repr=False, default=None)
-
-    def __post_init__(self) -> None:
-        if has_pass(self.model):
-            self._fast = one_pass(self.sequence, self.model, self.axis)
-
-    def cloud(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Reconstruct frames (n, h, w): (points (h, w, 3) float32 mm, texture (h, w) uint8), both
-        new arrays.
-
-        As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for
-        frames of another sequence or camera.
-        """
-        if self.calibrated:
-            height, width = frames.shape[1:]
-            check_sizes(
-                "the live scan", (width, height), self.sequence.projector_size, self.calibrated
-            )
-        if self._fast:
-            before = self._before  # whose other arrays are used again
-            out = None if before is None else replace(before, points=np.empty_like(before.points))
-            scan = self._fast.run(frames, out=out)
-            self._before, points = scan, scan.points
-            phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
-        else:
-            decoded = decode(self.sequence, frames, self.axis)
-            points = self.model.points(decoded)
-            phase, modulation, noise = decoded.phase, decoded.modulation, decoded.noise
-        mask_motion(self.sequence, frames, self.axis, phase, modulation, noise, points)
-        if self.factor != 1.0:
-            points *= np.float32(self.factor)
-        return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
-
-
-class LiveCalibration:
-    """The session's preferred calibration, loaded again when it changes."""
-
-    def __init__(self, store: Session, sequence: PatternSequence, axis: Axis) -> None:
-        self._store, self._sequence, self._axis = store, sequence, axis
-        self._key: tuple[object, ...] = ()
-        self._loaded = 0.0
-        self._current: LiveModel | None = None
-
-    def current(self) -> LiveModel:
+    def _load_model(self) -> LiveModel:
         """Return the model, checked for changes at most a second ago. Raises SlviewerError where
         none is usable."""
         now, store = time.monotonic(), self._store
-        if self._current and now - self._loaded <= _RELOAD_S:
-            return self._current
+        if self._model and now - self._loaded <= _RELOAD_S:
+            return self._model
         self._loaded = now
         name = preferred_model(store)
         factor = scale_factor(store, name)
@@ -223,18 +213,18 @@ class LiveCalibration:
             accepts_rejected(store),
             *sorted(store.input_hashes(f"calibration/{name}").items()),
         )
-        if self._current and key == self._key:
-            return self._current
+        if self._model and key == self._key:
+            return self._model
         check_accepted(store, accepts_rejected(store))
         model = load_model(store, name)
-        if self._axis not in model.axes:
+        if self.axis not in model.axes:
             raise InputError(
-                f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture"
+                f"the {name} calibration has no axis {self.axis}, which a live scan needs: capture"
                 " a scan"
             )
         self._key, rig = key, load_stereo(store).rig
-        self._current = LiveModel(self._sequence, self._axis, model, factor, rig)
-        return self._current
+        self._model = LiveModel(self.stream.sequence, self.axis, model, factor, rig)
+        return self._model
 
 
 def _compute_rate(events: deque[tuple[float, float]], now: float) -> float:

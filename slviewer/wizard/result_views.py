@@ -30,7 +30,8 @@ THUMBNAIL_PX = 240
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanCloud(Cloud):
     """The cloud of a capture, with its `name`; `phase` (rad) and `modulation` (h, w) float32, NaN
-    where invalid; `errors` of `load_error_maps`.
+    where invalid; `errors`: {model: (h, w) float32 mm} signed distances from the fitted plane or
+    sphere, NaN where not measured.
     """
 
     name: str
@@ -87,15 +88,10 @@ def whole_cloud(session: Session, name: str) -> ScanCloud:
     """Load the reconstructed cloud of a capture with all of its points. Raises InputError where
     there is none."""
     meta, arrays = session.load_result(f"clouds/{name}")
-    errors = load_error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
+    verified = f"verify/{name}"
+    errors = session.load_result(verified)[1] if session.has_result(verified) else {}
+    errors = {key.removeprefix("error_"): array for key, array in errors.items()}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
-
-
-def load_error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
-    """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where
-    not measured."""
-    arrays = session.load_result(f"verify/{name}")[1]
-    return {key.removeprefix("error_"): array for key, array in arrays.items()}
 
 
 def aligned_scans(session: Session) -> AlignedScans:
