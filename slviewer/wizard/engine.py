@@ -397,12 +397,13 @@ class Engine:
             self._reported_faults |= set(new_faults)
             for fault in new_faults:
                 self._notices.add("error", fault)
-        self._watcher.watch = preview_watcher.Watch()
+        watch = preview_watcher.Watch()
+        if session and session.target:
+            lens = session.plan.lens if session.plan else None
+            watch = preview_watcher.Watch(Board.parse(session.target), lens)
+        self._watcher.watch = watch
         if session is None:
             return
-        if session.target:
-            lens = session.plan.lens if session.plan else None
-            self._watcher.watch = preview_watcher.Watch(Board.parse(session.target), lens)
         if session.pending_plan:
             self._planner.request(session.pending_plan)
             return
