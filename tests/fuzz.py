@@ -34,9 +34,8 @@ import trimesh
 from slviewer import cli
 from slviewer.fringe.presets import phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
+from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.session.store import Session
-from slviewer.wizard import tasks
-from slviewer.wizard.jobs import Reporter
 from tests import faults
 
 SECONDS, MEGABYTES = 10.0, 2048
@@ -163,8 +162,8 @@ def make_seed(folder: Path) -> None:
         ):
             faults.run_sound(command.split())
     with Session.open(session, write=True) as store:
-        tasks.reconstruct_capture(store, "object_r1", None, Reporter(lambda: None), print)
-        tasks.verify_captures(store, ["sphere_1"], "sphere", None, Reporter(lambda: None), print)
+        reconstruct(store, "object_r1")
+        verify(store, ["sphere_1"], "sphere")
         cv2.imwrite(str(folder / "board.png"), store.load_capture("pose_01").frames.max(0))
         store.exclude("pose_10", "blurred")
         store.decide("names", {"object_r1": "part"})

@@ -7,22 +7,14 @@ page locks exposure, focus and white balance as far as the browser lets it; what
 reported in `notes`.
 """
 
-import struct
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
-from slviewer.devices.page_channel import ANSWER_S, Done, PageChannel, PageConnection
-from slviewer.devices.protocols import (
-    CameraSettings,
-    Channel,
-    Openable,
-    check_channel,
-    check_frame,
-    check_image_size,
-)
+from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection, resolve_page
+from slviewer.devices.protocols import CameraSettings, Channel, Openable, check_channel, check_frame
 from slviewer.errors import DeviceError
 
 FRAME_S = 10.0
@@ -69,69 +61,36 @@ class Video(msgspec.Struct, frozen=True):
     exposure_ms: _Milliseconds | None
     visible: bool
 
-
-class CameraHello(msgspec.Struct, tag_field="op", tag="hello"):
-    """The first message of the camera page."""
-
-    window: str
-    take: bool
-    facts: Video = msgspec.field(name="video")
-
-
-class CameraReport(msgspec.Struct, tag_field="op", tag="video"):
-    """Message of the page that its camera has changed."""
-
-    facts: Video = msgspec.field(name="video")
+    def refusal(self, size: tuple[int, int] | None) -> str:
+        """Return why pictures of `size` (width, height; None: any) cannot be taken there, with a
+        remedy; else ""."""
+        if self.size is None:
+            failed = f"the camera page has no pictures ({self.problem or 'its camera is starting'})"
+            return _PROBLEMS.get(self.problem, f"{failed}: wait a moment, else reload the page")
+        if not self.visible:
+            return "the camera page is hidden: bring it to the front, and keep its screen on"
+        if size is not None and size != self.size:
+            (width, height), (columns, rows) = self.size, size
+            return (
+                f"the camera page's pictures have {width} x {height} px and no longer {columns} x"
+                f" {rows}: turn the phone back and fix it, or choose the rig again"
+            )
+        return ""
 
 
 class CameraChannel(PageChannel[Video]):
     """Connects a camera to its page."""
 
-    hello, report = CameraHello, CameraReport
+    facts = Video
     name = "the camera page"
     remedy = "open the camera's link on the phone or laptop whose camera is used"
 
     def __init__(self, answer_s: float = ANSWER_S, settling_ms: float = SETTLING_MS) -> None:
         super().__init__(answer_s)
         self.settling_ms = settling_ms
-        self._frame_size: tuple[int, int] | None = None
-
-    def set_use(self, size: tuple[int, int] | None) -> None:
-        """Judge pages by pictures of this size (width, height) from now on; None: no camera is
-        open."""
-        with self._condition:
-            self._frame_size = size
-            self._publish_state()
-
-    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Video:
-        if isinstance(message, str):
-            return super()._read_message(message)
-        start = 4 + struct.unpack("<I", message[:4])[0] if len(message) >= 4 else 4
-        return self._decode(message[4:start], Done), message[start:]
-
-    def _refuse(self, facts: Video) -> str:
-        if facts.size is None:
-            failed = (
-                f"the camera page has no pictures ({facts.problem or 'its camera is starting'})"
-            )
-            return _PROBLEMS.get(facts.problem, f"{failed}: wait a moment, else reload the page")
-        if not facts.visible:
-            return "the camera page is hidden: bring it to the front, and keep its screen on"
-        if self._frame_size not in (None, facts.size):
-            size, expected = (
-                "{} x {}".format(*each) for each in (facts.size, self._frame_size or facts.size)
-            )
-            return (
-                f"the camera page's pictures have {size} px and no longer {expected}: turn the"
-                " phone back and fix it, or choose the rig again"
-            )
-        return ""
-
-    def _size(self, facts: Video) -> tuple[int, int] | None:
-        return facts.size
 
     def _describe_state(self, facts: Video) -> tuple[Any, dict[str, Any]]:
-        in_use = self._frame_size is not None
+        in_use = self._wanted_size is not None
         return (facts.size, in_use), {"used": in_use}
 
 
@@ -158,33 +117,18 @@ class BrowserCamera(Openable):
         Raises DeviceError without a `page`, and where `size` is None and no page is ready.
         """
         check_channel(channel)
-        if page is None:
-            raise DeviceError(
-                "the browser camera's page is served by `slviewer wizard` and `slviewer capture`:"
-                " use one of them"
-            )
+        self._pages, self.size = resolve_page(page, "camera", size, _MAX_SIDE_PX)
         super().__init__("the browser camera")
         self._channel: Channel = channel
-        self._pages = page
         self._exposure_ms = CameraSettings(exposure_ms).exposure_ms
         self._page: PageConnection[Video] | None = None
         self._note = ""
-        known = (
-            page.page_state().size
-            if size is None
-            else check_image_size("camera", size, _MAX_SIDE_PX)
-        )
-        if known is None:
-            raise DeviceError(
-                "the camera's size is unknown: open the camera page first, or give the size"
-            )
-        self.size: tuple[int, int] = known
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Warnings about the settings, a sentence each."""
         page, unlocked = self._page, ""
-        if page is not None and page.facts.automatic:
+        if page and page.facts.automatic:
             unlocked = (
                 f"its browser does not lock {' and '.join(page.facts.automatic)}: nothing may move"
                 " or change its brightness during a capture; Chrome on Android locks most"
@@ -194,7 +138,7 @@ class BrowserCamera(Openable):
     def _start(self) -> None:
         """Lock what is automatic. Raises DeviceError with a remedy where the page has no pictures
         of this size."""
-        self._pages.set_use(self.size)
+        self._pages.set_size(self.size)
         page = self._pages.page()
         self._lock(page, self._exposure_ms)
         self._page = page
@@ -202,7 +146,7 @@ class BrowserCamera(Openable):
     def close(self) -> None:
         """Release the page, which unlocks its camera; nothing happens when it is not open."""
         if self._open:
-            self._pages.set_use(None)
+            self._pages.set_size(None)
         self._page = None
         super().close()
 
@@ -257,6 +201,6 @@ class BrowserCamera(Openable):
         """Return the page that was locked when the camera was opened. Raises DeviceError where it
         was reloaded."""
         self.check_open()
-        assert self._page is not None
+        assert self._page
         self._page.check()
         return self._page

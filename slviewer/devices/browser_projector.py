@@ -8,19 +8,12 @@ measured and waited for as the rig's `settle_ms`.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
-from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection
-from slviewer.devices.protocols import (
-    Openable,
-    check_image_size,
-    check_index,
-    check_level,
-    check_sequence,
-)
-from slviewer.devices.screen import Screen, refusal
+from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection, resolve_page
+from slviewer.devices.protocols import Openable, check_index, check_level, check_sequence
 from slviewer.errors import DeviceError
 from slviewer.fringe.patterns import profile
 from slviewer.fringe.sequence import PatternSequence
@@ -28,37 +21,109 @@ from slviewer.fringe.sequence import PatternSequence
 _MAX_SIZE_PX = 16384
 
 
-class ProjectorHello(msgspec.Struct, tag_field="op", tag="hello"):
-    """The first message of the projector page."""
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**16)]
+_Ratio = Annotated[float, msgspec.Meta(gt=0, le=64)]
 
-    window: str
-    take: bool
-    facts: Screen = msgspec.field(name="screen")
+# browsers round the ratio to single precision; a window that is cut off is 0.25 px or more away
+_EXACT_PX = 0.01
 
 
-class ProjectorReport(msgspec.Struct, tag_field="op", tag="screen"):
-    """Message of the page that its screen has changed."""
+class Screen(msgspec.Struct, frozen=True):
+    """Screen and window of the projector page, as it reports them.
 
-    facts: Screen = msgspec.field(name="screen")
+    `dpr`: device pixels per page pixel. `inner`, `whole`: (width, height) of the window's inside
+    and of its screen in page pixels. `box`: the inside in device pixels as the browser laid it out,
+    None where a browser does not report it. `full`: shown full screen on request. `settled`: the
+    browser no longer shows over the page that Esc leaves full screen. `pinched`: magnification by
+    touch.
+    """
+
+    dpr: _Ratio
+    inner: tuple[_Count, _Count]
+    whole: tuple[_Count, _Count]
+    box: tuple[_Count, _Count] | None
+    full: bool
+    settled: bool
+    visible: bool
+    pinched: _Ratio
+
+    @property
+    def full_screen(self) -> bool:
+        """Whether the window is full screen, on request or because it was opened so (kiosk,
+        F11)."""
+        return self.full or self.inner == self.whole
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) device px of the window if it is full screen, else of the screen."""
+        width, height = self.inner if self.full_screen else self.whole
+        return round(width * self.dpr), round(height * self.dpr)
+
+    @property
+    def is_pixel_exact(self) -> bool:
+        """Whether the window is a whole number of device pixels wide and high."""
+        sides = [self.dpr * side for side in self.inner]
+        whole = tuple(round(side) for side in sides)
+        near = all(abs(side - px) < _EXACT_PX for side, px in zip(sides, whole, strict=True))
+        # a ratio that developer tools emulate is not in the box, which is then in page pixels
+        return near and self.box in (None, whole, self.inner)
+
+    def refusal(self, size: tuple[int, int] | None) -> str:
+        """Return why patterns of `size` (width, height; None: unknown) cannot be shown there, with
+        a remedy; else ""."""
+        if not self.visible:
+            return (
+                "the projector page is hidden: bring its window to the front of the projector's"
+                " screen, and leave nothing on top of it"
+            )
+        if not self.full_screen:
+            return (
+                "the projector page does not fill its screen: put its window on the projector's"
+                " screen and click into it (or press F11)"
+            )
+        if abs(self.pinched - 1) > 1e-3:
+            return (
+                "the projector page is magnified by touch: pinch it back to its normal size, or"
+                " reload it"
+            )
+        if not self.is_pixel_exact:
+            width, height = (self.dpr * side for side in self.inner)
+            return (
+                f"the projector page would resample the patterns, its window is {width:g} x"
+                f" {height:g} px at {self.dpr:g} px per page pixel: set the scaling of the"
+                " projector's display to 100 % in the system's display settings, and the page's"
+                " zoom to 100 % (Ctrl+0)"
+            )
+        # zoomed, next to a bar, or full screen inside a tab that is recorded
+        if self.inner != self.whole:
+            (width, height), (columns, rows) = self.inner, self.whole
+            return (
+                f"the projector page is full screen and {width} x {height} page pixels large where"
+                f" its screen has {columns} x {rows}: set the page's zoom to 100 % (Ctrl+0), close"
+                " any bar that the browser shows above it, and let nothing share or record this tab"
+            )
+        if size is not None and self.size != size:
+            (columns, rows), (width, height) = self.size, size
+            return (
+                f"the projector page fills {columns} x {rows} px and the patterns have {width} x"
+                f" {height}, which must fill it exactly: set the resolution of that display to"
+                f" {width} x {height}, or choose {columns} x {rows} as the projector's size"
+            )
+        if not self.settled:
+            return "the browser still shows a notice over the projector page: wait a few seconds"
+        return ""
 
 
 class ProjectorChannel(PageChannel[Screen]):
     """Connects a projector to its page."""
 
-    hello, report = ProjectorHello, ProjectorReport
+    facts = Screen
     name = "the projector page"
     remedy = "open the projector's link on the projector's screen"
 
     def __init__(self, answer_s: float = ANSWER_S) -> None:
         super().__init__(answer_s)
-        self._pattern_size: tuple[int, int] | None = None
         self._light: int | None = None
-
-    def set_pattern_size(self, size: tuple[int, int]) -> None:
-        """Judge pages by patterns of this size (width, height) from now on."""
-        with self._condition:
-            self._pattern_size = size
-            self._publish_state()
 
     def set_light(self, grey: int | None) -> None:
         """Set the light that a page shows after a reload; None: no projector is open, it shows its
@@ -67,14 +132,8 @@ class ProjectorChannel(PageChannel[Screen]):
             self._light = grey
             self._publish_state()
 
-    def _refuse(self, facts: Screen) -> str:
-        return refusal(facts, self._pattern_size)
-
-    def _size(self, facts: Screen) -> tuple[int, int]:
-        return facts.pixels
-
     def _describe_state(self, facts: Screen) -> tuple[Any, dict[str, Any]]:
-        size = self._pattern_size or facts.pixels
+        size = self._wanted_size or facts.size
         return (size, self._light is None), {
             "full": facts.full_screen,
             "size": size,
@@ -103,7 +162,7 @@ class BrowserProjector(Openable):
         """Show dark. Raises DeviceError with a remedy where the page cannot show patterns pixel by
         pixel."""
         self._forget_loaded()
-        self._channel.set_pattern_size(self.size)
+        self._channel.set_size(self.size)
         self._channel.page()
         self.show_level(None)
 
@@ -135,7 +194,7 @@ class BrowserProjector(Openable):
         check_index(self, self._sequence, index)
         page = self._page
         try:
-            assert page is not None
+            assert page
             page.request("show", index=index)
             if page.changes != self._changes:
                 raise DeviceError(
@@ -166,18 +225,4 @@ def browser_projector(
 
     Raises DeviceError without a `page`, and where `size` is None and no page is connected.
     """
-    if page is None:
-        raise DeviceError(
-            "the browser projector's page is served by `slviewer wizard` and `slviewer capture`:"
-            " use one of them"
-        )
-    known = (
-        page.page_state().size
-        if size is None
-        else check_image_size("projector", size, _MAX_SIZE_PX)
-    )
-    if known is None:
-        raise DeviceError(
-            "the projector's size is unknown: open the projector page first, or give the size"
-        )
-    return BrowserProjector(page, known)
+    return BrowserProjector(*resolve_page(page, "projector", size, _MAX_SIZE_PX))

@@ -33,7 +33,7 @@ def capture_frames(
     with report_driver_faults(rig.projector):
         rig.projector.load(sequence)
     out = _allocate(rig, len(sequence.frames), out)
-    _capture_loaded(rig, len(sequence.frames), out, progress, sleep)
+    _capture_loaded(rig, out, range(len(out)), progress, sleep)
     return out
 
 
@@ -53,31 +53,31 @@ def _allocate(rig: Rig, n: int, out: np.ndarray | None) -> np.ndarray:
 
 def _capture_loaded(
     rig: Rig,
-    n: int,
     out: np.ndarray,
+    places: range,
     progress: Callable[[int, int], None] | None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Show and grab the `n` loaded frames into `out` (n, h, w)."""
-    if progress is not None:
-        progress(0, n)
-    for k in range(n):
+    """Show and grab the loaded frames into their `places` in `out` (k, h, w)."""
+    report = progress or (lambda done, n: None)
+    report(places.start, len(out))
+    for k, place in enumerate(places):
         try:
             with report_driver_faults(rig.projector):
                 rig.projector.show(k)
             settle(rig, sleep)
             with report_driver_faults(rig.camera):
-                rig.camera.grab(out[k])
-            if k == n - 1:
+                rig.camera.grab(out[place])
+            if k == len(places) - 1:
                 with report_driver_faults(rig.projector):
                     # a change during this exposure is reported by the next request only
                     rig.projector.show(k)
         except DeviceError as error:
             raise DeviceError(
-                f"the capture ended at frame {k + 1} of {n}, and its frames were discarded: {error}"
+                f"the capture ended at frame {k + 1} of {len(places)}, and its frames were"
+                f" discarded: {error}"
             ) from error
-        if progress is not None:
-            progress(k + 1, n)
+        report(place + 1, len(out))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +111,15 @@ def capture_with_texture(
     raises.
     """
     if not exposures_ms:
-        frames = capture_frames(rig, sequence, out, progress)
-        return CapturedFrames(
-            frames, _read_settings(rig), sequence, rig.name, (), _try_capture_colour(rig)
-        )
+        return _complete(rig, sequence, capture_frames(rig, sequence, out, progress))
     wanted = check_exposures(exposures_ms)
     n = len(sequence.frames)
     out = _allocate(rig, n * len(wanted), out)
     with report_driver_faults(rig.projector):
         # once: a projector reconnected between two exposures must not go unnoticed
         rig.projector.load(sequence)
-    before, applied_ms = _read_settings(rig), []
+    with report_driver_faults(rig.camera):
+        before, applied_ms = rig.camera.settings(), list[float]()
     try:
         for e, exposure in enumerate(wanted):
             applied_ms.append(_set_exposure(rig, exposure))
@@ -130,19 +128,25 @@ def capture_with_texture(
                     f"{rig.camera.name} set {applied_ms[e]:g} ms instead of the requested"
                     f" {exposure:g} ms: choose exposures that it can tell apart, or a single one"
                 )
-            _capture_loaded(
-                rig, n, out[e * n : (e + 1) * n], _offset_progress(progress, e * n, len(out))
-            )
+            _capture_loaded(rig, out, range(e * n, (e + 1) * n), progress)
     finally:
         # a lost device raises its own error
-        with (
-            contextlib.suppress(DeviceError),
-            report_driver_faults(rig.camera),
-        ):
+        with contextlib.suppress(DeviceError), report_driver_faults(rig.camera):
             rig.camera.apply(before)
-    return CapturedFrames(
-        out, _read_settings(rig), sequence, rig.name, tuple(applied_ms), _try_capture_colour(rig)
-    )
+    return _complete(rig, sequence, out, tuple(applied_ms))
+
+
+def _complete(
+    rig: Rig, sequence: PatternSequence, frames: np.ndarray, applied_ms: tuple[float, ...] = ()
+) -> CapturedFrames:
+    """Return captured frames with the camera's settings and the colour texture (h, w, 3), None also
+    on a DeviceError: the frames are complete without it."""
+    texture = None
+    with report_driver_faults(rig.camera):
+        settings = rig.camera.settings()
+        with contextlib.suppress(DeviceError):
+            texture = capture_colour(rig)
+    return CapturedFrames(frames, settings, sequence, rig.name, applied_ms, texture)
 
 
 def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
@@ -157,20 +161,6 @@ def check_exposures(exposures_ms: Sequence[float]) -> list[float]:
     return wanted
 
 
-def _try_capture_colour(rig: Rig) -> np.ndarray | None:
-    """Capture the colour texture (h, w, 3); None also on a DeviceError: the frames are complete
-    without it."""
-    with report_driver_faults(rig.camera), contextlib.suppress(DeviceError):
-        return capture_colour(rig)
-    return None
-
-
-def _read_settings(rig: Rig) -> CameraSettings:
-    """Return the camera's settings. Raises DeviceError."""
-    with report_driver_faults(rig.camera):
-        return rig.camera.settings()
-
-
 def _set_exposure(rig: Rig, exposure_ms: float) -> float:
     """Set the exposure; returns the value, ms, that the camera applied. Raises DeviceError where it
     is unknown."""
@@ -181,14 +171,6 @@ def _set_exposure(rig: Rig, exposure_ms: float) -> float:
             f"{rig.camera.name} does not report its exposure: capture in a single one"
         )
     return applied_ms
-
-
-def _offset_progress(
-    progress: Callable[[int, int], None] | None, before: int, frames: int
-) -> Callable[[int, int], None] | None:
-    """Return progress over all `frames`, for one exposure whose frames come after `before`
-    others."""
-    return None if progress is None else lambda done, _: progress(before + done, frames)
 
 
 def capture_colour(rig: Rig) -> np.ndarray | None:

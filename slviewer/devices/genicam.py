@@ -1,15 +1,28 @@
-"""USB3 Vision and GigE Vision cameras, through the GenTL producer that their maker installs."""
+"""USB3 Vision and GigE Vision cameras, through the GenTL producer that their maker installs.
+
+`Features` are those for a structured-light rig: exposure in ms, gain as a factor, a trigger, no
+automatics. A node map is any object with a camera's nodes as attributes; its nodes are those of
+`genicam.genapi`.
+"""
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from slviewer.devices.drivers import Driver
-from slviewer.devices.genicam_features import Features, Trigger
-from slviewer.devices.gentl import ListedCamera, list_cameras
-from slviewer.devices.gentl_link import Image, Link, open_node_map
+from slviewer.devices.gentl import (
+    Image,
+    Link,
+    ListedCamera,
+    as_device_error,
+    list_cameras,
+    open_node_map,
+)
+from slviewer.devices.pixel_formats import PixelFormat, best_format, pixel_format
 from slviewer.devices.protocols import (
     CameraSettings,
     Channel,
@@ -19,6 +32,238 @@ from slviewer.devices.protocols import (
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
+
+Trigger = Literal["software", "hardware", "free"]
+
+# EAccessMode: 1 not now, 2 write, 3 read, 4 both
+_IMPLEMENTED, _READABLE, _WRITABLE = ((1, 2, 3, 4), (3, 4), (2, 4))
+_EXPOSURES = ("ExposureTime", "ExposureTimeAbs")  # the second is older GigE cameras'
+_MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "s": 1e3}
+_AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "BlackLevelAuto")
+_ALTERING = (
+    "AcquisitionFrameRateEnable",
+    "AcquisitionFrameRateEnabled",
+    "GammaEnable",
+    "GammaEnabled",
+    "LUTEnable",
+)
+_FRAME_TRIGGERS = ("FrameStart", "ExposureStart")
+
+
+class Features:
+    """The GenICam features of a camera called `name`. Every method raises DeviceError if it does
+    not answer."""
+
+    def __init__(self, node_map: Any, name: str) -> None:
+        self._nodes, self._name = node_map, name
+
+    def size(self) -> tuple[int, int]:
+        """Return the (width, height) px of its images: the whole sensor, or the region that is set
+        in it."""
+        width, height = self._get_node("Width"), self._get_node("Height")
+        if width is None or height is None:
+            raise DeviceError(f"{self._name} does not report its image size: use another camera")
+        with as_device_error(self._name):
+            return int(width.value), int(height.value)
+
+    def choose_format(self, wanted: str | None = None) -> PixelFormat:
+        """Choose the pixel format, `wanted` or the best. Raises InputError for one that is not
+        offered or not supported.
+        """
+        offered = self._list_choices("PixelFormat")
+        usable = [name for name in offered if pixel_format(name) is not None]
+        chosen = (
+            best_format(usable)
+            if wanted is None
+            else pixel_format(wanted)
+            if wanted in offered
+            else None
+        )
+        if chosen is None:
+            missing = "none that can be read" if wanted is None else f"no {wanted} that can be read"
+            raise InputError(
+                f"{self._name} offers {missing}: use one of {', '.join(usable) or 'another camera'}"
+                " as pixel_format"
+            )
+        return chosen
+
+    def choose_trigger(self, wanted: Trigger | None, line: str | None) -> Trigger:
+        """Choose what starts an exposure: `wanted`, else software where supported, else free
+        running.
+
+        Raises InputError for a trigger or a line that the camera lacks.
+        """
+        if wanted is not None and wanted not in get_args(Trigger):
+            raise InputError(
+                f"no trigger is called {wanted!r}: use one of {', '.join(get_args(Trigger))}"
+            )
+        has_mode = "On" in self._list_choices("TriggerMode")
+        sources = self._list_choices("TriggerSource") if has_mode else []
+        software = (
+            "Software" in sources and self._get_node("TriggerSoftware", _IMPLEMENTED) is not None
+        )
+        if wanted is None:
+            return "software" if software else "free"
+        if wanted == "software" and not software:
+            raise InputError(
+                f"{self._name} has no software trigger: leave `trigger` out, and it runs free"
+            )
+        lines = [source for source in sources if source not in ("Software", "Off")]
+        if wanted == "hardware" and (line is None or line not in lines):
+            raise InputError(
+                f"{self._name} has"
+                f" {f'no trigger line {line!r}' if line else 'a trigger line to be named'}: use one"
+                f" of {', '.join(lines)} as `line`"
+                if lines
+                else f"{self._name} has no trigger lines: leave `trigger` out"
+            )
+        return wanted
+
+    def check_settings(self, wanted: CameraSettings) -> None:
+        """Raise InputError for settings that the camera has no feature for."""
+        if wanted.exposure_ms is not None and self._get_exposure_node() is None:
+            raise InputError(
+                f"{self._name} has no exposure time that can be set: leave exposure_ms out"
+            )
+        if wanted.gain is not None and self._get_gain_node() is None:
+            gain = self._get_node("Gain")
+            why = "no gain" if gain is None else "a gain in device-specific steps of unknown factor"
+            raise InputError(
+                f"{self._name} has {why}: leave `gain` out, and set it with its maker's software"
+            )
+
+    def prepare(self, chosen: PixelFormat, trigger: Trigger, line: str | None) -> None:
+        """Configure comparable frames: no automatics, grey levels proportional to light, this
+        format and trigger."""
+        with as_device_error(self._name):
+            self._choose("PixelFormat", chosen.name)
+            self._choose("AcquisitionMode", "Continuous")
+            self._choose("ExposureMode", "Timed")
+            for name in _AUTOMATIC:
+                self._choose(name, "Off")
+            for name in _ALTERING:
+                if (node := self._get_node(name, _WRITABLE)) is not None:
+                    node.value = False
+            if (gamma := self._get_node("Gamma", _WRITABLE)) is not None:
+                _set_nearest(gamma, 1.0)
+            self._choose("GainSelector", "All")
+            self._set_trigger(trigger, line)
+            current = self._get_node("PixelFormat")
+            if current is None or current.value != chosen.name:
+                raise DeviceError(
+                    f"{self._name} did not accept the pixel format {chosen.name}: choose"
+                    " another one"
+                )
+
+    def release(self) -> None:
+        """Restore free running, which other programs expect."""
+        with as_device_error(self._name):
+            self._set_trigger("free", None)
+
+    def fire(self) -> None:
+        """Start an exposure by software."""
+        with as_device_error(self._name):
+            self._nodes.TriggerSoftware.execute()
+
+    def settings(self) -> CameraSettings:
+        """Read the current settings; None for those that the camera lacks, and for a gain of
+        unknown factor."""
+        with as_device_error(self._name):
+            exposure, gain = self._get_exposure_node(), self._get_gain_node()
+            return CameraSettings(
+                None if exposure is None else float(exposure.value) * _ms_per_unit(exposure),
+                None if gain is None else 10 ** (float(gain.value) / 20),
+            )
+
+    def apply(self, settings: CameraSettings) -> None:
+        """Set the nearest supported values of the settings that the camera has."""
+        with as_device_error(self._name):
+            exposure, gain = self._get_exposure_node(), self._get_gain_node()
+            if settings.exposure_ms is not None and _is_settable(exposure):
+                _set_nearest(exposure, settings.exposure_ms / _ms_per_unit(exposure))
+            if settings.gain is not None and _is_settable(gain):
+                _set_nearest(gain, 20 * math.log10(settings.gain))
+
+    def _get_exposure_node(self) -> Any:
+        """Return the readable node of the exposure time; None where there is none."""
+        return next(
+            (node for name in _EXPOSURES if (node := self._get_node(name)) is not None), None
+        )
+
+    def _get_gain_node(self) -> Any:
+        """Return the readable node of the gain, if its unit is dB; else None."""
+        gain = self._get_node("Gain")
+        return (
+            gain
+            if gain is not None and str(getattr(gain, "unit", "")).strip().lower() == "db"
+            else None
+        )
+
+    def _set_trigger(self, trigger: Trigger, line: str | None) -> None:
+        """Switch every trigger off but the one that starts each frame."""
+        selectors = self._list_choices("TriggerSelector")
+        for selector in selectors or [""]:
+            self._choose("TriggerSelector", selector)
+            self._choose("TriggerMode", "Off")
+        if trigger == "free":
+            return
+        self._choose(
+            "TriggerSelector", next((name for name in _FRAME_TRIGGERS if name in selectors), "")
+        )
+        source = "Software" if trigger == "software" else line
+        if not (self._choose("TriggerSource", source or "") and self._choose("TriggerMode", "On")):
+            raise DeviceError(
+                f"{self._name} did not accept the trigger {source}: choose another one"
+            )
+
+    def _list_choices(self, name: str) -> list[str]:
+        """List the readable entries of the enumeration `name`."""
+        node = self._get_node(name)
+        if node is None:
+            return []
+        with as_device_error(self._name):
+            return [
+                entry.symbolic for entry in node.entries if entry.get_access_mode() in _READABLE
+            ]
+
+    def _choose(self, name: str, choice: str) -> bool:
+        """Set the enumeration `name` to `choice`; False where the camera does not offer it."""
+        if choice not in self._list_choices(name):
+            return False
+        node = getattr(self._nodes, name)
+        if node.value != choice:
+            node.value = choice
+        return True
+
+    def _get_node(self, name: str, access: tuple[int, ...] = _READABLE) -> Any:
+        """Return the node `name`, if it has one of these access modes now; else None."""
+        with as_device_error(self._name):
+            node = getattr(self._nodes, name, None)
+            return node if node is not None and node.get_access_mode() in access else None
+
+
+def _is_settable(node: Any) -> bool:
+    """Whether a node exists and can be written now."""
+    return node is not None and node.get_access_mode() in _WRITABLE
+
+
+def _ms_per_unit(exposure: Any) -> float:
+    """Return the length of the exposure node's unit in ms; microseconds, as in the standard, where
+    it names none."""
+    return _MS.get(str(getattr(exposure, "unit", "")).strip(), 1e-3)
+
+
+def _set_nearest(node: Any, wanted: float) -> None:
+    """Set a numeric node to the nearest valid value."""
+    low, high = node.min, node.max
+    whole = isinstance(low, int)
+    step = node.inc if whole or node.has_inc() else 0
+    value = min(max(wanted, low), high)
+    if step:
+        value = low + round((value - low) / step) * step
+        value = value if value <= high else value - step
+    node.value = int(value) if whole else float(value)
+
 
 IN_FLIGHT = 2
 """Frames of a camera that runs by its own clock, or a line's, that may have begun before a call and
@@ -92,7 +337,7 @@ class GenicamCamera(Openable):
         """Release the camera, in free-running mode."""
         super().close()
         link, self._link = self._link, None
-        if link is not None:
+        if link:
             link.stop()
             with contextlib.suppress(Exception):
                 Features(link.node_map, self.name).release()
@@ -139,7 +384,7 @@ class GenicamCamera(Openable):
         """Yield an image whose exposure began after the call; after an error the stream is
         stopped."""
         link = self._link
-        assert link is not None
+        assert link
         try:
             if not link.streaming:
                 link.start()
@@ -161,7 +406,7 @@ class GenicamCamera(Openable):
 
     def _get_features(self) -> Features:
         """Return the features of the open camera."""
-        assert self._link is not None
+        assert self._link
         return Features(self._link.node_map, self.name)
 
 

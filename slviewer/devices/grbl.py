@@ -8,7 +8,7 @@ knows that it may turn.
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -164,7 +164,7 @@ class GcodeTurntable(Openable):
                 " it, and check the port; `slviewer devices` lists those that are connected"
             ) from error
         self._buffer, self._unreadable = b"", 0
-        self._is_marlin = self._probe() == "marlin"
+        self._probe()
         self.position_deg()  # raises where it is locked
 
     def close(self) -> None:
@@ -224,9 +224,9 @@ class GcodeTurntable(Openable):
             raise
         time.sleep(self.settle_ms / 1000)
 
-    def _probe(self) -> Dialect:
-        """Ask who is there until the controller answers. Raises TurntableError where it does not,
-        or not readably."""
+    def _probe(self) -> None:
+        """Ask who is there, GRBL or Marlin, until it answers. Raises TurntableError where it does
+        not, or not readably."""
         end = self._clock() + self.boot_s
         while self._clock() < end:
             for question, dialect, answer in (
@@ -242,7 +242,8 @@ class GcodeTurntable(Openable):
                     refused = dialect == "grbl" and line.startswith("error:")
                     if answer in line or refused:
                         self._drain()
-                        return "grbl" if dialect == "grbl" else "marlin"
+                        self._is_marlin = dialect == "marlin"
+                        return
                     if line.startswith(("ok", "error:")):
                         break
         if self._unreadable:
@@ -286,9 +287,7 @@ class GcodeTurntable(Openable):
     def _read_grbl(self) -> tuple[str, float]:
         """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which
         it cannot turn."""
-        self._write(b"?")
-        end = self._clock() + self.reply_s
-        while (line := self._read_line(end)) is not None:
+        for line in self._ask("?", "state"):
             if match := re.fullmatch(r"<(\w+)[^|]*\|[MW]Pos:([-\d.,]+)(\|.*)?>", line):
                 state, positions = match[1], match[2].split(",")
                 if state == "Alarm":
@@ -305,26 +304,30 @@ class GcodeTurntable(Openable):
                         f"{self.name} has no axis {self.axis}, it has {'XYZABC'[: len(positions)]}:"
                         " set `axis`"
                     ) from None
-            self._check_line(line, "?")
-        raise TurntableError(
-            f"{self.name} did not report its state in time: switch it off and on, and check its"
-            " cable"
-        )
+        raise AssertionError
 
     def _read_marlin(self) -> float:
         """Ask Marlin for the position of the axis, in units."""
-        self._write(b"M114\n")
-        end, position = self._clock() + self.reply_s, None
-        while (line := self._read_line(end)) is not None:
-            self._check_line(line, "M114")
+        position = None
+        for line in self._ask("M114\n", "angle"):
             match = re.search(rf"(?<!\w){self.axis}:\s*(-?\d+(?:\.\d+)?)", line.split("Count")[0])
             position = float(match[1]) if match else position
             if line.startswith("ok"):
                 if position is None:
                     raise TurntableError(f"{self.name} has no axis {self.axis}: set `axis`")
                 return position
+        raise AssertionError
+
+    def _ask(self, question: str, what: str) -> Iterator[str]:
+        """Send a question, and yield the lines that come. Raises TurntableError where one reports a
+        fault, and where none is taken for the answer in time."""
+        self._write(question.encode())
+        end = self._clock() + self.reply_s
+        while (line := self._read_line(end)) is not None:
+            self._check_line(line, question.strip())
+            yield line
         raise TurntableError(
-            f"{self.name} did not report its angle in time: switch it off and on, and check its"
+            f"{self.name} did not report its {what} in time: switch it off and on, and check its"
             " cable"
         )
 

@@ -12,12 +12,13 @@ import struct
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import msgspec
 
+from slviewer.devices.protocols import check_image_size
 from slviewer.errors import DeviceError, InputError
 
 ANSWER_S = 1.8
@@ -27,8 +28,36 @@ unless it says more."""
 Send = Callable[[bytes | None], None]
 """Queue a message for the page, from any thread, and return at once; None: end it, another window
 took over."""
-Facts = TypeVar("Facts")
-"""What a kind of page reports of itself."""
+
+
+class PageFacts(Protocol):
+    """What a kind of page reports of itself."""
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """The (width, height) px of the page's screen or camera."""
+
+    def refusal(self, size: tuple[int, int] | None) -> str:
+        """Return why the page cannot be a device of this size (None: unknown), with a remedy; ""
+        where it can."""
+
+
+Facts = TypeVar("Facts", bound=PageFacts)
+
+
+class Hello(msgspec.Struct, Generic[Facts], tag_field="op", tag="hello"):
+    """A page's first message; `window` is the same after a reload, `take`: it requests to be the
+    device."""
+
+    window: str
+    take: bool
+    facts: Facts
+
+
+class Report(msgspec.Struct, Generic[Facts], tag_field="op", tag="report"):
+    """Message of a page that what it reports has changed."""
+
+    facts: Facts
 
 
 class Done(msgspec.Struct, tag_field="op", tag="done"):
@@ -71,7 +100,7 @@ class PageConnection(Generic[Facts]):
     gone: str = ""
     published: Any = None
     _number: int = 0
-    _answer: tuple[Done, bytes] | None = None
+    answer: tuple[Done, bytes] | None = None
 
     def request(
         self, op: str, payload: bytes = b"", timeout_s: float | None = None, **fields: Any
@@ -87,7 +116,7 @@ class PageConnection(Generic[Facts]):
             self.check()
             self.send(encode_message({"op": op, "number": self._number, **fields}, payload))
             end = time.monotonic() + timeout_s
-            while self._answer is None or self._answer[0].number != self._number:
+            while self.answer is None or self.answer[0].number != self._number:
                 self.check()
                 remaining_s = end - time.monotonic()
                 if remaining_s <= 0:
@@ -96,8 +125,8 @@ class PageConnection(Generic[Facts]):
                         " window is covered, its computer asleep, or the network down"
                     )
                 self.condition.wait(remaining_s)
-            done, content = self._answer
-            self._answer = None
+            done, content = self.answer
+            self.answer = None
             if done.why:
                 raise DeviceError(f"{self.name} failed, {done.why}: reload it")
             return content
@@ -107,20 +136,13 @@ class PageConnection(Generic[Facts]):
         if self.gone or self.refused:
             raise DeviceError(self.gone or self.refused)
 
-    def store_answer(self, done: Done, content: bytes = b"") -> None:
-        """Store an answer for the waiting `request`."""
-        self._answer = done, content
-
 
 class PageChannel(ABC, Generic[Facts]):
     """Connects a device to its page. Every method may be called from any thread; only `wait_ready`
     waits."""
 
-    hello: type
-    """The page's first message, a struct of `window`, `take` and `facts`; `window` is the same
-    after a reload, `take`: it requests to be the device."""
-    report: type
-    """Message of the page that its `facts` have changed."""
+    facts: type
+    """What the page reports of itself."""
     name: str
     """Of the page, to start a sentence with."""
     remedy: str
@@ -130,17 +152,14 @@ class PageChannel(ABC, Generic[Facts]):
         self._condition = threading.Condition()
         self._answer_s = answer_s
         self._page: PageConnection[Facts] | None = None
+        self._wanted_size: tuple[int, int] | None = None
 
-    # what kinds of pages differ in
-
-    @abstractmethod
-    def _refuse(self, facts: Facts) -> str:
-        """Return why a page that reports this cannot be the device, with a remedy; "" where it
-        can."""
-
-    @abstractmethod
-    def _size(self, facts: Facts) -> tuple[int, int] | None:
-        """Return the (width, height) px of the page's screen or camera."""
+    def set_size(self, size: tuple[int, int] | None) -> None:
+        """Judge pages by pictures or patterns of this size (width, height) from now on; None: of
+        any."""
+        with self._condition:
+            self._wanted_size = size
+            self._publish_state()
 
     @abstractmethod
     def _describe_state(self, facts: Facts) -> tuple[Any, dict[str, Any]]:
@@ -155,7 +174,7 @@ class PageChannel(ABC, Generic[Facts]):
             page = self._page
             if page is None:
                 return PageState("waiting", "waiting for the page")
-            size = self._size(page.facts)
+            size = page.facts.size
             if page.refused or size is None:
                 return PageState("refused", page.refused, size)
             return PageState("ready", f"ready {size[0]} x {size[1]}", size)
@@ -184,10 +203,10 @@ class PageChannel(ABC, Generic[Facts]):
         """Connect the page that sent `hello`; None where another window is the device. Raises
         InputError for an invalid message.
         """
-        first = self._decode(hello, self.hello)
+        first = self._decode(hello, Hello[self.facts])  # type: ignore[name-defined]
         with self._condition:
             before = self._page
-            if before is not None:
+            if before:
                 is_same = first.window == before.window
                 if not is_same and not first.take:
                     return None
@@ -205,12 +224,16 @@ class PageChannel(ABC, Generic[Facts]):
 
     def handle_message(self, page: PageConnection[Facts], message: str | bytes) -> None:
         """Handle a message of a connected page. Raises InputError for an invalid one."""
-        incoming = self._read_message(message)
+        content = b""
+        if isinstance(message, bytes):  # an answer, as `encode_message` makes it
+            length = struct.unpack("<I", message[:4])[0] if len(message) >= 4 else 0
+            message, content = message[4 : 4 + length], message[4 + length :]
+        incoming = self._decode(message, Report[self.facts] | Done)  # type: ignore[name-defined]
         with self._condition:
-            if isinstance(incoming, tuple):
-                page.store_answer(*incoming)
-            elif incoming != page.facts:
-                page.facts = incoming
+            if isinstance(incoming, Done):
+                page.answer = incoming, content
+            elif incoming.facts != page.facts:
+                page.facts = incoming.facts
                 page.changes += 1
                 self._publish_state()
             self._condition.notify_all()
@@ -232,17 +255,12 @@ class PageChannel(ABC, Generic[Facts]):
         page = self._page
         if page is None:
             return
-        page.refused = self._refuse(page.facts)
+        page.refused = page.facts.refusal(self._wanted_size)
         self._condition.notify_all()
         state, fields = self._describe_state(page.facts)
         if (page.refused, state) != page.published:
             page.published = page.refused, state
             page.send(encode_message({"op": "stand", "refused": page.refused, **fields}))
-
-    def _read_message(self, message: str | bytes) -> tuple[Done, bytes] | Facts:
-        """Return an answer and what came with it, or what the page reports. Raises InputError."""
-        incoming = self._decode(message, self.report | Done)
-        return (incoming, b"") if isinstance(incoming, Done) else incoming.facts
 
     def _decode(self, message: str | bytes, kind: Any) -> Any:
         """Decode a JSON message of the page as `kind`. Raises InputError for an invalid one."""
@@ -252,8 +270,32 @@ class PageChannel(ABC, Generic[Facts]):
             raise InputError(f"{self.name} sent an invalid message ({error}): reload it") from error
 
 
+Channel = TypeVar("Channel", bound=PageChannel[Any])
+
+
 def encode_message(header: dict[str, Any], payload: bytes = b"") -> bytes:
     """Encode a message: the header's length as 4 bytes, little endian, the header as JSON, then the
     payload."""
     text = msgspec.json.encode(header)
     return struct.pack("<I", len(text)) + text + payload
+
+
+def resolve_page(
+    page: Channel | None, what: str, size: Sequence[int] | None, most_px: int
+) -> tuple[Channel, tuple[int, int]]:
+    """Return the channel of a device, and its size (width, height) px, by default that of the
+    connected page.
+
+    Raises DeviceError without a channel, and where the size is None and no page is ready.
+    """
+    if page is None:
+        raise DeviceError(
+            f"the browser {what}'s page is served by `slviewer wizard` and `slviewer capture`: use"
+            " one of them"
+        )
+    known = page.page_state().size if size is None else check_image_size(what, size, most_px)
+    if known is None:
+        raise DeviceError(
+            f"the {what}'s size is unknown: open the {what} page first, or give the size"
+        )
+    return page, known

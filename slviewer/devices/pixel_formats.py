@@ -17,30 +17,13 @@ import numpy as np
 from slviewer.errors import InputError
 
 _NAME = re.compile(r"(Mono|Bayer(?:RG|GR|GB|BG)|RGBa?|BGRa?)(8|10|12|14|16)(p|Packed)?")
-_ORDERS = {"RGB": (0, 1, 2), "RGBa": (0, 1, 2), "BGR": (2, 1, 0), "BGRa": (2, 1, 0)}
+_COLOURS = ("RGB", "RGBa", "BGR", "BGRa")
 _DEMOSAIC = {
     "BayerRG": cv2.COLOR_BayerRGGB2RGB,
     "BayerGR": cv2.COLOR_BayerGRBG2RGB,
     "BayerGB": cv2.COLOR_BayerGBRG2RGB,
     "BayerBG": cv2.COLOR_BayerBGGR2RGB,
 }
-
-_Bits = tuple[int, int, int]  # byte, which of its bits, by how much they move to the left
-_GROUPS: dict[tuple[int, str], tuple[int, tuple[tuple[_Bits, _Bits], ...]]] = {
-    (10, "p"): (
-        5,
-        (
-            ((0, 0xFF, 0), (1, 0x03, 8)),
-            ((1, 0xFC, -2), (2, 0x0F, 6)),
-            ((2, 0xF0, -4), (3, 0x3F, 4)),
-            ((3, 0xC0, -6), (4, 0xFF, 2)),
-        ),
-    ),
-    (12, "p"): (3, (((0, 0xFF, 0), (1, 0x0F, 8)), ((1, 0xF0, -4), (2, 0xFF, 4)))),
-    (10, "Packed"): (3, (((0, 0xFF, 2), (1, 0x03, 0)), ((2, 0xFF, 2), (1, 0x30, -4)))),
-    (12, "Packed"): (3, (((0, 0xFF, 4), (1, 0x0F, 0)), ((2, 0xFF, 4), (1, 0xF0, -4)))),
-}
-"""Bytes of a group, and the pixels that they hold."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +49,7 @@ class PixelFormat:
     @property
     def samples(self) -> int:
         """Samples per pixel."""
-        return len(self.kind) if self.kind in _ORDERS else 1
+        return len(self.kind) if self.kind in _COLOURS else 1
 
     def nbytes(self, size: tuple[int, int], padding: int = 0) -> int:
         """Return the bytes of an image (width, height) px whose rows end with `padding` bytes;
@@ -95,7 +78,7 @@ class PixelFormat:
             :, :used
         ]
         if self.packing:
-            _unpack_groups(lines, out.reshape(rows, pixels), *_GROUPS[self.bits, self.packing])
+            _unpack_groups(lines, out.reshape(rows, pixels), self.bits, self.packing)
         elif self.bits == 8:
             np.copyto(out.reshape(rows, used), lines)
         else:
@@ -115,9 +98,8 @@ class PixelFormat:
     def rgb(self, samples: np.ndarray) -> np.ndarray:
         """Convert the result of `view_samples` to (h, w, 3) RGB; a Bayer mosaic is interpolated
         linearly."""
-        if self.kind in _ORDERS:
-            reverse = _ORDERS[self.kind] == (2, 1, 0)
-            return samples[..., 2::-1] if reverse else samples[..., :3]
+        if self.kind in _COLOURS:
+            return samples[..., 2::-1] if self.kind.startswith("BGR") else samples[..., :3]
         if self.kind in _DEMOSAIC:
             return cv2.cvtColor(samples, _DEMOSAIC[self.kind])
         raise InputError(f"{self.name} tells no colours: choose a colour format")
@@ -129,11 +111,11 @@ def pixel_format(name: str) -> PixelFormat | None:
     if match is None:
         return None
     kind, bits, packing = match[1], int(match[2]), match[3] or ""
-    if kind in _ORDERS:
+    if kind in _COLOURS:
         packing = packing.replace("Packed", "")  # RGB8Packed is the old name of RGB8
         known = bits == 8 and not packing
     else:
-        known = not packing or (bits, packing) in _GROUPS
+        known = not packing or bits in (10, 12)
     return PixelFormat(name, kind, bits, packing) if known else None
 
 
@@ -157,31 +139,20 @@ def best_format(names: Sequence[str]) -> PixelFormat | None:
     )
 
 
-def _unpack_groups(
-    lines: np.ndarray, out: np.ndarray, group: int, pixels: tuple[tuple[_Bits, _Bits], ...]
-) -> None:
+def _unpack_groups(lines: np.ndarray, out: np.ndarray, bits: int, packing: str) -> None:
     """Fill `out` (rows, n) uint16 from (rows, bytes) in groups, of which the last may be short."""
-    count = len(pixels)
+    count = 4 if (bits, packing) == (10, "p") else 2
+    size = 5 if count == 4 else 3  # of a group, bytes
     groups = -(-out.shape[1] // count)
-    whole = out
-    if groups * group != lines.shape[1]:
-        lines = np.pad(lines, ((0, 0), (0, groups * group - lines.shape[1])))
-    if groups * count != out.shape[1]:
-        whole = np.empty((len(out), groups * count), np.uint16)
-    for k, parts in enumerate(pixels):
-        first, second = (
-            _shift_bits(lines[:, byte::group] & np.uint8(bits), shift)
-            for byte, bits, shift in parts
-        )
-        np.bitwise_or(first, second, out=whole[:, k::count])
-    if whole is not out:
-        out[:] = whole[:, : out.shape[1]]
-
-
-def _shift_bits(bits: np.ndarray, shift: int) -> np.ndarray:
-    """Shift bits to the left as uint16; to the right where `shift` is negative."""
-    return (
-        np.left_shift(bits, shift, dtype=np.uint16)
-        if shift > 0
-        else np.right_shift(bits, -shift, dtype=np.uint16)
-    )
+    lines = np.pad(lines, ((0, 0), (0, groups * size - lines.shape[1])))
+    columns = lines.reshape(len(lines), groups, size).astype(np.uint16)
+    whole = np.empty((len(out), groups, count), np.uint16)
+    for k in range(count):
+        if packing == "Packed":
+            rest = (columns[..., 1] >> 4 * k) & (2 ** (bits - 8) - 1)
+            whole[..., k] = (columns[..., 2 * k] << (bits - 8)) | rest
+        else:
+            first, shift = divmod(k * bits, 8)
+            pair = (columns[..., first + 1] << 8) | columns[..., first]
+            whole[..., k] = (pair >> shift) & (2**bits - 1)
+    out[:] = whole.reshape(len(out), -1)[:, : out.shape[1]]

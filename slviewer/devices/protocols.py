@@ -101,23 +101,19 @@ def list_changed_settings(
 ) -> tuple[str, ...]:
     """Return a sentence for each setting that the camera changed noticeably, unless its own `notes`
     report it."""
-    sentences = []
-    for what, unit, value, in_effect in (
+    settings = (
         ("an exposure", " ms", wanted.exposure_ms, applied.exposure_ms),
         ("a gain", "", wanted.gain, applied.gain),
-    ):
-        if (
-            value is None
-            or in_effect is None
-            or abs(in_effect - value) <= _SETTING_TOLERANCE * value
-        ):
-            continue
-        if not any(f"{value:g}{unit}" in note for note in list_notes(camera)):
-            sentences.append(
-                f"{camera.name} took {what} of {in_effect:g}{unit} in place of {value:g}{unit}: "
-                "give one that it supports"
-            )
-    return tuple(sentences)
+    )
+    return tuple(
+        f"{camera.name} took {what} of {in_effect:g}{unit} in place of {value:g}{unit}: "
+        "give one that it supports"
+        for what, unit, value, in_effect in settings
+        if value is not None
+        and in_effect is not None
+        and abs(in_effect - value) > _SETTING_TOLERANCE * value
+        and not any(f"{value:g}{unit}" in note for note in list_notes(camera))
+    )
 
 
 def find_full_scale(camera: Camera, largest: int) -> float:

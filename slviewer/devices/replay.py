@@ -108,9 +108,8 @@ class ReplayProjector(Openable):
     def show(self, index: int) -> None:
         """Select frame `index` as the camera's next one."""
         self.check_open()
-        frames, sequence = self._loaded or (None, None)
+        frames, sequence = self._loaded or (np.empty(0), None)
         check_index(self, sequence, index)
-        assert frames is not None
         self._recording.visible_frame = frames[index]
 
     def show_level(self, grey: int | None) -> None:

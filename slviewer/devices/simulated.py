@@ -79,14 +79,12 @@ class SimulatedCamera(Openable):
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set exposure and gain, limited to 0.01 ... 100 ms and 1 ... 16 times."""
         self.check_open()
-        exposure, gain = (
-            before if wanted is None else min(max(wanted, low), high)
-            for wanted, before, (low, high) in (
-                (settings.exposure_ms, self._settings.exposure_ms, _EXPOSURES_MS),
-                (settings.gain, self._settings.gain, _GAINS),
-            )
+        before = self._settings
+        exposure_ms, gain = settings.exposure_ms or before.exposure_ms, settings.gain or before.gain
+        assert exposure_ms is not None and gain is not None
+        self._settings = CameraSettings(
+            float(np.clip(exposure_ms, *_EXPOSURES_MS)), float(np.clip(gain, *_GAINS))
         )
-        self._settings = CameraSettings(exposure, gain)
         return self._settings
 
 

@@ -43,14 +43,9 @@ Thing = Literal[
 turntable, alone and on a table, a plate with coded markers, and three surfaces that light
 themselves."""
 
-_INITIAL_DEPTHS_MM = {
-    "board": 600.0,
-    "plane": 600.0,
-    "sphere": 690.0,
-    "object": 600.0,
-    "marked": 600.0,
-}
-_INITIAL_DEPTHS_MM |= dict.fromkeys(CONCAVE, 640.0)
+_INITIAL_DEPTHS_MM = {"sphere": 690.0, **dict.fromkeys(CONCAVE, 640.0)}
+_USUAL_DEPTH_MM = 600.0
+"""At which things stand at first."""
 SETTLED_S = 0.3
 """A thing that has not been moved for so long is rendered in full by a preview too."""
 _DRAFT_SCALE = (
@@ -120,19 +115,25 @@ class SimulatedWorld:
     @property
     def board(self) -> Board:
         """The printed board geometry."""
-        board = self._get_board_scene().board
-        assert board is not None
-        return board
+        scene = self._things["board"]
+        assert isinstance(scene, BoardScene) and scene.board is not None
+        return scene.board
 
     @property
     def shape(self) -> BoardShape:
         """The board's deviation from flat, and of its features from their nominal positions."""
-        return self._get_board_scene().shape
+        scene = self._things["board"]
+        assert isinstance(scene, BoardScene)
+        return scene.shape
 
     @property
     def pose(self) -> Pose:
         """T_camera_thing of the thing in view; identity rotation for a sphere."""
-        return _get_pose(self.scene)
+        scene = self.scene
+        if isinstance(scene, Spheres):
+            return Pose(np.eye(3), scene.centres[0])
+        assert isinstance(scene, BoardScene | MeshScene | MarkedScene)
+        return scene.pose
 
     @property
     def turn_deg(self) -> float:
@@ -147,7 +148,7 @@ class SimulatedWorld:
         Raises InputError for ChArUco boards, which the simulation does not print.
         """
         middle = (board.points.min(0) + board.points.max(0)) / 2
-        pose = Pose(np.eye(3), np.array([0, 0, _INITIAL_DEPTHS_MM["board"]]) - middle)
+        pose = Pose(np.eye(3), np.array([0, 0, _USUAL_DEPTH_MM]) - middle)
         self._store_scene("board", printed_board(board, pose, shape, self.rig.seed))
 
     def place(self, thing: Thing, pose: Pose | None = None) -> None:
@@ -215,21 +216,6 @@ class SimulatedWorld:
                 self._moved = self._clock()
                 self._renderers.clear()
 
-    def _get_board_scene(self) -> BoardScene:
-        """Return the scene of the board."""
-        with self._lock:
-            scene = self._things["board"]
-        assert isinstance(scene, BoardScene)
-        return scene
-
-
-def _get_pose(scene: Scene) -> Pose:
-    """Return the T_camera_thing of a scene; identity rotation for a sphere."""
-    if isinstance(scene, Spheres):
-        return Pose(np.eye(3), scene.centres[0])
-    assert isinstance(scene, BoardScene | MeshScene | MarkedScene)
-    return scene.pose
-
 
 def _move_scene(scene: Scene, pose: Pose) -> Scene:
     """Return a scene moved to another pose; of a sphere only the centre moves."""
@@ -255,4 +241,4 @@ def _make_scene(thing: Thing) -> Scene:
 def _make_initial_pose(thing: Thing) -> Pose:
     """Return the pose at which a thing is first placed: in front of the camera at its default
     depth."""
-    return Pose(np.eye(3), np.array([0.0, 0.0, _INITIAL_DEPTHS_MM[thing]]))
+    return Pose(np.eye(3), np.array([0.0, 0.0, _INITIAL_DEPTHS_MM.get(thing, _USUAL_DEPTH_MM)]))

@@ -4,6 +4,7 @@ them."""
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest, crop_mask
 
 OFF = "off"
+C = TypeVar("C", bound=Cloud)
 _EXAMPLE = "such as --roi=-50,50,-40,40,300,500"
 
 
@@ -59,9 +61,7 @@ def refuse_region(merge: str, roi: str) -> None:
         )
 
 
-def restrict_cloud(
-    store: Session, scan: str, cloud: Cloud, region: RegionOfInterest | None
-) -> Cloud:
+def restrict_cloud(store: Session, scan: str, cloud: C, region: RegionOfInterest | None) -> C:
     """Return a scan's cloud with NaN for what was deleted from it and what lies outside of the
     region.
 

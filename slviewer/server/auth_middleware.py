@@ -133,10 +133,7 @@ class AuthMiddleware:
         if path == "/":
             return self._show_login(host)
         # browsers ask for the icon by themselves, and would report its absence
-        if path in (
-            "/favicon.ico",
-            HEALTH,
-        ):
+        if path in ("/favicon.ico", HEALTH):
             return respond(HTTPStatus.NO_CONTENT)
         return self._log_in(connection, request) if path == LOGIN else None
 

@@ -13,19 +13,19 @@ RESOLVE_SECONDS = 1.5
 """A name server that does not answer must not keep the operator waiting."""
 
 
-def listen(host: str, port: int, resolve_s: float = RESOLVE_SECONDS) -> Listener:
+def listen(host: str, port: int) -> Listener:
     """A TCP socket listening at exactly this address, with limits for unauthenticated clients; port
     0 takes any free one.
 
-    A name server has `resolve_s` to answer. Raises SlviewerError at the latest then, where the port
-    is in use or the address is not this machine's.
+    A name server has RESOLVE_SECONDS to answer. Raises SlviewerError at the latest then, where the
+    port is in use or the address is not this machine's.
     """
     if not host or not 0 <= port <= 65535:
         raise SlviewerError(
             f"{host or 'An empty host'}:{port} is not an address to serve at: try 127.0.0.1 and"
             " port 8080."
         )
-    family, address = _resolve(host, port, resolve_s)
+    family, address = _resolve(host, port)
     sock = Listener(family, socket.SOCK_STREAM)
     try:
         if os.name == "posix":  # elsewhere this option lets two programs share a port
@@ -52,7 +52,7 @@ def network_address() -> str | None:
         return str(sock.getsockname()[0])
 
 
-def _resolve(host: str, port: int, resolve_s: float) -> tuple[int, tuple]:
+def _resolve(host: str, port: int) -> tuple[int, tuple]:
     """Address family and socket address of host and port; raises SlviewerError if the name does not
     resolve in time."""
     candidates: list[tuple[int, tuple]] = []
@@ -67,7 +67,7 @@ def _resolve(host: str, port: int, resolve_s: float) -> tuple[int, tuple]:
 
     thread = threading.Thread(target=look_up, daemon=True)
     thread.start()
-    thread.join(resolve_s)
+    thread.join(RESOLVE_SECONDS)
     if not candidates:
         raise SlviewerError(
             f"No address was found for the host {host!r}: use 127.0.0.1 for this machine alone, "

@@ -33,16 +33,6 @@ class Connection(ServerConnection):
     """What a message becomes on its way in; None drops it."""
     _request_bytes = 0
 
-    def __init__(
-        self,
-        *args: Any,
-        request_s: float = REQUEST_SECONDS,
-        stall_s: float = STALL_SECONDS,
-        **options: Any,
-    ) -> None:
-        super().__init__(*args, **options)
-        self._request_s, self._stall_s = request_s, stall_s
-
     def data_received(self, data: bytes) -> None:
         """As websockets, but a request that is too long ends the connection before it takes up
         memory."""
@@ -58,7 +48,7 @@ class Connection(ServerConnection):
         alone."""
         await asyncio.wait(
             [self.request_rcvd, self.connection_lost_waiter],
-            timeout=self._request_s,
+            timeout=REQUEST_SECONDS,
             return_when=asyncio.FIRST_COMPLETED,
         )
         if self.request is None:
@@ -69,9 +59,7 @@ class Connection(ServerConnection):
         """The next message that the gate lets pass."""
         while True:
             data = await super().recv(decode)
-            if self.gate is None:
-                return data
-            passed = self.gate(data)
+            passed = data if self.gate is None else self.gate(data)
             if passed is not None:
                 return passed
 
@@ -80,18 +68,18 @@ class Connection(ServerConnection):
         must return.
 
         The reader's pace is kept, so that a file of any size takes one chunk of memory. A reader
-        who takes nothing for ``stall_s``, or a server that stops, ends it.
+        who takes nothing for STALL_SECONDS, or a server that stops, ends it.
         """
         tail: bytes = b"HTTP/1.1 200 OK\r\n" + headers.serialize()
         try:
-            async with asyncio.timeout(self._stall_s) as limit:
+            async with asyncio.timeout(STALL_SECONDS) as limit:
                 while chunk := await asyncio.to_thread(file.read, CHUNK):
                     if self.transport.is_closing() or not self.server.is_serving():
                         raise TimeoutError
                     self.transport.write(tail)
                     await self.drain()
                     tail = chunk
-                    limit.reschedule(asyncio.get_running_loop().time() + self._stall_s)
+                    limit.reschedule(asyncio.get_running_loop().time() + STALL_SECONDS)
         except (TimeoutError, OSError):
             # The answer has begun, so there is no other to give; a cancelled handshake ends the
             # connection silently.

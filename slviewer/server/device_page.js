@@ -4,10 +4,10 @@
 const FIRST_WAIT_MS = 250, LONGEST_WAIT_MS = 4000, ANOTHER_WINDOW = 4001;
 
 class DeviceLink {
-  // device: of which the page is one; subject: what the server calls `facts()`, plain values that describe the page;
+  // device: of which the page is one; facts(): plain values that describe the page;
   // receive(socket, header, payload): a message; changed(): the connection began or ended
-  constructor(device, subject, { facts, receive, changed }) {
-    Object.assign(this, { device, subject, facts, receive, changed });
+  constructor(device, { facts, receive, changed }) {
+    Object.assign(this, { device, facts, receive, changed });
     this.elsewhere = false;  // another window is the device
     this.socket = null;
     this.wait = FIRST_WAIT_MS;
@@ -24,7 +24,7 @@ class DeviceLink {
     const now = this.facts(), text = JSON.stringify(now);
     if (text === this.reported || !this.open) return;
     this.reported = text;
-    this.socket.send(JSON.stringify({ op: this.subject, [this.subject]: now }));
+    this.socket.send(JSON.stringify({ op: "report", facts: now }));
   }
 
   // take: even if another window is the device.
@@ -38,7 +38,7 @@ class DeviceLink {
       this.wait = FIRST_WAIT_MS;
       const now = this.facts();
       this.reported = JSON.stringify(now);
-      mine.send(JSON.stringify({ op: "hello", window: this.windowName(), take, [this.subject]: now }));
+      mine.send(JSON.stringify({ op: "hello", window: this.windowName(), take, facts: now }));
       this.changed();
     };
     mine.onmessage = ({ data }) => {

@@ -75,17 +75,16 @@ class ViserGate:
         """Return the bytes to pass on to viser for this message; raises MessageRefused if it is not
         allowed."""
         client = self._client
-        assert client is not None
-        if type(message) not in MESSAGES[self._role]:
-            raise MessageRefused("not for this link", correct=True)
-        if not _is_finite(vars(message)):
-            raise MessageRefused("numbers that are none")
+        assert client
+        _check(type(message) in MESSAGES[self._role], "not for this link", correct=True)
+        _check(_is_finite(vars(message)), "numbers that are none")
         match message:
             case messages.ViewerCameraMessage():
-                _check_camera(message)
+                sides_px = message.image_height, message.image_width
+                _check(all(0 < side_px < 2**15 for side_px in sides_px), "no camera")
+                _check(math.hypot(*message.wxyz) > 1e-6, "no camera")
             case messages.GuiUpdateMessage():
-                if message.updates.keys() != {"value"}:
-                    raise MessageRefused("only an input's value can be set")
+                _check(message.updates.keys() == {"value"}, "only an input's value can be set")
                 check_value(self._require_input(message.uuid), message.updates["value"])
             case messages.CommandTriggerMessage():
                 _check(client.command(message.uuid) is not None)
@@ -111,16 +110,13 @@ class ViserGate:
         scene = client.scene_api(message.owner)
         _check(scene is not None)
         match message:
-            case messages.TransformControlsUpdateMessage():
-                _check(
-                    client.listens_to_gizmo(scene, message.name)
-                    and math.hypot(*message.wxyz) > 1e-6
-                )
             case (
-                messages.TransformControlsDragStartMessage()
+                messages.TransformControlsUpdateMessage()
+                | messages.TransformControlsDragStartMessage()
                 | messages.TransformControlsDragEndMessage()
             ):
-                _check(client.listens_to_gizmo(scene, message.name))
+                turn = getattr(message, "wxyz", (1.0,))  # not in those that begin and end a drag
+                _check(client.listens_to_gizmo(scene, message.name) and math.hypot(*turn) > 1e-6)
             case messages.SceneNodeClickMessage():
                 _check(inside.listens_to_clicks(scene, message.name))
             case _:
@@ -128,17 +124,15 @@ class ViserGate:
 
     def _require_input(self, uuid: str) -> Any:
         """Return the visible, enabled input with this id; raises MessageRefused otherwise."""
-        assert self._client is not None
+        assert self._client
         handle = self._client.gui_input(uuid)
-        if handle is None:
-            raise MessageRefused("nothing visible there")
-        if getattr(handle, "disabled", False):
-            raise MessageRefused("disabled", correct=True)
+        _check(handle is not None, "nothing visible there")
+        _check(not getattr(handle, "disabled", False), "disabled", correct=True)
         return handle
 
     def _send_refusal(self, message: Any, refused: MessageRefused) -> None:
         """Notify the client that its upload was refused, or send it the true value of an input."""
-        assert self._client is not None
+        assert self._client
         if isinstance(message, messages.FileTransferStartUpload):
             self._client.refuse_upload(
                 message.source_component_uuid, message.transfer_uuid, message.size_bytes
@@ -154,19 +148,8 @@ class ViserGate:
         waiting."""
         # viser handles what passed in tasks of its own, in their order: after those that are
         # waiting.
-        assert self._client is not None
+        assert self._client
         asyncio.get_running_loop().call_soon(self._client.forget_upload, transfer)
-
-
-def _check_camera(message: messages.ViewerCameraMessage) -> None:
-    """Raise MessageRefused unless image size and orientation of the camera are plausible."""
-    usable = (
-        0 < message.image_height < 2**15
-        and 0 < message.image_width < 2**15
-        and math.hypot(*message.wxyz) > 1e-6
-    )
-    if not usable:
-        raise MessageRefused("no camera")
 
 
 def _is_finite(value: Any) -> bool:
@@ -174,10 +157,8 @@ def _is_finite(value: Any) -> bool:
     if isinstance(value, float):
         return math.isfinite(value)
     if isinstance(value, dict):
-        return all(map(_is_finite, value.values()))
-    if isinstance(value, list | tuple):
-        return all(map(_is_finite, value))
-    return True
+        value = list(value.values())
+    return not isinstance(value, list | tuple) or all(map(_is_finite, value))
 
 
 def check_value(handle: Any, value: Any) -> None:

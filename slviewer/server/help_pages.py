@@ -65,15 +65,15 @@ class HelpPages:
 
     def __init__(self, folder: Path | None = None) -> None:
         """``folder``: that of the documentation, by default the one that ships with the program."""
-        folder = folder or docs_folder()
-        names = (
-            {}
-            if folder is None
-            else {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*.*"))}
-        )
-        served = {name: path for name, path in names.items() if _is_served(name) and path.is_file()}
-        self._pages = {name: path for name, path in served.items() if name.endswith(".md")}
-        self._pictures = {name: path for name, path in served.items() if path.suffix in _PICTURES}
+        place = folder or docs_folder()
+        self._pages: dict[str, Path] = {}
+        self._pictures: dict[str, Path] = {}
+        if place:
+            for path in sorted(place.rglob("*.*")):
+                name = path.relative_to(place).as_posix()
+                if path.is_file() and _is_served(name):
+                    files = self._pages if path.suffix == ".md" else self._pictures
+                    files[name] = path
         self._rendered: dict[str, HelpFile] = {}
 
     @property
@@ -111,23 +111,16 @@ class HelpPages:
             if token.type == "fence" and token.info.strip() == "math":
                 token.type, token.content = "html_block", draw_equation(token.content)
         root = "../" * name.count("/")
-        groups = [
-            (
-                title,
-                [
-                    (root + page, self._title(page), page == name)
-                    for page in self.names
-                    if _top_folder(page) == key
-                ],
-            )
-            for key, title in _GROUPS.items()
-        ]
+        groups: dict[str, list[tuple[str, str, bool]]] = {}
+        for page in self.names:
+            link = root + page, self._title(page), page == name
+            groups.setdefault(_GROUPS[_top_folder(page)], []).append(link)
         return str(
             _template().render(
                 title=self._title(name) if name else "Help",
                 body=parser.renderer.render(tokens, parser.options, {}),
                 headings=[heading for heading in headings if heading.level in (2, 3)],
-                groups=[(title, pages) for title, pages in groups if pages],
+                groups=list(groups.items()),
                 root=root or "./",
             )
         )
@@ -206,7 +199,8 @@ def _is_served(name: str) -> bool:
     folder = _top_folder(name)
     if name.endswith(".md"):
         return folder in _GROUPS and name not in _DEVELOPMENT and not name.endswith("/index.md")
-    return not any(part.startswith((".", "_")) for part in name.split("/"))
+    hidden = any(part.startswith((".", "_")) for part in name.split("/"))
+    return Path(name).suffix in _PICTURES and not hidden
 
 
 @cache

@@ -8,7 +8,7 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
@@ -37,11 +37,8 @@ class Listener(socket.socket):
     until `admit` is called for its address.
     """
 
-    def __init__(
-        self, *args: Any, unauthenticated: int = MAX_UNAUTHENTICATED, **options: Any
-    ) -> None:
+    def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self._max_unauthenticated = unauthenticated
         self._unauthenticated: dict[Any, _Accepted] = {}
         self._counts = Counter[str]()
         self._closing: dict[Any, float] = {}
@@ -86,7 +83,7 @@ class Listener(socket.socket):
         Returns it; None where it is not among them.
         """
         accepted = self._unauthenticated.pop(peer, None)
-        if accepted is not None:
+        if accepted:
             self._counts[accepted.group] -= 1
             self._counts += Counter()  # without addresses that have none
         return accepted
@@ -96,13 +93,13 @@ class Listener(socket.socket):
         busiest, count = self._counts.most_common(1)[0]
         if (
             count <= MAX_UNAUTHENTICATED_PER_ADDRESS
-            and len(self._unauthenticated) <= self._max_unauthenticated
+            and len(self._unauthenticated) <= MAX_UNAUTHENTICATED
         ):
             return
         oldest = self.admit(
             next(peer for peer, one in self._unauthenticated.items() if one.group == busiest)
         )
-        assert oldest is not None
+        assert oldest
         self._closing[oldest.peer] = time.monotonic()
         with contextlib.suppress(OSError):  # it is closed as soon as its transport reads the end
             oldest.shutdown(socket.SHUT_RDWR)
@@ -129,27 +126,26 @@ class _Accepted(socket.socket):
 
 
 class Admissions:
-    """The connections with a valid cookie, by role, at most ``limits``. Only for the server's own
-    thread."""
+    """The connections with a valid cookie, by role. Only for the server's own thread."""
 
-    def __init__(self, listener: socket.socket, limits: Mapping[Role, int] = CONNECTIONS) -> None:
-        self._listener, self._limits = listener, limits
-        self._connections: dict[Role, set[Any]] = {role: set() for role in limits}
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self._connections: dict[Role, set[Any]] = {role: set() for role in CONNECTIONS}
 
     def admit(self, connection: Any, role: Role) -> None:
         """Count a connection (with `transport` and `role`) among those of a role; raises Refusal
         for one too many."""
-        if len(self._connections[role]) >= self._limits[role]:
+        connections = self._connections[role]
+        if len(connections) >= CONNECTIONS[role]:
             raise Refusal(
                 HTTPStatus.SERVICE_UNAVAILABLE,
                 "Too many pages are open by this link: close some of them.",
             )
-        if isinstance(self._listener, Listener):
-            self._listener.admit(connection.transport.get_extra_info("peername"))
+        self._listener.admit(connection.transport.get_extra_info("peername"))
         connection.role = role
-        self._connections[role].add(connection)
+        connections.add(connection)
         connection.connection_lost_waiter.add_done_callback(
-            lambda _: self._connections[role].discard(connection)
+            lambda _: connections.discard(connection)
         )
 
     def close_all(self, but: Any = None, only: Any = None) -> None:

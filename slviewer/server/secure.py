@@ -3,9 +3,8 @@ to change."""
 
 import ipaddress
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from slviewer.errors import UsageError
 from slviewer.server import viser_internals
 from slviewer.server.access import Access, Role
 from slviewer.server.auth_middleware import AuthMiddleware, DevicePage
-from slviewer.server.binding import RESOLVE_SECONDS, listen, network_address
-from slviewer.server.connection import REQUEST_SECONDS, STALL_SECONDS, Connection, quiet_logger
+from slviewer.server.binding import listen, network_address
+from slviewer.server.connection import REQUEST_SECONDS, Connection, quiet_logger
 from slviewer.server.credentials import (
     TlsCertificate,
     load_tokens,
@@ -27,7 +26,7 @@ from slviewer.server.credentials import (
 )
 from slviewer.server.downloads import Downloads
 from slviewer.server.gate import ViserGate
-from slviewer.server.limits import CONNECTIONS, Admissions, limit_log, raise_descriptor_limit
+from slviewer.server.limits import Admissions, limit_log, raise_descriptor_limit
 from slviewer.server.uploads import UploadBudget
 from slviewer.server.viser_internals import ViserClient
 
@@ -87,15 +86,18 @@ class SafeServer:
 
     @property
     def origin(self) -> str:
-        """Scheme, host and port of its address."""
-        return self._format_origin(self._format_host())
+        """Scheme, host and port of its address, in brackets for IPv6; loopback if all are open."""
+        address = self._address
+        if address.is_unspecified:
+            return self._format_origin("127.0.0.1" if address.version == 4 else "[::1]")
+        return self._format_origin(f"[{address}]" if address.version == 6 else str(address))
 
     @property
     def shared_origin(self) -> str:
         """Scheme, host and port for other devices: the address in the network, where all addresses
         are open."""
         found = network_address() if self._address.is_unspecified else None
-        return self._format_origin(found or self._format_host())
+        return self._format_origin(found) if found else self.origin
 
     def link(self, role: Role = "operate", origin: str | None = None) -> str:
         """The link of a role, with its token behind the #, which browsers do not send; as secret as
@@ -111,9 +113,9 @@ class SafeServer:
         """A link for the operator's browser that can be opened once, soon."""
         return f"{self.origin}/#{self.access.issue_one_time_token()}"
 
-    def renew_links(self, client_id: int, leaving_s: float = LEAVING_SECONDS) -> None:
+    def renew_links(self, client_id: int) -> None:
         """Replace all tokens, close all connections, and lead the operator's client that requested
-        it to its new page, for which it has `leaving_s`.
+        it to its new page, for which it has LEAVING_SECONDS.
 
         Raises OSError where the tokens come from a file that cannot be replaced; they are replaced
         here nevertheless.
@@ -123,7 +125,9 @@ class SafeServer:
         self.access.renew()
         viser_internals.call_soon(self.viser, 0.0, self.admissions.close_all, leaving)
         client.navigate(f"/#{self.access.issue_one_time_token()}")
-        viser_internals.call_soon(self.viser, leaving_s, self.admissions.close_all, None, leaving)
+        viser_internals.call_soon(
+            self.viser, LEAVING_SECONDS, self.admissions.close_all, None, leaving
+        )
         if self.serving.token_file is not None:
             save_tokens(
                 self.serving.token_file,
@@ -159,29 +163,11 @@ class SafeServer:
         """The IP address that the server listens at, without an IPv6 zone."""
         return ipaddress.ip_address(self.viser.get_host().partition("%")[0])
 
-    def _format_host(self) -> str:
-        """The host part of links: the address, in brackets for IPv6; loopback if all addresses are
-        open."""
-        address = self._address
-        if address.is_unspecified:
-            return "127.0.0.1" if address.version == 4 else "[::1]"
-        return f"[{address}]" if address.version == 6 else str(address)
-
 
 def serve(
-    serving: Serving,
-    *,
-    label: str | None = None,
-    upload_limit: int = 256 * 10**6,
-    request_s: float = REQUEST_SECONDS,
-    stall_s: float = STALL_SECONDS,
-    resolve_s: float = RESOLVE_SECONDS,
-    connections: Mapping[Role, int] = CONNECTIONS,
+    serving: Serving, *, label: str | None = None, upload_limit: int = 256 * 10**6
 ) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
-
-    A browser has `request_s` to send its request, the reader of a file `stall_s` to take some of
-    it, and a name server `resolve_s` to answer; `connections` bounds the open ones by role.
 
     Raises SlviewerError within two seconds where the address can't be served, where viser is not
     the pinned one, and where tokens or certificate cannot be used.
@@ -196,11 +182,11 @@ def serve(
     context = certificate.context() if certificate else None
     limit_log()
     raise_descriptor_limit()
-    sock = listen(serving.host, serving.port, resolve_s)
+    sock = listen(serving.host, serving.port)
     address, port = sock.getsockname()[:2]
     try:
         access = Access(port, tokens, serving.names, tls=certificate is not None)
-        admissions = Admissions(sock, connections)
+        admissions = Admissions(sock)
         device_pages: dict[Role, DevicePage] = {}
         downloads = Downloads()
         is_trusted = certificate is not None and not certificate.self_made
@@ -232,7 +218,7 @@ def serve(
             options.update(
                 sock=sock,
                 process_request=middleware.answer,
-                create_connection=partial(Connection, request_s=request_s, stall_s=stall_s),
+                create_connection=Connection,
                 max_size=MESSAGE_LIMIT,
                 server_header=None,
                 # of a crowd: a browser whose request does not fit in tries again after a second
@@ -240,8 +226,8 @@ def serve(
                 open_timeout=None,  # Connection limits the request alone
                 logger=quiet_logger(),
             )
-            if context is not None:
-                options.update(ssl=context, ssl_handshake_timeout=request_s)
+            if context:
+                options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
             return serve_websockets(handle, **options)
 
         server = viser_internals.start(serve_viser, address, port, label)

@@ -53,7 +53,16 @@ class Viewers:
         number = client.client_id
         with self._lock:
             self._request_times[number] = self._clock()
-        viser_internals.request_answer(client, lambda: self._record_answer(number))
+
+        def record_answer() -> None:
+            """Record how long the client took, s, and call `answered`."""
+            with self._lock:
+                sent_s = self._request_times.pop(number, None)
+                if sent_s is not None:
+                    self._durations[number] = min(self._clock() - sent_s, STALLED_S)
+            self._answered()
+
+        viser_internals.request_answer(client, record_answer)
 
     def slowest_s(self) -> float:
         """Time, s, that the slowest client took to draw its last update, stalled ones excluded; 0
@@ -64,12 +73,3 @@ class Viewers:
                 now - sent_s for sent_s in self._request_times.values() if now - sent_s < STALLED_S
             ]
             return max([*self._durations.values(), *waiting], default=0.0)
-
-    def _record_answer(self, number: int) -> None:
-        """Record the duration, s, until the client answered request ``number``, and call
-        ``answered``."""
-        with self._lock:
-            sent_s = self._request_times.pop(number, None)
-            if sent_s is not None:
-                self._durations[number] = min(self._clock() - sent_s, STALLED_S)
-        self._answered()

@@ -8,7 +8,6 @@ is queued among the captures, and ends and fails as they do. A stream replaces t
 anything else is requested.
 """
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -30,6 +29,7 @@ from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import Progress
 from slviewer.wizard.live_frames import Stream
 from slviewer.wizard.notices import Notices, describe_failure
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import CaptureProgress, RigView
 
 RETRY_S = 2.0
@@ -67,14 +67,15 @@ class CaptureRequest:
 
 @dataclass(frozen=True)
 class _Task:
-    """Work with the open rig other than a capture."""
+    """Work with the open rig; `frames`: of a capture, 0 for other work."""
 
     name: str
     work: Callable[[Rig, Progress], Any]
     done: Callable[[Any], None]
+    frames: int = 0
 
 
-class Acquisition:
+class Acquisition(Service):
     """Owns the devices and the queue of requests. Every method may be called from any thread, and
     returns at once.
 
@@ -92,18 +93,16 @@ class Acquisition:
         previews_per_s: float = PREVIEWS_PER_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        super().__init__("slviewer acquisition")
         self._notices, self._changed, self._offer = notices, changed, offer
         self._retry_s, self._preview_s, self._clock = retry_s, 1 / previews_per_s, clock
-        self._condition = threading.Condition()
-        self._requests: deque[CaptureRequest | _Task] = deque()
+        self._requests: deque[_Task] = deque()
         self._wanted: Rig | None = None
         self._settings: CameraSettings | None = None
         self._light: tuple[str, PatternSequence | None] = ("white", None)
         self._view = RigView()
         self._stream: Stream | None = None
         self._cancel = False
-        self._closing = False
-        self._thread: threading.Thread | None = None
         # the thread's own:
         self._rig: Rig | None = None
         self._is_open = False
@@ -125,22 +124,19 @@ class Acquisition:
             self._requests.clear()
             self._cancel = self._view.capture is not None
             self._light = ("white", None)  # a pattern is made for one projector
-            self._view = RigView(light="white", capture=self._view.capture)
-            if rig is not None:
+            self._view = RigView(capture=self._view.capture)
+            if rig:
                 self._view = replace(
                     self._view, state="opening", name=rig.name, camera=rig.camera.size,
                     projector=rig.projector.size,
-                    turntable=rig.turntable.name if rig.turntable is not None else "",
+                    turntable=rig.turntable.name if rig.turntable else "",
                 )  # fmt: skip
-            if self._thread is None and rig is not None:
-                self._thread = threading.Thread(
-                    target=self._serve, name="slviewer acquisition", daemon=True
-                )
+            if rig and not self._thread.ident:
                 self._thread.start()
             self._condition.notify_all()
         for name in dropped:
             self._notices.add("info", f"{name}: not captured, another rig was chosen")
-        if stream is not None:
+        if stream:
             stream.end()
         self._changed()
 
@@ -155,7 +151,7 @@ class Acquisition:
         """Set the delay between showing and grabbing, from the next capture on; the devices stay
         open."""
         with self._condition:
-            if self._wanted is not None:
+            if self._wanted:
                 settled = replace(self._wanted, settle_ms=settle_ms)
                 self._rig = settled if self._rig is self._wanted else self._rig
                 self._wanted = settled
@@ -170,7 +166,17 @@ class Acquisition:
 
     def capture(self, request: CaptureRequest) -> None:
         """Queue a capture. Raises DeviceError where no rig is open."""
-        self._queue_request(request)
+
+        def work(rig: Rig, _: Progress) -> None:
+            """Capture the frames, and save them."""
+            out = self._get_buffer(rig, request.frames)
+            request.save(
+                capture_with_texture(
+                    rig, request.sequence, request.exposures_ms, out, self._report_frame
+                )
+            )
+
+        self._queue(_Task(request.name, work, lambda _: request.saved(), request.frames))
 
     def run_task(
         self, name: str, task: Callable[[Rig, Progress], T], done: Callable[[T], None]
@@ -182,7 +188,7 @@ class Acquisition:
         progress appears in `view().capture`, and raises Cancelled. What the task raises is reported
         like a capture's fault. Raises DeviceError where no rig is open.
         """
-        self._queue_request(_Task(name, task, done))
+        self._queue(_Task(name, task, done))
 
     def stream(self, stream: Stream) -> None:
         """Show and grab a stream repeatedly, in place of previews, until it is stopped.
@@ -193,11 +199,11 @@ class Acquisition:
         with self._condition:
             if self._view.state != "open":
                 raise DeviceError(self._view.fault or _NOT_OPEN)
-            if self._requests or self._view.capture is not None:
+            if self._requests or self._view.capture:
                 raise DeviceError("a capture is running: wait for it, or cancel it")
             before, self._stream = self._stream, stream
             self._condition.notify_all()
-        if before is not None:
+        if before:
             before.end()
 
     def stop_stream(self) -> None:
@@ -205,7 +211,7 @@ class Acquisition:
         with self._condition:
             stream, self._stream = self._stream, None
             self._condition.notify_all()
-        if stream is not None:
+        if stream:
             stream.end()
 
     def cancel(self) -> None:
@@ -238,23 +244,18 @@ class Acquisition:
     def close(self) -> None:
         """End a running capture, close the devices and join the thread."""
         with self._condition:
-            self._closing, self._cancel = True, True
+            self._cancel = True
             self._requests.clear()
-            self._condition.notify_all()
         self.stop_stream()
-        if self._thread is not None:
-            self._thread.join(5.0)
+        super().close()
 
-    def _queue_request(self, request: CaptureRequest | _Task) -> None:
-        """Append a capture or task to the queue, and end the stream. Raises DeviceError where no
-        rig is open."""
+    def _queue(self, task: _Task) -> None:
+        """Append a task to the queue, and end the stream. Raises DeviceError where no rig is
+        open."""
         with self._condition:
             if self._view.state != "open":
-                raise DeviceError(
-                    f"{request.name} is not possible: {self._view.fault or _NOT_OPEN}"
-                )
-            self._requests.append(request)
-            self._condition.notify_all()
+                raise DeviceError(f"{task.name} is not possible: {self._view.fault or _NOT_OPEN}")
+            self._requests.append(task)
         self.stop_stream()
 
     # on the thread
@@ -271,8 +272,8 @@ class Acquisition:
                 if self._is_open and self._rig is self._wanted and self._requests:
                     request = self._requests.popleft()
                     self._cancel = False
-                    n = request.frames if isinstance(request, CaptureRequest) else 0
-                    self._view = replace(self._view, capture=CaptureProgress(request.name, 0, n, 0))
+                    progress = CaptureProgress(request.name, 0, request.frames, 0)
+                    self._view = replace(self._view, capture=progress)
                 wanted, stream = self._wanted, self._stream
             rig = self._rig
             try:
@@ -281,13 +282,13 @@ class Acquisition:
                     self._rig, self._next_try = wanted, 0.0
                 elif rig is None:
                     pass
-                elif request is not None:
+                elif request:
                     self._serve_request(rig, request)
                     next_preview = 0.0
                 elif not self._is_open:
                     if self._clock() >= self._next_try:
                         self._open_devices(rig)
-                elif stream is not None:
+                elif stream:
                     self._serve_stream(rig, stream)
                 elif self._clock() >= next_preview:
                     next_preview = self._clock() + self._preview_s
@@ -303,7 +304,7 @@ class Acquisition:
         with self._condition:
             if self._closing or self._requests or self._rig is not self._wanted:
                 return
-            if self._is_open and self._stream is not None:
+            if self._is_open and self._stream:
                 return
             until = next_preview if self._is_open else self._next_try
             pause = self._retry_s if self._rig is None else until - self._clock()
@@ -385,31 +386,25 @@ class Acquisition:
             self._next_preview = self._clock() + 1 / STREAM_PREVIEWS_PER_S
             self._offer(white, stated_full_scale(rig.camera))
 
-    def _serve_request(self, rig: Rig, request: CaptureRequest | _Task) -> None:
-        """Execute a queued capture or task and report how it ended; a DeviceError is raised to the
-        caller."""
+    def _serve_request(self, rig: Rig, task: _Task) -> None:
+        """Execute a queued task and report how it ended; a DeviceError is raised to the caller."""
         try:
             self._prepare_devices(rig)
-            self._shown = None  # the request shows and sets its own from here on
-            if isinstance(request, CaptureRequest):
-                out = self._get_buffer(rig, request.frames)
-                request.save(
-                    capture_with_texture(
-                        rig, request.sequence, request.exposures_ms, out, self._report_frame
-                    )
-                )
-                request.saved()
-            else:
+            self._shown = None  # the task shows and sets its own from here on
+            if not task.frames:
                 self._applied = None
-                request.done(request.work(rig, self._report_stage))
+            task.done(
+                task.work(
+                    rig, lambda share, stage: self._report_frame(round(100 * share), 100, stage)
+                )
+            )
         except Cancelled:
-            self._notices.add("info", f"{request.name}: cancelled")
-        except TurntableError as error:  # camera and projector work without it
-            self._notices.add("error", f"{request.name}: {error}")
-        except DeviceError:
-            raise
-        except SlviewerError as error:  # the disk or the patterns, not the devices
-            self._notices.add("error", f"{request.name}: {error}")
+            self._notices.add("info", f"{task.name}: cancelled")
+        except SlviewerError as error:
+            # the disk, the patterns or the turntable: camera and projector work without these
+            if isinstance(error, DeviceError) and not isinstance(error, TurntableError):
+                raise
+            self._notices.add("error", f"{task.name}: {error}")
         finally:
             with self._condition:
                 self._view = replace(self._view, capture=None)  # whichever rig is wanted by now
@@ -426,20 +421,16 @@ class Acquisition:
         return self._buffer
 
     def _report_frame(self, frame: int, frames: int, stage: str = "") -> None:
-        """Publish the progress of the running capture. Raises Cancelled once it was cancelled."""
+        """Publish the progress of the running capture, or the percent of a task and its stage.
+        Raises Cancelled once it was cancelled."""
         if self._cancel:
             raise Cancelled("cancelled")
         with self._condition:
             now = self._view.capture
-            if now is not None:
+            if now:
                 progress = replace(now, frame=frame, frames=frames, stage=stage)
                 self._view = replace(self._view, capture=progress)
         self._changed()
-
-    def _report_stage(self, share: float, stage: str) -> None:
-        """Publish the progress of a task, `share` 0 ... 1, as percent. Raises Cancelled once it was
-        cancelled."""
-        self._report_frame(round(100 * share), 100, stage)
 
     def _handle_fault(self, error: Exception) -> None:
         """Report a device fault, close the devices, drop waiting requests and end the stream."""
@@ -455,13 +446,13 @@ class Acquisition:
         if first:
             dropped = f"; {waiting} waiting capture{'s' * (waiting > 1)} dropped" if waiting else ""
             self._notices.add("error", text + dropped)
-        if stream is not None:
+        if stream:
             stream.end()
         self._changed()
 
     def _close_devices(self) -> None:
         """Close the open devices; what they raise is logged."""
-        if self._rig is not None and self._is_open:
+        if self._rig and self._is_open:
             self._is_open = False
             try:
                 self._rig.close()

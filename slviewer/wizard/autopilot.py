@@ -4,7 +4,7 @@ newcomer."""
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres
 from slviewer.simulation.scenes import Scene, Spheres
 from slviewer.wizard.operator import Operator
-from slviewer.wizard.snapshot import ScanView, Snapshot
+from slviewer.wizard.snapshot import SessionView, Snapshot
 
 RIG = {"driver": "simulated", "preset": "letter", "scale": 0.5, "seed": 0}
 TARGET = "circles:21x16:9"
@@ -91,36 +91,24 @@ class Autopilot:
         """Choose the simulated rig and the target, unless they are in use. Raises SlviewerError."""
         operator = self._operator
         if not self._wait_until_settled().rig.simulated:
-            self._perform_act("Choosing the simulated rig", lambda: operator.choose_rig(RIG))
+            self._perform_act("Choosing the simulated rig", operator.choose_rig, RIG)
         if operator.wait_for(lambda s: s.rig.state == "open", self._patience_s) is None:
             raise SlviewerError("the simulated rig does not open")
-        session = self._wait_until_settled().session
-        if session is None:
-            raise SlviewerError("no session is open: open or create one first")
-        if session.target != TARGET:
-            self._perform_act(
-                f"Choosing the target {TARGET}", lambda: operator.choose_target(TARGET)
-            )
+        if self._read_session().target != TARGET:
+            self._perform_act(f"Choosing the target {TARGET}", operator.choose_target, TARGET)
 
     def _calibrate(self) -> None:
         """Capture suggested poses until there are enough, then calibrate. Raises SlviewerError if
         too many fail."""
         operator = self._operator
         tried = 0
-        while (good := _count_good_poses(now := self._wait_until_settled())) < self._poses and not (
-            now.session and now.session.enough
-        ):
+        while (good := (now := self._read_session()).good_poses) < self._poses and not now.enough:
             tried += 1
             if tried > 2 * self._poses:
                 raise SlviewerError(
                     f"only {good} of {tried} poses could be used: see why the others were refused"
                 )
-            session = operator.snapshot().session
-            act = (
-                session.suggestion.sentence
-                if session and session.suggestion
-                else "Placing the board"
-            )
+            act = now.suggestion.sentence if now.suggestion else "Placing the board"
             self._perform_act(act, operator.place_at_suggestion)
             self._perform_act(f"Capturing pose {good + 1} of {self._poses}", operator.capture_pose)
         self._perform_act("Calibrating", operator.calibrate)
@@ -129,39 +117,31 @@ class Autopilot:
         """Capture a simulated plane and a simulated sphere."""
         operator = self._operator
         self._place("plane", planes()[PLANE])
-        self._perform_act("Capturing a plane", lambda: operator.capture_plane("A flat plate"))
+        self._perform_act("Capturing a plane", operator.capture_plane, "A flat plate")
         self._place("sphere", spheres()[SPHERE])
-        self._perform_act(
-            "Capturing a sphere", lambda: operator.capture_sphere("A sphere of 196 mm")
-        )
+        self._perform_act("Capturing a sphere", operator.capture_sphere, "A sphere of 196 mm")
 
     def _scan(self) -> None:
         """Scan the simulated object at three distances, and merge the scans."""
         operator = self._operator
-        before = {scan.name for scan in _list_scans(operator.snapshot())}
+        before = self._list_scans("scan")
         for label, scene in zip(("near", "middle", "far"), objects().values(), strict=True):
             self._place("object", scene)
             self._perform_act(
-                f"Scanning the object, {label}",
-                partial(operator.capture_scan, f"Ammonite, {label}"),
+                f"Scanning the object, {label}", operator.capture_scan, f"Ammonite, {label}"
             )
-        names = [scan.name for scan in _list_scans(operator.snapshot()) if scan.name not in before]
-        self._perform_act("Merging the three scans", lambda: operator.merge(names, names[-1]))
+        names = [name for name in self._list_scans("scan") if name not in before]
+        self._perform_act("Merging the three scans", operator.merge, names, names[-1])
 
     def _measure(self) -> None:
         """Measure the sphere's radius and the object's width."""
         operator = self._operator
-        scans = operator.snapshot().session.scans  # type: ignore[union-attr]
-        sphere = next(scan.name for scan in reversed(scans) if scan.purpose == "sphere")
+        sphere, latest = self._list_scans("sphere")[-1], self._list_scans("scan")[-1]
         region = _make_ball_region(operator.surface(sphere))
+        self._perform_act("Measuring the sphere", operator.measure, sphere, "sphere", region=region)
+        ends = _select_width_ends(operator.surface(latest))
         self._perform_act(
-            "Measuring the sphere", partial(operator.measure, sphere, "sphere", region=region)
-        )
-        latest = _list_scans(operator.snapshot())[-1].name
-        a, b = _select_width_ends(operator.surface(latest))
-        self._perform_act(
-            "Measuring the width of the object",
-            partial(operator.measure, latest, "distance", [a, b]),
+            "Measuring the width of the object", operator.measure, latest, "distance", ends
         )
 
     def _place(self, thing: Thing, scene: Scene) -> None:
@@ -171,10 +151,12 @@ class Autopilot:
             T[:3, 3] = scene.centres[0]
         else:
             assert isinstance(scene, BoardScene | MeshScene)
-            T[:3, :3], T[:3, 3] = scene.pose.R, scene.pose.t
-        self._perform_act(f"Placing the {thing}", lambda: self._operator.place(thing, T))
+            T = scene.pose.matrix
+        self._perform_act(f"Placing the {thing}", self._operator.place, thing, T)
 
-    def _perform_act(self, act: str, request: Callable[[], bool]) -> None:
+    def _perform_act(
+        self, act: str, request: Callable[..., bool], *args: Any, **options: Any
+    ) -> None:
         """Send one request and wait until all its work has ended. Raises SlviewerError with the
         notice of a failure."""
         self._operator.set_autopilot_status(act)
@@ -182,11 +164,21 @@ class Autopilot:
         if self._stopped.wait(self._pause_s):
             raise Cancelled("autopilot was stopped")
         last = max((notice.number for notice in self._operator.snapshot().notices), default=0)
-        request()
-        after = self._wait_until_settled()
-        for notice in after.notices:
+        request(*args, **options)
+        for notice in self._wait_until_settled().notices:
             if notice.number > last and notice.level == "error":
                 raise SlviewerError(f"{act}: {notice.text}")
+
+    def _read_session(self) -> SessionView:
+        """Return the session once no work runs. Raises SlviewerError where none is open."""
+        session = self._wait_until_settled().session
+        if session is None:
+            raise SlviewerError("no session is open: open or create one first")
+        return session
+
+    def _list_scans(self, purpose: str) -> list[str]:
+        """List the names of captures made for a purpose: scan, plane or sphere."""
+        return [scan.name for scan in self._read_session().scans if scan.purpose == purpose]
 
     def _wait_until_settled(self) -> Snapshot:
         """Wait until no work runs; returns the snapshot. Raises Cancelled when stopped,
@@ -202,12 +194,6 @@ class Autopilot:
                     raise
 
 
-def _count_good_poses(snapshot: Snapshot) -> int:
-    """Count the poses that a calibration can use."""
-    poses = snapshot.session.poses if snapshot.session else ()
-    return sum(pose.state in ("good", "used", "unused") for pose in poses)
-
-
 def _make_ball_region(on: MeasuredSurface) -> Region:
     """Return a ball around the point nearest to the camera, its radius half the measured extent."""
     z = np.where(on.measured, on.points[..., 2], np.inf)
@@ -221,12 +207,3 @@ def _select_width_ends(on: MeasuredSurface) -> tuple[Place, Place]:
     v = int(np.argmax(on.measured.sum(axis=1)))
     columns = np.flatnonzero(on.measured[v])
     return (int(columns[0]), v), (int(columns[-1]), v)
-
-
-def _list_scans(snapshot: Snapshot) -> list[ScanView]:
-    """List the captures of objects, without planes and spheres."""
-    return [
-        scan
-        for scan in (snapshot.session.scans if snapshot.session else ())
-        if scan.purpose == "scan"
-    ]

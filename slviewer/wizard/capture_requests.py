@@ -1,39 +1,72 @@
-"""Requests to capture: what is projected, the name under which it is saved, and what follows."""
+"""Requests to capture, live or all round on a turntable, and to import captures that other tools
+made: what is projected, the name under which it is saved, and what follows."""
 
-from collections.abc import Callable
+import io
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
 
-from slviewer.devices.capture import CapturedFrames
-from slviewer.errors import DeviceError, InputError
-from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.capture import check_space, choose_sequence, depth_axis, save_frames
-from slviewer.session.names import clean_label
+import numpy as np
+
+from slviewer.devices.capture import CapturedFrames, capture_with_texture
+from slviewer.devices.protocols import Rig
+from slviewer.errors import InputError
+from slviewer.fringe.presets import short
+from slviewer.fringe.sequence import PatternSequence
+from slviewer.pipeline.capture import check_space, depth_axis, save_frames
+from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.import_captures import Role, describe_import, import_captures
+from slviewer.pipeline.turn import (
+    FULL_TURN_DEG,
+    STEPS,
+    capture_turn,
+    missing_steps,
+    next_turn,
+    place_object,
+    plan_turn,
+    recorded_steps,
+    require_turntable,
+)
+from slviewer.session import atomic
+from slviewer.session.capture import TurnStep
+from slviewer.session.importers.archive import unpack, unpacked_size
+from slviewer.session.names import new_name
+from slviewer.session.reading import expand_user
+from slviewer.session.store import Session
 from slviewer.wizard.acquisition import CaptureRequest
-from slviewer.wizard.engine import Engine
-from slviewer.wizard.requests import request
+from slviewer.wizard.engine import request
+from slviewer.wizard.jobs import Reporter
+from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.result_requests import ResultRequests
+from slviewer.wizard.rig_requests import RigRequests
 
 Purpose = Literal["scan", "plane", "sphere"]
+IMPORTING = "Importing"
+UNPACKED = "import"
+"""Name in the session's folder beside which an upload is unpacked: the session clears what a crash
+leaves of it."""
 
 
-class CaptureRequests(ResultRequests):
-    """Captures of the target, of objects, planes and spheres."""
+class CaptureRequests(RigRequests, ResultRequests):
+    """Captures of the target, of objects, planes and spheres, in short and in live scans, on a
+    turntable, and from files."""
 
     @request("Capturing the pose")
     def capture_pose(self) -> None:
         """Capture the board where it is; its features are evaluated in the background."""
         # first: a capture that fails is not repeated with every preview
-        self._engine.hands_free.note_capture()
+        self._hands_free.note_capture()
         self._capture_pose(self._next_name("pose"), retake=False)
 
     @request("Retaking the pose")
     def retake_pose(self, name: str) -> None:
         """Capture the board in place of a pose; the old one goes to the trash once the new one is
         saved."""
-        if self._engine.store.load_capture(name).role != "calibration":
+        if self._store.load_capture(name).role != "calibration":
             raise InputError(f"{name} is not a target pose: capture another scan instead")
-        self._engine.hands_free.note_capture()
+        self._hands_free.note_capture()
         self._capture_pose(name, retake=True)
 
     @request("Capturing the scan")
@@ -54,14 +87,13 @@ class CaptureRequests(ResultRequests):
     @request("Switching hands-free capture")
     def set_hands_free(self, on: bool) -> None:
         """Capture a pose whenever the board is held still in a new place."""
-        self._engine.hands_free.switch(on)
+        self._hands_free.is_on = on
 
     def _capture_pose(self, name: str, retake: bool) -> None:
         """Queue the capture of a target pose; `retake` replaces the one of that name."""
-        engine, store, target = self._engine, self._engine.store, self._engine.reader.target()
+        store, target = self._store, self._reader.target()
         if not target:
             raise InputError("choose the target first: a pose is judged by it")
-        sequence = pose_sequence(engine)
 
         def save(captured: CapturedFrames) -> None:
             """Save the captured frames as a target pose; a retaken pose is included again."""
@@ -69,90 +101,253 @@ class CaptureRequests(ResultRequests):
             if retake and name in store.excluded():
                 store.include(name)
 
-        self._queue_capture(name, sequence, save)
+        self._queue_capture(name, self._pose_sequence(), save)
 
     def _capture_scan(self, purpose: Purpose, label: str, follow: Callable[[str], object]) -> None:
         """Queue the capture of a scan, plane or sphere; `follow(name)` is called once it is
         saved."""
-        engine, store = self._engine, self._engine.store
-        sequence = scan_sequence(engine)
-        name = self._next_name(purpose)
+        store, sequence, name = self._store, self._scan_sequence(), self._next_name(purpose)
 
         def save(captured: CapturedFrames) -> None:
             """Save the captured frames as a scan, with the operator's label."""
             save_frames(store, name, purpose, captured)
-            self._set_label(name, label)
+            if label.strip():
+                self._set_label(name, label)
 
-        self._queue_capture(name, sequence, save, lambda: follow(name))
+        self._queue_capture(name, sequence, save, follow)
 
     def _queue_capture(
         self,
         name: str,
         sequence: PatternSequence,
         save: Callable[[CapturedFrames], None],
-        follow: Callable[[], object] = lambda: None,
+        follow: Callable[[str], object] = lambda name: None,
     ) -> None:
-        """Queue a capture; `follow()` is called once it is saved. Raises SessionError where the
+        """Queue a capture; `follow(name)` is called once it is saved. Raises SessionError where the
         disk is too full."""
-        engine, bench = self._engine, self._engine.bench
-        exposures = engine.reader.exposures_ms()
+        reel, exposures = self._require_bench().reel, self._reader.exposures_ms()
         self._check_space(name, len(sequence.frames) * max(1, len(exposures)))
 
         def saved() -> None:
             """Queue the processing of the saved capture, call `follow`, and advance a replayed
             recording."""
-            engine.queue_processing()
-            follow()
-            engine.publisher.mark_changed(session=True)
-            if bench is not None and bench.reel is not None:
+            self._queue_processing()
+            follow(name)
+            self._note_change()
+            if reel:
                 # the next recording may lack these
-                if engine.acquisition.view().light in (
-                    "dark",
-                    "pattern",
-                ):
-                    engine.acquisition.set_light("white")
-                bench.reel.wind_on()
+                if self._acquisition.view().light in ("dark", "pattern"):
+                    self._acquisition.set_light("white")
+                reel.wind_on()
 
-        engine.acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
-
-    def _set_label(self, name: str, label: str) -> None:
-        """Store the operator's label of a capture, unless it is blank."""
-        store = self._engine.store
-        if label.strip():
-            store.decide("names", {**(store.decision("names") or {}), name: clean_label(label)})
+        self._acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
 
     def _check_space(self, name: str, frames: int) -> None:
         """Raise SessionError where the disk has no room for so many frames."""
-        if self._engine.bench is not None:
-            check_space(self._engine.store, self._engine.bench.rig.camera, frames, name)
+        check_space(self._store, self._require_bench().rig.camera, frames, name)
 
     def _next_name(self, kind: str) -> str:
         """Return the next unused name, such as pose_07, counting saved and queued captures."""
-        used_names = [*self._engine.store.taken_names(), *self._engine.acquisition.names()]
+        used_names = [*self._store.taken_names(), *self._acquisition.names()]
         numbers = [
             name.removeprefix(f"{kind}_") for name in used_names if name.startswith(f"{kind}_")
         ]
         number = max((int(number) for number in numbers if number.isdecimal()), default=0) + 1
         return f"{kind}_{number:02d}"
 
+    # live
 
-def pose_sequence(engine: Engine) -> PatternSequence:
-    """Return the sequence for target poses: the session's pattern sequence along both axes, or that
-    of a recording."""
-    if engine.bench is None:
-        raise DeviceError("no rig is chosen: choose one in the step Rig")
-    sequence = choose_sequence(engine.bench, engine.reader.patterns())
-    levels = engine.reader.levels()
-    return sequence if levels is None else replace(sequence, levels=levels)
+    @request("Scanning live")
+    def start_live(self) -> None:
+        """Start a live scan, which ends at `stop_live`, a capture, another rig or session, or a
+        fault."""
+        calibration = self._require_calibration("a live scan needs a calibration")
+        bench = self._require_bench()
+        if bench.reel:
+            raise InputError(
+                "a recording holds only its own patterns: choose a real rig or the simulated one"
+            )
+        axis = depth_axis(calibration.stereo.rig)
+        sequence = replace(short(bench.rig.projector.size, axis), levels=self._reader.levels())
+        live = LiveScan(
+            self._store, axis, sequence, self._acquisition, self._notices,
+            self._live_listeners.call, self._publisher.mark_changed,
+        )  # fmt: skip
+        live.start()
+        self._live = live
+
+    @request("Ending the live scan")
+    def stop_live(self) -> None:
+        """End the live scan, if one runs."""
+        self._acquisition.stop_stream()
+
+    @request("Saving the live scan")
+    def save_live(self, label: str = "") -> None:
+        """Save the frames of the latest live cloud as a scan, and reconstruct it; the live scan
+        goes on."""
+        live = self._live
+        shot = live.stream.copy_latest() if live and live.is_running else None
+        if live is None or shot is None:
+            raise InputError("no live scan runs: start one, and wait for a cloud")
+        name = self._next_name("scan")
+        self._check_space(name, len(shot.frames))
+        source = self._acquisition.view().name
+        captured = CapturedFrames(shot.frames, shot.settings, live.stream.sequence, source)
+        save_frames(self._store, name, "scan", captured)
+        if label.strip():
+            self._set_label(name, label)
+        self._queue_processing()
+        self._finish_scan(name)
+
+    def subscribe_live(self, listener: Callable[[LiveCloud], None]) -> Callable[[], None]:
+        """Call back with every live cloud, on the live scan's thread; returns a function that
+        unsubscribes.
+
+        A listener must return at once.
+        """
+        return self._live_listeners.add(listener)
+
+    @property
+    def live_captures(self) -> int:
+        """The number of short captures of the latest live scan, including those without a cloud."""
+        return 0 if self._live is None else self._live.stream.captured
+
+    def count_live_shown(self, cloud: LiveCloud) -> None:
+        """Record that a cloud was sent to the browsers, which ends its latency."""
+        if self._live:
+            self._live.count_shown(cloud)
+
+    # all round
+
+    @request("Scanning all round")
+    def scan_all_round(
+        self, steps: int = STEPS, range_deg: float = FULL_TURN_DEG, *, then_merge: bool = True
+    ) -> None:
+        """Capture and reconstruct the steps of a turn; `then_merge` merges them and makes a
+        watertight mesh."""
+        self._scan_turn(plan_turn(next_turn(self._store), steps, range_deg), then_merge)
+
+    @request("Resuming the turn")
+    def resume_turn(self, *, then_merge: bool = True) -> None:
+        """Capture the missing steps of the last turn."""
+        self._scan_turn(missing_steps(self._store), then_merge)
+
+    def _scan_turn(self, steps: Sequence[TurnStep], then_merge: bool) -> None:
+        """Queue the capture of steps of one turn, each reconstructed while the table turns on."""
+        store, sequence, turn = self._store, self._scan_sequence(), steps[0].turn
+        bench = self._require_bench()
+        require_turntable(bench.rig)
+        exposures, recorded = self._reader.exposures_ms(), recorded_steps(store, turn)
+        frames = len(sequence.frames) * max(1, len(exposures))
+        self._check_space(turn, frames * len(steps))
+        place_object(bench)
+
+        def work(rig: Rig, progress: Progress) -> None:
+            """Capture all steps into one buffer."""
+            width, height = rig.camera.size
+            buffer = np.empty((frames, height, width), rig.camera.dtype)
+
+            def capture_step(step: TurnStep, progress: Progress) -> None:
+                """Capture and save one step, and queue its reconstruction."""
+                captured = capture_with_texture(
+                    rig,
+                    sequence,
+                    exposures,
+                    buffer,
+                    lambda done, n: progress(done / n, f"frame {done} of {n}"),
+                )
+                save_frames(store, step.name, "scan", captured, turn_step=step)
+                self._queue_processing()
+                self._finish_scan(step.name)
+
+            capture_turn(rig, steps, capture_step, recorded, progress, self._warner("scans"))
+
+        def done(_: None) -> None:
+            """Report the captured turn, and queue its merge."""
+            names = [step.name for step in recorded_steps(store, turn)]
+            self._notices.add("good", f"{turn}: {len(names)} scans all round")
+            if then_merge:
+                self._merge_turn(names)
+
+        self._acquisition.run_task("Scanning all round", work, done)
+
+    # files
+
+    @request(IMPORTING)
+    def import_folder(
+        self, folder: Path | str, layout: str = "detect", role: Role = "calibration", **options: Any
+    ) -> None:
+        """Import the captures in a folder of this computer; `options` as `import_captures` takes
+        them."""
+        path = str(folder).strip()
+        if not path:
+            raise InputError(
+                "no folder is named: enter the path of a folder on the computer that runs slviewer"
+            )
+        store = self._store
+
+        def work(report: Reporter) -> list[str]:
+            """Import the folder's captures; returns their names."""
+            guarded = store.guarded(report.saving)
+            return self._import(guarded, expand_user(path), layout, role, report, options)
+
+        self._submit(IMPORTING, work, partial(describe_import, role=role))
+
+    @request(IMPORTING)
+    def import_zip(
+        self,
+        name: str,
+        content: bytes,
+        layout: str = "detect",
+        role: Role = "calibration",
+        **options: Any,
+    ) -> None:
+        """Import the captures in a zip that was uploaded as `name`; images outside of folders
+        become one capture of that name."""
+        store = self._store
+
+        def work(report: Reporter) -> list[str]:
+            """Unpack the zip into a temporary folder and import it; returns the names of the
+            captures."""
+            archive, words = io.BytesIO(content), f"unpacking {name}"
+            report(0.0, words)
+            with atomic.staged_folder(store.folder / UNPACKED, unpacked_size(archive)) as staged:
+                folder = staged / _make_capture_name(Path(name).stem)
+                folder.mkdir()
+                try:
+                    unpacking = part(report, 0, 0.2)
+                    source, warnings = unpack(archive, folder, lambda done: unpacking(done, words))
+                    for warning in warnings:
+                        self._warner("frames")(warning)
+                    guarded, origin = store.guarded(report.saving), {"origin": name, **options}
+                    return self._import(guarded, source, layout, role, part(report, 0.2, 1), origin)
+                finally:
+                    atomic.discard(staged)
+
+        self._submit(IMPORTING, work, partial(describe_import, role=role))
+
+    def _import(
+        self,
+        store: Session,
+        source: Path,
+        layout: str,
+        role: Role,
+        progress: Progress,
+        options: dict[str, Any],
+    ) -> list[str]:
+        """Import the captures in a folder, and queue their processing; returns their names."""
+        names = import_captures(
+            source, store, layout, role=role, progress=progress, warn=self._warner("frames"),
+            **options,
+        )  # fmt: skip
+        self._queue_processing()
+        return names
 
 
-def scan_sequence(engine: Engine) -> PatternSequence:
-    """Return the sequence for scans: that of poses along the one axis that measures depth.
-    InputError before a calibration."""
-    calibration = engine.publisher.refresh().calibration
-    if calibration is None:
-        raise InputError("calibrate first: a capture cannot be measured without a calibration")
-    sequence = pose_sequence(engine)
-    if engine.bench is None or engine.bench.reel is not None:
-        return sequence
-    return one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
+def _make_capture_name(name: str) -> str:
+    """Return a valid capture name, ASCII and at most 100 characters, made from the name of an
+    upload."""
+    plain = "".join(c if (c.isalnum() and c.isascii()) or c in "_-." else "_" for c in name).strip(
+        "._-"
+    )
+    return new_name(plain[:100] or "capture")

@@ -4,7 +4,6 @@ It holds no frames, and no passwords, which addresses of cameras may contain.
 """
 
 import importlib.metadata
-import json
 import logging
 import os
 import platform
@@ -12,7 +11,6 @@ import sys
 import zipfile
 from collections import deque
 from contextlib import suppress
-from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
@@ -80,7 +78,15 @@ def write_bundle(
     ):
         report(0.1, "versions and settings")
         bundle.writestr("versions.json", to_json(_collect_versions()))
-        bundle.writestr("state.json", hide_passwords(to_json(_summarise_state(snapshot)).decode()))
+        state = {
+            "rig": snapshot.rig,
+            "steps": snapshot.steps,
+            "notices": [
+                [each.time.isoformat(), each.level, each.text] for each in snapshot.notices
+            ],
+            "space": snapshot.space,
+        }
+        bundle.writestr("state.json", hide_passwords(to_json(state).decode()))
         bundle.writestr("log.txt", "\n".join(log.lines) + "\n")
         for file in ("session.json", "decisions.json"):
             # whatever it holds: a damaged one may be the reason for the report
@@ -100,12 +106,12 @@ def write_bundle(
                 described = {"damaged": str(error)}
             bundle.writestr(f"session/results/{result}.json", to_json(described))
         report(0.8, "previews")
-        if snapshot.session is not None:
+        if snapshot.session:
             thumbnails = {pose.name: pose.thumbnail for pose in snapshot.session.poses}
             thumbnails |= {scan.name: scan.thumbnail for scan in snapshot.session.scans}
             for each, jpeg in thumbnails.items():
                 bundle.writestr(f"previews/{each}.jpg", jpeg)
-        if preview is not None:
+        if preview:
             bundle.writestr("previews/now.jpg", bytes(cv2.imencode(".jpg", preview.image)[1]))
     report(1.0, "collected")
     return name
@@ -115,10 +121,8 @@ def _collect_versions() -> dict[str, Any]:
     """Return the versions of slviewer, Python, the operating system and the installed packages."""
     versions = {}
     for package in PACKAGES:
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return {
         "slviewer": __version__,
         "python": sys.version,
@@ -126,17 +130,3 @@ def _collect_versions() -> dict[str, Any]:
         "processors": os.cpu_count(),
         "packages": versions,
     }
-
-
-def _summarise_state(snapshot: Snapshot) -> dict[str, Any]:
-    """Return the serialisable part of the snapshot: devices, steps, notices, disk space."""
-    rig = asdict(snapshot.rig)
-    notices = [[notice.time.isoformat(), notice.level, notice.text] for notice in snapshot.notices]
-    space = None if snapshot.space is None else asdict(snapshot.space)
-    state = {
-        "rig": rig,
-        "steps": [asdict(step) for step in snapshot.steps],
-        "notices": notices,
-        "space": space,
-    }
-    return json.loads(to_json(state))

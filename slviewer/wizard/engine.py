@@ -1,49 +1,44 @@
 """The wizard's state and its threads: the session, the rig, the jobs, and the snapshot made of
 them.
 
-Requests (`operator` and the `*_requests`) call in here; panels do not. Each attribute is written by
-the engine alone.
+The requests are methods of its subclasses (the `*_requests`, `operator`), which alone write the
+state; panels see snapshots. `request` makes a method a request: granted or refused at once, without
+raising.
 """
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
-import numpy as np
-
+from slviewer.calibration.guidance import pose_selection
 from slviewer.calibration.observe import Observation, Smoothing
-from slviewer.devices.protocols import CameraSettings
-from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
-from slviewer.pipeline.capture import measure_space, warn_of_captured
-from slviewer.pipeline.check_results import Preflight
+from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
+from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.models import accepts_rejected
+from slviewer.pipeline.operation import Findings, Operation
 from slviewer.pipeline.poses import read_stored_poses
-from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages, save_rig
-from slviewer.registration.refusal import Reason
+from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
 from slviewer.session.capture import Capture
-from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.wizard.acquisition import Acquisition
+from slviewer.wizard import acquisition, preview_watcher
 from slviewer.wizard.diagnostics import LogKeeper
 from slviewer.wizard.jobs import Jobs, Reporter
 from slviewer.wizard.live_scan import LiveCloud, LiveScan
 from slviewer.wizard.notices import Notices, describe_failure
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.pose_plan import plan_next_pose
-from slviewer.wizard.preview_watcher import HandsFree, Watch, Watcher
 from slviewer.wizard.publisher import Listeners, Publisher
 from slviewer.wizard.result_views import make_thumbnail
 from slviewer.wizard.session_reader import SessionReader
 from slviewer.wizard.snapshot import (
     Brightness,
-    ExposureChange,
     PreviewView,
     RigView,
     SessionView,
@@ -51,301 +46,230 @@ from slviewer.wizard.snapshot import (
     WorldView,
 )
 from slviewer.wizard.steps import Facts, views
-from slviewer.wizard.timing import Timing
 
 READ_ATTEMPTS = 20
 """Snapshots in a row that may meet the session's files in the middle of a change."""
 
+P = ParamSpec("P")
+T = TypeVar("T")
+Handler = TypeVar("Handler", bound="Engine")
+Request = Callable[Concatenate[Any, P], bool]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How often the wizard repeats what it does by itself, and how much it computes each time.
+
+    ``retry_s``: s between two attempts to open devices, or to read files that could not be read.
+    ``previews_per_s``: rate of the camera preview. ``trials``: candidates of the next pose whose
+    gain is computed. ``hold_s``: s for which a board is held still before the hands-free countdown
+    starts, which takes ``count_s``.
+    """
+
+    retry_s: float = acquisition.RETRY_S
+    previews_per_s: float = acquisition.PREVIEWS_PER_S
+    trials: int = pose_selection.TRIALS
+    hold_s: float = preview_watcher.HOLD_S
+    count_s: float = preview_watcher.COUNT_S
+
+
+def request(action: str) -> Callable[[Callable[Concatenate[Handler, P], None]], Request[P]]:
+    """Return a decorator: the method then returns whether its request was granted, and an error
+    becomes a notice."""
+
+    def decorate(function: Callable[Concatenate[Handler, P], None]) -> Request[P]:
+        """Wrap a method as a request."""
+
+        @wraps(function)
+        def handle(self: Handler, /, *args: P.args, **kwargs: P.kwargs) -> bool:
+            """Call the method; return True, or False with a notice where it raised an error."""
+            try:
+                function(self, *args, **kwargs)
+            except Exception as error:
+                self._notices.add_failure(action, error)
+                return False
+            finally:
+                self._note_change()
+            return True
+
+        return handle
+
+    return decorate
+
 
 class Engine:
-    """Everything behind the requests. `capture_now` is called, on the preview's thread, for a
+    """The state behind the requests. `capture_now` is called, on the preview's thread, for a
     hands-free capture."""
 
     def __init__(self, set_up: SetUp, capture_now: Callable[[], object], timing: Timing) -> None:
         self._set_up, self._capture_now = set_up, capture_now
-        self.lock = threading.RLock()
-        self.log = LogKeeper()
-        self.preview: PreviewView | None = None
-        self.preview_listeners = Listeners[PreviewView]()
-        self.live: LiveScan | None = None  # the last one, whether it runs or not
-        self.live_listeners = Listeners[LiveCloud]()
-        self.hands_free = HandsFree(timing.hold_s, timing.count_s)
-        self.bench: RigSetup | None = None
-        self.preflight: Preflight | None = None  # of the rig in use
-        self.exposure_change: ExposureChange | None = None  # of the rig in use
-        self._autopilot = ""
-        self._preparing: float | None = None
-        self._merge_failure = ""
-        self._merge_refusal: Reason | None = None
+        self._lock = threading.RLock()
+        self._log = LogKeeper()
+        self._preview: PreviewView | None = None
+        self._preview_listeners = Listeners[PreviewView]()
+        self._live: LiveScan | None = None  # the last one, whether it runs or not
+        self._live_listeners = Listeners[LiveCloud]()
+        self._hands_free = preview_watcher.HandsFree(timing.hold_s, timing.count_s)
+        self._bench: RigSetup | None = None
         self._choice: Choice | None = None
         self._rig_fault = ""  # why the chosen rig could not even be set up
-        self._reader: SessionReader | None = None
+        self._session_reader: SessionReader | None = None
         # captures by name and content hash, and the target
         self._queued: set[tuple[str, str, str]] = set()
         self._brightness: Brightness = ""
         # the publisher's thread alone writes these:
         # a session, and whether its poses were enough
-        self._reached: tuple[Path | None, bool] = (
-            None,
-            False,
-        )
+        self._reached: tuple[Path | None, bool] = (None, False)
         self._failed_reads, self._reported_faults = 0, set[str]()
-        empty = Snapshot(
-            0, None, RigView(), None, None, (), views(Facts(None, RigView(), None)), None, False, ""
-        )
-        self.publisher = Publisher(self._build_snapshot, empty, timing.retry_s)
-        self.notices = Notices(self.publisher.mark_changed)
-        self.jobs = Jobs(self.notices, self.publisher.mark_changed)
+        # what later snapshots show beside what is read for each
+        self._shown = Snapshot(steps=views(Facts()))
+        self._publisher = Publisher(self._build_snapshot, self._shown, timing.retry_s)
+        changed = self._publisher.mark_changed
+        self._notices = Notices(changed)
+        self._jobs = Jobs(self._notices, changed)
         compute = partial(plan_next_pose, trials=timing.trials)
-        self._planner = Planner(lambda: self.publisher.mark_changed(session=True), compute)
-        self.watcher = Watcher(self._handle_preview)
-        self.acquisition = Acquisition(
-            self.notices,
-            self.publisher.mark_changed,
-            self.watcher.offer,
+        self._planner = Planner(self._note_change, compute)
+        self._watcher = preview_watcher.Watcher(self._handle_preview)
+        self._acquisition = acquisition.Acquisition(
+            self._notices,
+            changed,
+            self._watcher.offer,
             retry_s=timing.retry_s,
             previews_per_s=timing.previews_per_s,
         )
-        self.publisher.listeners.add(self._follow_up)
-        self.publisher.start()
-
-    # session and rig
+        self._publisher.listeners.add(self._follow_up)
+        self._publisher.start()
 
     @property
     def session(self) -> Session | None:
-        """The open session; None where none is open."""
-        reader = self._reader
+        """The open session, to be read by `result_views`; None where none is open."""
+        reader = self._session_reader
         return None if reader is None else reader.session
 
     @property
-    def reader(self) -> SessionReader:
+    def _reader(self) -> SessionReader:
         """The reader of the open session. Raises SessionError where none is open."""
-        reader = self._reader
+        reader = self._session_reader
         if reader is None:
             raise SessionError("no session is open: open or create one first")
         return reader
 
     @property
-    def store(self) -> Session:
+    def _store(self) -> Session:
         """The open session. Raises SessionError where none is open."""
-        return self.reader.session
-
-    @property
-    def world(self) -> SimulatedWorld:
-        """The scene of the simulated rig. Raises InputError where the rig is a real one."""
-        world = self.bench.world if self.bench else None
-        if world is None:
-            raise InputError(
-                "objects can be placed only before the simulated rig: choose it in the step Rig"
-            )
-        return world
-
-    def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
-        """Open another session, with `rig`, else the one that it remembers, else the one in use.
-
-        Jobs of the previous session are cancelled. If the remembered rig is not connected, the
-        session opens without. Where the session is open already, only the rig changes.
-        """
-        with self.lock:
-            if not self.acquisition.idle:
-                raise InputError(
-                    "a capture is running: wait for it, or cancel it, before you open another"
-                    " session"
-                )
-            before = self.session
-            if before is not None and expand_user(path).resolve() == before.folder.resolve():
-                if rig:
-                    self._restore_rig(before, rig)
-                return
-            store = Session.open_or_create(path)
-            self.acquisition.stop_stream()
-            self.jobs.cancel_all()
-            self._reader, self._queued = SessionReader(store, self._planner), set()
-            self._merge_failure = ""
-            if before is not None:
-                before.close()
-            for name in store.recovered:
-                self.notices.add(
-                    "info",
-                    f"{name} was complete when the program ended, and is in the session again",
-                )
-            try:
-                self._restore_rig(store, rig)
-            finally:
-                self.update_board()
-
-    def _restore_rig(self, store: Session, rig: Choice | None) -> None:
-        """Use `rig`, else the rig saved in the session, else save the current one there; report one
-        that fails."""
-        choice = rig or store.valid_decision("rig")
-        if choice and choice != self._choice:
-            try:
-                self.use_rig(choice)
-            except SlviewerError as error:
-                if rig:
-                    raise
-                self._forget_rig(choice, None)
-                self._rig_fault = str(error)
-                self.acquisition.use(None)
-                self.notices.add_failure("Choosing the rig", error)
-        elif self._choice is not None:
-            self._remember(store, "rig", dict(self._choice))
-            if exposure := store.valid_decision("exposure"):
-                self.acquisition.set_camera(CameraSettings(**exposure))
-
-    def use_rig(self, choice: Choice) -> None:
-        """Use other devices from now on, in the session too.
-
-        If it is the same rig again, the measured delay stays unless the choice has one, and so does
-        the exposure that the session remembers.
-        """
-        with self.lock:
-            store = self.session
-            known = dict((store.valid_decision("rig") if store is not None else None) or {})
-            same = {**known, "settle_ms": None} == {**choice, "settle_ms": None}
-            if same and "settle_ms" in known and "settle_ms" not in choice:
-                choice = {**choice, "settle_ms": known["settle_ms"]}
-            bench = self._set_up(choice, self._parse_board())
-            if store is not None and known != dict(choice):
-                self._remember(store, "rig", dict(choice))
-            if store is not None and not same:
-                # those of another camera do not apply
-                for decision in (
-                    "exposure",
-                    "exposures",
-                    "levels",
-                ):
-                    self._remember(store, decision, None)
-            exposure = store.valid_decision("exposure") if store is not None else None
-            exposure = exposure or {
-                key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)
-            }
-            self._forget_rig(choice, bench)
-            self._rig_fault = ""
-            self.acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
-
-    @staticmethod
-    def _remember(store: Session, what: str, value: Any) -> None:
-        """Remember a decision of the rig's in the session, unless its decisions are damaged, which
-        its faults name."""
-        with contextlib.suppress(DamagedError):
-            store.decide(what, value)
-
-    def _forget_rig(self, choice: Choice, bench: RigSetup | None) -> None:
-        """Forget what was measured with the rig before, and remember the new one."""
-        self._choice, self.bench, self.preview = dict(choice), bench, None
-        self.preflight = self.exposure_change = None
-
-    def save_rig(self, name: str, what: str) -> None:
-        """Save the rig in use, with its exposure, as a preset of the session."""
-        if self._choice is None:
-            raise InputError("no rig is in use: choose one in the step Rig")
-        now = self.acquisition.view()
-        exposure = {"exposure_ms": now.exposure_ms, "gain": now.gain}
-        save_rig(
-            self.store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what
-        )
-
-    def set_preflight(self, bench: RigSetup | None, result: Preflight) -> bool:
-        """Store the result of a rig check, and use the delay that it measured; the session
-        remembers it with the rig.
-
-        Returns False, and changes nothing, where `bench` is no longer in use.
-        """
-        with self.lock:
-            if self.bench is not bench:
-                return False
-            self.preflight = result
-            if result.settle_ms is not None and self._choice is not None:
-                self._choice = {**self._choice, "settle_ms": result.settle_ms}
-                self.acquisition.set_delay(result.settle_ms)
-                if self.session is not None:
-                    self.session.decide("rig", dict(self._choice))
-            return True
-
-    def update_board(self) -> None:
-        """Apply the current target: print it on the simulated board, and queue the evaluation of
-        the poses by it."""
-        board, world = self._parse_board(), self.bench.world if self.bench else None
-        if board is not None and world is not None and board != world.board:
-            world.print_board(board)
-        self.queue_processing()
-        self.publisher.mark_changed(session=True)
-
-    def set_live(self, live: LiveScan) -> None:
-        """Set the current live scan."""
-        self.live = live
-
-    def set_autopilot(self, act: str) -> None:
-        """Set the autopilot's current act; empty: it is off."""
-        self._autopilot = act
-        self.publisher.mark_changed()
-
-    def set_preparing(self, share: float | None) -> None:
-        """Set the share of the kernels that are compiled in the background; None: none are being
-        compiled."""
-        self._preparing = share
-        self.publisher.mark_changed()
-
-    def set_merge_failure(self, why: str, reason: Reason | None = None) -> None:
-        """Set why the last merge failed, empty: it did not; ``reason``: that of a refused
-        registration."""
-        self._merge_failure, self._merge_refusal = why, reason
-        self.publisher.mark_changed()
+        return self._reader.session
 
     def close(self) -> None:
-        """Stop all threads, close the devices and the session."""
-        self.acquisition.close()
-        self.watcher.close()
-        self.jobs.close()
-        self._planner.close()
-        self.publisher.close()
-        with self.lock:
-            if self.session is not None:
+        """Stop all threads, close the devices and the session; captures are saved already."""
+        for part in (
+            self._acquisition,
+            self._watcher,
+            self._jobs,
+            self._planner,
+            self._publisher,
+            self._log,
+        ):
+            part.close()
+        with self._lock:
+            if self.session:
                 self.session.close()
-        self.log.close()
 
-    def _parse_board(self) -> Board | None:
-        """Return the board of the session's target; None where none is chosen."""
-        target = self._reader.target() if self._reader else ""
-        return Board.parse(target) if target else None
+    def _note_change(self) -> None:
+        """Request a snapshot: the session's files have changed."""
+        self._publisher.mark_changed(session=True)
+
+    def _show(self, **changes: Any) -> None:
+        """Change fields of the next snapshots."""
+        with self._lock:
+            self._shown = replace(self._shown, **changes)
+        self._publisher.mark_changed()
+
+    # work
+
+    def _warner(self, section: str) -> Warn:
+        """Return a function that adds a warning to the notices, with its section of the help."""
+        return lambda text: self._notices.add("warning", text, section)
+
+    def _submit(
+        self,
+        name: str,
+        work: Callable[[Reporter], T],
+        describe: Callable[[T], str],
+        failed: Callable[[BaseException], None] | None = None,
+    ) -> None:
+        """Queue a job; `describe(result)` becomes a notice, and `failed(error)` replaces the notice
+        of a failure."""
+
+        def done(result: T) -> None:
+            """Add the description of the result to the notices, and mark the session as changed."""
+            is_good = not isinstance(result, Findings) or all(
+                each.is_good for each in result.values()
+            )
+            if text := describe(result):
+                self._notices.add("good" if is_good else "warning", text)
+            self._note_change()
+
+        def end_badly(error: BaseException) -> None:
+            """Report why the job failed; what it has saved before is to be seen."""
+            (failed or partial(self._notices.add_failure, name))(error)
+            self._note_change()
+
+        self._jobs.submit(name, work, done, failed=end_badly)
+
+    def _run(
+        self,
+        title: str,
+        operation: Operation[..., Any, Any],
+        settings: Any,
+        section: str = "",
+        failed: Callable[[BaseException], None] | None = None,
+    ) -> None:
+        """Queue an operation on the session; the summary of what it found becomes a notice.
+
+        A calibration that the operator uses although it was rejected is used. ``section``: of the
+        help, of warnings.
+        """
+        store, warn = self._store, self._warner(section)
+
+        def work(report: Reporter) -> Findings[Any]:
+            """Run the operation, which no longer saves once the job was cancelled."""
+            used = settings
+            if accepts_rejected(store) and hasattr(settings, "accept_rejected"):
+                used = replace(settings, accept_rejected=True)
+            return operation.run(store.guarded(report.saving), used, report, warn)
+
+        self._submit(title, work, Findings.summary, failed)
 
     # the background
 
-    def queue_processing(self) -> None:
+    def _queue_processing(self) -> None:
         """Queue background jobs for captures without thumbnail, frame check or pose features."""
-        reader = self._reader
+        reader = self._session_reader
         if reader is None:
             return
         target = reader.target()
         for capture in reader.session.captures():
             key = (capture.name, capture.hash, target)
-            with self.lock:
+            with self._lock:
                 if key in self._queued:
                     continue
                 self._queued.add(key)
-            self.jobs.submit(
+            self._jobs.submit(
                 f"Processing {capture.name}",
                 partial(self._process_capture, reader, capture),
-                lambda _: self.publisher.mark_changed(session=True),
+                lambda _: self._note_change(),
                 failed=partial(self._handle_processing_failure, reader, capture),
                 background=True,
             )
-
-    def reprocess(self, capture: Capture) -> None:
-        """Process a restored capture again, whose results no longer exist."""
-        with self.lock:
-            self._queued = {key for key in self._queued if key[1] != capture.hash}
-        self.queue_processing()
 
     def _process_capture(self, reader: SessionReader, capture: Capture, report: Reporter) -> None:
         """Make the thumbnail of a capture, check its frames, and read its features if it is a
         target pose."""
         if capture.name not in reader.session.capture_names():
             return  # deleted since
-        if not reader.has_thumbnail(capture):
-            reader.add_thumbnail(capture, make_thumbnail(capture))
-            self.publisher.mark_changed(session=True)
+        if capture.hash not in reader.thumbnails:
+            reader.thumbnails[capture.hash] = make_thumbnail(capture)
+            self._note_change()
         session = reader.session.guarded(report.saving)
         report(0.0, f"reading {capture.name}")
         is_new = load_examination(session, capture.name) is None
@@ -355,12 +279,8 @@ class Engine:
         finally:
             if is_new:
                 for sentence in load_or_save_examination(session, capture).warnings():
-                    self.notices.add("warning", f"{capture.name}: {sentence}", "frames")
-                warn_of_captured(
-                    capture.name,
-                    capture,
-                    lambda text: self.notices.add("warning", text, "check-exposure"),
-                )
+                    self._warner("frames")(f"{capture.name}: {sentence}")
+                warn_of_captured(capture.name, capture, self._warner("check-exposure"))
 
     def _judge_pose(self, reader: SessionReader, session: Session, capture: Capture) -> None:
         """Read the features of a target pose, examine its frames, and save both; the next pose is
@@ -370,104 +290,97 @@ class Engine:
         def plan_next(observation: Observation) -> None:
             """Let the next pose be planned from the features, before the frames are examined."""
             reader.add_features(capture, target, observation)
-            self.publisher.mark_changed(session=True)
+            self._note_change()
 
         poses = read_stored_poses(
             session, [capture.name], Board.parse(target), Smoothing(), plan_next
         )
         judged = next(poses)
         if judged.observation is None:
-            self.notices.add(
-                "warning", f"{capture.name} cannot be used: {judged.refused}", "target-poses"
-            )
-        self.publisher.mark_changed(session=True)
+            self._warner("target-poses")(f"{capture.name} cannot be used: {judged.refused}")
+        self._note_change()
 
     def _handle_processing_failure(
         self, reader: SessionReader, capture: Capture, error: BaseException
     ) -> None:
         """Report that a capture could not be processed, and store why it is unreadable."""
-        self.notices.add_failure(f"Processing {capture.name}", error)
+        self._notices.add_failure(f"Processing {capture.name}", error)
         if isinstance(error, InputError | DamagedError):
             reader.add_unreadable(capture, str(error))
-        self.publisher.mark_changed(session=True)
+        self._note_change()
 
     # previews
 
     def _handle_preview(self, view: PreviewView) -> None:
         """Publish an analysed preview, trigger hands-free capture, and update the brightness
         (preview thread)."""
-        countdown = self.hands_free.countdown(
-            view.board, not self.acquisition.idle, time.monotonic()
+        countdown = self._hands_free.countdown(
+            view.board, not self._acquisition.idle, time.monotonic()
         )
         now = countdown is not None and countdown <= 0
-        self.preview = view = replace(view, countdown_s=None if now else countdown)
+        self._preview = view = replace(view, countdown_s=None if now else countdown)
         if now:
             self._capture_now()
-        brightness = view.brightness if self.acquisition.view().light == "white" else ""
+        brightness = view.brightness if self._acquisition.view().light == "white" else ""
         if brightness != self._brightness:
             self._brightness = brightness
-            self.publisher.mark_changed()
-        self.preview_listeners.call(view)
+            self._publisher.mark_changed()
+        self._preview_listeners.call(view)
 
     # snapshots
 
     def _build_snapshot(self, version: int, session_changed: bool) -> Snapshot:
         """Build the current snapshot without changing any state (publisher's thread)."""
-        reader, bench, choice, rig = self._reader, self.bench, self._choice, self.acquisition.view()
-        session, space, read_failure = (
-            self.publisher.latest.session,
-            None,
-            self.publisher.latest.read_failure,
-        )
-        if reader is None:
-            session = None
-        else:
-            if session_changed or session is None or session.folder != reader.session.folder:
-                session, read_failure = self._read_session(reader, rig, session)
-            try:
-                camera = bench.rig.camera if bench is not None and rig.camera is not None else None
-                space = measure_space(reader.session, camera, reader.count_frames(rig))
-            except (SlviewerError, OSError) as error:
-                read_failure = read_failure or describe_failure("Reading the session", error)
+        reader, bench, choice = self._session_reader, self._bench, self._choice
+        rig = self._acquisition.view()
+        session, space, read_failure = None, None, ""
+        if reader:
+            session, space, read_failure = self._read_session(reader, rig, session_changed)
         if self._rig_fault:
             rig = replace(rig, state="lost", fault=self._rig_fault)
-        world = _view_world(bench.world) if bench is not None and bench.world is not None else None
+        world = bench.world if bench else None
         rig = replace(
-            rig,
-            simulated=world is not None,
-            choice=choice,
-            pages=() if choice is None else list_needed_pages(choice),
+            rig, simulated=world is not None, choice=choice, pages=list_needed_pages(choice or {})
         )
-        return Snapshot(
+        live = self._live
+        return replace(
+            self._shown,
             version=version,
             session=session,
             rig=rig,
-            world=world,
-            job=self.jobs.view(),
-            notices=self.notices.all(),
+            world=None
+            if world is None
+            else WorldView(world.standing, world.pose.matrix, world.turn_deg),
+            job=self._jobs.view(),
+            notices=self._notices.all(),
             steps=views(Facts(session, rig, space, self._brightness)),
             space=space,
-            hands_free=self.hands_free.is_on,
-            autopilot=self._autopilot,
-            preflight=self.preflight,
-            exposure_change=self.exposure_change,
-            live=self.live.figures() if self.live is not None and self.live.is_running else None,
-            merge_failure=self._merge_failure,
-            merge_refusal=self._merge_refusal,
+            hands_free=self._hands_free.is_on,
+            live=live.figures() if live and live.is_running else None,
             read_failure=read_failure,
-            preparing=self._preparing,
         )
 
     def _read_session(
-        self, reader: SessionReader, rig: RigView, before: SessionView | None
-    ) -> tuple[SessionView | None, str]:
-        """Return (the session, ""); where it cannot be read, (`before` if it is of the same folder,
-        why)."""
+        self, reader: SessionReader, rig: RigView, changed: bool
+    ) -> tuple[SessionView | None, Space | None, str]:
+        """Return (the session, its space, why reading failed); a session that cannot be read stays
+        as it was."""
+        before, bench, space = self._publisher.latest, self._bench, None
+        session, failure = before.session, before.read_failure
+        if session is None or session.folder != reader.session.folder:
+            session, changed = None, True
         try:
-            return reader.read(rig, self.bench.focal_px if self.bench else None), ""
+            if changed:
+                failure = ""
+                session = reader.read(rig, bench.focal_px if bench else None)
         except Exception as error:  # most likely files were being changed
-            is_same = before is not None and before.folder == reader.session.folder
-            return before if is_same else None, describe_failure("Reading the session", error)
+            failure = describe_failure("Reading the session", error)
+        try:
+            camera = bench.rig.camera if bench and rig.camera is not None else None
+            space = measure_space(reader.session, camera, reader.count_frames(rig))
+        except (SlviewerError, OSError) as error:
+            failure = failure or describe_failure("Reading the session", error)
+        return session, space, failure
 
     def _follow_up(self, snapshot: Snapshot) -> None:
         """Act on a new snapshot: retry failed reads, plan the next pose, end hands-free capture."""
@@ -479,35 +392,24 @@ class Engine:
         self._reported_faults &= set(faults)
         self._failed_reads = self._failed_reads + 1 if new_faults else 0
         if 0 < self._failed_reads < READ_ATTEMPTS:
-            self.publisher.mark_changed(session=True)
+            self._note_change()
         elif new_faults:  # each is reported once, until it can be read again
             self._reported_faults |= set(new_faults)
             for fault in new_faults:
-                self.notices.add("error", fault)
-        self.watcher.watch(_choose_watch(session))
+                self._notices.add("error", fault)
+        watch = preview_watcher.Watch()
+        if session and session.target:
+            lens = session.plan.lens if session.plan else None
+            watch = preview_watcher.Watch(Board.parse(session.target), lens)
+        self._watcher.watch = watch
         if session is None:
             return
-        if session.pending_plan is not None:
+        if session.pending_plan:
             self._planner.request(session.pending_plan)
             return
         reached, self._reached = self._reached, (session.folder, session.enough)
-        if session.enough and reached != self._reached and self.hands_free.is_on:
-            self.hands_free.switch(False)
-            self.notices.add(
+        if session.enough and reached != self._reached and self._hands_free.is_on:
+            self._hands_free.is_on = False
+            self._notices.add(
                 "good", "the poses reach the wanted accuracy: hands-free capture has stopped"
             )
-
-
-def _view_world(world: SimulatedWorld) -> WorldView:
-    """Return what stands before the simulated rig, and its pose."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = world.pose.R, world.pose.t
-    return WorldView(world.standing, T, world.turn_deg)
-
-
-def _choose_watch(session: SessionView | None) -> Watch:
-    """Return what to detect in the previews: the session's board, and the lens to estimate its pose
-    with."""
-    if session is None or not session.target:
-        return Watch()
-    return Watch(Board.parse(session.target), session.plan.lens if session.plan else None)

@@ -17,13 +17,13 @@ import ctypes
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from slviewer.errors import Cancelled
 from slviewer.wizard.notices import Notices, log
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import JobView
 
 PATIENCE_S = 0.5
@@ -44,7 +44,7 @@ class Reporter:
     def __init__(self, changed: Callable[[], None]) -> None:
         self._changed = changed
         self._lock = threading.Lock()
-        self._cancelled, self._saving = False, False
+        self.cancelled, self._saving = False, False
         self.share, self.stage = 0.0, ""
 
     def __call__(self, share: float, stage: str) -> None:
@@ -59,57 +59,26 @@ class Reporter:
 
     def check(self) -> None:
         """Raise Cancelled if the work was cancelled."""
-        if self._cancelled:
+        if self.cancelled:
             raise Cancelled("cancelled")
 
     def saving(self) -> None:
         """Mark the start of a save: raises Cancelled, or defers cancelling until the next
         report."""
         with self._lock:
-            if self._cancelled and not self._saving:
+            if self.cancelled and not self._saving:
                 raise Cancelled("cancelled")
             self._saving = True
 
     def cancel(self) -> None:
         """Make the next report raise Cancelled."""
         with self._lock:
-            self._cancelled = True
-
-    def within(self, start: float, end: float) -> "Reporter":
-        """Return a reporter for one part of the work, which maps its shares 0 ... 1 to `start` ...
-        `end`."""
-        # the last report is the whole work's own
-        return _PartReporter(self, start, min(end, 0.999))
-
-    @property
-    def cancelled(self) -> bool:
-        """Whether the operator has cancelled the job."""
-        return self._cancelled
+            self.cancelled = True
 
     @property
     def has_saved(self) -> bool:
         """Whether a save has begun since the last report of a share below 1."""
         return self._saving
-
-
-class _PartReporter(Reporter):
-    """A `Reporter` that maps its shares to a part of another's and forwards every call to it."""
-
-    def __init__(self, whole: Reporter, start: float, end: float) -> None:
-        super().__init__(whole._changed)
-        self._whole, self._start, self._end = whole, start, end
-
-    def __call__(self, share: float, stage: str) -> None:
-        """Report progress of the part, `share` 0 ... 1, to the whole."""
-        self._whole(self._start + (self._end - self._start) * share, stage)
-
-    def check(self) -> None:
-        """Raise Cancelled if the whole work was cancelled."""
-        self._whole.check()
-
-    def saving(self) -> None:
-        """Mark the start of a save in the whole work; raises Cancelled if that was cancelled."""
-        self._whole.saving()
 
 
 @dataclass(eq=False)
@@ -129,19 +98,16 @@ class _Job:
     error: BaseException | None = None
 
 
-class Jobs:
+class Jobs(Service):
     """A worker thread with a foreground and a background queue. Every method may be called from any
     thread."""
 
     def __init__(self, notices: Notices, changed: Callable[[], None]) -> None:
+        super().__init__("slviewer worker")
         self._notices, self._changed = notices, changed
-        self._condition = threading.Condition()
-        self._waiting: deque[_Job] = deque()
-        self._waiting_behind: deque[_Job] = deque()
+        self._waiting: list[_Job] = []
         self._running: _Job | None = None
-        self._closing = False
-        self._worker = threading.Thread(target=self._serve, name="slviewer worker", daemon=True)
-        self._worker.start()
+        self._thread.start()
 
     def submit(
         self,
@@ -161,33 +127,34 @@ class Jobs:
         with self._condition:
             if self._closing:
                 return
-            (self._waiting_behind if background else self._waiting).append(job)
+            self._waiting.append(job)
             self._condition.notify_all()
         self._changed()
 
     def cancel(self) -> None:
         """Cancel the running foreground job, else the first waiting one; other jobs continue."""
         with self._condition:
-            if self._running is not None and not self._running.background:
+            if self._running and not self._running.background:
                 self._running.reporter.cancel()
                 self._condition.notify_all()
-            elif self._waiting:
-                self._notices.add("info", f"{self._waiting.popleft().name}: cancelled")
+            elif requested := [job for job in self._waiting if not job.background]:
+                self._waiting.remove(requested[0])
+                self._notices.add("info", f"{requested[0].name}: cancelled")
         self._changed()
 
     def cancel_all(self) -> None:
         """Cancel the running job and drop the waiting ones, background work too."""
         with self._condition:
             self._waiting.clear()
-            self._waiting_behind.clear()
-            if self._running is not None:
+            if self._running:
                 self._running.reporter.cancel()
             self._condition.notify_all()
 
     def view(self) -> JobView | None:
         """Return the running job; None where none runs."""
         with self._condition:
-            job, waiting = self._running, len(self._waiting)
+            job = self._running
+            waiting = sum(not each.background for each in self._waiting)
         if job is None:
             return None
         reporter = job.reporter
@@ -206,19 +173,12 @@ class Jobs:
     def idle(self) -> bool:
         """Whether no job runs and none waits, background work included."""
         with self._condition:
-            return self._running is None and not self._waiting and not self._waiting_behind
-
-    def wait_until_idle(self, timeout_s: float) -> bool:
-        """Wait until no job runs or waits; returns False after `timeout_s`."""
-        with self._condition:
-            return self._condition.wait_for(lambda: self.idle, timeout_s)
+            return self._running is None and not self._waiting
 
     def close(self) -> None:
         """Cancel everything and end the worker; returns within a second or so."""
-        with self._condition:
-            self._closing = True
         self.cancel_all()
-        self._worker.join(4 * PATIENCE_S)
+        super().close()
 
     def _serve(self) -> None:
         """Run the worker loop until closing: take the next job, foreground jobs first, and run
@@ -229,12 +189,11 @@ class Jobs:
                 self._condition.notify_all()
             self._changed()
             with self._condition:
-                self._condition.wait_for(
-                    lambda: self._closing or self._waiting or self._waiting_behind
-                )
+                self._condition.wait_for(lambda: self._closing or self._waiting)
                 if self._closing:
                     return
-                job = (self._waiting or self._waiting_behind).popleft()
+                job = min(self._waiting, key=lambda each: each.background)
+                self._waiting.remove(job)
                 job.begun = time.monotonic()
                 self._running = job
             self._changed()
@@ -267,11 +226,11 @@ class Jobs:
         ):
             if not job.background:
                 self._notices.add("info", f"{job.name}: cancelled")
-        elif job.error is not None and job.failed is not None:
+        elif job.error and job.failed:
             job.failed(job.error)
-        elif job.error is not None:
+        elif job.error:
             self._notices.add_failure(job.name, job.error)
-        elif job.done is not None:
+        elif job.done:
             job.done(job.result)
 
     def _execute_job(self, job: _Job) -> None:

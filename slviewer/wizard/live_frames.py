@@ -63,7 +63,11 @@ class Stream:
             # a change during this exposure is reported at the next call
             rig.projector.show(count - 1)
             last = frames[-1].copy()
-            self._store_newest(LiveCapture(frames, begun, settings))
+            with self._condition:
+                self._recycle(self._waiting)  # it was not read
+                self._waiting = LiveCapture(frames, begun, settings)
+                self.captured += 1
+                self._condition.notify_all()
             return last
         with self._condition:
             self._free.append(frames)
@@ -106,15 +110,7 @@ class Stream:
             return allocate_frames(shape, dtype)
         return buffer
 
-    def _store_newest(self, shot: LiveCapture) -> None:
-        """Make a capture the one to read next, and recycle one that was not read."""
-        with self._condition:
-            self._recycle(self._waiting)  # it was not read
-            self._waiting = shot
-            self.captured += 1
-            self._condition.notify_all()
-
     def _recycle(self, shot: LiveCapture | None) -> None:
         """Return the buffer of a capture, if there is one, to the free list."""
-        if shot is not None:
+        if shot:
             self._free.append(shot.frames)

@@ -41,6 +41,7 @@ from slviewer.wizard.snapshot import LiveView
 REPORTS_PER_S = 3.0
 # rates are averages over this time, or over the last two clouds where these came more slowly
 _AVERAGED_S = 2.0
+_MOST_EVENTS = 1000  # whose times are remembered
 _RELOAD_S = 1.0  # between two checks whether the calibration has changed
 _RELEASE_S = 30.0  # between two releases of freed memory
 
@@ -57,101 +58,6 @@ class LiveCloud:
     points: np.ndarray
     texture: np.ndarray
     begun: float
-
-
-class LiveScan:
-    """A live scan, from its start to its end.
-
-    `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures
-    changed or it ended. `figures` and `count_shown` may be called from any thread.
-    """
-
-    def __init__(
-        self,
-        store: Session,
-        axis: Axis,
-        sequence: PatternSequence,
-        acquisition: Acquisition,
-        notices: Notices,
-        publish: Callable[[LiveCloud], None],
-        changed: Callable[[], None],
-    ) -> None:
-        self._store, self.axis, self._acquisition, self._notices = store, axis, acquisition, notices
-        self._publish, self._changed = publish, changed
-        self.stream = Stream(sequence, changed)
-        self._lock = threading.Lock()
-        self._made: deque[float] = deque()
-        self._sent: deque[tuple[float, float]] = deque()
-        self._points, self._number, self._reported = 0, 0, 0.0
-        self._model: LiveCalibration | None = None
-        self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
-
-    def start(self) -> None:
-        """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
-        usable calibration."""
-        self._model = LiveCalibration(self._store, self.stream.sequence, self.axis)
-        self._acquisition.stream(self.stream)
-        self._made.append(time.monotonic())  # the first cloud has a rate too
-        self._thread.start()
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the live scan has not ended."""
-        return not self.stream.has_ended
-
-    def count_shown(self, cloud: LiveCloud) -> None:
-        """Record that a cloud was sent to the browsers, for rate and latency."""
-        now = time.monotonic()
-        with self._lock:
-            self._sent.append((now, now - cloud.begun))
-            _drop_old(self._sent, now)
-
-    def figures(self) -> LiveView:
-        """Return the rates and the median latency of the last seconds."""
-        now = time.monotonic()
-        with self._lock:
-            _drop_old(self._made, now)
-            _drop_old(self._sent, now)
-            latency_s = float(np.median([late for _, late in self._sent])) if self._sent else None
-            return LiveView(
-                clouds_per_s=_compute_rate(self._made, now),
-                shown_per_s=_compute_rate([at for at, _ in self._sent], now),
-                latency_ms=None if latency_s is None else 1e3 * latency_s,
-                points=self._points,
-            )
-
-    def _serve(self) -> None:
-        """Compute and publish a cloud of each new capture until the stream ends; a failure ends it
-        with a notice."""
-        released = time.monotonic()
-        while (shot := self.stream.wait_next()) is not None:
-            try:
-                cloud = self._compute_cloud(shot)
-            except Exception as error:
-                self._notices.add_failure("Live", error)
-                self._acquisition.stop_stream()
-                return
-            now = time.monotonic()
-            with self._lock:
-                self._made.append(now)
-                _drop_old(self._made, now)
-            if not self.is_running:
-                return
-            self._publish(cloud)
-            if now - self._reported > 1 / REPORTS_PER_S:
-                self._reported = now
-                self._changed()
-            if now - released > _RELEASE_S:
-                released = now
-                release_memory()
-
-    def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
-        """Reconstruct a capture with the current calibration."""
-        assert self._model is not None
-        points, texture = self._model.current().cloud(shot.frames)
-        self._number += 1
-        self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
-        return LiveCloud(self._number, points, texture, shot.begun)
 
 
 @dataclass(eq=False)
@@ -181,13 +87,15 @@ class LiveModel:
         As in `reconstruct`, but what moved between the frames is NaN too. Raises InputError for
         frames of another sequence or camera.
         """
-        if self.calibrated is not None:
+        if self.calibrated:
             height, width = frames.shape[1:]
             check_sizes(
                 "the live scan", (width, height), self.sequence.projector_size, self.calibrated
             )
-        if self._fast is not None:
-            scan = self._fast.run(frames, out=self._reuse_workspace())
+        if self._fast:
+            before = self._before  # whose other arrays are used again
+            out = None if before is None else replace(before, points=np.empty_like(before.points))
+            scan = self._fast.run(frames, out=out)
             self._before, points = scan, scan.points
             phase, modulation, noise = scan.phase, scan.modulation, scan.light.noise
         else:
@@ -199,33 +107,104 @@ class LiveModel:
             points *= np.float32(self.factor)
         return points, np.array(to_eight_bits(frames[-1], self.sequence.full_scale))
 
-    def _reuse_workspace(self) -> PassResult | None:
-        """Return the previous result with new points, to reuse its other arrays; None at first."""
-        before = self._before
-        return None if before is None else replace(before, points=np.empty_like(before.points))
 
+class LiveScan:
+    """A live scan, from its start to its end.
 
-class LiveCalibration:
-    """The session's preferred calibration, loaded again when it changes."""
+    `publish(cloud)` is called with every cloud on the scan's own thread, `changed()` when figures
+    changed or it ended. `figures` and `count_shown` may be called from any thread.
+    """
 
-    def __init__(self, store: Session, sequence: PatternSequence, axis: Axis) -> None:
-        self._store, self._sequence, self._axis = store, sequence, axis
+    def __init__(
+        self,
+        store: Session,
+        axis: Axis,
+        sequence: PatternSequence,
+        acquisition: Acquisition,
+        notices: Notices,
+        publish: Callable[[LiveCloud], None],
+        changed: Callable[[], None],
+    ) -> None:
+        self._store, self.axis, self._acquisition, self._notices = store, axis, acquisition, notices
+        self._publish, self._changed = publish, changed
+        self.stream = Stream(sequence, changed)
+        self._lock = threading.Lock()
+        # time and latency, s, of the latest clouds
+        self._made: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
+        self._sent: deque[tuple[float, float]] = deque(maxlen=_MOST_EVENTS)
+        self._points, self._number, self._reported = 0, 0, 0.0
+        self._model: LiveModel | None = None  # of the calibration of this key, checked at that time
         self._key: tuple[object, ...] = ()
         self._loaded = 0.0
-        self._current = self._load()
+        self._thread = threading.Thread(target=self._serve, name="slviewer live", daemon=True)
 
-    def current(self) -> LiveModel:
+    def start(self) -> None:
+        """Start capturing. Raises DeviceError if the rig is not ready, SlviewerError without a
+        usable calibration."""
+        self._load_model()
+        self._acquisition.stream(self.stream)
+        self._made.append((time.monotonic(), 0.0))  # the first cloud has a rate too
+        self._thread.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the live scan has not ended."""
+        return not self.stream.has_ended
+
+    def count_shown(self, cloud: LiveCloud) -> None:
+        """Record that a cloud was sent to the browsers, for rate and latency."""
+        now = time.monotonic()
+        with self._lock:
+            self._sent.append((now, now - cloud.begun))
+
+    def figures(self) -> LiveView:
+        """Return the rates and the median latency of the last seconds."""
+        now = time.monotonic()
+        with self._lock:
+            rates = _compute_rate(self._made, now), _compute_rate(self._sent, now)
+            late_s = [late for _, late in self._sent]
+            return LiveView(
+                *rates, 1e3 * float(np.median(late_s)) if late_s else None, self._points
+            )
+
+    def _serve(self) -> None:
+        """Compute and publish a cloud of each new capture until the stream ends; a failure ends it
+        with a notice."""
+        released = time.monotonic()
+        while (shot := self.stream.wait_next()) is not None:
+            try:
+                cloud = self._compute_cloud(shot)
+            except Exception as error:
+                self._notices.add_failure("Live", error)
+                self._acquisition.stop_stream()
+                return
+            now = time.monotonic()
+            with self._lock:
+                self._made.append((now, now - shot.begun))
+            if not self.is_running:
+                return
+            self._publish(cloud)
+            if now - self._reported > 1 / REPORTS_PER_S:
+                self._reported = now
+                self._changed()
+            if now - released > _RELEASE_S:
+                released = now
+                release_memory()
+
+    def _compute_cloud(self, shot: LiveCapture) -> LiveCloud:
+        """Reconstruct a capture with the current calibration."""
+        points, texture = self._load_model().cloud(shot.frames)
+        self._number += 1
+        self._points = int(np.count_nonzero(np.isfinite(points[..., 2])))
+        return LiveCloud(self._number, points, texture, shot.begun)
+
+    def _load_model(self) -> LiveModel:
         """Return the model, checked for changes at most a second ago. Raises SlviewerError where
         none is usable."""
-        if time.monotonic() - self._loaded > _RELOAD_S:
-            self._current = self._load()
-        return self._current
-
-    def _load(self) -> LiveModel:
-        """Load the session's preferred model and its scale, or return the current one where neither
-        has changed."""
-        store = self._store
-        self._loaded = time.monotonic()
+        now, store = time.monotonic(), self._store
+        if self._model and now - self._loaded <= _RELOAD_S:
+            return self._model
+        self._loaded = now
         name = preferred_model(store)
         factor = scale_factor(store, name)
         key = (
@@ -234,34 +213,26 @@ class LiveCalibration:
             accepts_rejected(store),
             *sorted(store.input_hashes(f"calibration/{name}").items()),
         )
-        if key == self._key:
-            return self._current
+        if self._model and key == self._key:
+            return self._model
         check_accepted(store, accepts_rejected(store))
         model = load_model(store, name)
-        if self._axis not in model.axes:
+        if self.axis not in model.axes:
             raise InputError(
-                f"the {name} calibration has no axis {self._axis}, which a live scan needs: capture"
+                f"the {name} calibration has no axis {self.axis}, which a live scan needs: capture"
                 " a scan"
             )
-        self._key = key
-        return LiveModel(self._sequence, self._axis, model, factor, load_stereo(store).rig)
+        self._key, rig = key, load_stereo(store).rig
+        self._model = LiveModel(self.stream.sequence, self.axis, model, factor, rig)
+        return self._model
 
 
-def _compute_rate(times: "deque[float] | list[float]", now: float) -> float:
-    """Return the rate per second of sorted times in s, less where none has come for long; 0 for
-    fewer than two."""
-    return (
-        (len(times) - 1) / max(times[-1] - times[0], now - times[-1], 1e-6)
-        if len(times) > 1
-        else 0.0
-    )
-
-
-def _drop_old(times: "deque[float] | deque[tuple[float, float]]", now: float) -> None:
-    """Remove entries whose time in s is older than the averaging window from the front of a deque,
-    but the last two."""
-    while (
-        len(times) > 2
-        and now - (times[0][0] if isinstance(times[0], tuple) else times[0]) > _AVERAGED_S
-    ):
-        times.popleft()
+def _compute_rate(events: deque[tuple[float, float]], now: float) -> float:
+    """Return the rate per second of events, (time in s, latency), less where none has come for
+    long; 0 for fewer than two. Those before the averaging window are removed, but the last two."""
+    while len(events) > 2 and now - events[0][0] > _AVERAGED_S:
+        events.popleft()
+    if len(events) < 2:
+        return 0.0
+    first, last = events[0][0], events[-1][0]
+    return (len(events) - 1) / max(last - first, now - last, 1e-6)

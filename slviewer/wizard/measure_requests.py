@@ -3,6 +3,7 @@ model."""
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from slviewer.pipeline.measure import (
     restore_measurement,
     trash_measurement,
 )
-from slviewer.pipeline.measured_surface import LoadSurface, MeasuredSurface, Place
+from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.operation import Job
 from slviewer.records.measurement import MeasuredRegion
 from slviewer.records.plain import from_plain, to_plain
@@ -32,15 +33,15 @@ from slviewer.session.atomic import rename
 from slviewer.session.inspection_plan import OWN_PLAN, PLANS, list_plans, read_plan, write_plan
 from slviewer.session.names import safe_name
 from slviewer.session.nominal import NOMINALS, Units, read_nominal
+from slviewer.wizard.engine import Engine, request
 from slviewer.wizard.jobs import Reporter
-from slviewer.wizard.requests import RequestHandler, request
 from slviewer.wizard.surfaces import Surfaces
 
 TABLE, PLAN = "measurements.csv", Path(OWN_PLAN).name
 MEASURING, COMPARING = "Measuring", "Comparing with the nominal model"
 
 
-class MeasureRequests(RequestHandler):
+class MeasureRequests(Engine):
     """Requests that measure on a scan or a merge, on the worker, and edit the list of
     measurements."""
 
@@ -49,7 +50,7 @@ class MeasureRequests(RequestHandler):
     def surface(self, name: str) -> MeasuredSurface:
         """Load a scan or merge to measure on, which is slow. Raises InputError where it cannot be
         measured on."""
-        return self._surfaces.load(self._engine.store, name)
+        return self._surfaces.load(self._store, name)
 
     @request(MEASURING)
     def measure(
@@ -60,32 +61,19 @@ class MeasureRequests(RequestHandler):
             {} if region is None else from_plain(to_plain(region), MeasuredRegion).to_settings()
         )
         chosen["at"] = [int(number) for number in np.ravel(at)] if len(at) else ()
-        self._run(
-            MEASURING,
-            measure,
-            MeasureSettings(on, what, **chosen, load=self._loader(on)),
-            "measurements",
-        )
+        settings = MeasureSettings(on, what, **chosen, load=partial(self._surfaces.load, name=on))
+        self._run(MEASURING, measure, settings, "measurements")
 
     @request(MEASURING)
     def measure_between(self, a: str, b: str) -> None:
         """Measure angles and distances between two points or fits, by their ids."""
         self._run(MEASURING, relate, RelateSettings(a, b), "measurements")
 
-    def _loader(self, on: str) -> LoadSurface:
-        """Return what loads a surface, unless it is the last one that was."""
-        return lambda store: self._surfaces.load(store, on)
-
     @request("Reading the nominal model")
     def upload_nominal(self, name: str, content: bytes) -> None:
         """Save an uploaded nominal model in the session, if it can be read."""
-        self._save_upload(
-            "Reading the nominal model",
-            NOMINALS,
-            name,
-            content,
-            lambda path: read_nominal(path).text(),
-        )
+        title = "Reading the nominal model"
+        self._save_upload(title, NOMINALS, name, content, lambda path: read_nominal(path).text())
 
     @request("Reading the plan")
     def upload_plan(self, name: str, content: bytes) -> None:
@@ -111,7 +99,7 @@ class MeasureRequests(RequestHandler):
     ) -> None:
         """Save an uploaded file in a folder of the session, if ``read`` can read it, which
         describes it."""
-        store, plain = self._engine.store, plain_name(name)
+        store, plain = self._store, plain_name(name)
 
         def work(report: Reporter) -> str:
             """Write the upload to its place if it can be read; returns its description."""
@@ -132,18 +120,13 @@ class MeasureRequests(RequestHandler):
     def run_plan(self, plan: str, *surfaces: str) -> None:
         """Inspect surfaces, each a part, by a plan of `SessionView.plans`; also writes the report
         into the exports."""
-        store = self._engine.store
+        store = self._store
         if plan not in list_plans(store.folder):
             raise InputError(f"there is no plan {plan!r} in the session: make or upload one first")
         if not surfaces:
             raise InputError("no scan to inspect: reconstruct one in the step Scan first")
-
-        self._run(
-            "Running the plan",
-            run_plan,
-            RunPlanSettings(store.folder / plan, surfaces),
-            "measurements",
-        )
+        settings = RunPlanSettings(store.folder / plan, surfaces)
+        self._run("Running the plan", run_plan, settings, "measurements")
 
     @request(COMPARING)
     def compare_nominal(
@@ -151,69 +134,75 @@ class MeasureRequests(RequestHandler):
     ) -> None:
         """Measure a surface's deviation from one of the session's nominal models after best fit;
         also writes a PLY."""
-        path = self._engine.store.folder / NOMINALS / safe_name(nominal)
+        path = self._store.folder / NOMINALS / safe_name(nominal)
         if not path.is_file():
             raise InputError(
                 f"there is no nominal model {nominal!r} in the session: upload it first"
             )
-        settings = CompareSettings(on, path, tolerance_mm, units, load=self._loader(on))
+        load = partial(self._surfaces.load, name=on)
+        settings = CompareSettings(on, path, tolerance_mm, units, load=load)
 
         def failed(error: BaseException) -> None:
             """Report why, in the words of the panel."""
-            self._engine.notices.add_failure(COMPARING, _reword(error))
+            self._notices.add_failure(COMPARING, _reword(error))
 
         self._run(COMPARING, compare, settings, "measurements", failed)
 
     @request("Renaming")
     def relabel_measurement(self, identity: str, name: str) -> None:
         """Rename a measurement; an empty name restores its original name."""
-        rename_measurement(self._engine.store, identity, name)
+        rename_measurement(self._store, identity, name)
 
     @request("Deleting")
     def delete_measurement(self, identity: str) -> None:
         """Move a measurement to the trash; results made from it are stale until it is restored."""
-        trash_measurement(self._engine.store, identity)
+        trash_measurement(self._store, identity)
 
     @request("Restoring")
     def undo_delete(self) -> None:
         """Restore the measurement that was deleted last."""
-        restore_measurement(self._engine.store)
+        restore_measurement(self._store)
 
     @request("Writing the table")
     def export_measurements_table(self) -> None:
         """Write all measurements as CSV into the exports."""
-        store = self._engine.store
+        store = self._store
 
-        def work(report: Reporter) -> str:
-            """Write the CSV into the exports; returns a sentence with the number of
-            measurements."""
-            with store.guarded(report.saving).staged_export(TABLE) as path:
-                count = export_measurements(store, path)
-            report(1.0, "written")
-            return f"{TABLE} is ready to download: {count} measurement{'s' * (count != 1)}"
+        def write(path: Path) -> str:
+            """Write the CSV; returns the number of measurements in words."""
+            return format_count(export_measurements(store, path), "measurement")
 
-        self._submit("Writing the table", work, str)
+        self._submit_export("Writing the table", TABLE, write)
 
     @request("Making the plan")
     def make_inspection_plan(self) -> None:
         """Write an inspection plan of the fits and relations into the exports, to repeat them on
         other scans."""
-        store = self._engine.store
+        store, warn = self._store, self._warner("measurements")
 
-        def work(report: Reporter) -> str:
-            """Write the plan into the exports; returns a sentence with what to do with it."""
-            job = Job(store, warn=self._warner("measurements"))
-            made = make_plan(job, TOLERANCE_MM, store.folder.name)
-            with store.guarded(report.saving).staged_export(PLAN) as path:
-                write_plan(made, path)
-            report(1.0, "written")
+        def write(path: Path) -> str:
+            """Write the plan; returns what to do with it."""
+            made = make_plan(Job(store, warn=warn), TOLERANCE_MM, store.folder.name)
+            write_plan(made, path)
             return (
-                f"{PLAN} is ready to download:"
-                f" {format_count(len(made.characteristic), 'characteristic')}; set its limits, then"
+                f"{format_count(len(made.characteristic), 'characteristic')}; set its limits, then"
                 f" upload it below, or run slviewer inspect-parts {PLAN} SESSION..."
             )
 
-        self._submit("Making the plan", work, str)
+        self._submit_export("Making the plan", PLAN, write)
+
+    def _submit_export(self, title: str, name: str, write: Callable[[Path], str]) -> None:
+        """Queue the writing of a file into the exports; ``write`` returns words about it."""
+        store = self._store
+
+        def work(report: Reporter) -> str:
+            """Write the file; returns a sentence about it."""
+            with store.guarded(report.saving).staged_export(name) as path:
+                words = write(path)
+            report(1.0, "written")
+            return f"{name} is ready to download: {words}"
+
+        self._submit(title, work, str)
 
 
 def _reword(error: BaseException) -> BaseException:

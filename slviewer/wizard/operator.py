@@ -12,18 +12,11 @@ from typing import Protocol
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.pipeline.rig_choice import Choice, SetUp, set_up
-from slviewer.session.store import Session
-from slviewer.wizard.edit_requests import EditRequests
-from slviewer.wizard.engine import Engine
-from slviewer.wizard.import_requests import ImportRequests
-from slviewer.wizard.live_requests import LiveRequests
+from slviewer.wizard.capture_requests import CaptureRequests
+from slviewer.wizard.engine import Timing, request
 from slviewer.wizard.measure_requests import MeasureRequests
-from slviewer.wizard.requests import request
-from slviewer.wizard.rig_requests import RigRequests
 from slviewer.wizard.snapshot import Level, Notice, PreviewView, Snapshot
 from slviewer.wizard.surfaces import Surfaces
-from slviewer.wizard.timing import Timing
-from slviewer.wizard.turn_requests import TurnRequests
 
 
 class AutopilotLike(Protocol):
@@ -40,9 +33,7 @@ class AutopilotLike(Protocol):
         """Stop sending requests."""
 
 
-class Operator(
-    RigRequests, LiveRequests, TurnRequests, MeasureRequests, EditRequests, ImportRequests
-):
+class Operator(CaptureRequests, MeasureRequests):
     """The wizard: requests in, snapshots out. Close it, or use it in a `with` block."""
 
     def __init__(
@@ -54,7 +45,7 @@ class Operator(
         timing: Timing | None = None,
     ) -> None:
         """Open or create `session`, with `rig`, by default the one that the session remembers."""
-        self._engine = Engine(set_up, self.capture_pose, timing or Timing())
+        super().__init__(set_up, self.capture_pose, timing or Timing())
         self._autopilot: AutopilotLike | None = None
         self._surfaces = Surfaces()
         if session is not None:
@@ -70,18 +61,13 @@ class Operator(
         """Close the operator."""
         self.close()
 
-    @property
-    def session(self) -> Session | None:
-        """The open session, to be read by `result_views`; None where none is open."""
-        return self._engine.session
-
     def snapshot(self) -> Snapshot:
         """Return the latest snapshot."""
-        return self._engine.publisher.latest
+        return self._publisher.latest
 
     def preview(self) -> PreviewView | None:
         """Return the latest preview; None until there is one."""
-        return self._engine.preview
+        return self._preview
 
     def subscribe(
         self,
@@ -94,9 +80,9 @@ class Operator(
         Returns a function that unsubscribes. A callback must return soon, and must not wait for
         another snapshot.
         """
-        removals = [self._engine.publisher.listeners.add(callback)]
-        if preview is not None:
-            removals.append(self._engine.preview_listeners.add(preview))
+        removals = [self._publisher.listeners.add(callback)]
+        if preview:
+            removals.append(self._preview_listeners.add(preview))
 
         def stop() -> None:
             """Remove the callbacks."""
@@ -107,12 +93,12 @@ class Operator(
 
     def notices(self) -> tuple[Notice, ...]:
         """Return the latest notices, oldest first, also those that no snapshot shows yet."""
-        return self._engine.notices.all()
+        return self._notices.all()
 
     def wait_for(self, condition: Callable[[Snapshot], bool], timeout_s: float) -> Snapshot | None:
         """Wait for the first snapshot for which `condition` holds, and return it; None after
         `timeout_s`."""
-        return self._engine.publisher.wait_for(condition, timeout_s)
+        return self._publisher.wait_for(condition, timeout_s)
 
     def wait_until_idle(self, timeout_s: float = 60.0) -> Snapshot:
         """Wait until all captures, jobs and the plan of the next pose are complete; returns the
@@ -120,58 +106,58 @@ class Operator(
 
         Raises SlviewerError after `timeout_s`.
         """
-        engine, end = self._engine, time.monotonic() + timeout_s
+        end = time.monotonic() + timeout_s
         while True:
             # captures first: each submits its jobs before it ends
             idle = self.wait_for(
-                lambda now: engine.acquisition.idle and engine.jobs.idle and not _is_planning(now),
+                lambda now: self._acquisition.idle and self._jobs.idle and not _is_planning(now),
                 end - time.monotonic(),
             )
             if idle is None:
                 raise SlviewerError(
                     f"work is still running after {timeout_s:g} s: cancel it, or wait longer"
                 )
-            now = engine.publisher.refresh()
-            if not _is_planning(now) and engine.publisher.is_current:
+            now = self._publisher.refresh()
+            if not _is_planning(now) and self._publisher.is_current:
                 return now
 
     @request("Cancelling")
     def cancel(self) -> None:
         """Cancel the running capture, else the running job; an autopilot stops too."""
-        if self._autopilot is not None:
+        if self._autopilot:
             self._autopilot.stop()
-        if not self._engine.acquisition.idle:
-            self._engine.acquisition.cancel()
+        if not self._acquisition.idle:
+            self._acquisition.cancel()
         else:
-            self._engine.jobs.cancel()
+            self._jobs.cancel()
 
     @request("Starting autopilot")
     def start_autopilot(self, autopilot: AutopilotLike) -> None:
         """Start an autopilot, which sends requests until it is done or `cancel` stops it."""
-        with self._engine.lock:
-            if self._autopilot is not None and self._autopilot.running:
+        with self._lock:
+            if self._autopilot and self._autopilot.running:
                 raise InputError("an autopilot is running already: cancel it first")
             self._autopilot = autopilot
             autopilot.start()
 
     def set_autopilot_status(self, act: str) -> None:
         """Set the autopilot's current act, which the snapshot shows; empty when it has ended."""
-        self._engine.set_autopilot(act)
+        self._show(autopilot=act)
 
     def set_preparing(self, share: float | None) -> None:
         """Set the share of the kernels that are compiled in the background; None: none are being
         compiled."""
-        self._engine.set_preparing(share)
+        self._show(preparing=share)
 
     def notify(self, level: Level, text: str) -> None:
         """Add a notice of the caller's own."""
-        self._engine.notices.add(level, text)
+        self._notices.add(level, text)
 
     def close(self) -> None:
         """Stop everything and close the session; captures are saved already."""
-        if self._autopilot is not None:
+        if self._autopilot:
             self._autopilot.stop()
-        self._engine.close()
+        super().close()
 
 
 def _is_planning(snapshot: Snapshot) -> bool:

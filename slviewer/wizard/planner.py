@@ -28,11 +28,9 @@ class Planner:
     ) -> None:
         self._changed, self._compute, self._quick = changed, compute, quick
         self._lock = threading.Lock()
-        self._plans: dict[object, PosePlan] = {}
-        self._latest: tuple[PlanInput, PosePlan] | None = (
-            None  # the last one that was computed and looked up
-        )
-        self._interim: tuple[object, PosePlan] | None = None
+        self._plans: dict[object, tuple[PosePlan, bool]] = {}  # and whether it is final
+        # the last one that was computed and looked up
+        self._latest: tuple[PlanInput, PosePlan] | None = None
         self._requested: object = None
         self._worker = LatestWorker("slviewer planner", self._compute_plan)
 
@@ -44,37 +42,28 @@ class Planner:
         its suggestion and sigma are that plan's as long as poses were only added.
         """
         with self._lock:
-            final = self._plans.get(given.key)
-            if final is not None:
-                self._latest = (given, final) if given.takes_time else self._latest
-                return final, True
-            if self._interim is not None and self._interim[0] == given.key:
-                return self._interim[1], False
+            if cached := self._plans.get(given.key):
+                if cached[1] and given.takes_time:
+                    self._latest = given, cached[0]
+                return cached
             latest = self._latest
         if not given.takes_time:
-            return self._cache_plan(given, self._compute(given)), True
-        before, grown = None, False
-        if latest is not None and latest[0].rig_key == given.rig_key:
-            same = {name for name, _ in {*latest[0].hashes} & {*given.hashes}}
-            before = replace(
-                latest[1], poses={name: T for name, T in latest[1].poses.items() if name in same}
-            )
-            grown = latest[0].features.keys() <= same
-        interim = self._quick(given, before)
-        if before is not None and grown:
-            interim = replace(
-                interim,
-                sigma_mm=before.sigma_mm,
-                suggestion=before.suggestion or interim.suggestion,
-            )
-        with self._lock:
-            self._interim = given.key, interim
-        return interim, False
+            return self._cache_plan(given, self._compute(given), True)
+        if latest is None or latest[0].rig_key != given.rig_key:
+            return self._cache_plan(given, self._quick(given, None), False)
+        earlier, plan = latest
+        same = {name for name, _ in {*earlier.hashes} & {*given.hashes}}
+        poses = {name: T for name, T in plan.poses.items() if name in same}
+        interim = self._quick(given, replace(plan, poses=poses))
+        if earlier.features.keys() <= same:
+            suggestion = plan.suggestion or interim.suggestion
+            interim = replace(interim, sigma_mm=plan.sigma_mm, suggestion=suggestion)
+        return self._cache_plan(given, interim, False)
 
     def request(self, given: PlanInput) -> None:
         """Compute the plan for this input in the background, in place of an earlier request."""
         with self._lock:
-            if self._requested == given.key or given.key in self._plans:
+            if self._requested == given.key or self._plans.get(given.key, (None, False))[1]:
                 return
             self._requested = given.key
         self._worker.offer(given)
@@ -92,15 +81,15 @@ class Planner:
             computed = self._compute(given)
         except Exception:  # the operator can go on without a suggestion
             log.exception("the next pose could not be computed")
-            computed = self.look_up(given)[0]
-        self._cache_plan(given, computed)
+            computed, _ = self.look_up(given)
+        self._cache_plan(given, computed, True)
         self._changed()
 
-    def _cache_plan(self, given: PlanInput, computed: PosePlan) -> PosePlan:
-        """Cache a final plan under its input's key, dropping the oldest where the cache is full;
-        returns it."""
+    def _cache_plan(self, given: PlanInput, plan: PosePlan, final: bool) -> tuple[PosePlan, bool]:
+        """Cache a plan under its input's key, dropping the oldest where the cache is full; returns
+        what `look_up` does."""
         with self._lock:
             while len(self._plans) >= MOST_PLANS:
                 self._plans.pop(next(iter(self._plans)))
-            self._plans[given.key] = computed
-        return computed
+            self._plans[given.key] = plan, final
+        return plan, final

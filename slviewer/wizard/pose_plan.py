@@ -79,11 +79,7 @@ class PlanInput:
     @cached_property
     def calibrated(self) -> StereoModel | None:
         """The stereo calibration, if its camera has this size; else None."""
-        return (
-            self.stereo
-            if self.stereo is not None and self.stereo.rig.camera.size == self.camera
-            else None
-        )
+        return self.stereo if self.stereo and self.stereo.rig.camera.size == self.camera else None
 
     @property
     def takes_time(self) -> bool:
@@ -139,7 +135,7 @@ def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
     The rig is the calibrated one, else one estimated from the poses.
     """
     poses = list(given.features.values())
-    if given.calibrated is not None:
+    if given.calibrated:
         rig, known = given.calibrated.rig, given.calibrated.poses
     else:
         rough = estimate_rig(
@@ -157,10 +153,7 @@ def plan_next_pose(given: PlanInput, trials: int = TRIALS) -> PosePlan:
         guidance = suggest_poses(
             GuidanceModel(rig, given.board, expected), list(spread.poses.values()), trials
         )
-    except (
-        InputError,
-        np.linalg.LinAlgError,
-    ):
+    except (InputError, np.linalg.LinAlgError):
         # devices that share no view: better coverage may repair it
         guidance = None
     if guidance is None:
@@ -180,9 +173,9 @@ def quick_plan(given: PlanInput, before: PosePlan | None) -> PosePlan:
     Poses come from the calibration, else from the lens of the plan `before`, else from the initial
     lens.
     """
-    if given.calibrated is not None:
+    if given.calibrated:
         return _plan_by_coverage(given, given.calibrated.rig.camera, given.calibrated.poses)
-    if before is not None:
+    if before:
         return _plan_by_coverage(given, before.lens, before.poses)
     return _plan_by_coverage(given, given.initial_lens(), {})
 

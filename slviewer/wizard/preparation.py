@@ -50,7 +50,7 @@ class Preparation:
 
     def close(self) -> None:
         """End the process; what it has compiled is saved."""
-        if self._process is not None:
+        if self._process:
             self._process.kill()
 
     def _run(self) -> None:

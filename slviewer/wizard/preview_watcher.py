@@ -22,6 +22,7 @@ from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
 from slviewer.target.planar import fit_homography, to_image
 from slviewer.wizard.notices import log
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import BoardSeen, PreviewView
 
 Item = TypeVar("Item")
@@ -49,15 +50,13 @@ class Watch:
     lens: Lens | None = None
 
 
-class LatestWorker(Generic[Item]):
+class LatestWorker(Service, Generic[Item]):
     """A thread that calls `work(item)` with the latest item offered, and drops earlier ones."""
 
     def __init__(self, name: str, work: Callable[[Item], None], rest: float = 0.0) -> None:
+        super().__init__(name)
         self._work, self._rest = work, rest
-        self._condition = threading.Condition()
         self._item: Item | None = None
-        self._closing = False
-        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         self._thread.start()
 
     def offer(self, item: Item) -> None:
@@ -65,13 +64,6 @@ class LatestWorker(Generic[Item]):
         with self._condition:
             self._item = item
             self._condition.notify_all()
-
-    def close(self) -> None:
-        """End the thread."""
-        with self._condition:
-            self._closing = True
-            self._condition.notify_all()
-        self._thread.join(2.0)
 
     def _serve(self) -> None:
         """Process the latest item until closing, pausing `rest` times its duration; failures are
@@ -99,12 +91,11 @@ class Watcher:
 
     def __init__(self, analysed: Callable[[PreviewView], None]) -> None:
         self._analysed = analysed
-        self._watch = Watch()
-        self._result: tuple[Watch, BoardSeen | None, str] = (self._watch, None, "")
+        self.watch = Watch()  # what to detect from now on
+        self._result: tuple[Watch, BoardSeen | None, str] = (self.watch, None, "")
         self._stillness = Stillness()
-        self._searched: tuple[Board | None, np.ndarray] | None = (
-            None  # the board, and a thumbnail of the last image
-        )
+        # the board, and a thumbnail of the last image
+        self._searched: tuple[Board | None, np.ndarray] = (None, np.zeros((0, 0), np.uint8))
         self._detected: tuple[Detection | None, str] = (None, "")
         self._number, self._rate, self._last = 0, 0.0, 0.0
         self._detector = LatestWorker("slviewer board detection", self._detect, _REST)
@@ -114,10 +105,6 @@ class Watcher:
         """Analyse `frame` (h, w) next, instead of any that is still waiting; `full_scale` is what
         the camera states."""
         self._viewer.offer((frame, full_scale))
-
-    def watch(self, target: Watch) -> None:
-        """Set the board to detect from now on."""
-        self._watch = target
 
     def close(self) -> None:
         """End both threads."""
@@ -133,14 +120,14 @@ class Watcher:
         now = time.monotonic()
         frame, full_scale = item
         image, scale = reduced(frame, full_scale=full_scale)
-        if self._watch.board is not None:
+        if self.watch.board:
             self._detector.offer((image, scale, now))
         if self._last:
             self._rate += 0.2 * (1 / max(now - self._last, 1e-3) - self._rate)
         self._last = now
         self._number += 1
         watch, board, missing = self._result
-        if watch.board != self._watch.board:
+        if watch.board != self.watch.board:
             board, missing = None, ""
         rate = round(self._rate, 1)
         light = brightness(frame, full_scale)
@@ -153,19 +140,18 @@ class Watcher:
         An image in which nothing has moved is not searched again.
         """
         image, scale, time_s = item
-        watch, board = self._watch, None
+        watch, board = self.watch, None
         thumbnail = reduced(image, _THUMBNAIL_PX)[0]
+        board_before, before = self._searched
         if (
-            self._searched is None
-            or self._searched[0] != watch.board
-            or _differs(thumbnail, self._searched[1])
+            board_before != watch.board
+            or before.shape != thumbnail.shape
+            or float(np.percentile(cv2.absdiff(thumbnail, before), 99)) >= _UNCHANGED
         ):
-            self._searched, self._detected = (
-                (watch.board, thumbnail),
-                detect_in_preview(watch.board, image),
-            )
+            self._searched = watch.board, thumbnail
+            self._detected = detect_in_preview(watch.board, image)
         detection, missing = self._detected
-        if detection is not None and watch.board is not None:
+        if detection and watch.board:
             # centres of reduced pixels to those of the camera's
             detection = replace(detection, pixels=(detection.pixels + 0.5) / scale - 0.5)
             still = self._stillness.update(
@@ -213,14 +199,6 @@ def reduced(
         else frame
     )
     return to_eight_bits(small, full_scale, int(frame.max(initial=0))), scale
-
-
-def _differs(image: np.ndarray, before: np.ndarray) -> bool:
-    """Whether anything has moved between two thumbnails (h, w) uint8."""
-    return (
-        image.shape != before.shape
-        or float(np.percentile(cv2.absdiff(image, before), 99)) >= _UNCHANGED
-    )
 
 
 def brightness(frame: np.ndarray, full_scale: int | None = None) -> tuple[float, float, np.ndarray]:
@@ -273,19 +251,10 @@ class HandsFree:
         )
         self._begun: float | None = None
 
-    def switch(self, on: bool) -> None:
-        """Switch hands-free capture on or off."""
-        self.is_on = on
-
     def countdown(self, board: BoardSeen | None, busy: bool, now: float) -> float | None:
         """Return the seconds until the capture, 0 or less when it is due; None where none is
         coming."""
-        if (
-            self._requested is not None
-            and not busy
-            and board is not None
-            and board.time_s > self._requested
-        ):
+        if self._requested is not None and not busy and board and board.time_s > self._requested:
             self._captured, self._requested = board.outline, None
         held = self.is_on and self._requested is None and board is not None and not busy
         if (

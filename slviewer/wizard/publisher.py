@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Generic, TypeVar
 
 from slviewer.wizard.notices import describe_failure, log
+from slviewer.wizard.service import Service
 from slviewer.wizard.snapshot import Snapshot
 
 PAUSE_S = 0.05
@@ -48,7 +49,7 @@ class Listeners(Generic[Item]):
                 log.exception("a listener failed")
 
 
-class Publisher:
+class Publisher(Service):
     """Builds a snapshot when something has changed, and publishes it to every listener.
 
     Where that fails, the last snapshot is published again with the reason as its `read_failure`,
@@ -60,11 +61,10 @@ class Publisher:
     def __init__(
         self, build: Callable[[int, bool], Snapshot], first: Snapshot, retry_s: float = RETRY_S
     ) -> None:
+        super().__init__("slviewer publisher")
         self._build, self._retry_s = build, retry_s
-        self._condition = threading.Condition()
         self._requested = self._published = 0  # changes: counted, and those that listeners know
-        self._session_changed = self._urgent = self._closing = False
-        self._thread = threading.Thread(target=self._serve, name="slviewer publisher", daemon=True)
+        self._session_changed = self._urgent = False
         self.latest = first
         self.listeners = Listeners[Snapshot]()
 
@@ -106,13 +106,6 @@ class Publisher:
                     return None
                 self._condition.wait(remaining_s)
             return self.latest
-
-    def close(self) -> None:
-        """End the thread."""
-        with self._condition:
-            self._closing = True
-            self._condition.notify_all()
-        self._thread.join(5.0)
 
     def _serve(self) -> None:
         """Build and publish a snapshot after each batch of changes, or after a failure, until

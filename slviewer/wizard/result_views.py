@@ -2,7 +2,7 @@
 changes the session."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,7 +16,8 @@ from slviewer.pipeline.align import AlignedScans, view_aligned
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
-from slviewer.pipeline.scan_edits import restriction_mask
+from slviewer.pipeline.scan_edits import restrict_cloud
+from slviewer.reconstruction.cloud import Cloud
 from slviewer.report.data import PixelCurve
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
@@ -26,26 +27,18 @@ from slviewer.session.store import Session
 THUMBNAIL_PX = 240
 
 
-@dataclass(frozen=True, eq=False)
-class ScanCloud:
-    """A reconstructed capture on the camera's grid: `points` (h, w, 3) float32 mm and `sigma_z`,
-    `phase` (rad), `modulation` (h, w) float32, NaN where invalid; `texture` (h, w) or (h, w, 3)
-    uint8; `errors` of `load_error_maps`. `sigma_calibration` (h, w) float32 mm is what the
-    calibration's own uncertainty adds, `sigma_edges` what blur at edges does; None where it is not
-    known.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanCloud(Cloud):
+    """The cloud of a capture, with its `name`; `phase` (rad) and `modulation` (h, w) float32, NaN
+    where invalid; `errors`: {model: (h, w) float32 mm} signed distances from the fitted plane or
+    sphere, NaN where not measured.
     """
 
     name: str
-    model: str
-    axis: Axis
-    points: np.ndarray
-    sigma_z: np.ndarray
     phase: np.ndarray
     modulation: np.ndarray
     texture: np.ndarray
     errors: Mapping[str, np.ndarray]
-    sigma_calibration: np.ndarray | None = None
-    sigma_edges: np.ndarray | None = None
 
     @property
     def measured_count(self) -> int:
@@ -88,27 +81,17 @@ def used_points(session: Session, cloud: ScanCloud) -> ScanCloud:
     remains."""
     if session.load_capture(cloud.name).role != "scan":
         return cloud
-    kept = restriction_mask(session, cloud.name, cloud.points, load_region(session))
-    return (
-        cloud
-        if kept is None
-        else replace(cloud, points=np.where(kept[..., None], cloud.points, np.float32(np.nan)))
-    )
+    return restrict_cloud(session, cloud.name, cloud, load_region(session))
 
 
 def whole_cloud(session: Session, name: str) -> ScanCloud:
     """Load the reconstructed cloud of a capture with all of its points. Raises InputError where
     there is none."""
     meta, arrays = session.load_result(f"clouds/{name}")
-    errors = load_error_maps(session, name) if f"verify/{name}" in session.result_names() else {}
+    verified = f"verify/{name}"
+    errors = session.load_result(verified)[1] if session.has_result(verified) else {}
+    errors = {key.removeprefix("error_"): array for key, array in errors.items()}
     return ScanCloud(name=name, model=meta["model"], axis=meta["axis"], errors=errors, **arrays)
-
-
-def load_error_maps(session: Session, name: str) -> dict[str, np.ndarray]:
-    """Load {model: (h, w) float32 mm} signed distances from the fitted plane or sphere, NaN where
-    not measured."""
-    arrays = session.load_result(f"verify/{name}")[1]
-    return {key.removeprefix("error_"): array for key, array in arrays.items()}
 
 
 def aligned_scans(session: Session) -> AlignedScans:

@@ -2,26 +2,33 @@
 rig."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from slviewer.devices.capture import check_exposures
 from slviewer.devices.protocols import CameraSettings, Rig
-from slviewer.devices.world import Thing
-from slviewer.errors import InputError
+from slviewer.devices.world import SimulatedWorld, Thing
+from slviewer.errors import DamagedError, DeviceError, InputError, SlviewerError
 from slviewer.fringe.presets import PRESETS
+from slviewer.fringe.sequence import PatternSequence, one_axis
+from slviewer.pipeline.capture import choose_sequence, depth_axis
 from slviewer.pipeline.check_results import CheckVerdict, Preflight
 from slviewer.pipeline.feedback import Progress
-from slviewer.pipeline.rig_choice import Choice
+from slviewer.pipeline.rig_choice import Choice, RigSetup, save_rig
 from slviewer.pipeline.suggest_exposure import BUDGET_S, ExposureSuggestion, suggest_exposure
 from slviewer.preflight.check_rig import preflight
+from slviewer.session.reading import expand_user
+from slviewer.session.store import Session
 from slviewer.simulation.boards import Pose
 from slviewer.target.board import Board
 from slviewer.wizard.acquisition import LIGHTS
-from slviewer.wizard.capture_requests import pose_sequence, scan_sequence
-from slviewer.wizard.requests import RequestHandler, request
-from slviewer.wizard.snapshot import ExposureChange, Level
+from slviewer.wizard.engine import Engine, request
+from slviewer.wizard.session_reader import SessionReader
+from slviewer.wizard.snapshot import CalibrationView, ExposureChange, Level
 
 _CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
     "good": ("good", "the rig is ready to capture"),
@@ -31,19 +38,99 @@ _CHECKED: dict[CheckVerdict, tuple[Level, str]] = {
 }
 
 
-class RigRequests(RequestHandler):
+class RigRequests(Engine):
     """Requests about the session, the devices, the target and the patterns."""
 
     @request("Opening the session")
     def open_session(self, path: Path | str, rig: Choice | None = None) -> None:
         """Open or create a session for writing, with `rig`, else the one that it remembers, else
-        the one in use."""
-        self._engine.open_session(path, rig)
+        the one in use.
+
+        Jobs of the previous session are cancelled. If the remembered rig is not connected, the
+        session opens without. Where the session is open already, only the rig changes.
+        """
+        with self._lock:
+            if not self._acquisition.idle:
+                raise InputError(
+                    "a capture is running: wait for it, or cancel it, before you open another"
+                    " session"
+                )
+            before = self.session
+            if before and expand_user(path).resolve() == before.folder.resolve():
+                if rig:
+                    self._restore_rig(before, rig)
+                return
+            store = Session.open_or_create(path)
+            self._acquisition.stop_stream()
+            self._jobs.cancel_all()
+            self._session_reader, self._queued = SessionReader(store, self._planner), set()
+            self._show(merge_failure="")
+            if before:
+                before.close()
+            for name in store.recovered:
+                self._notices.add(
+                    "info",
+                    f"{name} was complete when the program ended, and is in the session again",
+                )
+            try:
+                self._restore_rig(store, rig)
+            finally:
+                self._update_board()
 
     @request("Choosing the rig")
     def choose_rig(self, choice: Choice) -> None:
         """Use other devices from now on (see `rig_choice`). The session remembers it."""
-        self._engine.use_rig(choice)
+        self._use_rig(choice)
+
+    def _restore_rig(self, store: Session, rig: Choice | None) -> None:
+        """Use `rig`, else the rig saved in the session, else save the current one there; report one
+        that fails."""
+        choice = rig or store.valid_decision("rig")
+        if choice and choice != self._choice:
+            try:
+                self._use_rig(choice)
+            except SlviewerError as error:
+                if rig:
+                    raise
+                self._forget_rig(choice, None)
+                self._rig_fault = str(error)
+                self._acquisition.use(None)
+                self._notices.add_failure("Choosing the rig", error)
+        elif self._choice is not None:
+            _remember(store, rig=dict(self._choice))
+            if exposure := store.valid_decision("exposure"):
+                self._acquisition.set_camera(CameraSettings(**exposure))
+
+    def _use_rig(self, choice: Choice) -> None:
+        """Use other devices from now on, in the session too.
+
+        If it is the same rig again, the measured delay stays unless the choice has one, and so does
+        the exposure that the session remembers.
+        """
+        with self._lock:
+            store, exposure = self.session, None
+            known = dict((store.valid_decision("rig") if store else None) or {})
+            same = {**known, "settle_ms": None} == {**choice, "settle_ms": None}
+            if same:
+                choice = {**known, **choice}
+            bench = self._set_up(choice, self._parse_board())
+            if store:
+                if known != dict(choice):
+                    _remember(store, rig=dict(choice))
+                if not same:  # those of another camera do not apply
+                    _remember(store, exposure=None, exposures=None, levels=None)
+                exposure = store.valid_decision("exposure")
+            exposure = exposure or {
+                key: choice[key] for key in ("exposure_ms", "gain") if choice.get(key)
+            }
+            self._forget_rig(choice, bench)
+            self._rig_fault = ""
+            self._acquisition.use(bench.rig, CameraSettings(**exposure) if exposure else None)
+
+    def _forget_rig(self, choice: Choice, bench: RigSetup | None) -> None:
+        """Forget what was measured with the rig before, and remember the new one."""
+        self._choice, self._bench, self._preview = dict(choice), bench, None
+        self._show(preflight=None, exposure_change=None)
 
     @request("Setting the exposure")
     def set_exposure(self, exposure_ms: float | None = None, gain: float | None = None) -> None:
@@ -52,16 +139,15 @@ class RigRequests(RequestHandler):
 
         Several exposures of each capture are scaled by the same factor.
         """
-        engine = self._engine
-        now, session = engine.acquisition.view(), engine.session
+        now, session = self._acquisition.view(), self.session
         settings = CameraSettings(exposure_ms or now.exposure_ms, gain or now.gain)
-        engine.acquisition.set_camera(settings)
+        self._acquisition.set_camera(settings)
         if session is None:
             return
-        with engine.lock:  # dragging a slider sends requests from several threads
+        with self._lock:  # dragging a slider sends requests from several threads
             before = (session.decision("exposure") or {}).get("exposure_ms") or now.exposure_ms
             session.decide("exposure", {"exposure_ms": settings.exposure_ms, "gain": settings.gain})
-            several = engine.reader.exposures_ms()
+            several = self._reader.exposures_ms()
             if several and exposure_ms and before:
                 session.decide(
                     "exposures", check_exposures([each * exposure_ms / before for each in several])
@@ -71,9 +157,7 @@ class RigRequests(RequestHandler):
     def set_exposures(self, exposures_ms: Sequence[float]) -> None:
         """Set several exposures, ms, for every capture, for shiny and dark parts; empty: a single
         one."""
-        self._engine.store.decide(
-            "exposures", check_exposures(exposures_ms) if exposures_ms else []
-        )
+        self._store.decide("exposures", check_exposures(exposures_ms) if exposures_ms else [])
 
     @request("Suggesting the exposure")
     def suggest_exposure(self, for_scan: bool = False, budget_s: float = BUDGET_S) -> None:
@@ -82,9 +166,9 @@ class RigRequests(RequestHandler):
 
         The snapshot has what they measure; `undo_exposure` sets the ones before.
         """
-        engine, bench = self._engine, self._engine.bench
-        sequence = scan_sequence(engine) if for_scan else pose_sequence(engine)
-        current_ms = engine.reader.exposures_ms()
+        bench = self._bench
+        sequence = self._scan_sequence() if for_scan else self._pose_sequence()
+        current_ms = self._reader.exposures_ms()
 
         def work(rig: Rig, progress: Progress) -> ExposureSuggestion:
             """Take the bracket and choose."""
@@ -94,35 +178,35 @@ class RigRequests(RequestHandler):
 
         def done(suggestion: ExposureSuggestion) -> None:
             """Set what was chosen, if the rig is still in use."""
-            with engine.lock:
-                if engine.bench is not bench:
+            with self._lock:
+                if self._bench is not bench:
                     return
-                store, now = engine.store, engine.acquisition.view()
-                before = store.decision("exposure") or {
+                now = self._acquisition.view()
+                before = self._store.decision("exposure") or {
                     "exposure_ms": now.exposure_ms,
                     "gain": now.gain,
                 }
-                engine.exposure_change = ExposureChange(
-                    suggestion, before, engine.reader.exposures_ms()
+                self._show(
+                    exposure_change=ExposureChange(suggestion, before, self._reader.exposures_ms())
                 )
                 exposures = suggestion.exposures_ms
                 self._decide_exposure(
                     {"exposure_ms": exposures[0], "gain": suggestion.gain},
                     exposures if len(exposures) > 1 else (),
                 )
-            engine.publisher.mark_changed(session=True)
-            engine.notices.add("good", suggestion.text())
+            self._note_change()
+            self._notices.add("good", suggestion.text())
 
-        engine.acquisition.run_task("Suggesting the exposure", work, done)
+        self._acquisition.run_task("Suggesting the exposure", work, done)
 
     @request("Undoing the exposure")
     def undo_exposure(self) -> None:
         """Set the exposures from before the last suggestion."""
-        with self._engine.lock:
-            change = self._engine.exposure_change
+        with self._lock:
+            change = self._shown.exposure_change
             if change is None:
                 raise InputError("no suggested exposure is set: nothing can be undone")
-            self._engine.exposure_change = None
+            self._show(exposure_change=None)
             self._decide_exposure(change.exposure_before or {}, change.exposures_before_ms)
 
     def _decide_exposure(
@@ -130,39 +214,63 @@ class RigRequests(RequestHandler):
     ) -> None:
         """Set the camera's exposure and gain, and the exposures of each capture, none for a single
         one."""
-        self._engine.acquisition.set_camera(CameraSettings(**exposure))
-        self._engine.store.decide("exposure", dict(exposure))
-        self._engine.store.decide("exposures", list(exposures_ms))
+        self._acquisition.set_camera(CameraSettings(**exposure))
+        self._store.decide("exposure", dict(exposure))
+        self._store.decide("exposures", list(exposures_ms))
 
     @request("Checking the rig")
     def check_rig(self) -> None:
         """Run the preflight, about 10 s; the snapshot has its result, and the delay that it
         measured is used."""
-        engine, bench = self._engine, self._engine.bench
+        bench = self._bench
 
         def done(result: Preflight) -> None:
             """Store the result of the check, and report its verdict, if the rig is still in use."""
-            if engine.set_preflight(bench, result):
-                engine.notices.add(*_CHECKED[result.verdict])
+            if self._set_preflight(bench, result):
+                self._notices.add(*_CHECKED[result.verdict])
 
-        engine.acquisition.run_task(
+        self._acquisition.run_task(
             "Checking the rig", lambda rig, progress: preflight(rig, progress=progress), done
         )
+
+    def _set_preflight(self, bench: RigSetup | None, result: Preflight) -> bool:
+        """Store the result of a rig check, and use the delay that it measured; the session
+        remembers it with the rig.
+
+        Returns False, and changes nothing, where `bench` is no longer in use.
+        """
+        with self._lock:
+            if self._bench is not bench:
+                return False
+            self._show(preflight=result)
+            if result.settle_ms is not None and self._choice is not None:
+                self._choice = {**self._choice, "settle_ms": result.settle_ms}
+                self._acquisition.set_delay(result.settle_ms)
+                if self.session:
+                    self.session.decide("rig", dict(self._choice))
+            return True
 
     @request("Linearising the projector")
     def set_linear_light(self, on: bool) -> None:
         """Switch the projector's linearisation, by the table of grey levels from the rig check, on
         or off."""
-        levels = self._engine.preflight.levels if self._engine.preflight else None
+        preflight = self._shown.preflight
+        levels = preflight.levels if preflight else None
         if on and levels is None:
             raise InputError("no table of grey levels is measured: check the rig first")
-        self._engine.store.decide("levels", list(levels) if on and levels else None)
+        self._store.decide("levels", list(levels) if on and levels else None)
 
     @request("Saving the rig")
     def save_rig(self, name: str, what: str = "") -> None:
         """Save the rig in use, with its exposure, under a name in the session, where `rig_choice`
         lists it."""
-        self._engine.save_rig(name, what)
+        if self._choice is None:
+            raise InputError("no rig is in use: choose one in the step Rig")
+        now = self._acquisition.view()
+        exposure = {"exposure_ms": now.exposure_ms, "gain": now.gain}
+        save_rig(
+            self._store, name, {**self._choice, **{k: v for k, v in exposure.items() if v}}, what
+        )
 
     @request("Changing the light")
     def set_light(self, light: str) -> None:
@@ -170,37 +278,44 @@ class RigRequests(RequestHandler):
         focus by."""
         if light not in (*LIGHTS, "pattern"):
             raise InputError(f"there is no light {light!r}: choose {', '.join(LIGHTS)} or pattern")
-        bench = self._engine.bench
-        if (
-            light == "dark"
-            and bench is not None
-            and bench.reel is not None
-            and not bench.reel.has_dark
-        ):
+        reel = self._bench.reel if self._bench else None
+        if light == "dark" and reel and not reel.has_dark:
             raise InputError("the recording has no dark frame: choose another light")
-        self._engine.acquisition.set_light(
-            light, pose_sequence(self._engine) if light == "pattern" else None
-        )
+        self._acquisition.set_light(light, self._pose_sequence() if light == "pattern" else None)
 
     @request("Choosing the target")
     def choose_target(self, notation: str) -> None:
         """Set the board; poses captured before are evaluated again with it."""
-        board, engine = Board.parse(notation), self._engine
-        with engine.lock:
-            before = engine.reader.target()
-            engine.store.decide("target", str(board))
+        board = Board.parse(notation)
+        with self._lock:
+            before = self._reader.target()
+            self._store.decide("target", str(board))
             try:
-                engine.update_board()
+                self._update_board()
             except InputError:  # a board that the simulated rig cannot show
-                engine.store.decide("target", before)
+                self._store.decide("target", before)
                 raise
+
+    def _update_board(self) -> None:
+        """Apply the current target: print it on the simulated board, and queue the evaluation of
+        the poses by it."""
+        board, world = self._parse_board(), self._bench.world if self._bench else None
+        if board and world and board != world.board:
+            world.print_board(board)
+        self._queue_processing()
+        self._note_change()
+
+    def _parse_board(self) -> Board | None:
+        """Return the board of the session's target; None where none is chosen."""
+        target = self._session_reader.target() if self._session_reader else ""
+        return Board.parse(target) if target else None
 
     @request("Choosing the patterns")
     def choose_patterns(self, name: str) -> None:
         """Set the pattern sequence of later captures."""
         if name not in PRESETS:
             raise InputError(f"no pattern sequence is called {name!r}: use {', '.join(PRESETS)}")
-        self._engine.store.decide("patterns", name)
+        self._store.decide("patterns", name)
 
     @request("Setting the wanted accuracy")
     def set_wanted_sigma(self, sigma_mm: float | None) -> None:
@@ -210,7 +325,7 @@ class RigRequests(RequestHandler):
             raise InputError(
                 f"a standard deviation of {sigma_mm:g} mm is not possible: give one above 0 mm"
             )
-        self._engine.store.decide("sigma_wanted_mm", sigma_mm)
+        self._store.decide("sigma_wanted_mm", sigma_mm)
 
     @request("Placing")
     def place(self, thing: Thing, T_camera_object: np.ndarray | None = None) -> None:
@@ -222,22 +337,69 @@ class RigRequests(RequestHandler):
         T = None if T_camera_object is None else np.asarray(T_camera_object, float)
         if T is not None and T.shape != (4, 4):
             raise InputError(f"a pose has the shape {T.shape}: give (4, 4)")
-        self._engine.world.place(
-            thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy())
-        )
+        self._world.place(thing, None if T is None else Pose(T[:3, :3].copy(), T[:3, 3].copy()))
 
     @request("Placing")
     def move_object(self, distance_mm: float | None = None, turn_deg: float | None = None) -> None:
         """Move the simulated object to a distance on its ray; turn it about the vertical."""
-        self._engine.world.move(distance_mm, turn_deg)
+        self._world.move(distance_mm, turn_deg)
 
     def place_at_suggestion(self) -> bool:
         """Place the simulated board at the suggested next pose; False, with a notice, where none is
         suggested."""
-        session = self._engine.publisher.refresh().session
+        session = self._publisher.refresh().session
         if session is None or session.suggestion is None:
-            self._engine.notices.add(
-                "error", "no pose is suggested yet: choose a rig and a target first"
-            )
+            self._notices.add("error", "no pose is suggested yet: choose a rig and a target first")
             return False
         return self.place("board", session.suggestion.T_camera_board)
+
+    @property
+    def _world(self) -> SimulatedWorld:
+        """The scene of the simulated rig. Raises InputError where the rig is a real one."""
+        world = self._bench.world if self._bench else None
+        if world is None:
+            raise InputError(
+                "objects can be placed only before the simulated rig: choose it in the step Rig"
+            )
+        return world
+
+    # what captures project
+
+    def _require_bench(self) -> RigSetup:
+        """Return the rig in use. Raises DeviceError where none is chosen."""
+        if self._bench is None:
+            raise DeviceError("no rig is chosen: choose one in the step Rig")
+        return self._bench
+
+    def _require_calibration(self, why: str) -> CalibrationView:
+        """Return the session's calibration. Raises InputError with ``why`` where there is none."""
+        calibration = self._publisher.refresh().calibration
+        if calibration is None:
+            raise InputError(f"calibrate first: {why}")
+        return calibration
+
+    def _pose_sequence(self) -> PatternSequence:
+        """Return the sequence for target poses: the session's pattern sequence along both axes, or
+        that of a recording."""
+        sequence = choose_sequence(self._require_bench(), self._reader.patterns())
+        levels = self._reader.levels()
+        return sequence if levels is None else replace(sequence, levels=levels)
+
+    def _scan_sequence(self) -> PatternSequence:
+        """Return the sequence for scans: that of poses along the one axis that measures depth.
+        InputError before a calibration."""
+        calibration = self._require_calibration(
+            "a capture cannot be measured without a calibration"
+        )
+        sequence = self._pose_sequence()
+        if self._require_bench().reel:
+            return sequence
+        return one_axis(sequence, depth_axis(calibration.stereo.rig))  # half of the frames
+
+
+def _remember(store: Session, **decisions: Any) -> None:
+    """Remember decisions of the rig's in the session, unless its decisions are damaged, which its
+    faults name."""
+    with suppress(DamagedError):
+        for what, value in decisions.items():
+            store.decide(what, value)

@@ -272,6 +272,11 @@ class SessionView:
         is_judged = all(pose.state != "judging" for pose in self.poses)
         return is_judged and self.plan is not None and self.plan.reaches(self.wanted_mm)
 
+    @property
+    def good_poses(self) -> int:
+        """Number of poses that a calibration can use."""
+        return sum(pose.state in ("good", "used", "unused") for pose in self.poses)
+
     def list_records(self, kind: type[R]) -> list[Stored[R]]:
         """Return the session's records of a kind."""
         return [each for each in self.records if isinstance(each.record, kind)]
@@ -322,16 +327,16 @@ class Snapshot:
     """Everything at one moment; `version` grows with each change. `session` is None until one is
     open."""
 
-    version: int
-    session: SessionView | None
-    rig: RigView
-    world: WorldView | None  # None for real devices
-    job: JobView | None
-    notices: tuple[Notice, ...]
-    steps: tuple[StepView, ...]
-    space: Space | None
-    hands_free: bool
-    autopilot: str  # what it does now; empty where it is off
+    version: int = 0
+    session: SessionView | None = None
+    rig: RigView = RigView()
+    world: WorldView | None = None  # None for real devices
+    job: JobView | None = None
+    notices: tuple[Notice, ...] = ()
+    steps: tuple[StepView, ...] = ()
+    space: Space | None = None
+    hands_free: bool = False
+    autopilot: str = ""  # what it does now; empty where it is off
     preflight: Preflight | None = None  # result of the last check of the rig in use
     exposure_change: ExposureChange | None = (
         None  # the last suggestion for the rig in use, unless it was undone

@@ -5,7 +5,8 @@ Everything here follows from the session's files and the rig.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 from slviewer.calibration.stereo import MIN_POSES
 from slviewer.evaluation.render import format_count
@@ -15,44 +16,31 @@ from slviewer.records.merge import MIN_OVERLAP
 from slviewer.records.verification import Verification
 from slviewer.session.atomic import format_bytes
 from slviewer.session.names import join_names
-from slviewer.wizard.snapshot import (
-    Brightness,
-    CalibrationView,
-    RigView,
-    SessionView,
-    StepState,
-    StepView,
-)
+from slviewer.wizard.snapshot import Brightness, RigView, SessionView, StepState, StepView
 
 COVERED, MANY_POSES = 0.75, 15
 """Share of the coverage's goal, or number of poses, from which on the poses are enough."""
+_EMPTY = SessionView(Path(), "", "")
 
 
 @dataclass(frozen=True)
 class Facts:
     """State that the steps depend on; `session` is None until one is open."""
 
-    session: SessionView | None
-    rig: RigView
-    space: Space | None
+    session: SessionView | None = None
+    rig: RigView = field(default_factory=RigView)
+    space: Space | None = None
     brightness: Brightness = ""
 
     @property
-    def good_poses(self) -> int:
-        """Number of poses that a calibration can use."""
-        poses = self.session.poses if self.session else ()
-        return sum(pose.state in ("good", "used", "unused") for pose in poses)
+    def content(self) -> SessionView:
+        """The session's content, which is empty until one is open."""
+        return self.session or _EMPTY
 
     @property
     def scans(self) -> int:
         """Number of scans with an up-to-date cloud."""
-        scans = self.session.scans if self.session else ()
-        return sum(scan.purpose == "scan" and scan.cloud == "fresh" for scan in scans)
-
-    @property
-    def calibration(self) -> CalibrationView | None:
-        """The session's calibration; None where there is none."""
-        return self.session.calibration if self.session else None
+        return sum(scan.purpose == "scan" and scan.cloud == "fresh" for scan in self.content.scans)
 
 
 @dataclass(frozen=True)
@@ -68,7 +56,7 @@ class Step:
     blocked: Callable[[Facts], str]
     done: Callable[[Facts], bool]
     instruction: Callable[[Facts], str]
-    problems: Callable[[Facts], Iterator[str]]
+    problems: Callable[[Facts], Iterator[str]] = lambda facts: iter(())
 
 
 def views(facts: Facts) -> tuple[StepView, ...]:
@@ -87,11 +75,6 @@ def _no_session(facts: Facts) -> str:
     return "" if facts.session else "Open or create a session first."
 
 
-def _no_problems(facts: Facts) -> Iterator[str]:
-    """Return no problems."""
-    return iter(())
-
-
 def _device_problems(facts: Facts) -> Iterator[str]:
     """Yield problems of rig, disk space and image brightness that prevent or degrade a capture."""
     if facts.rig.state == "lost" and facts.rig.camera is None:
@@ -101,7 +84,7 @@ def _device_problems(facts: Facts) -> Iterator[str]:
         )
     elif facts.rig.state == "lost":
         yield f"The connection to the rig is lost: {facts.rig.fault}. Retrying every two seconds."
-    if facts.space is not None and not facts.space.enough:
+    if facts.space and not facts.space.enough:
         needs, free = (
             format_bytes(facts.space.capture_bytes or 0),
             format_bytes(facts.space.free_bytes),
@@ -124,9 +107,9 @@ def _rig_instruction(facts: Facts) -> str:
 
 def _target_instruction(facts: Facts) -> str:
     """Return the instruction of the step Target."""
-    if facts.session is None or not facts.session.target:
+    if not facts.content.target:
         return "Choose your board, or print one and measure its scale bar."
-    return f"Hold the board {facts.session.target} in view until it is detected."
+    return f"Hold the board {facts.content.target} in view until it is detected."
 
 
 def _poses_blocked(facts: Facts) -> str:
@@ -142,21 +125,21 @@ def _poses_blocked(facts: Facts) -> str:
 
 def _poses_done(facts: Facts) -> bool:
     """Whether the poses suffice, by number and by predicted sigma or coverage."""
-    session = facts.session
-    # cells that the projector never reaches cannot be covered: many poses are enough too
-    enough = facts.good_poses >= MANY_POSES or facts.rig.state == "none"
-    if session is not None:
-        enough |= session.enough or (
-            session.coverage is not None and session.coverage.share > COVERED
-        )
-    return facts.good_poses >= POSES_FOR_PIXELWISE and enough
+    session = facts.content
+    return session.good_poses >= POSES_FOR_PIXELWISE and (
+        # cells that the projector never reaches cannot be covered: many poses are enough too
+        session.good_poses >= MANY_POSES
+        or facts.rig.state == "none"
+        or session.enough
+        or (session.coverage is not None and session.coverage.share > COVERED)
+    )
 
 
 def _poses_instruction(facts: Facts) -> str:
     """Return the instruction of the step Poses: the suggested next pose, or that there are
     enough."""
-    session, n = facts.session, facts.good_poses
-    if session is None:
+    session, n = facts.content, facts.content.good_poses
+    if facts.session is None:
         return "Hold the board in view of camera and projector."
     if _poses_done(facts):
         sigma_mm = session.plan.sigma_mm if session.plan else None
@@ -166,9 +149,9 @@ def _poses_instruction(facts: Facts) -> str:
         if session.enough:
             return f"{n} good poses are enough ({predicted}): calibrate."
         return f"{n} good poses cover the view ({predicted}): add more, or calibrate."
-    if session.pending_plan is not None:
+    if session.pending_plan:
         action = "Computing the best next pose; or hold the board in any new place, and capture"
-    elif session.suggestion is not None:
+    elif session.suggestion:
         action = f"{session.suggestion.sentence}, and capture"
     else:
         action = "Hold the board and capture"
@@ -178,7 +161,7 @@ def _poses_instruction(facts: Facts) -> str:
 def _poses_problems(facts: Facts) -> Iterator[str]:
     """Yield device problems, and which of the last three poses were refused and why."""
     yield from _device_problems(facts)
-    for pose in facts.session.poses[-3:] if facts.session else ():
+    for pose in facts.content.poses[-3:]:
         if pose.state == "refused":
             yield f"{pose.name} cannot be used: {pose.why}"
 
@@ -188,28 +171,25 @@ def _calibrate_blocked(facts: Facts) -> str:
     empty."""
     if facts.session is None:
         return _no_session(facts)
-    if facts.calibration is not None:
+    if facts.content.calibration:
         return ""
     if not facts.session.target:
         return "Choose the target first."
-    if facts.good_poses < MIN_POSES:
-        return (
-            f"{facts.good_poses} good poses so far, at least {MIN_POSES} are needed: capture the"
-            " board first."
-        )
+    if (n := facts.content.good_poses) < MIN_POSES:
+        return f"{n} good poses so far, at least {MIN_POSES} are needed: capture the board first."
     return ""
 
 
 def _calibrate_done(facts: Facts) -> bool:
     """Whether there is a calibration that is up to date and not refused."""
-    calibration = facts.calibration
+    calibration = facts.content.calibration
     return calibration is not None and not calibration.stale and not calibration.refused
 
 
 def _calibrate_instruction(facts: Facts) -> str:
     """Return the instruction of the step Calibrate, with the number of poses and the reprojection
     RMS."""
-    calibration, n = facts.calibration, facts.good_poses
+    calibration, n = facts.content.calibration, facts.content.good_poses
     if calibration is None:
         return f"Calibrate from {n} poses."
     if calibration.stale:
@@ -229,17 +209,16 @@ def _calibrate_instruction(facts: Facts) -> str:
 def _calibrate_problems(facts: Facts) -> Iterator[str]:
     """Yield why to calibrate again, and a warning where there are poses for the stereo model
     only."""
-    if facts.session is None:
-        return
-    if facts.calibration is not None:
-        if facts.calibration.stale:
-            yield f"The calibration is out of date: {facts.calibration.stale}."
-        elif added := sum(pose.state == "good" for pose in facts.session.poses):
+    session = facts.content
+    if session.calibration:
+        if session.calibration.stale:
+            yield f"The calibration is out of date: {session.calibration.stale}."
+        elif added := sum(pose.state == "good" for pose in session.poses):
             yield (
                 f"{format_count(added, 'good pose')} captured after the calibration: calibrate"
                 " again to use them."
             )
-    if MIN_POSES <= facts.good_poses < POSES_FOR_PIXELWISE:
+    if MIN_POSES <= session.good_poses < POSES_FOR_PIXELWISE:
         yield (
             f"With fewer than {POSES_FOR_PIXELWISE} poses only the stereo model is reliable:"
             " capture more."
@@ -248,14 +227,14 @@ def _calibrate_problems(facts: Facts) -> Iterator[str]:
 
 def _not_calibrated(facts: Facts) -> str:
     """Return what is missing, a session or a calibration; else empty."""
-    return _no_session(facts) or ("" if facts.calibration else "Calibrate first.")
+    return _no_session(facts) or ("" if facts.content.calibration else "Calibrate first.")
 
 
 def _no_usable_calibration(facts: Facts) -> str:
     """Return why there is no calibration to measure with, none or a rejected one; else empty."""
-    if facts.calibration is None:
+    if facts.content.calibration is None:
         return _not_calibrated(facts)
-    if reason := facts.calibration.refused:
+    if reason := facts.content.calibration.refused:
         return (
             f"The calibration was rejected: {reason}. Calibrate again, or accept it in the step"
             " Calibrate."
@@ -266,15 +245,13 @@ def _no_usable_calibration(facts: Facts) -> str:
 def _capture_problems(facts: Facts) -> Iterator[str]:
     """Yield device problems, and whether the calibration is out of date."""
     yield from _device_problems(facts)
-    if facts.calibration is not None and facts.calibration.stale:
-        yield f"The calibration is out of date: {facts.calibration.stale}."
+    if facts.content.calibration and facts.content.calibration.stale:
+        yield f"The calibration is out of date: {facts.content.calibration.stale}."
 
 
 def _verify_done(facts: Facts) -> bool:
     """Whether there is an up-to-date verification."""
-    return facts.session is not None and any(
-        not each.stale for each in facts.session.list_records(Verification)
-    )
+    return any(not each.stale for each in facts.content.list_records(Verification))
 
 
 def _verify_instruction(facts: Facts) -> str:
@@ -287,11 +264,8 @@ def _verify_instruction(facts: Facts) -> str:
 def _verify_problems(facts: Facts) -> Iterator[str]:
     """Yield capture problems, and verifications of an older calibration."""
     yield from _capture_problems(facts)
-    if stale := (
-        [each.name for each in facts.session.list_records(Verification) if each.stale]
-        if facts.session
-        else []
-    ):
+    records = facts.content.list_records(Verification)
+    if stale := [each.name for each in records if each.stale]:
         yield f"{join_names(stale, 3)} measured with an older calibration: measure again."
 
 
@@ -308,7 +282,7 @@ def _scan_instruction(facts: Facts) -> str:
 def _scan_problems(facts: Facts) -> Iterator[str]:
     """Yield capture problems, and scans whose cloud is of an older calibration."""
     yield from _capture_problems(facts)
-    for scan in facts.session.scans if facts.session else ():
+    for scan in facts.content.scans:
         if scan.cloud == "stale":
             yield f"{scan.label} was reconstructed with an older calibration: reconstruct it again."
 
@@ -318,18 +292,15 @@ def _merge_blocked(facts: Facts) -> str:
     empty."""
     if why := _no_usable_calibration(facts):
         return why
-    if facts.scans < 2 and not (facts.session and facts.session.merge):
+    if facts.scans < 2 and not facts.content.merge:
         return "Merging needs at least two scans of one object: scan it again from another side."
     return ""
 
 
 def _merge_done(facts: Facts) -> bool:
     """Whether there is an up-to-date merge."""
-    return (
-        facts.session is not None
-        and facts.session.merge is not None
-        and not facts.session.merge.stale
-    )
+    merge = facts.content.merge
+    return merge is not None and not merge.stale
 
 
 def _merge_instruction(facts: Facts) -> str:
@@ -341,7 +312,7 @@ def _merge_instruction(facts: Facts) -> str:
 
 def _merge_problems(facts: Facts) -> Iterator[str]:
     """Yield whether the merge is stale, and scans whose overlap is too small."""
-    merge = facts.session.merge if facts.session else None
+    merge = facts.content.merge
     if merge is None:
         return
     if merge.stale:
@@ -358,45 +329,33 @@ def _measure_blocked(facts: Facts) -> str:
     """Return why measuring is not possible yet: no usable calibration or no scan; else empty."""
     if why := _no_usable_calibration(facts):
         return why
-    session = facts.session
-    if (
-        session is None
-        or session.merge
-        or session.measurements
-        or any(s.cloud == "fresh" for s in session.scans)
-    ):
+    session = facts.content
+    if session.merge or session.measurements or any(s.cloud == "fresh" for s in session.scans):
         return ""
     return "Measuring needs a scan: capture one, or reconstruct a recorded one."
 
 
 def _measure_done(facts: Facts) -> bool:
     """Whether there is an up-to-date measurement."""
-    return facts.session is not None and any(
-        not measured.stale for measured in facts.session.measurements
-    )
+    return any(not measured.stale for measured in facts.content.measurements)
 
 
 def _measure_instruction(facts: Facts) -> str:
     """Return the instruction of the step Measure."""
-    if facts.session is not None and _measure_done(facts):
-        n = sum(not measured.stale for measured in facts.session.measurements)
+    if n := sum(not measured.stale for measured in facts.content.measurements):
         return f"{format_count(n, 'measurement')}: add more, or export next."
     return "Choose a surface and a tool, then click in the 3D view; or export next."
 
 
 def _measure_problems(facts: Facts) -> Iterator[str]:
     """Yield the stale measurements, whose surface has changed."""
-    if stale := (
-        [measured.label for measured in facts.session.measurements if measured.stale]
-        if facts.session
-        else []
-    ):
+    if stale := [measured.label for measured in facts.content.measurements if measured.stale]:
         yield f"{join_names(stale, 3)}: the measured surface has changed; measure again."
 
 
 def _export_instruction(facts: Facts) -> str:
     """Return the instruction of the step Export."""
-    if exports := facts.session.exports if facts.session else ():
+    if exports := facts.content.exports:
         return f"{format_count(len(exports), 'file')} to download."
     return "Choose what to write: a cloud, a mesh, the calibration, the report."
 
@@ -404,9 +363,8 @@ def _export_instruction(facts: Facts) -> str:
 STEPS = (
     Step("rig", "Rig", lambda f: "", lambda f: f.rig.state == "open", _rig_instruction,
     _device_problems),
-    Step("target", "Target", _no_session, lambda f: bool(f.session and f.session.target),
-    _target_instruction,
-         _no_problems),
+    Step("target", "Target", _no_session, lambda f: bool(f.content.target),
+    _target_instruction),
     Step("poses", "Poses", _poses_blocked, _poses_done, _poses_instruction, _poses_problems),
     Step("calibrate", "Calibrate", _calibrate_blocked, _calibrate_done, _calibrate_instruction,
     _calibrate_problems),
@@ -417,7 +375,6 @@ STEPS = (
     Step("merge", "Merge", _merge_blocked, _merge_done, _merge_instruction, _merge_problems),
     Step("measure", "Measure", _measure_blocked, _measure_done, _measure_instruction,
     _measure_problems),
-    Step("export", "Export", _not_calibrated, lambda f: bool(f.session and f.session.exports),
-    _export_instruction,
-         _no_problems),
+    Step("export", "Export", _not_calibrated, lambda f: bool(f.content.exports),
+    _export_instruction),
 )  # fmt: skip

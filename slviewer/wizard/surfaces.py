@@ -16,14 +16,12 @@ from slviewer.pipeline.measured_surface import (
     surface_from_cloud,
 )
 from slviewer.pipeline.models import load_model
-from slviewer.pipeline.scale import scale_factor
-from slviewer.pipeline.scan_edits import restrict_cloud
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.pipeline.stored_records import is_up_to_date
 from slviewer.session.nominal import NOMINALS
-from slviewer.session.scan_edits import load_region, restriction_inputs
+from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 from slviewer.surface.selection import ViewCamera, select_connected, select_in_outline
-from slviewer.wizard.result_views import nearest
+from slviewer.wizard.result_views import load_scan_cloud, nearest
 
 
 class Surfaces:
@@ -43,35 +41,22 @@ class Surfaces:
         result = name if name.startswith(MERGED) else f"clouds/{name}"
         if not store.has_result(result):
             raise InputError(f"{name} is not reconstructed: reconstruct it in the step Scan first")
-        meta = store.load_result(result, only=())[0]
         again = "merge again" if result == name else "reconstruct it again in the step Scan"
-        scaled = all(
-            scale_factor(store, model) == factor for model, factor in meta.get("scales", {}).items()
-        )
-        if store.state_of(result) == "stale" or not scaled:
+        if not is_up_to_date(store, result):
             raise InputError(f"the inputs of {name} have changed: {again}, then measure")
+        meta = store.load_result(result, only=())[0]
         cut = "" if result == name else str(restriction_inputs(store, [name]))
         key = (str(store.folder), result, str(meta["hash"]), cut)
         with self._lock:
             if self._key != key or self._cached is None:
-                self._cached = (
-                    load_merged_surface(store, name) if result == name else _load_scan(store, name)
-                )
+                if result == name:
+                    self._cached = load_merged_surface(store, name)
+                else:
+                    cloud = load_scan_cloud(store, name)
+                    model = load_model(store, cloud.model)
+                    self._cached = surface_from_cloud(store, name, cloud, model)
                 self._key = key
             return self._cached
-
-
-def _load_scan(store: Session, name: str) -> MeasuredSurface:
-    """Load the cloud of a scan as a surface, with its uncertainties and the model that it was made
-    by."""
-    meta, arrays = store.load_result(f"clouds/{name}")
-    systematic = arrays.get("sigma_calibration")
-    points, sigma, texture = (arrays[each] for each in ("points", "sigma_z", "texture"))
-    cloud = Cloud(
-        points, meta["axis"], meta["model"], sigma, texture, systematic, arrays.get("sigma_edges")
-    )
-    cloud = restrict_cloud(store, name, cloud, load_region(store))
-    return surface_from_cloud(store, name, cloud, load_model(store, meta["model"]))
 
 
 def place_at(on: MeasuredSurface, origin: np.ndarray, direction: np.ndarray) -> Place | None:

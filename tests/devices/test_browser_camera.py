@@ -22,7 +22,7 @@ def video(**changes: object) -> Video:
 
 
 def hello(shown: Video = VIDEO) -> bytes:
-    return msgspec.json.encode({"op": "hello", "window": "a", "take": False, "video": shown})
+    return msgspec.json.encode({"op": "hello", "window": "a", "take": False, "facts": shown})
 
 
 class Phone:
@@ -55,7 +55,7 @@ class Phone:
 
     def report(self, shown: Video) -> None:
         self.channel.handle_message(
-            self.page, msgspec.json.encode({"op": "video", "video": shown}).decode()
+            self.page, msgspec.json.encode({"op": "report", "facts": shown}).decode()
         )
 
 
@@ -142,7 +142,7 @@ def test_a_picture_that_is_none_ends_the_grab() -> None:
 
 @pytest.mark.parametrize(
     "message",
-    [b"", b"\xff" * 9, struct.pack("<I", 2**31) + b"{}", '{"op": "video"}', '{"op": "done"}', "x"],
+    [b"", b"\xff" * 9, struct.pack("<I", 2**31) + b"{}", '{"op": "report"}', '{"op": "done"}', "x"],
 )
 def test_nonsense_is_refused(message: bytes | str) -> None:
     channel = CameraChannel()

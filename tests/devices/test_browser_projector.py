@@ -5,9 +5,8 @@ import msgspec
 import pytest
 from facts import missing_facts, raises
 
-from slviewer.devices.browser_projector import ProjectorChannel, browser_projector
+from slviewer.devices.browser_projector import ProjectorChannel, Screen, browser_projector
 from slviewer.devices.drivers import driver
-from slviewer.devices.screen import Screen, refusal
 from slviewer.errors import DeviceError, InputError
 
 FULL_HD = Screen(1.0, (1920, 1080), (1920, 1080), (1920, 1080), True, True, True, 1.0)
@@ -18,7 +17,7 @@ def screen(**changes: object) -> Screen:
 
 
 def hello(window: str = "a", take: bool = False, shown: Screen = FULL_HD) -> bytes:
-    return msgspec.json.encode({"op": "hello", "window": window, "take": take, "screen": shown})
+    return msgspec.json.encode({"op": "hello", "window": window, "take": take, "facts": shown})
 
 
 @pytest.mark.parametrize(
@@ -34,8 +33,8 @@ def hello(window: str = "a", take: bool = False, shown: Screen = FULL_HD) -> byt
     ],
 )
 def test_windows_that_show_each_pixel_as_it_is(shown, size):
-    assert refusal(shown, size) == ""
-    assert shown.pixels == (size or (1920, 1080))
+    assert shown.refusal(size) == ""
+    assert shown.size == (size or (1920, 1080))
 
 
 @pytest.mark.parametrize(
@@ -56,7 +55,7 @@ def test_windows_that_show_each_pixel_as_it_is(shown, size):
     ],
 )
 def test_windows_that_would_spoil_patterns_are_refused_with_what_to_change(shown, size, facts):
-    assert missing_facts(refusal(shown, size), *facts) == []
+    assert missing_facts(shown.refusal(size), *facts) == []
 
 
 def test_without_a_server_the_driver_says_who_has_one():
@@ -111,17 +110,17 @@ def test_one_window_is_the_projector_until_another_is_asked_for():
 def test_what_the_page_says_is_judged_by_what_is_expected():
     channel, sent = ProjectorChannel(), []
     page = channel.connect(hello(), sent.append)
-    channel.set_pattern_size((912, 1140))
+    channel.set_size((912, 1140))
     assert channel.page_state().state == "refused" and not missing_facts(
         channel.page_state().words, "912 x 1140"
     )
     with raises(DeviceError, "1920 x 1080"):
         channel.page()
     told = len(sent)
-    channel.set_pattern_size((912, 1140))
+    channel.set_size((912, 1140))
     assert len(sent) == told, "what is no news is not sent again"
     small = screen(inner=(912, 1140), whole=(912, 1140), box=None)
-    channel.handle_message(page, msgspec.json.encode({"op": "screen", "screen": small}))
+    channel.handle_message(page, msgspec.json.encode({"op": "report", "facts": small}).decode())
     assert channel.page_state().state == "ready" and channel.page_state().size == (912, 1140)
     assert len(sent) == told + 1 and page.changes == 1
 
@@ -133,10 +132,10 @@ def test_what_the_page_says_is_judged_by_what_is_expected():
         b"{}",
         b"\xff",
         '{"op": "done"}',
-        '{"op": "screen", "screen": {}}',
+        '{"op": "report", "facts": {}}',
         hello(),
         msgspec.json.encode(
-            {"op": "screen", "screen": {**msgspec.structs.asdict(FULL_HD), "dpr": 0}}
+            {"op": "report", "facts": {**msgspec.structs.asdict(FULL_HD), "dpr": 0}}
         ),
     ],
 )

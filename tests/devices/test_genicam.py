@@ -23,8 +23,12 @@ pytest.importorskip("harvesters", reason="the optional package harvesters is not
 from slviewer.devices import genicam as driver_module  # noqa: E402
 from slviewer.devices.capture import capture_colour, capture_frames  # noqa: E402
 from slviewer.devices.drivers import driver  # noqa: E402
-from slviewer.devices.genicam import IN_FLIGHT, GenicamCamera, list_genicam_cameras  # noqa: E402
-from slviewer.devices.genicam_features import Features  # noqa: E402
+from slviewer.devices.genicam import (  # noqa: E402
+    IN_FLIGHT,
+    Features,
+    GenicamCamera,
+    list_genicam_cameras,
+)
 from slviewer.devices.gentl import PRODUCERS_VARIABLE  # noqa: E402
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig  # noqa: E402
 from slviewer.devices.simulated import preset_rig  # noqa: E402

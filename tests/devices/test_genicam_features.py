@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from facts import raises
 
-from slviewer.devices.genicam_features import Features
+from slviewer.devices.genicam import Features
 from slviewer.devices.pixel_formats import pixel_format
 from slviewer.devices.protocols import CameraSettings
 from slviewer.errors import DeviceError, InputError

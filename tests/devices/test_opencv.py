@@ -17,9 +17,8 @@ from mjpeg import NetworkCamera, network_camera
 
 from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.drivers import driver
-from slviewer.devices.opencv import OpenCVCamera
+from slviewer.devices.opencv import OpenCVCamera, list_sysfs_webcams
 from slviewer.devices.opencv_reader import StreamTiming
-from slviewer.devices.opencv_source import list_sysfs_webcams
 from slviewer.devices.protocols import (
     CameraSettings,
     ColourCamera,

@@ -11,15 +11,15 @@ from facts import missing_facts
 from mjpeg import network_camera
 
 from slviewer.devices import opencv as opencv_module
-from slviewer.devices.opencv import OpenCVCamera
-from slviewer.devices.opencv_controls import (
+from slviewer.devices.opencv import (
+    OpenCVCamera,
+    connect_source,
     dialect_of,
     disable_automatics,
     exposure_ms,
     set_exposure,
 )
 from slviewer.devices.opencv_reader import Connected, Pace, StreamTiming
-from slviewer.devices.opencv_source import connect_source
 from slviewer.devices.protocols import CameraSettings
 
 SIZE = (160, 120)

@@ -7,11 +7,10 @@ from colour_camera import ColouredCamera, coloured
 from facts import raises
 from faulty_rig import breakable
 
-from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel
+from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel, Screen
 from slviewer.devices.capture import capture_colour, capture_frames, capture_with_texture
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
-from slviewer.devices.screen import Screen
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import Cancelled, DeviceError, InputError
@@ -126,7 +125,7 @@ class _Page:
 
     def __init__(self, channel: ProjectorChannel, size: tuple[int, int]) -> None:
         shown = Screen(1.0, size, size, size, True, True, True, 1.0)
-        hello = {"op": "hello", "window": "a", "take": False, "screen": shown}
+        hello = {"op": "hello", "window": "a", "take": False, "facts": shown}
         self._channel, self.asked = channel, []
         self._page = channel.connect(msgspec.json.encode(hello), self._receive)
 
@@ -136,9 +135,8 @@ class _Page:
         header = msgspec.json.decode(message[4 : 4 + int.from_bytes(message[:4], "little")])
         self.asked.append(header["op"])
         if "number" in header and self._page is not None:
-            self._channel.handle_message(
-                self._page, msgspec.json.encode({"op": "done", "number": header["number"]})
-            )
+            done = {"op": "done", "number": header["number"]}
+            self._channel.handle_message(self._page, msgspec.json.encode(done).decode())
 
 
 def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():

@@ -75,7 +75,7 @@ def test_operator_sees_state_of_camera_page(browser: Browser) -> None:
             choose(page, "Rig", "Custom …")
             choose(page, "Camera", "browser: a page on a screen, phone or laptop")
             expect(page.get_by_text("Camera page: waiting for the page")).to_be_visible()
-            hello = {"op": "hello", "window": "a", "take": False, "video": VIDEO}
+            hello = {"op": "hello", "window": "a", "take": False, "facts": VIDEO}
             pages.camera.connect(msgspec.json.encode(hello), lambda _: None)
             expect(page.get_by_text("Camera page: ready 1920 x 1080")).to_be_visible()
             click(page, "Use these devices")

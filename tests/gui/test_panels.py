@@ -541,8 +541,9 @@ def test_cloud_is_coloured_by_chosen_quantity() -> None:
     points = np.full((4, 5, 3), np.nan, np.float32)
     points[1:, 1:] = np.stack(np.broadcast_arrays(0.0, 1.0, np.linspace(500, 600, 4)), axis=-1)
     flat = np.ones((4, 5), np.float32)
+    grey = np.full((4, 5), 7, np.uint8)
     cloud = ScanCloud(
-        "a", "stereo", "x", points, flat, flat, flat, np.full((4, 5), 7, np.uint8), {}
+        points, "x", "stereo", flat, name="a", phase=flat, modulation=flat, texture=grey, errors={}
     )
     painted, words = paint_cloud(cloud, "depth")
     assert painted.shape == (4, 5, 3) and len(np.unique(painted[1], axis=0)) == 5 and "mm" in words

@@ -16,6 +16,7 @@ from server_client import Browser
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import SlviewerError, UsageError
+from slviewer.server import binding, connection, secure
 from slviewer.server.access import (
     ONE_TIME_SECONDS,
     ROLES,
@@ -175,7 +176,7 @@ def test_wrong_tokens_are_limited_and_lock_out_no_random_one():
     assert rules.exchange("aaaaaaaaaaaaaaaa", "192.0.2.1").role == "watch"
 
 
-def test_new_links_end_all_that_the_old_ones_opened(operator_server):
+def test_new_links_end_all_that_the_old_ones_opened(operator_server, monkeypatch):
     server = operator_server
     browsers = {role: Browser(server, role) for role in ("operate", "watch")}
     asking, other, watching = (
@@ -184,7 +185,8 @@ def test_new_links_end_all_that_the_old_ones_opened(operator_server):
         browsers["watch"].client(),
     )
     old = {role: grant.token for role, grant in server.access.grants.items()}
-    server.renew_links(asking.number, leaving_s=1.0)
+    monkeypatch.setattr(secure, "LEAVING_SECONDS", 1.0)
+    server.renew_links(asking.number)
     for client in (other, watching):
         client.thread.join(HANG_S)
         assert not client.thread.is_alive()
@@ -454,8 +456,9 @@ def test_other_methods_and_half_requests_end_without_noise(operator, caplog):
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
 
 
-def test_whoever_asks_for_nothing_is_let_go():
-    server = serve(Serving(port=0), request_s=0.1)
+def test_whoever_asks_for_nothing_is_let_go(monkeypatch):
+    monkeypatch.setattr(connection, "REQUEST_SECONDS", 0.1)
+    server = serve(Serving(port=0))
     try:
         with socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S) as idle:
             idle.sendall(b"GET / HTTP/1.1\r\n")
@@ -506,8 +509,9 @@ def test_a_slow_name_server_is_not_waited_for(monkeypatch):
         return []
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    monkeypatch.setattr(binding, "RESOLVE_SECONDS", 0.1)
     with raises(SlviewerError, "slow.example", "127.0.0.1"):
-        serve(Serving("slow.example", 0), resolve_s=0.1)
+        serve(Serving("slow.example", 0))
     assert asked.wait(HANG_S) and not answered
     answering.set()
     assert until(lambda: answered)

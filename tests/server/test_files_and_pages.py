@@ -16,6 +16,7 @@ from server_client import Browser
 from websockets.exceptions import InvalidStatus
 
 from slviewer.errors import InputError
+from slviewer.server import connection
 from slviewer.server.auth_middleware import DevicePage
 from slviewer.server.connection import CHUNK
 from slviewer.server.limits import CONNECTIONS
@@ -104,10 +105,10 @@ def serving(tmp_path) -> Iterator:
     address."""
     servers = []
 
-    def start(**options: object) -> tuple[Browser, str]:
+    def start() -> tuple[Browser, str]:
         with (tmp_path / "large.bin").open("wb") as file:
             file.truncate(LARGE)
-        servers.append(serve(Serving(port=0), **options))
+        servers.append(serve(Serving(port=0)))
         return Browser(servers[-1], "operate"), servers[-1].downloads.offer(
             tmp_path / "large.bin", within=tmp_path
         )
@@ -117,9 +118,10 @@ def serving(tmp_path) -> Iterator:
         server.stop()
 
 
-def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(serving):
+def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(serving, monkeypatch):
     # whoever waited for the slow reader would wait for too long
-    operator, address = serving(stall_s=10 * HANG_S)
+    monkeypatch.setattr(connection, "STALL_SECONDS", 10 * HANG_S)
+    operator, address = serving()
     with socket.create_connection(("127.0.0.1", operator.server.port), timeout=HANG_S) as slow:
         slow.sendall(operator.raw_request(address))
         assert slow.recv(100).startswith(b"HTTP/1.1 200")
@@ -129,8 +131,10 @@ def test_a_slow_reader_of_a_large_file_costs_little_and_stops_nobody(serving):
     assert operator.get().status == 200  # the reader that left half-way did no harm
 
 
-def test_a_reader_who_takes_nothing_is_let_go(serving):
-    operator, address = serving(stall_s=0.2, connections={**CONNECTIONS, "operate": 1})
+def test_a_reader_who_takes_nothing_is_let_go(serving, monkeypatch):
+    monkeypatch.setattr(connection, "STALL_SECONDS", 0.2)
+    monkeypatch.setitem(CONNECTIONS, "operate", 1)
+    operator, address = serving()
     with socket.create_connection(("127.0.0.1", operator.server.port), timeout=HANG_S) as stalled:
         stalled.sendall(operator.raw_request(address))
         assert stalled.recv(100).startswith(b"HTTP/1.1 200")
@@ -244,8 +248,9 @@ def test_long_names_are_cut_and_keep_their_suffix():
     )
 
 
-def test_the_server_stops_and_its_port_is_free_again(serving):
-    browser, address = serving(stall_s=10 * HANG_S)
+def test_the_server_stops_and_its_port_is_free_again(serving, monkeypatch):
+    monkeypatch.setattr(connection, "STALL_SECONDS", 10 * HANG_S)
+    browser, address = serving()
     server, client = browser.server, browser.client()
     with socket.create_connection(("127.0.0.1", server.port), timeout=HANG_S) as slow:
         slow.sendall(browser.raw_request(address))

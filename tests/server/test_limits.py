@@ -73,8 +73,9 @@ def test_a_request_without_end_is_ended(server, crowd):
     assert until(lambda: not is_open(endless))
 
 
-def test_each_role_has_so_many_connections():
-    server = serve(Serving(port=0), connections={**CONNECTIONS, "watch": 2})
+def test_each_role_has_so_many_connections(monkeypatch):
+    monkeypatch.setitem(CONNECTIONS, "watch", 2)
+    server = serve(Serving(port=0))
     try:
         watcher, operator = Browser(server, "watch"), Browser(server, "operate")
         first, second = watcher.client(), watcher.client()
@@ -88,7 +89,8 @@ def test_each_role_has_so_many_connections():
 
 def test_the_busiest_address_makes_room(monkeypatch):
     closed = []
-    with Listener(socket.AF_INET, socket.SOCK_STREAM, unauthenticated=4) as listener:
+    monkeypatch.setattr(limits, "MAX_UNAUTHENTICATED", 4)
+    with Listener(socket.AF_INET, socket.SOCK_STREAM) as listener:
         for number, address in enumerate(
             ["192.0.2.1", "192.0.2.1", "192.0.2.1", "192.0.2.2", "192.0.2.3"]
         ):

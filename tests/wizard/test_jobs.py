@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import clocks
 import pytest
 from facts import missing_facts
 from wizard_events import HANG_S, until
@@ -44,7 +45,7 @@ def test_jobs_run_in_order_and_the_operators_before_the_background(jobs: Jobs) -
     for name in ("f1", "f2"):
         jobs.submit(name, lambda report, name=name: name, lambda result: order.append(result))
     gate.set()
-    assert jobs.wait_until_idle(HANG_S)
+    assert clocks.until(lambda: jobs.idle)
     assert order == ["f1", "f2", "b1", "b2"] and jobs.view() is None
 
 
@@ -69,7 +70,7 @@ def test_progress_is_seen(jobs: Jobs) -> None:
         1,
     )
     go_on.set()
-    assert jobs.wait_until_idle(HANG_S)
+    assert clocks.until(lambda: jobs.idle)
 
 
 def test_cooperative_work_stops_at_its_next_report(jobs: Jobs, notices: Notices) -> None:
@@ -88,7 +89,7 @@ def test_cooperative_work_stops_at_its_next_report(jobs: Jobs, notices: Notices)
     jobs.submit("Counting", work, done.append)
     assert started.wait(HANG_S)
     jobs.cancel()
-    assert jobs.wait_until_idle(HANG_S) and stopped.is_set() and done == []
+    assert clocks.until(lambda: jobs.idle) and stopped.is_set() and done == []
     assert missing_facts(the_only(notices, "info"), "Counting", "cancelled") == []
 
 
@@ -116,7 +117,7 @@ def test_what_cannot_be_interrupted_is_abandoned_and_never_saves(
     jobs.submit("Next", lambda report: "next", done.append)
     assert started.wait(HANG_S)
     jobs.cancel()
-    assert jobs.wait_until_idle(HANG_S)
+    assert clocks.until(lambda: jobs.idle)
     assert not woke.is_set() and done == ["next"], "the next job did not wait for it"
     wake.set()
     assert woke.wait(HANG_S) and saved == []
@@ -148,7 +149,7 @@ def test_a_save_that_has_begun_is_awaited_and_counts(
     jobs.submit("Saving", work, done.append)
     assert saving.wait(HANG_S)
     jobs.cancel()
-    assert jobs.wait_until_idle(HANG_S) and done == ["saved"] and notices.all() == ()
+    assert clocks.until(lambda: jobs.idle) and done == ["saved"] and notices.all() == ()
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,7 @@ def test_a_failure_becomes_a_notice_and_later_jobs_go_on(
     jobs.submit("Failing", work)
     jobs.submit("Failing when done", lambda report: None, lambda result: 1 / 0)
     jobs.submit("Next", lambda report: 1, done.append)
-    assert jobs.wait_until_idle(HANG_S) and done == [1]
+    assert clocks.until(lambda: jobs.idle) and done == [1]
     first, second = notices.all()
     assert first.level == "error" and missing_facts(first.text, *facts) == []
     assert missing_facts(second.text, "Failing when done") == []

@@ -82,12 +82,10 @@ def wizard(tmp_path: Path) -> Iterator[Wizard]:
 
 
 def test_slow_clouds_have_a_rate_too() -> None:
-    times = deque([0.0, 10.0, 15.0, 20.0])
-    live_scan._drop_old(times, 21.0)
-    assert live_scan._compute_rate(times, 21.0) == pytest.approx(0.2)
-    live_scan._drop_old(times, 60.0)  # nothing came since
-    assert live_scan._compute_rate(times, 60.0) == pytest.approx(1 / 40)
-    assert live_scan._compute_rate(deque([0.0]), 1.0) == 0.0
+    events = deque((time_s, 0.0) for time_s in (0.0, 10.0, 15.0, 20.0))
+    assert live_scan._compute_rate(events, 21.0) == pytest.approx(0.2)
+    assert live_scan._compute_rate(events, 60.0) == pytest.approx(1 / 40)  # nothing came since
+    assert live_scan._compute_rate(deque([(0.0, 0.0)]), 1.0) == 0.0
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ def test_the_board_is_found_in_the_cameras_pixels() -> None:
             arrived.set()
 
     watcher = Watcher(see)
-    watcher.watch(Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6)))
+    watcher.watch = Watch(BOARD, nominal_lens(rig.camera.size, 3555.6 * 0.6))
 
     def offer_again() -> bool:
         watcher.offer(frame)
@@ -85,13 +85,13 @@ def test_an_image_is_searched_again_only_once_something_has_moved(
     rig = letter(0.25, local_distortion_px=0)
     white = PatternSequence(rig.projector.size, (Frame("white"),))
     watcher = Watcher(lambda view: None)
-    watcher.watch(Watch(BOARD))
+    watcher.watch = Watch(BOARD)
     try:
         for shift_mm, seed, count in ((0, 0, 1), (0, 1, 1), (0.5, 2, 2), (0.5, 3, 2)):  # 0.7 px
             scene = printed_board(BOARD, Pose(np.eye(3), np.array([shift_mm - 80, -60, 620.0])))
             watcher._detect((Renderer(rig, scene).capture(white, seed)[0], 1.0, 0.0))
             assert len(searched) == count
-        watcher.watch(Watch(Board.parse("circles:7x5:20")))
+        watcher.watch = Watch(Board.parse("circles:7x5:20"))
         watcher._detect((searched[-1], 1.0, 0.0))
         assert len(searched) == 3
     finally:
@@ -147,7 +147,7 @@ def test_stillness_starts_anew_with_every_movement() -> None:
 def test_hands_free_counts_down_once_a_place() -> None:
     hands_free = HandsFree()
     assert hands_free.countdown(seen(7), False, 0) is None
-    hands_free.switch(True)
+    hands_free.is_on = True
     assert (
         hands_free.countdown(None, False, 0) is None
         and hands_free.countdown(seen(0.5), False, 0) is None

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import clocks
 from clocks import HANG_S
 
+from slviewer.wizard.engine import Timing
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Level, Snapshot
-from slviewer.wizard.timing import Timing
 
 SPARING = Timing(retry_s=0.1, previews_per_s=1.0, trials=20)
 """Nobody looks at the previews, and the best of fewer poses does."""
