@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import DamagedError, SlviewerError
-from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measurements import describe_measurement, load_measurements
 from slviewer.pipeline.models import available_models, load_stereo, preferred_model

@@ -15,8 +15,7 @@ from slviewer.evaluation.letter import SPHERE_RADIUS_MM
 from slviewer.examination.examine import examine
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, load_last_verdict
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
