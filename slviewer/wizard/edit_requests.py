@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from slviewer.errors import InputError
-from slviewer.pipeline.edit import Selection, delete_points, redo_next, undo_last
+from slviewer.pipeline.edit import Selection, delete_points, step_history
 from slviewer.session.scan_edits import load_region, save_region
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.wizard import tasks
@@ -59,9 +59,9 @@ class EditRequests(RequestHandler):
     @request("Undoing the edit")
     def undo_edit(self, *scans: str) -> None:
         """Undo the last edit of scans, of all those that it was made of."""
-        undo_last(self._engine.store, scans)
+        step_history(self._engine.store, scans)
 
     @request("Redoing the edit")
     def redo_edit(self, *scans: str) -> None:
         """Bring the last edit of scans that was undone back."""
-        redo_next(self._engine.store, scans)
+        step_history(self._engine.store, scans, redo=True)
