@@ -1,7 +1,7 @@
 """One part by an inspection plan: aligned, its features fitted, each characteristic measured and
 judged."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -147,9 +147,14 @@ class AlignedPart:
         return face_towards(fit, T[:3, 3] - fit.feature.place)
 
 
-def fit_to_nominal(surface: MeasuredSurface, nominal: Nominal) -> Deviation:
-    """Align a surface by the best fit to the nominal model. Raises SlviewerError where that cannot
-    be trusted."""
+def fit_to_nominal(
+    surface: MeasuredSurface,
+    nominal: Nominal,
+    reach_mm: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Deviation:
+    """Align a surface by the best fit to the nominal model; ``reach_mm`` as in `deviation`. Raises
+    SlviewerError where that cannot be trusted."""
     points = surface.points[surface.measured].astype(np.float64)
     normals = (
         None if surface.normals is None else surface.normals[surface.measured].astype(np.float64)
@@ -157,7 +162,14 @@ def fit_to_nominal(surface: MeasuredSurface, nominal: Nominal) -> Deviation:
     check_size(nominal, points)
     sigma = surface.sigma_mm[surface.measured]
     typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
-    return deviation(points, nominal.mesh, normals=normals, sigma_mm=typical)
+    return deviation(
+        points,
+        nominal.mesh,
+        normals=normals,
+        sigma_mm=typical,
+        reach_mm=reach_mm,
+        progress=progress,
+    )
 
 
 def _shared_in(shared: Shared | None, T_part_scan: np.ndarray) -> Shared | None:
