@@ -12,12 +12,13 @@ from slviewer.gui.calibration_html import verdict_html
 from slviewer.gui.help_links import FINDINGS_PAGE, STAGES, STEPS_PAGE, help_link, step_help_link
 from slviewer.gui.merge_html import merge_failure_html
 from slviewer.gui.rig_check import checks_table
-from slviewer.pipeline.check_results import CHECK_NAMES, Check, Preflight
+from slviewer.pipeline.check_results import Check, CheckName, Preflight
 from slviewer.records.verdict import CAUSES, Finding, Verdict
 from slviewer.registration.refusal import Reason as Refusal
 from slviewer.server.help_pages import HelpPages, docs_folder
 from slviewer.wizard.steps import STEPS
 
+CHECK_NAMES: tuple[CheckName, ...] = get_args(CheckName)
 FINDINGS = {
     *(f"pixel-{reason.name.lower()}" for reason in PixelReason if reason != PixelReason.VALID),
     *(f"check-{name}" for name in CHECK_NAMES),
