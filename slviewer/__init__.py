@@ -67,17 +67,16 @@ if TYPE_CHECKING:
     from slviewer.pipeline.compare import compare
     from slviewer.pipeline.export import export
     from slviewer.pipeline.import_captures import import_captures, read_captures
+    from slviewer.pipeline.inspect_parts import run_plan
     from slviewer.pipeline.measure import measure
     from slviewer.pipeline.merge import merge
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
-    from slviewer.pipeline.reconstruct import reconstruct
+    from slviewer.pipeline.reconstruct import reconstruct, verify
     from slviewer.pipeline.report import report
-    from slviewer.pipeline.run_plan import run_plan
     from slviewer.pipeline.session_operations import SessionOperations as Session
     from slviewer.pipeline.simulate import simulate
     from slviewer.pipeline.stored_records import load_arrays
-    from slviewer.pipeline.verify import verify
     from slviewer.reconstruction.cloud import Cloud
     from slviewer.reconstruction.reconstruct import reconstruct_cloud
     from slviewer.records.measurement import Measurement
@@ -115,16 +114,9 @@ _EXPORTS = {
     "SimulatedWorld": "devices.world",
     "SlviewerError": "errors",
     "Verification": "records.verification",
-    "accept": "pipeline.accept",
-    "align": "pipeline.align",
     "align_clouds": "registration.multiway:register_all",
-    "batch": "pipeline.batch",
-    "calibrate": "pipeline.calibrate",
     "calibrate_frames": "pipeline.calibrate",
-    "capture": "pipeline.capture",
     "capture_frames": "devices.capture",
-    "check": "pipeline.check",
-    "compare": "pipeline.compare",
     "complementary": "fringe.presets",
     "datasets": "pipeline.datasets:*",
     "decode": "fringe.decode",
@@ -133,16 +125,11 @@ _EXPORTS = {
     "evaluate_plane": "evaluation.plane",
     "evaluate_sphere": "evaluation.sphere",
     "examine": "examination.examine",
-    "export": "pipeline.export",
     "fuse_clouds": "surface.fuse:fuse",
     "gray": "fringe.presets",
-    "import_captures": "pipeline.import_captures",
     "letter_rig": "simulation.rig:letter",
     "load_arrays": "pipeline.stored_records",
     "load_calibration": "pipeline.models",
-    "measure": "pipeline.measure",
-    "merge": "pipeline.merge",
-    "mesh": "pipeline.mesh",
     "mesh_cloud": "surface.meshing:build_mesh",
     "micro": "fringe.presets",
     "multifrequency": "fringe.presets",
@@ -151,19 +138,16 @@ _EXPORTS = {
     "plugins": "plugins:*",
     "read_captures": "pipeline.import_captures",
     "read_ply": "session.ply",
-    "reconstruct": "pipeline.reconstruct",
     "reconstruct_cloud": "reconstruction.reconstruct",
-    "report": "pipeline.report",
-    "run_plan": "pipeline.run_plan",
+    "run_plan": "pipeline.inspect_parts",
     "save_calibration": "pipeline.calibrate",
-    "simulate": "pipeline.simulate",
     "simulated_rig": "devices.simulated",
     "texture": "fringe.decode",
-    "verify": "pipeline.verify",
+    "verify": "pipeline.reconstruct",
     "write_ply": "session.ply",
 }
 """{public name: module}, or module:name where it has another name there, or module:* for the module
-itself."""
+itself; the others are in the module of ``slviewer.pipeline`` that has their name."""
 
 __all__ = [
     "Board", "CalibrationResult", "Cloud", "Frame", "Measurement", "MeshingPlan",
@@ -180,9 +164,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _EXPORTS:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, original = _EXPORTS[name].partition(":")
+    module, _, original = _EXPORTS.get(name, f"pipeline.{name}").partition(":")
     imported = import_module(f"{__name__}.{module}")
     return imported if original == "*" else getattr(imported, original or name)
 

@@ -47,11 +47,13 @@ class PluginGroup(Generic[T]):
         it.
         """
         plugins: list[Plugin] = []
-        for entry in sorted(
-            entry_points(group=self.name), key=lambda entry: (entry.name, _name_package(entry))
-        ):
+        entries = entry_points(group=self.name)
+        for entry in sorted(entries, key=lambda entry: (entry.name, _name_package(entry))):
             taken = {*self.built_in(), *(plugin.name for plugin in plugins if not plugin.problem)}
-            plugins.append(_load(entry, self.kind, taken))
+            value, problem = None, f"the name {entry.name} is taken: choose another"
+            if entry.name not in taken:
+                value, problem = _load(entry, self.kind)
+            plugins.append(Plugin(self.name, entry.name, _name_package(entry), value, problem))
         return tuple(plugins)
 
     def usable(self) -> dict[str, T]:
@@ -66,35 +68,18 @@ class PluginGroup(Generic[T]):
         return "; a plugin of this name cannot be used: `slviewer plugins` shows why"
 
 
-def _load(entry: EntryPoint, kind: type, taken: set[str]) -> Plugin:
-    """Import one plugin, and check it."""
-    package = _name_package(entry)
-    if entry.name in taken:
-        return Plugin(
-            entry.group,
-            entry.name,
-            package,
-            problem=f"the name {entry.name} is taken: choose another",
-        )
+def _load(entry: EntryPoint, kind: type) -> tuple[Any, str]:
+    """Import one plugin, and check it: its value, None where it has a problem, and the problem."""
     try:
         value = entry.load()
     except Exception as error:  # whatever a package's import raises must not stop the program
-        return Plugin(
-            entry.group,
-            entry.name,
-            package,
-            problem=f"its import failed, {type(error).__name__}: {error}",
-        )
+        return None, f"its import failed, {type(error).__name__}: {error}"
+    name = getattr(value, "name", None)
     if not isinstance(value, kind):
-        problem = f"{entry.value} is a {type(value).__name__}, not a {kind.__name__}"
-    elif getattr(value, "name", None) != entry.name:
-        problem = (
-            f"{entry.value} is called {getattr(value, 'name', None)!r}: use the same name for the"
-            " entry point"
-        )
-    else:
-        return Plugin(entry.group, entry.name, package, value)
-    return Plugin(entry.group, entry.name, package, problem=problem)
+        return None, f"{entry.value} is a {type(value).__name__}, not a {kind.__name__}"
+    if name != entry.name:
+        return (None, f"{entry.value} is called {name!r}: use the same name for the entry point")
+    return value, ""
 
 
 def _name_package(entry: EntryPoint) -> str:

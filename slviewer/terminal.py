@@ -18,10 +18,9 @@ def progress(done: float, doing: str) -> None:
     """Print the share `done`, 0 ... 1, as one line that is redrawn in place; silent unless on a
     terminal."""
     if sys.stderr.isatty():
-        end = "\n" if done >= 1 else ""
         print(
             f"\r\033[K{100 * done:3.0f} % {escape_controls(doing)}",
-            end=end,
+            end="\n" if done >= 1 else "",
             file=sys.stderr,
             flush=True,
         )

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from slviewer.pipeline.feedback import ignore_warnings
+from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.reconstruct import (
@@ -17,11 +18,18 @@ from slviewer.session.store import Session
 Warn = Callable[[str], None]
 
 
+def loaded(session: Path, scan: str) -> MeasuredSurface:
+    with Session.open(session) as store:
+        return load_surface(Job(store), scan)
+
+
 def reconstructed(
     session: Path, capture: str, warn: Warn = ignore_warnings, **settings: Any
 ) -> ReconstructedCapture:
     with Session.open(session) as store:
-        return reconstruct_capture(Job(store, warn=warn), ReconstructSettings(capture, **settings))
+        chosen = ReconstructSettings(capture, **settings)
+        with reconstruct_capture(Job(store, warn=warn), chosen) as made:
+            return made
 
 
 def merged(
@@ -32,4 +40,6 @@ def merged(
     **settings: Any,
 ) -> MergedScans:
     with Session.open(session) as store:
-        return merge_scans(Job(store, warn=warn), MergeSettings(captures, reference, **settings))
+        chosen = MergeSettings(captures, reference, **settings)
+        with merge_scans(Job(store, warn=warn), chosen) as made:
+            return made

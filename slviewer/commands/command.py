@@ -12,13 +12,13 @@ import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import GenericAlias, MappingProxyType
-from typing import Annotated, Any, Literal, Protocol, Union, get_args, runtime_checkable
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args
 
 import tyro
 
@@ -28,31 +28,17 @@ from slviewer.errors import SlviewerError, UsageError
 ModelName = Literal["stereo", "pixelwise", "splined"]
 
 
-@runtime_checkable
-class Operational(Protocol):
-    """An operation of `slviewer.pipeline.operation`, which is not imported here: it brings
-    NumPy."""
-
-    settings: Callable[..., Any]
-
-    def run(self, session: Any, settings: Any, progress: Any, warn: Any) -> Any:
-        """Run the operation on a session."""
-
-
-Run = Callable[[Callable[..., Any], dict[str, Any]], None]
+T = TypeVar("T")
+Function = Callable[..., Any]
+Arguments = dict[str, Any]
+"""Of a command, by name."""
+Work = Callable[[], None]
+Command = Callable[..., Work]
+"""Called with the arguments; what it returns does the work."""
+Run = Callable[[Function, Arguments], None]
 TYPES: dict[str, Any] = {"SessionLike": Path, "ModelName": ModelName, "Size": str}
 """What the terminal takes for types that are wider in Python; all others are looked up in the
 function's module."""
-
-
-@dataclass(frozen=True)
-class Option:
-    """An argument of a command that its function does not have."""
-
-    name: str
-    type: Any
-    default: Any
-    help: str
 
 
 LARGEST = 1e12
@@ -74,58 +60,65 @@ RANGES: dict[str, tuple[float, float]] = {
     "wait_s": (1, LARGEST),
 }
 """Of the numbers that a command takes, by its parameter, where they are narrower."""
-SETTINGS_OF = {"operation": 2, "takes_settings": 0}
-"""Which argument of a decorator names the settings of the function."""
-JSON = (Option("json", Path | None, None, "Write the result to this file too."),)
+JSON = ("commands.command:JsonFile",)
+
+
+@dataclass(frozen=True)
+class JsonFile:
+    """Where the result goes too.
+
+    Args:
+        json: Write the result to this file too.
+    """
+
+    json: Path | None = None
 
 
 def read_command(
     source: str,
     *positional: str,
-    options: Sequence[Option] = (),
+    options: Sequence[str] = (),
     names: Mapping[str, str] = MappingProxyType({}),
-    defaults: Mapping[str, Any] = MappingProxyType({}),
+    optional: Sequence[str] = (),
     description: str = "",
     run: Run | None = None,
-) -> Callable[..., Callable[[], None]]:
+) -> Command:
     """Return the command of the function ``module:function`` of slviewer, or of a module in use,
     for tyro.
 
     The command's value is the work to do once all arguments are parsed.
 
-    ``positional``: the parameters that are given without a name, ``options``: arguments that the
-    function does not have, ``names``: {parameter: option} where these differ, ``defaults`` and
+    ``positional``: the parameters that are given without a name, beside a session without default,
+    ``options``: dataclasses, ``module:class``, whose fields are arguments too, ``names``:
+    {parameter: option} where these differ, ``optional``: parameters that are None by default here,
     ``description``: in place of the function's own, ``run``: what to do with the function and its
     arguments, by default `show_result`.
     """
-    module, _, name = source.partition(":")
-    module = module if module in sys.modules else f"slviewer.{module}"
-    definition = _read_definitions(module)[name]
-    assert isinstance(definition, ast.FunctionDef)
-    doc, accepted = _read_arguments(definition, module)
-    if "\nArgs:\n" not in doc:
-        doc = doc.partition("\n\n")[0]
-    shown = re.findall(r"^ {4}(\w+):", doc, re.MULTILINE)
+    module, name = _split_place(source)
+    text, described, accepted = _read_function(module, name)
+    parts = [(described, accepted), *(_read_settings(*_split_place(each)) for each in options)]
+    described = "\n".join(each for each, _ in parts)
+    shown = [
+        argument
+        for each, arguments in parts
+        for argument in arguments
+        if re.search(rf"^ {{4}}{argument[0].arg}:", each, re.MULTILINE)
+    ]
     parameters = []
-    for argument, default, place in accepted:
-        if argument.arg not in shown:
-            continue
+    for argument, default, place in shown:
         assert argument.annotation is not None
         kind = _terminal_type(_evaluate(argument.annotation, place))
-        if defaults.get(argument.arg, ...) is None:
-            kind = kind | None
-        if argument.arg in positional:
+        value = inspect.Parameter.empty if default is None else _evaluate(default, place)
+        if argument.arg in optional:
+            kind, value = kind | None, None
+        if argument.arg in positional or (argument.arg == "session" and default is None):
             kind = Annotated[kind, tyro.conf.Positional]
         if argument.arg in names:
             kind = Annotated[kind, tyro.conf.arg(name=names[argument.arg])]
-        value = inspect.Parameter.empty if default is None else _evaluate(default, place)
-        value = defaults.get(argument.arg, value)
-        parameters.append(_make_parameter(argument.arg, kind, value))
-    for each in options:
-        kind = Annotated[each.type, tyro.conf.arg(help=each.help)]
-        parameters.append(_make_parameter(each.name, kind, each.default))
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(argument.arg, keyword, annotation=kind, default=value))
 
-    def parse(**arguments: Any) -> Callable[[], None]:
+    def parse(**arguments: Any) -> Work:
         """Return the work to do: the function, imported only when it is called, with the parsed
         arguments."""
 
@@ -138,54 +131,46 @@ def read_command(
 
         return work
 
-    parse.__doc__ = join_lines(description + doc[doc.index("\n\n") :] if description else doc)
+    # each argument on one line: tyro would break the help where the source is broken
+    joined = re.sub(r"\n {8,}(?=\S)", " ", described)
+    parse.__doc__ = (description or text) + (joined and f"\n\nArgs:\n{joined}")
     parse.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     parse.__annotations__ = {each.name: each.annotation for each in parameters}
     return parse
 
 
-def join_lines(doc: str) -> str:
-    """Return a docstring with each argument on one line: tyro would break the help where the source
-    is broken."""
-    return re.sub(r"\n {8,}(?=\S)", " ", doc)
+def take_options(arguments: Arguments, kind: type[T]) -> T:
+    """Take the options out of a command's arguments that are the fields of a dataclass."""
+    assert is_dataclass(kind)
+    return kind(**{each.name: arguments.pop(each.name) for each in fields(kind)})
 
 
-def show_result(
-    function: Callable[..., Any],
-    arguments: dict[str, Any],
-    describe: Callable[..., str] | None = None,
-) -> None:
-    """Call the function, write what it returns as JSON where that is requested, and print it.
+def show_result(function: Function, arguments: Arguments) -> None:
+    """Call the function, write what it returns as JSON where that is requested, and print it: text,
+    or the result's ``text()``.
 
-    ``describe``: the text to print, from the result and the arguments; by default the result's own
-    ``text()``. Raises SlviewerError with the result's ``failure``, where it has one.
+    Raises SlviewerError with the result's ``failure``, where it has one.
     """
     json_file = arguments.pop("json", None)
     result = call(function, **arguments)
     write_json(json_file, result.to_json() if hasattr(result, "to_json") else result)
-    if describe is not None:
-        text = describe(result, **arguments)
-    else:
-        text = result if isinstance(result, str) else result.text()
-    terminal.print_result(text)
+    terminal.print_result(result if isinstance(result, str) else result.text())
     if failure := getattr(result, "failure", ""):
         raise SlviewerError(failure)
 
 
-def call(function: Callable[..., Any], **arguments: Any) -> Any:
+def call(function: Any, **arguments: Any) -> Any:
     """Call the function and return its result; its progress and warnings go to standard error."""
-    if isinstance(function, Operational):
+    # an Operation, which is not imported here: it brings NumPy
+    if hasattr(function, "settings"):
         session = arguments.pop("session")
-        return function.run(
-            session, function.settings(**arguments), terminal.progress, terminal.warn
-        )
+        settings = function.settings(**arguments)
+        return function.run(session, settings, terminal.progress, terminal.warn)
     callbacks = {"progress": terminal.progress, "warn": terminal.warn}
-    callbacks = {
-        name: callbacks[name]
-        for name in callbacks
-        if name in inspect.signature(function).parameters
-    }
-    return function(**arguments, **callbacks)
+    accepted = inspect.signature(function).parameters
+    return function(
+        **arguments, **{name: each for name, each in callbacks.items() if name in accepted}
+    )
 
 
 def write_json(path: Path | None, result: object) -> None:
@@ -198,7 +183,7 @@ def write_json(path: Path | None, result: object) -> None:
         path.write_text(json.dumps(result, indent=2, default=to_plain) + "\n")
 
 
-def union(commands: Mapping[str, Callable[..., Any]]) -> Any:
+def union(commands: Mapping[str, Function]) -> Any:
     """Return the type whose value is one of the commands, for tyro."""
     choices = [
         Annotated[Any, tyro.conf.subcommand(name=name, constructor=f)]
@@ -221,65 +206,60 @@ def _check_numbers(arguments: Mapping[str, Any]) -> None:
                 )
 
 
-def _make_parameter(name: str, kind: Any, default: Any) -> inspect.Parameter:
-    """Return a keyword parameter of a command's signature."""
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-
-
 Argument = tuple[ast.arg, ast.expr | None, str]
 """A parameter, its default, None where it has none, and the module in which both are evaluated."""
 
 
-def _read_arguments(definition: ast.FunctionDef, module: str) -> tuple[str, list[Argument]]:
-    """Return the docstring of a function and its parameters; where it has settings, both are those
-    of the settings."""
-    doc = ast.get_docstring(definition) or ""
+def _split_place(source: str) -> tuple[str, str]:
+    """Return module and name of ``module:name``, of slviewer or of a module in use."""
+    module, _, name = source.partition(":")
+    return module if module in sys.modules else f"slviewer.{module}", name
+
+
+def _read_function(module: str, name: str) -> tuple[str, str, list[Argument]]:
+    """Return what the docstring of a function says before ``Args:`` and below it, and the
+    function's parameters; where it has settings, the latter are those of the settings."""
+    definition = _read_definitions(module)[name]
+    assert isinstance(definition, ast.FunctionDef)
+    text, _, described = (ast.get_docstring(definition) or "").partition("\n\nArgs:\n")
     for decorator in definition.decorator_list:
-        made_by = (
-            decorator.func.id
-            if isinstance(decorator, ast.Call) and isinstance(decorator.func, ast.Name)
-            else ""
-        )
-        if made_by in SETTINGS_OF:
-            assert isinstance(decorator, ast.Call)
-            name = decorator.args[SETTINGS_OF[made_by]]
-            assert isinstance(name, ast.Name)
-            described, fields = _read_settings(name.id, module)
-            if made_by == "operation":
-                described = f"    session: Session folder.\n{described}"
-                fields.insert(0, (ast.arg("session", ast.Name("SessionLike")), None, module))
-            return f"{doc}\n\nArgs:\n{described}", fields
-    return doc, [(*argument, module) for argument in _list_arguments(definition)]
+        match decorator:
+            case ast.Call(ast.Name("operation"), [_, _, ast.Name(settings)]):
+                described, accepted = _read_settings(module, settings)
+                session = ast.arg("session", ast.Name("SessionLike")), None, module
+                return text, f"    session: Session folder.\n{described}", [session, *accepted]
+            case ast.Call(ast.Name("takes_settings"), [ast.Name(settings)]):
+                return text, *_read_settings(module, settings)
+    arguments = definition.args
+    required = [None] * (len(arguments.args) - len(arguments.defaults))
+    pairs = [
+        *zip(arguments.args, [*required, *arguments.defaults], strict=True),
+        *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
+    ]
+    if not described:
+        text = text.partition("\n\n")[0]
+    return text, described.partition("\n\n")[0], [(*pair, module) for pair in pairs]
 
 
-def _read_settings(name: str, module: str) -> tuple[str, list[Argument]]:
+def _read_settings(module: str, name: str) -> tuple[str, list[Argument]]:
     """Return what a dataclass of settings and its bases describe of their fields, and these
     fields."""
     settings = _read_definitions(module)[name]
     if isinstance(settings, ast.ImportFrom):
         assert settings.module is not None
-        return _read_settings(name, settings.module)
+        return _read_settings(settings.module, name)
     assert isinstance(settings, ast.ClassDef)
-    described, _, rest = (
-        (ast.get_docstring(settings) or "").partition("Args:\n")[2].partition("\n\n")
-    )
+    doc = ast.get_docstring(settings) or ""
+    described = [doc.partition("Args:\n")[2].partition("\n\n")[0]]
     nodes = [node for node in settings.body if isinstance(node, ast.AnnAssign)]
-    fields = [
+    accepted = [
         (ast.arg(ast.unparse(node.target), node.annotation), node.value, module) for node in nodes
     ]
     for base in settings.bases:
-        inherited, further = _read_settings(ast.unparse(base), module)
-        described = "\n".join(filter(None, (described, inherited.partition("\n\n")[0])))
-        fields += further
-    return f"{described}\n\n{rest}", fields
-
-
-def _list_arguments(definition: ast.FunctionDef) -> list[tuple[ast.arg, ast.expr | None]]:
-    """List every parameter of a function with its default, None where it has none."""
-    places, defaults = definition.args.args, definition.args.defaults
-    required = [None] * (len(places) - len(defaults))
-    keywords = zip(definition.args.kwonlyargs, definition.args.kw_defaults, strict=True)
-    return [*zip(places, [*required, *defaults], strict=True), *keywords]
+        inherited, further = _read_settings(module, ast.unparse(base))
+        described.append(inherited)
+        accepted += further
+    return "\n".join(filter(None, described)), accepted
 
 
 @cache

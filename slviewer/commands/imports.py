@@ -1,49 +1,78 @@
 """`slviewer import`: one command a layout, and the calibrations that other tools made."""
 
-from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from slviewer import terminal
-from slviewer.commands.command import Option, Run, call, read_command, union
+from slviewer.commands.command import (
+    Arguments,
+    Command,
+    Function,
+    Run,
+    Work,
+    call,
+    read_command,
+    take_options,
+    union,
+)
 from slviewer.entry_points import IMPORTERS, list_names
 from slviewer.errors import InputError, UsageError
 
-CODEC = Option(
-    "codec",
-    Literal["2x3", "nstep", "3", "4", "gray"] | None,
-    None,
-    "What was shown; needed where the number of frames does not determine it.",
-)
-AXIS = Option("axis", Literal["x", "y"], "x", "Of a codec along a single axis.")
-FILES = Option(
-    "files",
-    str | None,
-    None,
-    'Pattern of the names to use, such as "pattern_cam1_*"; * and ? are wildcards.',
-)
-DESCRIBED = (
-    Option(
-        "sequence",
-        Path | None,
-        None,
-        "The TOML that says what each file shows, by default the one in the source; the reference "
-        "describes it, and `slviewer patterns` writes one.",
-    ),
-    Option(
-        "guess",
-        Path | None,
-        None,
-        "A capture folder, whose TOML is proposed from its images; nothing is imported. Exit status"
-        " 1 where a part of it is unsure.",
-    ),
-    Option("out", Path | None, None, "File for the proposed TOML, by default standard output."),
-)
+
+@dataclass(frozen=True)
+class SLStudioOptions:
+    """What was shown.
+
+    Args:
+        codec: What was shown; needed where the number of frames does not determine it.
+        axis: Of a codec along a single axis.
+    """
+
+    codec: Literal["2x3", "nstep", "3", "4", "gray"] | None = None
+    axis: Literal["x", "y"] = "x"
 
 
-def run_import(layout: str, import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:
+@dataclass(frozen=True)
+class FileOptions:
+    """Which files are images of the sequence.
+
+    Args:
+        files: Pattern of the names to use, such as "pattern_cam1_*"; * and ? are wildcards.
+    """
+
+    files: str | None = None
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """What describes the images.
+
+    Args:
+        sequence: The TOML that says what each file shows, by default the one in the source; the
+            reference describes it, and `slviewer patterns` writes one.
+    """
+
+    sequence: Path | None = None
+
+
+@dataclass(frozen=True)
+class GuessOptions:
+    """How that description is proposed.
+
+    Args:
+        guess: A capture folder, whose TOML is proposed from its images; nothing is imported. Exit
+            status 1 where a part of it is unsure.
+        out: File for the proposed TOML, by default standard output.
+    """
+
+    guess: Path | None = None
+    out: Path | None = None
+
+
+def run_import(layout: str, import_captures: Function, arguments: Arguments) -> None:
     """Import folders of a layout, and print the captures' role and names."""
     from slviewer.pipeline.import_captures import describe_import, detect_layout
 
@@ -55,30 +84,28 @@ def run_import(layout: str, import_captures: Callable[..., Any], arguments: dict
     terminal.print_result(describe_import(names, arguments["role"]))
 
 
-def run_frames(import_captures: Callable[..., Any], arguments: dict[str, Any]) -> None:
+def run_frames(import_captures: Function, arguments: Arguments) -> None:
     """Import folders that a TOML describes, or propose that TOML."""
-    folder, out = arguments.pop("guess"), arguments.pop("out")
+    options = take_options(arguments, GuessOptions)
     source, session, sequence = (arguments[name] for name in ("source", "session", "sequence"))
-    if folder is not None:
+    if options.guess is not None:
         if source is not None or sequence is not None:
             raise UsageError(
                 "--guess proposes a TOML and imports nothing: give it without SOURCE, SESSION,"
                 " --sequence"
             )
-        _propose_description(folder, out, arguments["projector"], arguments["channel"])
-        return
-    if source is None or session is None:
+        _propose_description(options, arguments["projector"], arguments["channel"])
+    elif source is None or session is None:
         raise UsageError("SOURCE or SESSION is missing: give both, or --guess FOLDER for a TOML")
-    if out is not None:
+    elif options.out is not None:
         raise UsageError(
             "--out is the file for the TOML of --guess: give --guess FOLDER, or omit --out"
         )
-    run_import("frames", import_captures, arguments)
+    else:
+        run_import("frames", import_captures, arguments)
 
 
-def run_import_calibration(
-    import_calibration: Callable[..., Any], arguments: dict[str, Any]
-) -> None:
+def run_import_calibration(import_calibration: Function, arguments: Arguments) -> None:
     """Import a calibration, and print what was read from its file."""
     from slviewer.pipeline.import_calibration import identify_calibration_keys
 
@@ -99,15 +126,14 @@ def run_import_calibration(
     )
 
 
-def _propose_description(
-    folder: Path, out: Path | None, projector: str | None, channel: str | None
-) -> None:
-    """Write the proposed TOML of a capture folder to `out` or standard output. Raises InputError
+def _propose_description(options: GuessOptions, projector: str | None, channel: Any) -> None:
+    """Write the proposed TOML of a capture folder to ``out`` or standard output. Raises InputError
     for doubts."""
     from slviewer.pipeline.import_captures import guess_description
 
-    guessed = guess_description(folder, projector=projector, channel=channel)  # type: ignore[arg-type]
-    if out is None:
+    assert options.guess is not None
+    guessed = guess_description(options.guess, projector=projector, channel=channel)
+    if (out := options.out) is None:
         print(guessed.toml, end="")
     else:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -120,21 +146,24 @@ def _propose_description(
 
 
 def _make_captures_command(
-    layout: str, description: str, *options: Option, run: Run | None = None, **defaults: Any
-) -> Callable[..., Callable[[], None]]:
+    layout: str,
+    description: str,
+    *options: str,
+    run: Run | None = None,
+    optional: tuple[str, ...] = (),
+) -> Command:
     """Return the import command of a layout."""
     return read_command(
         "pipeline.import_captures:import_captures",
         "source",
-        "session",
         description=description,
         options=options,
-        defaults=defaults,
+        optional=optional,
         run=run or partial(run_import, layout),
     )
 
 
-def make_import_command() -> Callable[..., Callable[[], None]]:
+def make_import_command() -> Command:
     """Return the command with one subcommand a layout."""
     layouts = {
         "auto": _make_captures_command(
@@ -157,7 +186,7 @@ def make_import_command() -> Callable[..., Callable[[], None]]:
             "opencv-graycode",
             "Import the images of OpenCV's structured_light GrayCodePattern: columns, then rows,"
             " each bit with its inverse.\n\nImages are read in natural order of their names.",
-            FILES,
+            "commands.imports:FileOptions",
         ),
         "sltk": _make_captures_command(
             "sltk",
@@ -168,30 +197,27 @@ def make_import_command() -> Callable[..., Callable[[], None]]:
             "slstudio",
             "Import the frames that SLStudio writes: frameSeq_NN.bmp.\n\nWith the diamond pattern,"
             " the projector's size has twice its columns.",
-            CODEC,
-            AXIS,
+            "commands.imports:SLStudioOptions",
         ),
         "frames": _make_captures_command(
             "frames",
             "Import any folder of images with a TOML that describes them, or propose that TOML with"
             " --guess FOLDER.",
-            *DESCRIBED,
+            "commands.imports:SequenceOptions",
+            "commands.imports:GuessOptions",
             run=run_frames,
-            source=None,
-            session=None,
+            optional=("source", "session"),
         ),
         "opencv-calibration": read_command(
             "pipeline.import_calibration:import_opencv_calibration",
             "file",
-            "session",
             run=run_import_calibration,
         ),
     }
 
-    def import_command(command: Any) -> Callable[[], None]:
+    def import_command(command: Any) -> Work:
         """Import captures or calibrations that other tools made."""
-        run: Callable[[], None] = command
-        return run
+        return command  # type: ignore[no-any-return]
 
     for name in sorted(set(list_names(IMPORTERS)) - layouts.keys()):
         layouts[name] = _make_captures_command(

@@ -1,10 +1,11 @@
 """The wizard in the browser."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
+
+from slviewer.commands.command import Work
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def wizard(
     rig: str = "",
     address: Address = Address(),
     no_browser: bool = False,
-) -> Callable[[], None]:
+) -> Work:
     """Start the wizard in the browser: from an unknown rig to a merged mesh. Plain `slviewer` does
     the same.
 
@@ -52,7 +53,6 @@ def wizard(
         from slviewer.gui.app import run
         from slviewer.server.secure import Serving
 
-        serving = Serving(*vars(address).values())
-        run(session, rig, serving, open_browser=not no_browser)
+        run(session, rig, Serving(*vars(address).values()), open_browser=not no_browser)
 
     return start

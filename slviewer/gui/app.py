@@ -24,8 +24,7 @@ from slviewer.gui.panel import PanelContext
 from slviewer.gui.scene import ViewerScene
 from slviewer.gui.shell import Shell, greet_viewer, notify
 from slviewer.gui.viewpoints import FIELD_OF_VIEW, OVERVIEW, Viewpoints
-from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.rig_presets import load_rig
+from slviewer.pipeline.rig_choice import load_rig, set_up
 from slviewer.server.access import ONE_TIME_SECONDS, ROLES
 from slviewer.server.device_pages import serve_device_pages
 from slviewer.server.secure import SafeServer, Serving, serve

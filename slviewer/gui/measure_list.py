@@ -17,7 +17,7 @@ from slviewer.gui.pictures import PLOT_PX, Painter, Plot
 from slviewer.gui.widgets import Text, link, paragraph
 from slviewer.inspection.colours import colour_limit
 from slviewer.inspection.section import CutPlane
-from slviewer.pipeline.measurements import section_lines
+from slviewer.pipeline.measure import section_lines
 from slviewer.pipeline.stored_records import Stored, load_arrays, name_records
 from slviewer.records.measurement import Measurement
 from slviewer.report.measurements import section_plot

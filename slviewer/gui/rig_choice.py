@@ -12,8 +12,7 @@ from slviewer.errors import InputError
 from slviewer.gui.inputs import SessionValue, change
 from slviewer.gui.panel import PanelContext
 from slviewer.gui.widgets import Html, Text, Tone, alert, coloured, paragraph, to_html
-from slviewer.pipeline.rig_choice import Choice
-from slviewer.pipeline.rig_presets import Preset, check_choice, presets
+from slviewer.pipeline.rig_choice import Choice, Preset, check_choice, presets
 from slviewer.server.viser_internals import make_private
 from slviewer.wizard.snapshot import RigView, SessionView, Snapshot
 

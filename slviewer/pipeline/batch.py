@@ -21,10 +21,13 @@ from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.evaluation.render import render
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Findings, Job
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
-from slviewer.pipeline.settings import Callbacks, takes_settings
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.operation import Callbacks, Findings, Job, takes_settings
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.atomic import to_json, write_bytes
 from slviewer.session.layout import is_session
@@ -293,19 +296,18 @@ def _check_version(task: Task) -> None:
 def _reconstruct(job: Job, capture: str, settings: BatchSettings, made: Path) -> dict[str, Any]:
     """Reconstruct a capture to a cloud or mesh in the folder ``made``, and return its figures."""
     is_mesh = settings.do == "mesh"
-    result = reconstruct_capture(
-        job,
-        ReconstructSettings(
-            capture,
-            model=settings.model,
-            out=made / "cloud.ply",
-            mesh=is_mesh,
-            accept_rejected=settings.accept_rejected,
-        ),
+    how = ReconstructSettings(
+        capture,
+        model=settings.model,
+        out=made / "cloud.ply",
+        mesh=is_mesh,
+        accept_rejected=settings.accept_rejected,
     )
-    name = f"{capture}_{result.cloud.model}{'_mesh' if is_mesh else ''}.ply"
-    result.ply.rename(made / name)
-    sigma = float(np.median(result.cloud.sigma_z[result.cloud.mask]))
+    with reconstruct_capture(job, how) as result:
+        cloud = result.cloud
+    name = f"{capture}_{cloud.model}{'_mesh' if is_mesh else ''}.ply"
+    result.found.files[0].rename(made / name)
+    sigma = float(np.median(cloud.sigma_z[cloud.mask]))
     return {"points": result.points, "noise mm": sigma, "file": name}
 
 

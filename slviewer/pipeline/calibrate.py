@@ -35,8 +35,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, match_names, opened_or_made
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.pose_evidence import DecodedPose
-from slviewer.pipeline.poses import Judged, read_pose, read_stored_poses
+from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
 from slviewer.pipeline.stored_records import load_record
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.plain import from_plain, to_plain
@@ -133,7 +132,7 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
     before = preferred_model(store) if available_models(store) else ""
     names, excluded = _choose_poses(store, settings, job.warn)
     diagnosed = _diagnose_poses(
-        read_stored_poses(store, names, board, settings.step_2, examine=True),
+        read_stored_poses(store, names, board, settings.step_2),
         len(names),
         store.load_capture(names[0]).sequence,
         board,
@@ -199,7 +198,6 @@ def calibrate_frames(
                 board,
             ),
             settings.step_2,
-            examine=True,
         )
         for name, frames in poses.items()
     )

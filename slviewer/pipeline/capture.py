@@ -28,9 +28,8 @@ from slviewer.pipeline.examination import save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Warn, ignore_warnings, part
 from slviewer.pipeline.open_session import opened_or_made
-from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, set_up
-from slviewer.pipeline.rig_presets import RigLike, load_rig
-from slviewer.pipeline.settings import Callbacks, takes_settings
+from slviewer.pipeline.operation import Callbacks, takes_settings
+from slviewer.pipeline.rig_choice import Choice, RigLike, RigSetup, SetUp, load_rig, set_up
 from slviewer.pipeline.suggest_exposure import (
     BUDGET_S,
     MAX_SUGGESTED,

@@ -14,7 +14,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Progress, Warn, ignore_warnings
 from slviewer.pipeline.models import Model, load_model, load_stereo
-from slviewer.pipeline.open_session import numbered_results
+from slviewer.pipeline.open_session import numbered_names
 from slviewer.pipeline.scale import scale_cloud, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud
 from slviewer.pipeline.stored_records import is_up_to_date, load_record
@@ -177,7 +177,7 @@ def scan_cloud(
 def merge_name(store: Session, name: str) -> str:
     """The merge of that number, or the last one where none is named; raises InputError where it
     does not exist."""
-    there = [result.removeprefix("merge/") for result in numbered_results(store, "merge")]
+    there = numbered_names(store, "merge")
     if not there:
         raise InputError("there is no merge yet: merge scans first")
     if name and name not in there:

@@ -1,7 +1,8 @@
 """From a stored capture to phase maps and a texture."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from slviewer.records.examination import Examination
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 
+T = TypeVar("T")
 MANY_SATURATED = 0.05
 """Share of the illuminated pixels: highlights saturate fewer, an exposure that is too long more."""
 NEAR_DARK = 2.0
@@ -269,7 +271,8 @@ def decode_captures(
     are masked; ``relative`` as in `decode_capture`. ``check``: compare the frames of captures that
     have no saved comparison.
     """
-    for capture, reading in read_ahead([session.load_capture(name) for name in names]):
+    captures = [session.load_capture(name) for name in names]
+    for capture, reading in compute_ahead(Capture.stack, captures):
         frames = reading.result()
         phases = decode_capture(capture, frames, relative=relative)
         if warn is not ignore_warnings:
@@ -285,13 +288,15 @@ def decode_captures(
         yield capture, frames, phases
 
 
-def read_ahead(captures: Sequence[Capture]) -> Iterator[tuple[Capture, Future[np.ndarray]]]:
-    """Yield captures with their frames, whose `result()` may raise; the next one's are read while
-    one is processed."""
-    with ThreadPoolExecutor(1) as reader:
-        ahead = [reader.submit(capture.stack) for capture in captures[:1]]
-        for i, capture in enumerate(captures):
-            frames = ahead.pop()
-            wait([frames])
-            ahead += [reader.submit(following.stack) for following in captures[i + 1 : i + 2]]
-            yield capture, frames
+def compute_ahead(
+    compute: Callable[[T], np.ndarray], items: Sequence[T]
+) -> Iterator[tuple[T, Future[np.ndarray]]]:
+    """Yield items with what is computed of them, whose `result()` may raise; the next one's is
+    computed while one is processed."""
+    with ThreadPoolExecutor(1) as worker:
+        ahead = [worker.submit(compute, item) for item in items[:1]]
+        for i, item in enumerate(items):
+            computed = ahead.pop()
+            wait([computed])
+            ahead += [worker.submit(compute, following) for following in items[i + 1 : i + 2]]
+            yield item, computed

@@ -13,6 +13,7 @@ from slviewer.inspection.colours import colour_limit, deviation_colours
 from slviewer.inspection.deviation import Deviation
 from slviewer.inspection.tolerance import judge_deviation
 from slviewer.pipeline.feedback import part, stage
+from slviewer.pipeline.inspect_parts import fit_to_nominal
 from slviewer.pipeline.measure import provenance
 from slviewer.pipeline.measured_surface import (
     LoadSurface,
@@ -23,7 +24,6 @@ from slviewer.pipeline.measured_surface import (
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.part_inspection import fit_to_nominal
 from slviewer.pipeline.stored_records import next_name
 from slviewer.records.measurement import (
     DeviationStatistics,
@@ -98,17 +98,10 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         raise InputError(f"{path.name} is not the nominal model that it was: it has changed since")
     for note in nominal.notes:
         job.warn(f"{nominal.name}: {note}")
-    if settings.load is not None:
-        on = settings.load(store)
-    else:
-        on = load_surface(
-            store,
-            settings.scan,
-            model=settings.model,
-            accept_rejected=settings.accept_rejected,
-            progress=part(job.progress, 0.0, 0.4),
-            warn=job.warn,
-        )
+    loading = replace(job, progress=part(job.progress, 0.0, 0.4))
+    on = load_surface(
+        loading, settings.scan, settings.model, "", settings.accept_rejected, settings.load
+    )
     aligning = stage(job.progress, 0.4, 0.9, "aligning")
     result = fit_to_nominal(on, nominal, settings.reach, aligning)
     if result.coverage < LIKELY_COVERAGE:

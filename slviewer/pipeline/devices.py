@@ -2,7 +2,7 @@
 
 from slviewer.devices.drivers import available
 from slviewer.errors import SlviewerError
-from slviewer.pipeline.rig_presets import rigs
+from slviewer.pipeline.rig_choice import rigs
 
 
 def devices() -> str:

@@ -12,8 +12,8 @@ from slviewer.pipeline.capture_clouds import scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName, check_accepted
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.scan_edits import OFF, parse_region
-from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
 from slviewer.surface.point_edits import Edit, make_edit

@@ -29,10 +29,10 @@ from slviewer.pipeline.models import (
     warn_if_stale,
 )
 from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.report import report
 from slviewer.pipeline.scale import describe_scale
 from slviewer.pipeline.scan_edits import refuse_region, resolve_region, restriction_notes
-from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.atomic import format_bytes

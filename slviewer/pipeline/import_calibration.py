@@ -1,6 +1,7 @@
 """Making a calibration from elsewhere the session's own, once it agrees with itself and with the
 session's captures."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,12 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_capture
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import (
-    available_models,
-    load_stereo,
-    save_imported_stereo,
-    trash_models,
-)
+from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.reconstruction.axis_agreement import check_phases
+from slviewer.session.capture import Capture
 from slviewer.session.importers import opencv_calibration
 from slviewer.session.importers.filestorage import read_storage
-from slviewer.session.store import Session
 
 Size = str | tuple[int, int]
 Keys = tuple[str, str, str, str, str, str]
@@ -72,28 +68,28 @@ def import_opencv_calibration(
                 "replace it with --force (it goes to the session's trash)"
             )
         captures = store.captures()
+        projectors = {capture.sequence.projector_size for capture in captures} - {None}
         sizes = {
-            "camera": _resolve_size(
-                path, "camera", camera, stated, {capture.size for capture in captures}
-            ),
-            "projector": _resolve_size(
-                path,
-                "projector",
-                projector,
-                stated,
-                {capture.sequence.projector_size for capture in captures} - {None},
-            ),
+            device: _resolve_size(path, device, given, stated, captured)
+            for device, given, captured in (
+                ("camera", camera, {capture.size for capture in captures}),
+                ("projector", projector, projectors),
+            )
         }
-        for device, size in sizes.items():  # raises what a lens cannot have
+        camera_lens, projector_lens = (  # raises what a lens cannot have
             Lens(matrices[f"K_{device}"], matrices[f"D_{device}"], size or (1, 1))
-        witnessed = _is_confirmed_by_captures(store, matrices, sizes, warn)
-        for device, size in sizes.items():
-            if size is not None and not witnessed:
-                _check_principal_point(device, matrices[f"K_{device}"], size, warn)
+            for device, size in sizes.items()
+        )
+        rig = StereoRig(camera_lens, projector_lens, matrices["R"], matrices["T"])
+        model = None if None in sizes.values() else StereoModel.from_rig(rig)
+        if model is None or not _is_confirmed(model, captures, warn):
+            for device, size in sizes.items():
+                if size is not None:
+                    _check_principal_point(device, matrices[f"K_{device}"], size, warn)
         with store.together():
             trash_models(store, there)
             save_imported_stereo(store, matrices, source=str(file), **sizes)
-        return load_stereo(store) if None not in sizes.values() else None
+        return model
 
 
 def identify_calibration_keys(file: Path | str) -> dict[str, str]:
@@ -134,34 +130,19 @@ def _resolve_size(
     return size
 
 
-def _is_confirmed_by_captures(
-    store: Session,
-    matrices: dict[str, np.ndarray],
-    sizes: dict[str, tuple[int, int] | None],
-    warn: Warn,
-) -> bool:
+def _is_confirmed(model: StereoModel, captures: Iterable[Capture], warn: Warn) -> bool:
     """Whether a capture with both axes confirms the calibration; False without such a capture.
     Raises InputError where one contradicts it."""
-    camera, projector = sizes["camera"], sizes["projector"]
-    if camera is None or projector is None:
-        return False
-    rig = StereoRig(
-        Lens(matrices["K_camera"], matrices["D_camera"], camera),
-        Lens(matrices["K_projector"], matrices["D_projector"], projector),
-        matrices["R"],
-        matrices["T"],
-    )
-    for capture in store.captures():
-        if len(capture.sequence.axes) < 2 or (capture.size, capture.sequence.projector_size) != (
-            camera,
-            projector,
-        ):
-            continue
-        check = check_phases(capture.name, decode_capture(capture), StereoModel.from_rig(rig))
-        for message in check.warnings:
-            warn(message)
-        if check.agreement is not None:
-            return True
+    rig = model.rig
+    for capture in captures:
+        sequence = capture.sequence
+        is_same = (capture.size, sequence.projector_size) == (rig.camera.size, rig.projector.size)
+        if is_same and len(sequence.axes) > 1:
+            check = check_phases(capture.name, decode_capture(capture), model)
+            for message in check.warnings:
+                warn(message)
+            if check.agreement is not None:
+                return True
     return False
 
 

@@ -1,17 +1,19 @@
-"""What a session holds, in words, and whether it is what was saved."""
+"""What a session holds, in words, and whether it is what was saved; and what is in its trash."""
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
-from slviewer.errors import DamagedError, SlviewerError
+from slviewer.errors import DamagedError, InputError, SlviewerError
+from slviewer.evaluation.render import render
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.measurements import describe_measurement, load_measurements
+from slviewer.pipeline.measure import describe_measurement
 from slviewer.pipeline.models import available_models, load_stereo, preferred_model
-from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.open_session import SessionLike, match_names, opened
+from slviewer.pipeline.stored_records import list_records
+from slviewer.records.measurement import Measurement
 from slviewer.session.capture import Capture
 from slviewer.session.results import verify_result
 from slviewer.session.store import Session
@@ -37,18 +39,24 @@ def inspect(
             f"  {name} was complete, and not yet in its place: it is now"
             for name in store.recovered
         ]
-        parts: list[Callable[[], Iterable[str]]] = [
-            partial(_describe_captures, store, captures),
-            *(partial(_describe_calibration, store, name) for name in available_models(store)),
-            partial(_describe_verdict, store),
-            partial(_describe_measurements, store),
-        ]
-        for part in parts:
-            try:
-                lines += part()
-            except SlviewerError as error:  # one damaged file hides nothing else
-                damage.append(str(error))
-        if not available_models(store):
+        models = available_models(store)
+        with _collecting(damage):
+            excluded = store.valid_decision("excluded") or {}
+            for capture in captures:
+                why = excluded.get(capture.name)
+                note = f"  [excluded: {why}]" if why else ""
+                lines.append(f"  {summarise_capture(capture)}{note}")
+        for name in models:
+            with _collecting(damage):
+                lines += _describe_calibration(store, name)
+        with _collecting(damage):
+            if (verdict := load_last_verdict(store)) is not None:
+                lines.append(verdict.text())
+        with _collecting(damage):
+            if measured := list_records(store, Measurement):
+                lines.append(f"{len(measured)} measurement{'s' * (len(measured) != 1)}:")
+                lines += [f"  {describe_measurement(each)}" for each in measured]
+        if not models:
             lines.append("no calibration yet: run `slviewer calibrate` with the --target in use")
         lines += [f"damaged: {fault}" for fault in dict.fromkeys(damage)]
     return "\n".join(lines)
@@ -59,16 +67,15 @@ def _check(store: Session, progress: Progress) -> str:
     damaged, if anything."""
     (captures, faults), results = store.read_captures(), store.result_names()
     damage = [*faults.values(), *store.decision_faults()]
-    checks: list[tuple[str, Callable[[], object]]] = [
-        (capture.name, capture.verify) for capture in captures
-    ]
-    checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
-    for i, (name, verify) in enumerate(checks):
-        progress(i / len(checks), f"checking {name}")
-        try:
-            verify()
-        except SlviewerError as error:
-            damage.append(str(error))
+    everything: list[Capture | str] = [*captures, *results]
+    for i, each in enumerate(everything):
+        name = each if isinstance(each, str) else each.name
+        progress(i / len(everything), f"checking {name}")
+        with _collecting(damage):
+            if isinstance(each, str):
+                verify_result(store.folder / "results" / each)
+            else:
+                each.verify()
     progress(1.0, "checked")
     counts = f"{len(captures)} captures and {len(results)} results"
     if damage:
@@ -78,11 +85,14 @@ def _check(store: Session, progress: Progress) -> str:
     return f"{store.folder}: {counts} are what was saved"
 
 
-def _describe_captures(store: Session, captures: Iterable[Capture]) -> list[str]:
-    """A line for each capture."""
-    excluded = store.valid_decision("excluded") or {}
-    notes = {name: f"  [excluded: {why}]" for name, why in excluded.items()}
-    return [f"  {summarise_capture(capture)}{notes.get(capture.name, '')}" for capture in captures]
+@contextmanager
+def _collecting(damage: list[str]) -> Iterator[None]:
+    """Context manager: an error of slviewer ends the block and is added; one damaged file hides
+    nothing else."""
+    try:
+        yield
+    except SlviewerError as error:
+        damage.append(str(error))
 
 
 def _describe_calibration(store: Session, name: str) -> list[str]:
@@ -91,36 +101,13 @@ def _describe_calibration(store: Session, name: str) -> list[str]:
     state = store.state_of(f"calibration/{name}")
     meta = store.load_result(f"calibration/{name}", only=())[0]
     mark = ", the default" if name == preferred_model(store) else ""
-    made = (
-        f"imported from {meta['source']}"
-        if "imported" in meta
-        else f"from {len(meta['inputs'])} poses"
-    )
-    lines = [f"calibration {name}: {made}, {state}{mark}"]
-    if "imported" in meta:
-        lines += _describe_imported_calibration(meta)
-    elif name == "stereo":
-        rms = load_stereo(store).reprojection_rms_px
-        lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms.items()))
-    return lines
-
-
-def _describe_verdict(store: Session) -> list[str]:
-    """The verdict on the last attempt to calibrate, where there was one."""
-    verdict = load_last_verdict(store)
-    return [] if verdict is None else [verdict.text()]
-
-
-def _describe_measurements(store: Session) -> list[str]:
-    """The measurements, a line each."""
-    measured = load_measurements(store)
-    heading = f"{len(measured)} measurement{'s' * (len(measured) != 1)}:"
-    return [heading, *(f"  {describe_measurement(each)}" for each in measured)] if measured else []
-
-
-def _describe_imported_calibration(meta: Mapping[str, Any]) -> list[str]:
-    """Sizes, lenses and baseline of a calibration that was imported."""
-    lines = []
+    if "imported" not in meta:
+        lines = [f"calibration {name}: from {len(meta['inputs'])} poses, {state}{mark}"]
+        if name == "stereo":
+            rms = load_stereo(store).reprojection_rms_px.items()
+            lines.append("  reprojection RMS " + ", ".join(f"{k} {v:.3f} px" for k, v in rms))
+        return lines
+    lines = [f"calibration {name}: imported from {meta['source']}, {state}{mark}"]
     for device in ("camera", "projector"):
         K, size = np.array(meta["imported"][f"K_{device}"]), meta[device]
         size_text = f"{size[0]}x{size[1]} px" if size else "size not stated (the captures' is used)"
@@ -150,3 +137,42 @@ def summarise_capture(capture: Capture) -> str:
     if capture.exposures_ms:
         line += f", exposures {', '.join(f'{exposure:g}' for exposure in capture.exposures_ms)} ms"
     return line + (", colour" if capture.meta.get("texture") else "")
+
+
+def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
+    """List what is in a session's trash, or bring back what is named.
+
+    Captures and results that were deleted or replaced are in the trash. What has a restored name
+    now goes there in exchange, in one step.
+
+    Args:
+        session: Session folder.
+        names: What to bring back: names, the last deleted of each, or patterns such as
+            'calibration/*', or the name of one folder in the trash; without any, the trash is
+            listed.
+    """
+    with opened(session, write=bool(names)) as store:
+        trashed = store.trashed()
+        if not names:
+            if not trashed:
+                return f"nothing is in the trash of {store.folder}"
+            rows = [
+                {
+                    "name": each.name,
+                    "kind": "capture" if each.is_capture else "result",
+                    "deleted (UTC)": f"{each.time:%Y-%m-%d %H:%M:%S}",
+                    "folder in the trash": each.place.name,
+                }
+                for each in trashed
+            ]
+            return render(rows)
+        latest = {each.name: each for each in reversed(trashed)}
+        latest |= {each.place.name: each for each in trashed}
+        found = match_names(list(latest), names, "item of the trash", InputError)
+        # patterns match no folders
+        chosen = [latest[name] for name in found if name in names or name == latest[name].name]
+        chosen = list(dict.fromkeys(chosen))
+        store.restore(chosen)
+        return "\n".join(
+            f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen
+        )

@@ -1,18 +1,22 @@
-"""Measuring on a scan or a merge: points, distances, sections, fitted shapes."""
+"""Measuring on a scan or a merge: points, distances, sections, fitted shapes, and the relations
+between them; the measurements of a session are listed, renamed, deleted and written as CSV."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any, ClassVar, Literal, NoReturn
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.inspection.features import KINDS, Feature
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.regions import Region
-from slviewer.inspection.relations import distance
+from slviewer.inspection.relations import distance, relation
 from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import Spread
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.measured_surface import (
     MERGED,
     LoadSurface,
@@ -22,12 +26,21 @@ from slviewer.pipeline.measured_surface import (
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName, available_models
-from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.stored_records import next_name
+from slviewer.pipeline.open_session import SessionLike, opened
+from slviewer.pipeline.operation import OPERATIONS, Found, Job, operation
+from slviewer.pipeline.stored_records import (
+    Stored,
+    list_records,
+    load_arrays,
+    load_stored,
+    next_name,
+)
+from slviewer.printable import format_csv
 from slviewer.records.measurement import MeasuredFeature, MeasuredRegion, Measurement, SectionPlane
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.quantities import Quantity
 from slviewer.records.record import to_vector
+from slviewer.session.atomic import replace_file
 from slviewer.session.names import clean_label
 from slviewer.session.store import Session
 
@@ -37,6 +50,11 @@ MAX_RMS_TO_NOISE = 5.0
 """Times the points' noise: a fit with a larger RMS gets a warning."""
 Measured = tuple[dict[str, Any], dict[str, np.ndarray]]
 """Fields of a measurement, and its arrays."""
+COLUMNS = (
+    "id", "name", "kind", "scan", "quantity", "value", "unit", "U (k = 2)", "calibration in U",
+    "state", "time",
+)  # fmt: skip
+_FOLDER = f"{Measurement.kind}/"
 
 
 @dataclass(frozen=True)
@@ -84,7 +102,7 @@ class MeasureSettings:
                 " in mm"
             )
         if self.what not in FITTED and len(self.at) not in (self.ends, 2 * self.ends):
-            self._raise_place_error("pixel u v")
+            raise self._place_error(organised=True)
 
     @property
     def ends(self) -> int:
@@ -103,18 +121,18 @@ class MeasureSettings:
         """Return the places on a surface; UsageError where there are too few or too many."""
         at = [int(number) for number in self.at]
         if len(at) != self.ends * (2 if on.organised else 1):
-            self._raise_place_error("pixel u v" if on.organised else "index")
+            raise self._place_error(on.organised)
         return list(zip(at[::2], at[1::2], strict=True)) if on.organised else list(at)
 
-    def _raise_place_error(self, which: str) -> NoReturn:
-        """Raise UsageError: the option --at does not have one place for each end of what is
-        measured."""
-        example = " ".join(
-            (("180 150", "220 150") if which == "pixel u v" else ("1200", "3400"))[: self.ends]
-        )
-        raise UsageError(
+    def _place_error(self, organised: bool) -> UsageError:
+        """Return the error that --at does not have one place for each end of what is measured."""
+        which, examples = "index", ["1200", "3400"]
+        if organised:
+            which, examples = "pixel u v", ["180 150", "220 150"]
+        return UsageError(
             f"a {self.what} needs --at with the {which} of"
-            f" {'its point' if self.ends == 1 else 'both its ends'}, such as --at {example}"
+            f" {'its point' if self.ends == 1 else 'both its ends'}, such as --at"
+            f" {' '.join(examples[: self.ends])}"
         )
 
 
@@ -122,36 +140,21 @@ class MeasureSettings:
 def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]:
     """Measure on a scan: a distance between points, a section, a shape fitted to a region; the
     session stores it."""
-    if settings.load is not None:
-        on = settings.load(job.store)
-    else:
-        on = load_surface(
-            job.store,
-            settings.scan,
-            model=settings.model,
-            roi=settings.roi,
-            accept_rejected=settings.accept_rejected,
-            progress=job.progress,
-            warn=job.warn,
-        )
+    store = job.store
+    on = load_surface(
+        job, settings.scan, settings.model, settings.roi, settings.accept_rejected, settings.load
+    )
     if settings.what in FITTED:
         fields, arrays = _fit(on, settings)
     else:
         makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
         fields, arrays = makers[settings.what](on, settings.places(on))
     record = Measurement(
-        what=settings.what,
-        name=clean_label(settings.name),
-        **provenance(on),
-        **fields,
+        what=settings.what, name=clean_label(settings.name), **provenance(on), **fields
     )
-    yield Found(
-        next_name(job.store, Measurement),
-        record,
-        arrays,
-        notes=uncertainty_notes(job.store, record),
-        settings=replace(settings, model=on.model),  # type: ignore[arg-type]
-    )
+    used = replace(settings, model=on.model)  # type: ignore[arg-type]
+    notes = uncertainty_notes(store, record)
+    yield Found(next_name(store, Measurement), record, arrays, notes=notes, settings=used)
     job.progress(1.0, "measured")
 
 
@@ -171,17 +174,13 @@ def uncertainty_notes(store: Session, measured: Measurement) -> tuple[str, ...]:
     whole."""
     if all(quantity.whole for quantity in measured.quantities):
         return ()
-    cause = "the model " + " or ".join(
-        each for each in measured.model.split(", ") if each != "splined"
-    )
+    models = [each for each in measured.model.split(", ") if each != "splined"]
+    cause = f"the model {' or '.join(models)}"
+    remedy = "measure with the splined model (--model splined)"
     if any(source.startswith(MERGED) for source in measured.source.split(", ")):
-        cause, remedy = (
-            "a merge",
-            "measure on one of its scans with the splined model (--model splined)",
-        )
-    elif "splined" in available_models(store):
-        remedy = "measure with the splined model (--model splined)"
-    else:
+        cause = "a merge"
+        remedy = "measure on one of its scans with the splined model (--model splined)"
+    elif "splined" not in available_models(store):
         remedy = (
             "calibrate with the splined model, which takes eight poses or more, and measure with it"
         )
@@ -191,12 +190,9 @@ def uncertainty_notes(store: Session, measured: Measurement) -> tuple[str, ...]:
 def _pick(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
     """A picked point, to relate it with fits."""
     feature, spread = on.picked(places[0])
-    quantities = [
-        Quantity(axis, float(value), "mm") for axis, value in zip("xyz", feature.place, strict=True)
-    ]
-    return {"quantities": quantities, "feature": _to_record(feature, spread)}, _shared_arrays(
-        spread
-    )
+    fields, arrays = _describe_feature(feature, spread)
+    at = zip("xyz", feature.place.tolist(), strict=True)
+    return fields | {"quantities": [Quantity(axis, value, "mm") for axis, value in at]}, arrays
 
 
 def _measure_distance(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
@@ -217,14 +213,14 @@ def _fit(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
             f"points lie {fit.rms:.3g} mm (RMS) off the {settings.what}, and their noise is"
             f" {noise:.2g} mm: see what it shows"
         )
-    fields = {
+    fields, arrays = _describe_feature(fit.feature, fit.spread)
+    fields |= {
         "quantities": fit.quantities(),
-        "feature": _to_record(fit.feature, fit.spread),
         "region": from_plain(to_plain(region), MeasuredRegion),
         "where": f"{region.text()}: {fit.used:,} used, {fit.left_out:,} excluded",
         "warnings": tuple(warnings),
     }
-    return fields, _shared_arrays(fit.spread)
+    return fields, arrays
 
 
 def _cut(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
@@ -240,22 +236,185 @@ def _cut(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
         vertices, faces = triangulate_near(on.points, on.normals, plane)
     lines = section(vertices, faces, plane)
     drawn = np.concatenate(lines)
-    quantities = [
-        Quantity("length along", float(np.ptp(drawn[:, 0])), "mm"),
-        Quantity("height range", float(np.ptp(drawn[:, 1])), "mm"),
-    ]
+    spans = zip(("length along", "height range"), np.ptp(drawn, axis=0).tolist(), strict=True)
+    quantities = [Quantity(name, span, "mm") for name, span in spans]
     lengths = np.array([len(line) for line in lines], np.int32)
     fields = {"quantities": quantities, "plane": from_plain(to_plain(plane), SectionPlane)}
     return fields, {"lines": drawn.astype(np.float32), "lengths": lengths}
 
 
-def _to_record(feature: Any, spread: Spread) -> MeasuredFeature:
-    """Return a feature and its own part of its uncertainty as a measurement holds them."""
+def _describe_feature(feature: Feature, spread: Spread) -> Measured:
+    """Return a feature as a measurement holds it, with its own part of its uncertainty; and the
+    part that fits of one calibration share, as an array."""
     own = {"scatter": spread.scatter.tolist(), "calibration": spread.calibration}
-    return from_plain(to_plain(feature) | own, MeasuredFeature)
+    arrays = {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
+    return {"feature": from_plain(to_plain(feature) | own, MeasuredFeature)}, arrays
 
 
-def _shared_arrays(spread: Spread) -> dict[str, np.ndarray]:
-    """Return the part of an uncertainty that fits of one calibration share, as an array of a
-    measurement."""
-    return {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
+@dataclass(frozen=True)
+class RelateSettings:
+    """Which measurements are related.
+
+    Args:
+        a: A point or a fit, such as m1.
+        b: Another one.
+    """
+
+    a: str
+    b: str
+
+
+@operation("relate", Measurement, RelateSettings)
+def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
+    """Measure the distances and angles between two points or fits.
+
+    Raises InputError where one is neither, is stale, or is in another camera's frame.
+    """
+    store = job.store
+    first, second = (load_stored(store, Measurement, each) for each in (settings.a, settings.b))
+    if settings.a == settings.b:
+        raise InputError(f"{first.label} was chosen twice: choose two measurements")
+    for each in (first, second):
+        if each.stale:
+            raise InputError(
+                f"{each.label} is stale, what it was measured on has changed: measure it again"
+            )
+    features = (*load_feature(store, first), *load_feature(store, second))
+    a, b = first.record, second.record
+    # scans are in one frame only while camera and calibration are the same; a merge has its own
+    scans = {a.source, b.source} <= set(store.capture_names())
+    if a.source != b.source and (a.model != b.model or not scans):
+        raise InputError(
+            f"{first.label} was measured on {a.source} with {a.model}, {second.label} on {b.source}"
+            f" with {b.model}: they do not lie in one frame; measure both on one surface"
+        )
+    record = Measurement(
+        what="relation",
+        name=f"{first.label} – {second.label}",
+        source=", ".join(dict.fromkeys((a.source, b.source))),
+        model=", ".join(dict.fromkeys((a.model, b.model))),
+        quantities=relation(*features),
+        where=f"{first.label} and {second.label}",
+        of=(settings.a, settings.b),
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        inputs=store.input_hashes(_FOLDER + settings.a, _FOLDER + settings.b),
+        scales=a.scales | b.scales,
+    )
+    yield Found(next_name(store, Measurement), record, notes=uncertainty_notes(store, record))
+
+
+def load_feature(store: Session, measured: Stored[Measurement]) -> tuple[Feature, Spread]:
+    """Load the point, plane, sphere or cylinder of a measurement, and its uncertainty."""
+    found = measured.record.feature
+    if found is None:
+        raise InputError(
+            f"{measured.label} is a {measured.record.what}: choose one of {', '.join(KINDS)}"
+        )
+    shared = load_arrays(store, _FOLDER + measured.name).get("shared")
+    shared = None if shared is None else shared.astype(np.float64)
+    spread = Spread(np.array(found.scatter), shared, found.calibration)
+    return from_plain(to_plain(found), Feature), spread
+
+
+def section_lines(session: SessionLike, name: str) -> tuple[CutPlane, list[np.ndarray]]:
+    """Load the plane of a saved section, and its lines (k, 2) mm: along, and up."""
+    with opened(session) as store:
+        measured = load_stored(store, Measurement, name)
+        if measured.record.plane is None:
+            raise InputError(
+                f"{measured.label} is a {measured.record.what}, not a section: choose a section"
+            )
+        arrays = load_arrays(store, _FOLDER + name)
+    lines = np.split(arrays["lines"].astype(np.float64), np.cumsum(arrays["lengths"])[:-1])
+    return from_plain(to_plain(measured.record.plane), CutPlane), lines
+
+
+def describe_measurement(measured: Stored[Measurement]) -> str:
+    """A measurement as one line of text."""
+    mark = "  [stale: measured on what has since changed]" if measured.stale else ""
+    return f"{measured.name:<4} {measured.label}: {measured.record.summary()}{mark}"
+
+
+def format_measurements(found: Sequence[Stored[Measurement]]) -> str:
+    """Return measurements as comma-separated values, one row a quantity; U where it is known."""
+    rows: list[Iterable[object]] = [COLUMNS]
+    for each in found:
+        record, state = each.record, "stale" if each.stale else "fresh"
+        for q in record.quantities:
+            known = ("", "") if q.U is None else (f"{q.U:.6g}", "yes" if q.whole else "no")
+            value = (q.name, f"{q.value:.6f}", q.unit, *known)
+            rows.append(
+                [each.name, each.label, record.what, record.source, *value, state, record.time]
+            )
+    return format_csv(rows)
+
+
+def export_measurements(store: Session, out: Path | str) -> int:
+    """Write all measurements to a CSV file; returns how many it holds."""
+    out = Path(out)
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out.name} is not a table: end its name in .csv")
+    found = list_records(store, Measurement)
+    replace_file(out.absolute(), format_measurements(found).encode("utf-8-sig"))
+    return len(found)
+
+
+def rename_measurement(store: Session, name: str, label: str) -> Stored[Measurement]:
+    """Call a measurement otherwise; an empty label restores its original one."""
+    load_stored(store, Measurement, name)
+    labels = store.decision(Measurement.labels) or {}
+    store.decide(Measurement.labels, {**labels, name: clean_label(label)})
+    return load_stored(store, Measurement, name)
+
+
+def trash_measurement(store: Session, name: str) -> None:
+    """Move a measurement to the trash; ``restore_measurement`` brings it back. What was made from
+    it becomes stale."""
+    load_stored(store, Measurement, name)
+    store.trash_result(_FOLDER + name)
+
+
+def restore_measurement(store: Session) -> Stored[Measurement]:
+    """Bring the measurement back that was deleted last. Raises InputError where there is none."""
+    deleted = [each for each in store.deleted_results() if each.startswith(_FOLDER)]
+    if not deleted:
+        raise InputError("no measurement was deleted, so none can be restored: measure again")
+    store.restore_last(deleted[0])
+    return load_stored(store, Measurement, deleted[0].removeprefix(_FOLDER))
+
+
+def edit_measurements(
+    session: SessionLike,
+    *,
+    relate: tuple[str, str] | None = None,
+    name: tuple[str, str] | None = None,
+    delete: Sequence[str] = (),
+    bring_back: bool = False,
+    csv: Path | None = None,
+    warn: Warn = ignore_warnings,
+) -> str:
+    """List the measurements that a session holds.
+
+    Args:
+        session: Session folder.
+        relate: Two of them, such as m1 m2: their distances and angles are measured too.
+        name: One of them, and what to call it from now on.
+        delete: Some of them, to the trash.
+        bring_back: Undo the last deletion.
+        csv: Write them all to this table too.
+    """
+    with opened(session, write=bool(relate or name or delete or bring_back)) as store:
+        if relate:
+            for note in OPERATIONS["relate"](store, *relate).notes:
+                warn(note)
+        if name:
+            rename_measurement(store, *name)
+        for each in delete:
+            trash_measurement(store, each)
+        if bring_back:
+            restore_measurement(store)
+        found = list_records(store, Measurement)
+        lines = [describe_measurement(each) for each in found] or ["nothing was measured yet"]
+        if csv is not None:
+            lines.append(f"{export_measurements(store, csv)} measurements -> {csv}")
+    return "\n".join(lines)

@@ -11,7 +11,7 @@ from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
 from slviewer.pipeline.capture_clouds import read_merge, scan_cloud
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
     check_accepted,
@@ -19,8 +19,8 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.scale import load_scale_correction, scale_factor, scale_sigma
+from slviewer.pipeline.operation import Job
+from slviewer.pipeline.scale import load_scale_correction
 from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import triangulate_grid
@@ -88,7 +88,7 @@ class MeasuredSurface:
                 f"{place} is not a place on {self.source}: give"
                 f" {'pixel (u, v)' if self.organised else 'an index'}"
             )
-        index = (place[1], place[0]) if isinstance(place, tuple) else (place,)
+        index = place[::-1] if isinstance(place, tuple) else (place,)
         if not all(0 <= i < n for i, n in zip(index, self.points.shape, strict=False)):
             raise InputError(f"{place} lies outside {self.source}: pick a point of it")
         point = np.asarray(self.points[index], np.float64)
@@ -96,21 +96,13 @@ class MeasuredSurface:
             raise InputError(
                 f"nothing was measured at {place} of {self.source}: pick another point"
             )
-        sigma = float(np.nan_to_num(self.sigma_mm[index]))
+        away, sigma = np.zeros(3), float(np.nan_to_num(self.sigma_mm[index]))
         if self.organised:
             away = sigma * point / point[2]
-        else:
-            away = (
-                np.zeros(3)
-                if self.normals is None
-                else sigma * np.asarray(self.normals[index], np.float64)
-            )
-        feature = Feature("point", point)
-        if self.shared is None:
-            return feature, Spread(np.outer(away, away))
-        return feature, Spread(
-            np.outer(away, away), self.shared(point[None], np.eye(3)[:, None]), self.calibration
-        )
+        elif self.normals is not None:
+            away = sigma * np.asarray(self.normals[index], np.float64)
+        shared = None if self.shared is None else self.shared(point[None], np.eye(3)[:, None])
+        return Feature("point", point), Spread(np.outer(away, away), shared, self.calibration)
 
     def sigma_along(self, normals: np.ndarray, whole: bool = False) -> np.ndarray:
         """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise
@@ -124,6 +116,10 @@ class MeasuredSurface:
         return sigma * np.abs(np.sum(points / points[:, 2:] * normals, axis=1))
 
 
+LoadSurface = Callable[[Session], MeasuredSurface]
+"""Returns a surface of a session that is at hand already."""
+
+
 def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float64 and faces (m, 3) of a surface; a scan's end where its depth jumps."""
     if on.faces is not None:
@@ -135,30 +131,30 @@ def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
 
 
 def load_surface(
-    session: SessionLike,
+    job: Job,
     scan: str,
-    *,
     model: str | None = None,
     roi: str = "",
     accept_rejected: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
+    load: LoadSurface | None = None,
 ) -> MeasuredSurface:
     """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``;
-    ``roi`` as in `resolve_region`, for captures alone."""
-    with opened(session) as store:
-        if scan.startswith(MERGED):
-            refuse_region(scan, roi)
-            return load_merged_surface(store, scan, warn)
-        check_accepted(store, accept_rejected)
-        warn_if_stale(store, warn)
-        cloud = scan_cloud(
-            store, scan, model or preferred_model(store), progress, warn, accept_rejected, roi
-        )
-        fitted = load_model(store, cloud.model)
-        measured_surface = surface_from_cloud(store, scan, cloud, fitted, with_region=not roi)
-        progress(1.0, "reconstructed")
-    return measured_surface
+    ``roi`` as in `resolve_region`, for captures alone. ``load`` returns a surface that is at
+    hand."""
+    store, warn = job.store, job.warn
+    if load is not None:
+        return load(store)
+    if scan.startswith(MERGED):
+        refuse_region(scan, roi)
+        return load_merged_surface(store, scan, warn)
+    check_accepted(store, accept_rejected)
+    warn_if_stale(store, warn)
+    model = model or preferred_model(store)
+    cloud = scan_cloud(store, scan, model, job.progress, warn, accept_rejected, roi)
+    fitted = load_model(store, cloud.model)
+    surface = surface_from_cloud(store, scan, cloud, fitted, with_region=not roi)
+    job.progress(1.0, "reconstructed")
+    return surface
 
 
 def surface_from_cloud(
@@ -168,15 +164,15 @@ def surface_from_cloud(
 
     ``with_region``: whether it was cut by the session's region, where that is in effect.
     """
-    calibration = f"calibration/{fitted.name}"
+    calibration, scale, sigma = f"calibration/{fitted.name}", 1.0, 0.0
     names = [scan, calibration]
-    if load_scale_correction(store, fitted.name) is not None:
+    if (applied := load_scale_correction(store, fitted.name)) is not None:
         names.append(f"scale/{fitted.name}")
+        scale, sigma = float(applied["factor"]), 1e-6 * float(applied["U_ppm"]) / 2
     inputs = store.input_hashes(*names) | restriction_inputs(store, [scan], with_region=with_region)
-    scale = scale_factor(store, fitted.name)
     shared = None
     if isinstance(fitted, SplinedModel):
-        shared = splined_shared(fitted.bundle, cloud.axis, scale, scale_sigma(store, fitted.name))
+        shared = splined_shared(fitted.bundle, cloud.axis, scale, sigma)
     return MeasuredSurface(
         cloud.points,
         cloud.sigma_z,
@@ -209,7 +205,3 @@ def load_merged_surface(
         texture=points.colours,
         scale=record.scales.get(record.model, 1.0),
     )
-
-
-LoadSurface = Callable[[Session], MeasuredSurface]
-"""Returns a surface of a session that is at hand already."""

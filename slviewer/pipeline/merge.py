@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import msgspec
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
@@ -16,15 +17,7 @@ from slviewer.pipeline.align import load_places
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Warn, stage
-from slviewer.pipeline.models import (
-    Model,
-    ModelName,
-    check_accepted,
-    frame_of,
-    load_model,
-    preferred_model,
-    warn_if_stale,
-)
+from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
 from slviewer.pipeline.open_session import next_number, placed_file
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scale import describe_scale, scale_factor
@@ -56,7 +49,6 @@ from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 from slviewer.surface.fuse import Fused, fuse
-from slviewer.surface.region_of_interest import RegionOfInterest
 
 MAX_CONTRADICTION_SHARE = 0.01
 """Share of contradicting points from which on a pair is warned about: noise alone has fewer than
@@ -86,11 +78,6 @@ class MergedScans:
     def record(self) -> Merge:
         """The figures of the merge."""
         return self.found.record
-
-    @property
-    def out(self) -> Path:
-        """The file of the surface."""
-        return self.found.files[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,20 +166,14 @@ def merge(job: Job, settings: MergeSettings) -> Iterator[Found[Merge]]:
     Reports the uncertainty of each registered pair, how well loops close, and what was excluded,
     and why.
     """
-    with _merging(job, settings) as merged:
+    with merge_scans(job, settings) as merged:
         yield merged.found  # and its file appears once that is stored
 
 
-def merge_scans(job: Job, settings: MergeSettings) -> MergedScans:
-    """Register and fuse scans, and write the file of the merge; nothing is stored."""
-    with _merging(job, settings) as merged:
-        return merged
-
-
 @contextmanager
-def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
-    """Context manager: registered and fused scans; the file of the merge gets its place at the
-    end."""
+def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
+    """Context manager: registered and fused scans, not stored yet; the file of the merge gets its
+    place at the end."""
     store, names, warn = job.store, settings.names, job.warn
     if settings.out is not None:
         # or it fails now, not after minutes
@@ -200,119 +181,86 @@ def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     table_deg = _list_table_angles(store, settings)
     starts = _initial_alignments(store, settings, table_deg, warn)
     check_accepted(store, settings.accept_rejected)
-    fitted = load_model(store, settings.model or preferred_model(store))
+    fitted = load_model(store, settings.model)
     warn_if_stale(store, warn)
     check_capture_sizes(store, names)
-    cuts = _list_cuts(store, settings)
-    clouds = _reconstruct_scans(job, settings, fitted, cuts)
-    if settings.start == "markers":
-        starts = replace(starts, markers=_measure_markers(clouds, warn))
-    elif table_deg is not None:
-        starts = replace(starts, markers=_measure_mat(clouds, table_deg, warn))
+    region = resolve_region(store, settings.roi)
+    restrictions = restriction_notes(store, names, region)
+    inputs = restriction_inputs(store, names, with_region=not settings.roi)
+    clouds, accepts = dict[str, Cloud](), settings.accept_rejected
+    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
+        job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
+        texture = capture_texture(shot, frames, stretch=False)
+        cloud = capture_cloud(
+            store, fitted, shot, phases, texture=texture, accept_rejected=accepts, warn=warn
+        )
+        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
+    if settings.start == "markers" or table_deg is not None:
+        markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
+        if table_deg is None:
+            _check_markers(markers, warn)
+        if table_deg is None or _is_mat(markers, table_deg, warn):
+            starts = replace(starts, markers=markers)
     registered = register_object(
         clouds, settings.reference, starts, stage(job.progress, 0.4, 0.75, "registering")
     )
-    alignment = registered.alignment
-    moved, background = _list_moved_markers(alignment), settings.keep_background
-    for why in [
-        *moved,
-        *alignment.dropped.values(),
-        *_scene_warnings(clouds, registered, background),
-    ]:
+    alignment, background = registered.alignment, settings.keep_background
+    for why in _list_warnings(clouds, registered, background):
         warn(why)
     clouds = clouds if background else dict(registered.clouds)
     left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
     fused = fuse(clouds, alignment.T_reference_scan, stage(job.progress, 0.75, 0.9, "fusing"), left)
     job.progress(0.9, "writing")
-    with _write_merge(store, settings, fitted.name, registered, fused, cuts) as found:
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{fitted.name}"))
+    record = _make_record(
+        registered,
+        fused,
+        model=fitted.name,
+        scale=describe_scale(store, fitted.name),
+        restrictions=list(restrictions),
+        scales={fitted.name: scale_factor(store, fitted.name)},
+        inputs={**store.input_hashes(*fused.names, *calibrations), **inputs},
+    )
+    with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")
 
 
-@dataclass(frozen=True)
-class _Cuts:
-    """What scans are restricted by: the region, edits and region in words, and their hashes, as
-    inputs."""
-
-    region: RegionOfInterest | None
-    notes: tuple[str, ...]
-    inputs: Mapping[str, str]
-
-
-def _list_cuts(store: Session, settings: MergeSettings) -> _Cuts:
-    """Return what the scans are restricted by now."""
-    names, region = settings.names, resolve_region(store, settings.roi)
-    inputs = restriction_inputs(store, names, with_region=not settings.roi)
-    return _Cuts(region, restriction_notes(store, names, region), inputs)
-
-
-def _reconstruct_scans(
-    job: Job, settings: MergeSettings, fitted: Model, cuts: _Cuts
-) -> dict[str, Cloud]:
-    """Return the cloud of each scan without what edits and region remove."""
-    store, names, clouds = job.store, settings.names, {}
-    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, job.warn)):
-        job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
-        texture = capture_texture(shot, frames, stretch=False)
-        accepted = settings.accept_rejected
-        cloud = capture_cloud(
-            store, fitted, shot, phases, texture=texture, accept_rejected=accepted, warn=job.warn
-        )
-        clouds[shot.name] = restrict_cloud(store, shot.name, cloud, cuts.region)
-    return clouds
-
-
 @contextmanager
 def _write_merge(
-    store: Session,
-    settings: MergeSettings,
-    model: str,
-    registered: ObjectAlignment,
-    fused: Fused,
-    cuts: _Cuts,
+    store: Session, settings: MergeSettings, fused: Fused, record: Merge
 ) -> Iterator[Found[Merge]]:
-    """Context manager: the record of a merge, to be stored unless its PLY has a place of its own,
-    which it gets at the end."""
-    surface = fused.surface
+    """Context manager: the record of a merge with its PLY, to be stored unless that has a place of
+    its own, which it gets at the end."""
+    surface, model = fused.surface, record.model
     scalars = {} if surface.sigma_mm is None else {"sigma": surface.sigma_mm}
     scalars |= {"seen_by": fused.seen_by, "source": fused.source}
     frame = f"{frame_of(store, model)}, at {settings.reference}"
-    notes = (
-        f"scans {', '.join(settings.names)}, frame: {frame}",
-        f"calibration {model}",
-        *cuts.notes,
-    )
+    scans = f"scans {', '.join(settings.names)}, frame: {frame}"
+    comments = (scans, f"calibration {model}", *record.restrictions)
     number = next_number(store, "merge") if settings.out is None else 0
     with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
-        write_ply(written, surface.points, surface.colours, surface.normals, scalars, notes=notes)
-        calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
-        record = _make_record(
-            registered,
-            fused,
-            ply=path.name,
-            model=model,
-            scale=describe_scale(store, model),
-            restrictions=list(cuts.notes),
-            scales={model: scale_factor(store, model)},
-            inputs={**store.input_hashes(*fused.names, *calibrations), **cuts.inputs},
+        write_ply(
+            written, surface.points, surface.colours, surface.normals, scalars, notes=comments
         )
         r1, r2 = letter.EXPERIMENT_3_ICP_RMS_MM.values()
-        said = [
+        notes = [
             f"(The Letter's three depths: point to point {r1:.2f} and {r2:.2f} mm.)",
             f"{record.points:,} points -> {path}",
         ]
         if number:
-            said.append(
+            notes.append(
                 f"the session stores it as merge/{number}: mesh, compare and measure accept that"
                 " name"
             )
-        yield Found(str(number or path.stem), record, {}, (path,), tuple(said), stored=bool(number))
+        placed = msgspec.structs.replace(record, ply=path.name)
+        name = str(number or path.stem)
+        yield Found(name, placed, files=(path,), notes=tuple(notes), stored=bool(number))
 
 
-def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, MeasuredMarkers]:
-    """Measure the coded markers on the scans; raises InputError where no two scans show the same
+def _check_markers(measured: Mapping[str, MeasuredMarkers], warn: Warn) -> None:
+    """Warn of coded markers that cannot be used; InputError where no two scans show the same
     one."""
-    measured = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     for note in marker_notes(measured):
         warn(note)
     numbers = [set(markers.ids.tolist()) for markers in measured.values()]
@@ -323,17 +271,15 @@ def _measure_markers(clouds: Mapping[str, Cloud], warn: Warn) -> dict[str, Measu
             " target markers:0-23:20`, put them on or beside the object so that neighbouring scans"
             " share three or more, and scan again; or start from features"
         )
-    return measured
 
 
-def _measure_mat(
-    clouds: Mapping[str, Cloud], table_deg: Mapping[str, float], warn: Warn
-) -> dict[str, MeasuredMarkers] | None:
-    """Measure the markers on a turntable, from which its axis follows; None where there are none,
-    or where they do not turn with it."""
-    measured = {name: measure_markers(cloud) for name, cloud in clouds.items()}
+def _is_mat(
+    measured: Mapping[str, MeasuredMarkers], table_deg: Mapping[str, float], warn: Warn
+) -> bool:
+    """Whether the markers on the scans turn with the turntable, so that its axis follows from
+    them."""
     compared = []
-    for a, b in pairwise(name for name in clouds if name in table_deg):
+    for a, b in pairwise(name for name in measured if name in table_deg):
         try:
             pose = fit_marker_pose(measured[a], measured[b])
         except Refused:
@@ -341,55 +287,36 @@ def _measure_mat(
         if pose is not None and len(pose.ids) >= MAT_MARKERS:
             turn_deg = abs(shortest_turn(table_deg[b] - table_deg[a]))
             compared.append(abs(float(np.degrees(rotation_angle(pose.T[:3, :3]))) - turn_deg))
-    if not compared:
-        return None
-    if max(compared) > MAT_TURN_DEG:
+    if compared and max(compared) > MAT_TURN_DEG:
         warn(
             f"coded markers are in view, and they turn by {max(compared):.1f} degrees more or less"
             " than the table: they are ignored; put them on the table, or check its angles"
         )
-        return None
-    return measured
+        return False
+    return bool(compared)
 
 
-def _list_moved_markers(alignment: MultiwayAlignment) -> list[str]:
-    """A sentence for each pair between whose scans markers have moved."""
-    return [
+def _list_warnings(
+    clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool
+) -> list[str]:
+    """Warnings of markers that have moved, of pairs that were dropped, and of points that are not
+    the object, or contradict another scan, with the remedy."""
+    alignment = registered.alignment
+    messages = [
         f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is"
         " ignored: glue it on, or take it away"
         for (a, b), pose in alignment.markers.items()
         if pose.moved
     ]
-
-
-def _load_places(store: Session, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The poses (4, 4) of scans that are in place, all in one frame; InputError where some are
-    not."""
-    places = load_places(store)
-    if missing := [name for name in names if name not in places]:
-        raise InputError(
-            f"{' and '.join(missing)} were not aligned: align them first, or start from features"
-        )
-    return {name: places[name] for name in names}
-
-
-def _scene_warnings(
-    clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool
-) -> list[str]:
-    """Warnings of points that are not the object, or contradict another scan, with the remedy."""
-    messages = []
+    messages += alignment.dropped.values()
     still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
     if still:
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
+        where = "in the merge once for each scan" if keep_background else "not part of the merge"
         messages.append(
             f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while"
-            " the object moves: "
-            + (
-                "they are in the merge once for each scan"
-                if keep_background
-                else "they are not part of the merge"
-            )
+            f" the object moves: they are {where}"
         )
     for (one, other), contradiction in registered.contradictions.items():
         if contradiction.share > MAX_CONTRADICTION_SHARE:
@@ -494,17 +421,22 @@ def _initial_alignments(
     it."""
     names, poses = settings.names, settings.poses
     if settings.start == "placed":
-        poses = _load_places(store, names)
+        poses = load_places(store)
+        if missing := [name for name in names if name not in poses]:
+            raise InputError(
+                f"{' and '.join(missing)} were not aligned: align them first, or start from"
+                " features"
+            )
+        poses = {name: poses[name] for name in names}
     elif settings.start == "identity" and poses is None:
-        poses = {name: np.eye(4) for name in names}
+        poses = dict.fromkeys(names, np.eye(4))
     picks = {}
     for (scan, onto), (pick, apart) in settings.fit_picks().items():
         picks[scan, onto] = pick
         warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
     for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
         # pairs without picked points start there too
-        if all((name, base) in picks for name in names if name != base):
-            poses = {base: np.eye(4)} | {
-                name: picks[name, base].T for name in names if name != base
-            }
+        others = [name for name in names if name != base]
+        if all((name, base) in picks for name in others):
+            poses = {base: np.eye(4)} | {name: picks[name, base].T for name in others}
     return Starts(poses=poses, table_deg=table_deg, axis=settings.axis, picked=picks)

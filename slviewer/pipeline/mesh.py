@@ -1,13 +1,16 @@
-"""From captures, or from a stored merge, to a mesh in a file."""
+"""From captures, or from a stored merge, to a mesh in a file, with a texture whose white may be
+balanced by the board or a grey card."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
+from slviewer.fringe.layout import to_eight_bits
 from slviewer.pipeline.capture_clouds import (
     merge_name,
     points_with_normals,
@@ -20,19 +23,25 @@ from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.operation import Findings, Job, show_found
+from slviewer.pipeline.operation import Callbacks, Findings, Job, show_found, takes_settings
+from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
-from slviewer.pipeline.settings import Callbacks, takes_settings
 from slviewer.pipeline.stored_records import load_record
-from slviewer.pipeline.white_balance import balance, measure_white
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
+from slviewer.session.capture import Capture
 from slviewer.session.mesh_files import write_shape, write_textured
 from slviewer.session.store import Session
 from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.texture import TexturedMesh, texture_mesh
 
+BOARD = "board"
+WHITE_SHARE = 0.25
+"""Of a reference's pixels, the brightest: a board has dark marks too."""
+SATURATED, DARKEST = 250, 10
+"""Grey levels between which a reference tells its colour."""
+MAX_GAIN = 8.0
 TEXTURED_TRIANGLES = 100_000
 """To so many a mesh is thinned that gets a texture, unless another number is given."""
 
@@ -139,12 +148,11 @@ def mesh(settings: MeshSettings) -> MeshResult:
     ``merge/`` alone is the session's last merge. The points of merged scans are written next to the
     mesh.
     """
-    sources, texture = settings.sources, settings.texture
-    progress, warn, accept_rejected = settings.progress, settings.warn, settings.accept_rejected
-    plan = settings.plan or MeshingPlan()
+    sources, texture, progress = settings.sources, settings.texture, settings.progress
+    warn, accept_rejected = settings.warn, settings.accept_rejected
+    plan, merged = settings.plan or MeshingPlan(), None
     if texture is not None and plan.triangles is None:
         plan = replace(plan, triangles=TEXTURED_TRIANGLES)
-    merged = None
     with opened(settings.session) as store:
         check_accepted(store, accept_rejected)
         gains = measure_white(store, settings.white) if settings.white else None
@@ -159,8 +167,8 @@ def mesh(settings: MeshSettings) -> MeshResult:
                 sources, sources[0], path.with_name(f"{path.stem}_points.ply"), settings.model,
                 settings.start, settings.angle, roi=settings.roi, accept_rejected=accept_rejected,
             )  # fmt: skip
-            merged = merge_scans(Job(store, before, warn), merging)
-            shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
+            with merge_scans(Job(store, before, warn), merging) as merged:
+                shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGED):
             refuse_region(sources[0], settings.roi)
             name = merge_name(store, sources[0].removeprefix(MERGED))
@@ -175,26 +183,23 @@ def mesh(settings: MeshSettings) -> MeshResult:
         if texture is not None:
             clouds, poses = _textured_scans(store, settings, shape, merged)
             rig = load_stereo(store).rig
-    made = None if merged is None else show_found(merged.found)
     meshed = build_mesh(shape, plan, part(progress, 0.5, 0.95 if texture is None else 0.6))
     notes = (f"of {', '.join(sources)}", *restrictions, *meshed.text().splitlines())
     textured = None
-    if texture is None:
-        progress(0.95, f"writing {path.name}")
-        write_shape(path, meshed.mesh, notes=notes)
-    else:
+    if texture is not None:
         if gains is not None:
             clouds = {name: _balance_cloud(name, cloud, gains) for name, cloud in clouds.items()}
-        projector, painting = (
-            -rig.R.T @ rig.t,
-            stage(progress, 0.6, 0.95, "projecting the scans onto the mesh"),
-        )
+        painting = stage(progress, 0.6, 0.95, "projecting the scans onto the mesh")
         textured = texture_mesh(
-            meshed.mesh, clouds, poses, size=texture, light=projector, progress=painting
+            meshed.mesh, clouds, poses, size=texture, light=-rig.R.T @ rig.t, progress=painting
         )
-        progress(0.95, f"writing {path.name}")
+    progress(0.95, f"writing {path.name}")
+    if textured is None:
+        write_shape(path, meshed.mesh, notes=notes)
+    else:
         write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
+    made = None if merged is None else show_found(merged.found)
     return MeshResult(meshed, sources, path, made, textured)
 
 
@@ -204,17 +209,14 @@ def _textured_scans(
     """Return the cloud of every scan that the mesh is made of, and its pose (4, 4) in the mesh's
     frame."""
     if merged is not None:
-        return {
-            name: merged.clouds[name] for name in merged.fused.names
-        }, merged.alignment.T_reference_scan
+        clouds = {name: merged.clouds[name] for name in merged.fused.names}
+        return clouds, merged.alignment.T_reference_scan
     (source,) = settings.sources
     if isinstance(shape, Cloud):
         return {source: shape}, {source: np.eye(4)}
     made = load_record(store, Merge, merge_name(store, source.removeprefix(MERGED)))
-    placed = {
-        name: np.array(pair.T_reference_scan, np.float64) for name, pair in made.pairs.items()
-    }
-    placed |= {made.reference: np.eye(4)}
+    placed = {made.reference: np.eye(4)}
+    placed |= {name: np.array(pair.T_reference_scan) for name, pair in made.pairs.items()}
     used = made.model or settings.model
     clouds = {  # what lies outside of the region still hides the surface from a scan
         name: scan_cloud(
@@ -233,3 +235,69 @@ def _balance_cloud(name: str, cloud: Cloud, gains: np.ndarray) -> Cloud:
             f"the picture of {name} has no colours: make the texture without a white balance"
         )
     return replace(cloud, texture=balance(cloud.texture, gains))
+
+
+def measure_white(store: Session, reference: str) -> np.ndarray:
+    """Return the gains (3,) of red, green and blue, at most 1, that make a reference neutral.
+
+    ``reference``: a capture of a grey card or white sheet that fills most of the view, a target
+    pose, or ``board``: all target poses. Raises InputError for pictures without colours, and for
+    white that is overexposed or too dark.
+    """
+    if reference != BOARD:
+        return _measure_gains(store, store.load_capture(reference))
+    captures = [capture for capture in store.captures("calibration") if capture.texture is not None]
+    if not captures:
+        raise InputError(
+            "the target poses have no colours, so that the board's white is unknown: capture them"
+            " with a colour camera and a white image, or name a capture of a grey card"
+        )
+    gains, refusals = list[np.ndarray](), list[str]()
+    for capture in captures:
+        try:
+            gains.append(_measure_gains(store, capture))
+        except InputError as error:
+            refusals.append(str(error))
+    if not gains:
+        raise InputError(refusals[0])
+    middle = np.median(gains, axis=0)
+    return np.asarray(middle / middle.max())
+
+
+def balance(texture: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return a texture (h, w, 3) uint8 with the gains (3,) applied; overexposed pixels become
+    neutral."""
+    return np.rint(np.minimum(texture * gains, 255 * gains.min())).astype(np.uint8)
+
+
+def _measure_gains(store: Session, capture: Capture) -> np.ndarray:
+    """Return the gains of one reference."""
+    texture = capture.texture
+    if texture is None:
+        raise InputError(
+            f"{capture.name} has no colours: name a capture of a colour camera with a white image"
+        )
+    texture = to_eight_bits(texture, capture.sequence.full_scale)
+    if observed := load_observations(store, [capture.name]):  # a target pose: its board
+        hull = cv2.convexHull(np.rint(observed[0].camera).astype(np.int32))
+        mask = cv2.fillConvexPoly(np.zeros(texture.shape[:2], np.uint8), hull, 1) == 1
+    else:  # what is lit
+        levels = texture.max(axis=2)
+        mask = levels >= 0.5 * np.quantile(levels, 0.99)
+    pixels = texture[mask].astype(np.float64)
+    brightness = pixels.max(axis=1)
+    white = pixels[brightness >= np.quantile(brightness, 1 - WHITE_SHARE)]
+    usable = white[white.max(axis=1) < SATURATED]
+    if len(usable) < len(white) / 2:
+        share = 100 * (1 - len(usable) / len(white))
+        raise InputError(
+            f"{share:.0f} % of the white in {capture.name} is overexposed: lower the exposure"
+        )
+    colour = np.median(usable, axis=0)
+    if colour.min() < DARKEST or colour.max() > MAX_GAIN * colour.min():
+        levels = ", ".join(f"{level:.0f}" for level in colour)
+        raise InputError(
+            f"the white in {capture.name} has {levels} grey levels of red, green and blue: expose"
+            f" it so that each has {DARKEST} or more, none {MAX_GAIN:g} times another"
+        )
+    return np.asarray(colour.min() / colour)

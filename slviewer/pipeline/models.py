@@ -1,7 +1,7 @@
 """Calibrations in a session: saving, loading, choosing, and noticing when one is stale."""
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -39,9 +39,9 @@ COMPILED_VERSION = 1
 MAX_LOADED = 2
 _LOADED: dict[str, Model] = {}  # by the hash of the saved result
 _LOADED_LOCK = threading.Lock()
-_RESTORED: dict[str, Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], Model]] = {
-    "pixelwise": PixelwiseModel.from_arrays,
-    "splined": SplinedModel.from_arrays,
+_RESTORED: dict[str, type[PixelwiseModel | SplinedModel]] = {
+    "pixelwise": PixelwiseModel,
+    "splined": SplinedModel,
 }
 
 
@@ -100,9 +100,8 @@ def save_imported_stereo(
 ) -> None:
     """Save imported matrices as the session's stereo calibration; sizes that are None follow from
     its captures."""
-    imported = {name: value.tolist() for name, value in matrices.items()}
     meta = {
-        "imported": imported,
+        "imported": {name: value.tolist() for name, value in matrices.items()},
         "source": source,
         "camera": camera,
         "projector": projector,
@@ -152,7 +151,9 @@ def load_calibration(
     that is accepted.
     """
     with opened(session) as store:
-        return load_model(store, model or best_model(store, accept_rejected))
+        if not model:
+            check_accepted(store, accept_rejected)
+        return load_model(store, model)
 
 
 def load_stereo_if_complete(store: Session) -> StereoModel | None:
@@ -168,12 +169,8 @@ def load_stereo_if_complete(store: Session) -> StereoModel | None:
 def load_residuals(store: Session) -> dict[str, np.ndarray]:
     """{pose: (n, 4) px} camera and projector residuals of the stereo calibration; empty for one
     made elsewhere."""
-    arrays = store.load_result("calibration/stereo")[1]
-    return {
-        name.removeprefix("residuals_"): r
-        for name, r in arrays.items()
-        if name.startswith("residuals_")
-    }
+    arrays, start = store.load_result("calibration/stereo")[1], "residuals_"
+    return {name.removeprefix(start): r for name, r in arrays.items() if name.startswith(start)}
 
 
 def load_model(store: Session, name: str | None) -> Model:
@@ -186,8 +183,7 @@ def load_model(store: Session, name: str | None) -> Model:
         there = ", ".join(available_models(store))
         raise InputError(
             f"{store.folder} holds no {name} calibration"
-            f" ({f'there is {there}' if there else 'there is none'}): run `slviewer calibrate`"
-            " first"
+            f" (there is {there or 'none'}): run `slviewer calibrate` first"
         )
     if name == "stereo":
         return load_stereo(store)
@@ -204,7 +200,7 @@ def load_model(store: Session, name: str | None) -> Model:
             f" {fault}: run `slviewer calibrate` again"
         ),
     ):
-        model = _RESTORED[name](meta["model"], arrays)
+        model: Model = _RESTORED[name].from_arrays(meta["model"], arrays)
     if isinstance(model, SplinedModel):
         _restore_or_compile(store, model, content)
     with _LOADED_LOCK:
@@ -216,42 +212,27 @@ def load_model(store: Session, name: str | None) -> Model:
 def _restore_or_compile(store: Session, model: SplinedModel, content: str) -> None:
     """Load what was compiled from the splined calibration of this hash; else compile and save it,
     where possible."""
+    inputs = {"calibration/splined": content}
     if store.has_result(COMPILED):
         with suppress(SessionError, KeyError):  # damaged: it is compiled again
             meta, arrays = store.load_result(COMPILED)
-            if (
-                meta["inputs"] == {"calibration/splined": content}
-                and meta["version"] == COMPILED_VERSION
-            ):
+            if (meta["inputs"], meta["version"]) == (inputs, COMPILED_VERSION):
                 model.restore_compiled(meta["compiled"], arrays)
                 return
     if store.is_writable:
         compiled, arrays = model.compile_depth()
-        inputs = {"calibration/splined": content}
+        meta = {"compiled": compiled, "version": COMPILED_VERSION, "inputs": inputs}
         with suppress(SessionError):  # a full disk prevents nothing else
-            store.save_result(
-                COMPILED,
-                {"compiled": compiled, "version": COMPILED_VERSION, "inputs": inputs},
-                arrays,
-            )
-
-
-def best_model(store: Session, accept_rejected: bool = False) -> str:
-    """Return the calibration to use where none is named: see ``preferred_model``.
-
-    Raises CalibrationRejected, with the reason, for one that was rejected, unless that is accepted.
-    """
-    check_accepted(store, accept_rejected)
-    return preferred_model(store)
+            store.save_result(COMPILED, meta, arrays)
 
 
 def preferred_model(store: Session) -> str:
     """Return the name of the model that the operator has chosen, while it exists; else
     ``recommended_model``."""
     decided = store.decision("model")
-    return (
-        str(decided) if decided and decided in available_models(store) else recommended_model(store)
-    )
+    if decided and decided in available_models(store):
+        return str(decided)
+    return recommended_model(store)
 
 
 def recommended_model(store: Session) -> str:
@@ -275,24 +256,19 @@ def _recommend(store: Session) -> tuple[str, str]:
     there = available_models(store)
     if not there:
         raise InputError(f"{store.folder} holds no calibration: run `slviewer calibrate` first")
-    compared = load_comparison(store)
+    compared = store.decode_fresh(
+        "validation/1", lambda meta, _: read_record(ModelComparison, meta), only=()
+    )
     if compared is not None and compared.recommended in there and compared.covers(there):
         return compared.recommended, "recommended by the comparison on held-out poses"
     for name in ("splined", "pixelwise"):
-        if (
-            name in there
-            and len(store.load_result(f"calibration/{name}", only=())[0]["inputs"])
-            >= POSES_FOR_PIXELWISE
-        ):
-            return name, f"made from {POSES_FOR_PIXELWISE} poses or more"
+        if name in there:
+            inputs = store.load_result(f"calibration/{name}", only=())[0]["inputs"]
+            if len(inputs) >= POSES_FOR_PIXELWISE:
+                return name, f"made from {POSES_FOR_PIXELWISE} poses or more"
     if others := there[1:]:
-        return (
-            there[0],
-            (
-                f"{' and '.join(others)} from fewer than {POSES_FOR_PIXELWISE} poses are used only"
-                " by --model"
-            ),
-        )
+        few = f"fewer than {POSES_FOR_PIXELWISE} poses are used only by --model"
+        return there[0], f"{' and '.join(others)} from {few}"
     return there[0], "the only one"
 
 
@@ -307,9 +283,8 @@ def find_target(store: Session) -> str:
         stereo = load_stereo_if_complete(store)
     if stereo is not None and stereo.board:
         return stereo.board
-    return next(
-        (str(c.meta["board"]) for c in store.captures("calibration") if c.meta.get("board")), ""
-    )
+    boards = (c.meta.get("board") for c in store.captures("calibration"))
+    return str(next(filter(None, boards), ""))
 
 
 def explain_board(notation: str) -> str:
@@ -324,14 +299,6 @@ def explain_board(notation: str) -> str:
             " another board"
         )
     return ""
-
-
-def load_comparison(store: Session) -> ModelComparison | None:
-    """How the session's calibrations compare on poses that they were not made from; None where they
-    were not compared as they are now."""
-    return store.decode_fresh(
-        "validation/1", lambda meta, _: read_record(ModelComparison, meta), only=()
-    )
 
 
 def rejection_reason(store: Session) -> str:
@@ -364,9 +331,8 @@ def accept_rejected_calibration(store: Session, on: bool) -> None:
 def accepts_rejected(store: Session) -> bool:
     """Whether the operator decided to use the present calibration although it was rejected."""
     decided = store.decision("use_anyway")
-    if not decided or "stereo" not in available_models(store):
-        return False
-    return bool(decided == store.input_hashes("calibration/stereo")["calibration/stereo"])
+    there = decided and "stereo" in available_models(store)
+    return bool(there) and decided == store.input_hashes("calibration/stereo")["calibration/stereo"]
 
 
 def frame_family(name: str) -> str:
@@ -404,16 +370,12 @@ def load_models(store: Session, names: Sequence[str]) -> dict[str, Model]:
 
 def warn_if_stale(store: Session, warn: Warn) -> None:
     """Warn when target poses have changed since the calibration was made."""
-    stale = [
-        name for name in available_models(store) if store.state_of(f"calibration/{name}") == "stale"
-    ]
+    names = available_models(store)
+    stale = [name for name in names if store.state_of(f"calibration/{name}") == "stale"]
     if stale:
-        *others, last = stale
-        which = (
-            f"{', '.join(others)} and {last} calibrations were"
-            if others
-            else f"{last} calibration was"
-        )
+        which = f"{stale[0]} calibration was"
+        if len(stale) > 1:
+            which = f"{', '.join(stale[:-1])} and {stale[-1]} calibrations were"
         warn(
             f"the {which} made from target poses that have since been replaced or removed: run"
             " `slviewer calibrate` again"

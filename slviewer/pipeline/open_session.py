@@ -1,7 +1,7 @@
 """A session by its folder, or one that is open already, and names in it."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -13,34 +13,26 @@ from slviewer.session.store import Session
 SessionLike = Path | str | Session
 
 
-@contextmanager
-def opened(session: SessionLike, write: bool = False) -> Iterator[Session]:
-    """Context manager: the session; one that was opened here is closed at the end, one that was
-    open stays so."""
+def opened(session: SessionLike, write: bool = False) -> AbstractContextManager[Session]:
+    """Return a context manager of the session; one that was opened here is closed at the end, one
+    that was open stays so."""
     if isinstance(session, Session):
-        yield session
-    else:
-        with Session.open(session, write=write) as store:
-            yield store
+        return nullcontext(session)
+    return Session.open(session, write=write)
 
 
-@contextmanager
-def opened_to_save(session: SessionLike, warn: Warn) -> Iterator[Session]:
-    """Context manager: the session, to store results in where ``is_writable``.
+def opened_to_save(session: SessionLike, warn: Warn) -> AbstractContextManager[Session]:
+    """Return a context manager of the session, to store results in where ``is_writable``.
 
     One that another process is writing to, or that cannot be written, is opened for reading, with a
     warning.
     """
-    if isinstance(session, Session):
-        yield session
-        return
     try:
-        store = Session.open(session, write=True)
+        return opened(session, write=True)
     except SessionError as error:
-        store = Session.open(session)
+        store = opened(session)
         warn(f"the result is not stored in the session: {error}")
-    with store:
-        yield store
+        return store
 
 
 @contextmanager
@@ -89,16 +81,13 @@ def match_names(
     return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
-def numbered_results(store: Session, kind: str) -> list[str]:
-    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., in the order of
-    their numbers."""
-    return sorted(
-        (name for name in store.result_names() if name.startswith(f"{kind}/")), key=natural_key
-    )
+def numbered_names(store: Session, kind: str) -> list[str]:
+    """Names of the session's results of a kind, ``merge/1``, ``merge/2``, ..., without it, in the
+    order of their numbers."""
+    names = (name for name in store.result_names() if name.startswith(f"{kind}/"))
+    return sorted((name.removeprefix(f"{kind}/") for name in names), key=natural_key)
 
 
 def next_number(store: Session, kind: str) -> int:
     """Return the number of the next result of a kind."""
-    return 1 + max(
-        (int(name.removeprefix(f"{kind}/")) for name in numbered_results(store, kind)), default=0
-    )
+    return 1 + max(map(int, numbered_names(store, kind)), default=0)

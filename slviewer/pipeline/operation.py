@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
-from functools import partial, update_wrapper
+from functools import partial, update_wrapper, wraps
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
@@ -14,7 +14,6 @@ import numpy as np
 
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.open_session import SessionLike, opened_to_save
-from slviewer.pipeline.settings import describe
 from slviewer.pipeline.stored_records import save_record
 from slviewer.records.plain import to_plain
 from slviewer.records.record import Record
@@ -23,6 +22,7 @@ from slviewer.session.store import Session
 
 P = ParamSpec("P")
 R = TypeVar("R", bound=Record)
+V = TypeVar("V")
 S = TypeVar("S")
 
 
@@ -112,20 +112,20 @@ class Operation(Generic[P, S, R]):
     def __init__(
         self,
         name: str,
-        function: Callable[[Job, S], Iterator[Found[Any]]],
         record: type[R],
         settings: Callable[P, S],
+        function: Callable[[Job, S], Iterator[Found[Any]]],
     ) -> None:
         update_wrapper(self, function)
         self.name, self.function, self.record, self.settings = name, function, record, settings
-        parameters = inspect.signature(settings).parameters.values()
-        session = inspect.Parameter(
-            "session", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=SessionLike
-        )
+        kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        session = inspect.Parameter("session", kind, annotation=SessionLike)
         self.__signature__ = inspect.Signature(
-            [session, *parameters], return_annotation=Findings[R]
+            [session, *inspect.signature(settings).parameters.values()],
+            return_annotation=Findings[R],
         )
         self.__doc__ = describe(function, settings)
+        OPERATIONS[name] = self
 
     def __call__(self, session: SessionLike, *args: P.args, **kwargs: P.kwargs) -> Findings[R]:
         """Run the operation on a session with these settings, and return what it found."""
@@ -178,13 +178,13 @@ class Operation(Generic[P, S, R]):
 def plain_settings(settings: Any) -> dict[str, Any]:
     """Return the settings that are not the default as plain values, but those that its
     ``UNRECORDED`` names, which do not influence what is found."""
-    kept = [
-        each for each in fields(settings) if each.name not in getattr(settings, "UNRECORDED", ())
-    ]
-    values = {each.name: getattr(settings, each.name) for each in kept}
-    return to_plain(
-        {each.name: values[each.name] for each in kept if values[each.name] != each.default}
-    )  # type: ignore[no-any-return]
+    unrecorded = getattr(settings, "UNRECORDED", ())
+    chosen = {
+        each.name: value
+        for each in fields(settings)
+        if each.name not in unrecorded and (value := getattr(settings, each.name)) != each.default
+    }
+    return to_plain(chosen)  # type: ignore[no-any-return]
 
 
 OPERATIONS: dict[str, Operation[Any, Any, Any]] = {}
@@ -196,10 +196,49 @@ def operation(
 ) -> Callable[[Callable[[Job, S], Iterator[Found[Any]]]], Operation[P, S, R]]:
     """Return a decorator that makes a function the operation of that name, which finds records with
     settings."""
+    return partial(Operation, name, record, settings)
 
-    def register(function: Callable[[Job, S], Iterator[Found[Any]]]) -> Operation[P, S, R]:
-        """Return the function's operation."""
-        OPERATIONS[name] = made = Operation(name, function, record, settings)
-        return made
 
-    return register
+@dataclass(frozen=True, kw_only=True)
+class Callbacks:
+    """What takes the progress and the warnings of work; the base of settings."""
+
+    progress: Progress = ignore_progress
+    warn: Warn = ignore_warnings
+
+
+def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Callable[P, V]]:
+    """Return a decorator of a function of such settings: it is called with their fields.
+
+    The function's docstring describes it, and those of the settings and their bases the fields.
+    """
+
+    def decorate(function: Callable[[S], V]) -> Callable[P, V]:
+        """Return the function that takes the fields."""
+
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> V:
+            return function(settings(*args, **kwargs))
+
+        call.__doc__ = describe(function, settings)
+        signature = inspect.signature(settings)
+        returned = inspect.signature(function).return_annotation
+        call.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
+        return call
+
+    return decorate
+
+
+def describe(function: Callable[..., Any], settings: Callable[..., Any]) -> str:
+    """Return the docstring of a function, with the fields that its settings and their bases
+    describe."""
+    assert inspect.isclass(settings)
+    docs = [
+        inspect.cleandoc(each.__doc__ or "").partition("Args:\n")[2] for each in settings.__mro__
+    ]
+    own, *inherited = docs
+    described, _, rest = own.partition("\n\n")
+    fields = "\n".join([described, *(doc.partition("\n\n")[0] for doc in inherited if doc)])
+    return "\n\n".join(
+        filter(None, (inspect.getdoc(function), fields and f"Args:\n{fields}", rest))
+    )

@@ -1,33 +1,15 @@
 """All operations by the names of their commands: whoever looks one up imports them from here."""
 
-from slviewer.pipeline import (  # each registers its own
+from slviewer.pipeline import (  # noqa: F401 (each registers its own)
     accept,
     align,
     calibrate,
     check,
     compare,
+    inspect_parts,
     measure,
     merge,
     reconstruct,
-    relate,
-    run_plan,
     validate,
-    verify,
 )
-from slviewer.pipeline.operation import OPERATIONS
-
-__all__ = [
-    "OPERATIONS",
-    "accept",
-    "align",
-    "calibrate",
-    "check",
-    "compare",
-    "measure",
-    "merge",
-    "reconstruct",
-    "relate",
-    "run_plan",
-    "validate",
-    "verify",
-]
+from slviewer.pipeline.operation import OPERATIONS as OPERATIONS

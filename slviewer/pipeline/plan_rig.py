@@ -23,7 +23,7 @@ from slviewer.evaluation.rig_plan import (
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import complementary
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.settings import Callbacks, takes_settings
+from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose, blank_board
@@ -91,41 +91,40 @@ class PlannedRig:
 
     def advice(self) -> list[str]:
         """Return what to change, a sentence each."""
-        plan, found = self.plan, []
+        plan, (least_deg, most_deg) = self.plan, _ANGLES_DEG
         ratio = plan.camera_px / plan.projector_px
-        if plan.coverage < _MIN_COVERAGE:
-            wide = (
-                plan.projector_field[0] < plan.camera_field[0]
-                or plan.projector_field[1] < plan.camera_field[1]
-            )
-            change = (
-                "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
-            )
-            found.append(
+        wide = any(np.less(plan.projector_field, plan.camera_field))
+        change = (
+            "a longer lens for the camera, or a greater throw" if wide else "a shorter baseline"
+        )
+        rules = (
+            (
+                plan.coverage < _MIN_COVERAGE,
                 f"the projector lights {100 * plan.coverage:.0f} % of what the camera sees: choose"
-                f" {change}"
-            )
-        if ratio > 1.5:
-            found.append(
+                f" {change}",
+            ),
+            (
+                ratio > 1.5,
                 f"a camera pixel covers {ratio:.1f} projector columns: choose a longer lens or more"
-                " camera pixels"
-            )
-        if plan.angle_deg < _ANGLES_DEG[0]:
-            found.append(
+                " camera pixels",
+            ),
+            (
+                plan.angle_deg < least_deg,
                 f"the angle of {plan.angle_deg:.0f} degrees is small: a longer baseline lowers the"
-                " noise"
-            )
-        if plan.angle_deg > _ANGLES_DEG[1]:
-            found.append(
+                " noise",
+            ),
+            (
+                plan.angle_deg > most_deg,
                 f"the angle of {plan.angle_deg:.0f} degrees is large: much of a part will be hidden"
-                " from one"
-            )
-        if plan.modulation < 20:
-            found.append(
+                " from one",
+            ),
+            (
+                plan.modulation < 20,
                 f"a modulation of {plan.modulation:.0f} grey levels is weak: expose longer, or"
-                " darken the room"
-            )
-        return found
+                " darken the room",
+            ),
+        )
+        return [advice for applies, advice in rules if applies]
 
 
 @dataclass(frozen=True)
@@ -218,38 +217,27 @@ def _simulate_plane(
         replace(camera, size=size), projector, plan.distance, plan.baseline, light, plan.period_px
     )
     rig = cut.rig
-    fx, fy = projector.focal_px
-    ideal = (0.0,) * 5
-    column, row = rig.projector.K[:2, 2].tolist()
+    camera_lens, projector_lens = (
+        SimulatedLens(
+            lens.size, (lens.K[0, 0], lens.K[1, 1]), (lens.K[0, 2], lens.K[1, 2]), (0.0,) * 5
+        )
+        for lens in (rig.camera, rig.projector)
+    )
     focus = float(rig.to_projector(np.array([0.0, 0.0, plan.distance]))[2])
+    blur = projector.blur_px, focus, projector.focal_px[0] * projector.aperture_mm / 4
     # the renderer exposes for what it sees
     peak = DARK_LEVEL + (PEAK_LEVEL - DARK_LEVEL) * light.reflectance
-    simulated = SimulatedRig(
-        SimulatedLens(size, (camera.focal_px,) * 2, ((size[0] - 1) / 2, (size[1] - 1) / 2), ideal),
-        SimulatedLens(projector.size, (fx, fy), (column, row), ideal),
-        np.array(rig.R),
-        np.array(rig.t),
-        Sensor(camera.blur_px, DARK_LEVEL, camera.read_variance, camera.shot_variance, peak),
-        Illumination(
-            light.ambient,
-            projector.black,
-            1.0,
-            0.0,
-            projector.blur_px,
-            focus,
-            fx * projector.aperture_mm / 4,
-        ),
-    )
+    sensor = Sensor(camera.blur_px, DARK_LEVEL, camera.read_variance, camera.shot_variance, peak)
+    illumination = Illumination(light.ambient, projector.black, 1.0, 0.0, *blur)
+    simulated = SimulatedRig(camera_lens, projector_lens, rig.R, rig.t, sensor, illumination)
     plate = blank_board(
         Pose(np.eye(3), np.array([0.0, 0.0, plan.distance])), (4 * plan.camera_field[0],) * 2
     )
     sequence = one_axis(complementary(projector.size, light.steps, plan.period_px), "x")
     phase = decode(sequence, Renderer(simulated, plate).capture(sequence), "x")
     cloud = reconstruct_cloud(StereoModel.from_rig(rig), {"x": phase}, "x")
-    return (
-        float(evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm),
-        cut.sigma_rms,
-    )
+    measured = evaluate_plane(cloud.points, np.isfinite(cloud.points[..., 2])).rms_mm
+    return float(measured), cut.sigma_rms
 
 
 def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
@@ -266,7 +254,7 @@ def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
         what = f"{text}, noise as 2 Mpx machine vision"
         entry = {key: value for key, value in entry.items() if key not in ("pixel_um", "lens_mm")}
         entry["view_deg"] = float(view[3])
-    size = (int(entry["size"][0]), int(entry["size"][1]))
+    width, height = entry["size"]
     if "pixel_um" in entry:
         millimetres = entry["lens_mm"] if lens is None else lens
         if not 1 <= millimetres <= 1000:
@@ -279,12 +267,10 @@ def _read_camera(text: str, lens: float | None) -> tuple[PlannedCamera, str]:
             " camera"
         )
     else:
-        focal = size[0] / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
+        focal = width / 2 / np.tan(np.radians(entry["view_deg"]) / 2)
         aperture = entry.get("aperture_mm", 3.0)
-    camera = PlannedCamera(
-        size, focal, aperture, entry["blur_px"], entry["full_well"], entry["read_noise"]
-    )
-    return camera, what
+    noise = entry["blur_px"], entry["full_well"], entry["read_noise"]
+    return PlannedCamera((width, height), focal, aperture, *noise), what
 
 
 def _read_projector(text: str) -> tuple[PlannedProjector, str]:
@@ -292,23 +278,17 @@ def _read_projector(text: str) -> tuple[PlannedProjector, str]:
     entry, view = _read_device(
         "projector", text, "projector-1080p", "size and throw ratio as in 1920x1080:1.4"
     )
-    ratio, what = (
-        (float(view[3]), f"{text}, as a common projector")
-        if view
-        else (entry["throw_ratio"], entry["what"])
-    )
+    ratio, what = entry["throw_ratio"], entry["what"]
+    if view:
+        ratio, what = float(view[3]), f"{text}, as a common projector"
     if not 0.1 <= ratio <= 20:
         raise InputError(
             f"a throw ratio of {ratio:g} is impossible: give distance over width, 0.1 to 20"
         )
-    size = (int(entry["size"][0]), int(entry["size"][1]))
-    focal = (size[0] * ratio, size[0] * ratio / entry.get("row_pitch", 1.0))
-    return (
-        PlannedProjector(
-            size, focal, entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]
-        ),
-        what,
-    )
+    width, height = entry["size"]
+    focal = (width * ratio, width * ratio / entry.get("row_pitch", 1.0))
+    optics = entry["offset"], entry["aperture_mm"], entry["blur_px"], entry["black"]
+    return PlannedProjector((width, height), focal, *optics), what
 
 
 def _read_device(

@@ -1,18 +1,10 @@
 """Which plugins are installed, and whether each can be used."""
 
 from slviewer.devices.drivers import DRIVER_PLUGINS
-from slviewer.entry_points import Plugin
 from slviewer.errors import InputError
 from slviewer.session.importers.layouts import LAYOUT_PLUGINS
 from slviewer.session.mesh_files import EXPORTER_PLUGINS
 from slviewer.target.board import BOARD_PLUGINS
-
-
-def list_plugins() -> list[Plugin]:
-    """All plugins that are installed, group by group; each is imported. One that cannot be used has
-    a ``problem``."""
-    groups = (DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS)
-    return [plugin for group in groups for plugin in group.plugins]
 
 
 def plugins() -> str:
@@ -20,7 +12,8 @@ def plugins() -> str:
 
     Ends with status 1 where one cannot be used, and states why.
     """
-    found = list_plugins()
+    groups = (DRIVER_PLUGINS, BOARD_PLUGINS, LAYOUT_PLUGINS, EXPORTER_PLUGINS)
+    found = [plugin for group in groups for plugin in group.plugins]
     if not found:
         return "no plugins are installed"
     lines = [

@@ -1,35 +1,54 @@
-"""The observation of each target pose, computed once and stored in the session with its frames."""
+"""The observation of each target pose, and the evidence of its frames, computed once and stored in
+the session as `poses/<name>` and `evidence/<name>`."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from slviewer.calibration.diagnosis.evidence import PoseEvidence
-from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe
+from slviewer.calibration.diagnosis.frames import (
+    fit_mean_turn,
+    measure_axis,
+    measure_motion_px,
+    measure_white_delay,
+)
+from slviewer.calibration.diagnosis.numbering import detect_grid_size
+from slviewer.calibration.observe import READING_VERSION, Observation, Smoothing, observe, pitch_px
 from slviewer.errors import DamagedError, InputError
 from slviewer.fringe.phase import PhaseMap
-from slviewer.fringe.sequence import Axis
+from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.pipeline.capture_phases import (
     capture_texture,
     check_capture,
+    compute_ahead,
     decode_capture,
-    read_ahead,
 )
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
-from slviewer.pipeline.pose_evidence import (
-    DecodedPose,
-    gather_evidence,
-    load_evidence,
-    save_evidence,
-)
 from slviewer.records.examination import Examination
+from slviewer.records.plain import to_plain
 from slviewer.session.capture import Capture
 from slviewer.session.store import Session
 from slviewer.target.board import Board
-from slviewer.target.detect import Detection, detect
+from slviewer.target.detect import Detection, board_mask, detect
+
+EVIDENCE_VERSION = 4
+"""Version of the examination; evidence that was stored by another version is computed again."""
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedPose:
+    """The frames (n, h, w) of a target pose with what they were decoded to; ``texture`` (h, w) or
+    (h, w, 3) uint8 shows the board."""
+
+    name: str
+    sequence: PatternSequence
+    frames: np.ndarray
+    phases: Mapping[Axis, PhaseMap]
+    texture: np.ndarray
+    board: Board
 
 
 @dataclass(frozen=True)
@@ -45,9 +64,9 @@ class Judged:
 def read_pose(
     pose: DecodedPose,
     smoothing: Smoothing,
-    examine: bool = False,
+    examine: bool = True,
     examined: Callable[[], Examination] | None = None,
-    observed: Callable[[Observation], None] = lambda observation: None,
+    observed: Callable[[Observation], None] | None = None,
 ) -> Judged:
     """Return the observation of a decoded target pose, or the reason why there is none.
 
@@ -62,7 +81,8 @@ def read_pose(
     try:
         detection = detect(pose.board, pose.texture)
         observation = observe(name, pose.board, detection, phases, smoothing)
-        observed(observation)
+        if observed is not None:
+            observed(observation)
     except InputError as error:
         refused = str(error).removeprefix(f"{name}: ")
     checked = (examined or partial(examine_frames, sequence, frames))() if examine else None
@@ -77,31 +97,34 @@ def read_pose(
     return Judged(name, None if refused else observation, refused, evidence)
 
 
-def read_stored_pose(
+def _read_stored_pose(
     store: Session,
     capture: Capture,
     frames: np.ndarray,
-    phases: dict[Axis, PhaseMap],
     board: Board,
     smoothing: Smoothing,
-    examine: bool = False,
-    observed: Callable[[Observation], None] = lambda observation: None,
+    observed: Callable[[Observation], None] | None,
 ) -> Judged:
-    """Read the pose as ``read_pose`` does, and save the result and the check of the frames in the
-    session."""
-    pose = DecodedPose(
-        capture.name, capture.sequence, frames, phases, capture_texture(capture, frames), board
-    )
+    """Decode the frames (n, h, w) of a pose, read it as ``read_pose`` does, and save the result and
+    the check of the frames in the session."""
+    phases, texture = decode_capture(capture, frames), capture_texture(capture, frames)
+    pose = DecodedPose(capture.name, capture.sequence, frames, phases, texture, board)
     examined = partial(load_or_save_examination, store, capture, frames)
-    judged = read_pose(pose, smoothing, examine, examined, observed)
-    if judged.evidence is not None:
-        save_evidence(store, capture, board, judged.evidence)
+    judged = read_pose(pose, smoothing, True, examined, observed)
+    inputs, target = {capture.name: capture.hash}, str(board)
     meta = {
-        "target": str(board),
+        "target": target,
+        "look": EVIDENCE_VERSION,
+        "evidence": to_plain(judged.evidence),
+        "inputs": inputs,
+    }
+    store.save_result(f"evidence/{capture.name}", meta, {})
+    meta = {
+        "target": target,
         "smoothing": _list_settings(smoothing),
         "reading": READING_VERSION,
         "refused": judged.refused,
-        "inputs": {capture.name: capture.hash},
+        "inputs": inputs,
     }
     arrays = judged.observation.to_arrays() if judged.observation else {}
     store.save_result(f"poses/{capture.name}", meta, arrays)
@@ -109,17 +132,23 @@ def read_stored_pose(
 
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
-    """Load the stored reading of a pose; None where it is of other frames, another board or another
-    smoothing."""
+    """Load the stored reading of a pose, and the evidence of its frames; None where one is missing,
+    or of other frames, another board or another smoothing."""
+
+    def decode_evidence(meta: Mapping[str, Any], _: object) -> PoseEvidence | None:
+        """Return the evidence, unless it is of another board or version."""
+        current = (meta["target"], meta.get("look")) == (str(board), EVIDENCE_VERSION)
+        return PoseEvidence.from_json(meta["evidence"]) if current else None
 
     def decode(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Judged | None:
         """Return the reading, unless it is of another board, smoothing or version."""
         settings = (meta["target"], meta["smoothing"], meta.get("reading"))
         if settings != (str(board), _list_settings(smoothing), READING_VERSION):
             return None
-        return Judged(name, _decode_observation(name, meta, arrays), meta["refused"])
+        return Judged(name, _decode_observation(name, meta, arrays), meta["refused"], evidence)
 
-    return store.decode_fresh(f"poses/{name}", decode)
+    evidence = store.decode_fresh(f"evidence/{name}", decode_evidence, only=())
+    return None if evidence is None else store.decode_fresh(f"poses/{name}", decode)
 
 
 def read_stored_poses(
@@ -127,14 +156,13 @@ def read_stored_poses(
     names: Sequence[str],
     board: Board,
     smoothing: Smoothing,
-    examine: bool = False,
-    observed: Callable[[Observation], None] = lambda observation: None,
+    observed: Callable[[Observation], None] | None = None,
 ) -> Iterator[Judged]:
-    """Yield every pose in order; frames are read only where no stored result is valid. Damaged
-    frames refuse the pose.
+    """Yield every pose in order, with the evidence of its frames; these are read only where no
+    stored result is valid. Damaged frames refuse the pose.
 
-    ``examine``: each with the evidence of its frames; ``observed`` as in ``read_pose``. Raises
-    InputError where poses come from cameras or projectors of different size.
+    ``observed`` as in ``read_pose``. Raises InputError where poses come from cameras or projectors
+    of different size.
     """
     captures = [store.load_capture(name) for name in names]
     for capture in captures[1:]:
@@ -147,19 +175,15 @@ def read_stored_poses(
                 " resolution"
             )
     cached = {name: load_judged(store, name, board, smoothing) for name in names}
-    if examine:
-        for name, judged in cached.items():
-            evidence = load_evidence(store, name, board)
-            cached[name] = replace(judged, evidence=evidence) if judged and evidence else None
-    ahead = read_ahead([capture for capture in captures if cached[capture.name] is None])
+    missing = [capture for capture in captures if cached[capture.name] is None]
+    ahead = compute_ahead(Capture.stack, missing)
     for name in names:
         judged = cached[name]
         if judged is None:
             capture, frames = next(ahead)
             try:
-                phases = decode_capture(capture, frames.result())
-                judged = read_stored_pose(
-                    store, capture, frames.result(), phases, board, smoothing, examine, observed
+                judged = _read_stored_pose(
+                    store, capture, frames.result(), board, smoothing, observed
                 )
             except DamagedError as error:
                 judged = Judged(name, None, str(error).removeprefix(f"{name}: "))
@@ -192,3 +216,39 @@ def _list_settings(smoothing: Smoothing) -> list[str | int]:
 def _wxh(size: tuple[int, int]) -> str:
     """Format a size (width, height) px as "WxH"."""
     return f"{size[0]}x{size[1]}"
+
+
+def gather_evidence(
+    pose: DecodedPose,
+    examination: Examination,
+    detection: Detection | None,
+    observation: Observation | None,
+    refused: str = "",
+) -> PoseEvidence:
+    """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
+    None where they could not be read, for the reason ``refused``; ``examination``: of its frames.
+    """
+    sequence, frames, board = pose.sequence, pose.frames, pose.board
+    grid, on_board, moved_px = None, None, np.nan
+    if detection is None:
+        grid = detect_grid_size(board, pose.texture)
+    else:
+        on_board = board_mask(board, detection, pose.texture.shape)
+        pitch = float(np.median(pitch_px(board, detection)))
+        moved_px = measure_motion_px(sequence, frames, detection.pixels, pitch)
+    turn = None
+    if observation is not None:
+        turn = fit_mean_turn(observation.camera, observation.projector)
+    return PoseEvidence(
+        name=pose.name,
+        refused=refused,
+        grid=grid,
+        axes={
+            axis: measure_axis(sequence, frames, phase, on_board)
+            for axis, phase in pose.phases.items()
+        },
+        findings=examination.findings,
+        displaced=measure_white_delay(sequence, frames),
+        moved_px=moved_px,
+        turn=turn,
+    )

@@ -1,26 +1,27 @@
-"""From a capture to a cloud."""
+"""From a capture to a cloud; and known shapes measured with each model, which compares them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.errors import DetectionError, InputError
+from slviewer.errors import DetectionError, InputError, UsageError
 from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Warn, ignore_warnings
+from slviewer.pipeline.feedback import Warn
 from slviewer.pipeline.models import (
     Model,
     ModelName,
     check_accepted,
     frame_of,
+    load_model,
     load_models,
     load_stereo,
     preferred_model,
@@ -35,7 +36,7 @@ from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP, normals
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.table import render_text
-from slviewer.records.verification import Verification
+from slviewer.records.verification import Shape, Verification
 from slviewer.session.capture import Capture
 from slviewer.session.ply import write_ply
 from slviewer.session.store import Session
@@ -45,18 +46,12 @@ from slviewer.target.detect import board_mask, detect
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedCapture:
-    """A reconstructed capture: what is stored of it; its cloud without what edits and region
-    remove; the phases that it came from; its PLY file with ``points`` points; for a board pose how
-    flat each model measures the board. ``restrictions`` describes edits and region.
-    """
+    """A reconstructed capture: what is stored of it, with its PLY file of ``points`` points, and
+    its cloud without what edits and region remove."""
 
     found: Found[Reconstruction]
     cloud: Cloud
-    phases: Mapping[Axis, PhaseMap]
-    ply: Path
     points: int
-    board: Comparison | None = None
-    restrictions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,23 +103,14 @@ class ReconstructSettings:
 def reconstruct(job: Job, settings: ReconstructSettings) -> Iterator[Found[Reconstruction]]:
     """Reconstruct a capture as a cloud, and write it as PLY; for a board pose also how flat each
     model measures the board."""
-    with _reconstructing(job, settings) as made:  # whose file appears once the record is stored
-        notes = (*made.restrictions, f"{made.points:,} points -> {made.ply}")
-        if made.board is not None:
-            tables = Verification.tables({settings.capture: made.board.record()})
-            notes += ("inside the board's outline:", *map(render_text, tables))
-        yield replace(made.found, files=(made.ply,), notes=notes)
-
-
-def reconstruct_capture(job: Job, settings: ReconstructSettings) -> ReconstructedCapture:
-    """Reconstruct a capture, and write its file; nothing is stored."""
-    with _reconstructing(job, settings) as made:
-        return made
+    with reconstruct_capture(job, settings) as made:
+        yield made.found  # and its file appears once that is stored
 
 
 @contextmanager
-def _reconstructing(job: Job, settings: ReconstructSettings) -> Iterator[ReconstructedCapture]:
-    """Context manager: a reconstructed capture; its file gets its place at the end."""
+def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[ReconstructedCapture]:
+    """Context manager: a reconstructed capture, not stored yet; its file gets its place at the
+    end."""
     store, capture, warn = job.store, settings.capture, job.warn
     check_accepted(store, settings.accept_rejected)
     name = settings.model or preferred_model(store)
@@ -139,27 +125,28 @@ def _reconstructing(job: Job, settings: ReconstructSettings) -> Iterator[Reconst
     texture = capture_texture(shot, frames, stretch=is_pose)
     chosen = load_models(store, () if is_pose and settings.model is None else (name,))
     job.progress(0.6, "reconstructing")
-    options: dict[str, Any] = {
-        "axis": settings.axis,
-        "texture": texture,
-        "accept_rejected": settings.accept_rejected,
-    }
+    accepts = settings.accept_rejected
     clouds = {
-        n: capture_cloud(store, m, shot, phases, warn=warn, **options) for n, m in chosen.items()
-    }
-    board, region = None, segment_board(store, shot, texture, warn) if is_pose else None
-    if region is not None:
-        depths = load_stereo(store).depth_range_mm
-        board = fit_clouds(
-            "plane", clouds, illuminated_pixels(phases, clouds), region=region, depth_range=depths
+        n: capture_cloud(
+            store, m, shot, phases, axis=settings.axis, texture=texture, accept_rejected=accepts,
+            warn=warn,
         )
-    cloud, restrictions = clouds[name], tuple[str, ...]()
-    if not is_pose:
+        for n, m in chosen.items()
+    }  # fmt: skip
+    cloud, region, board = clouds[name], None, tuple[str, ...]()
+    restrictions = tuple[str, ...]()
+    if is_pose:
+        region = segment_board(store, shot, texture, warn)
+    else:
         box = resolve_region(store, settings.roi)
-        cloud, restrictions = (
-            restrict_cloud(store, capture, cloud, box),
-            restriction_notes(store, [capture], box),
-        )
+        cloud = restrict_cloud(store, capture, cloud, box)
+        restrictions = restriction_notes(store, [capture], box)
+    if region is not None:
+        illuminated = phases[next(iter(clouds.values())).axis].illuminated
+        depths = load_stereo(store).depth_range_mm
+        fit = fit_clouds("plane", clouds, illuminated, region=region, depth_range=depths)
+        tables = Verification.tables({capture: fit.record()})
+        board = "inside the board's outline:", *map(render_text, tables)
     mask = cloud.mask if region is None else cloud.mask & region
     if not mask.any():
         raise InputError(
@@ -167,11 +154,11 @@ def _reconstructing(job: Job, settings: ReconstructSettings) -> Iterator[Reconst
             " to this camera and projector, and is the scene within its depths?"
         )
     job.progress(0.8, "writing")
+    points = int(np.count_nonzero(mask))
     found = cloud_record(store, settings, chosen[name], clouds[name], phases[cloud.axis], region)
     with _write_files(store, settings, cloud, mask, (f"calibration {name}", *restrictions)) as path:
-        yield ReconstructedCapture(
-            found, cloud, phases, path, int(np.count_nonzero(mask)), board, restrictions
-        )
+        notes = (*restrictions, f"{points:,} points -> {path}", *board)
+        yield ReconstructedCapture(replace(found, files=(path,), notes=notes), cloud, points)
     job.progress(1.0, "reconstructed")
 
 
@@ -187,14 +174,16 @@ def _write_files(
     appears there at the end; the cloud's grid is written too where that is wanted."""
     capture, points = settings.capture, cloud.points
     assert cloud.texture is not None
-    faces = triangulate_points(points, mask) if settings.mesh else None
+    faces = None
+    if settings.mesh:  # surfaces end where depth jumps
+        masked = np.where(mask[..., None], points, np.float32(np.nan))
+        faces = triangulate_grid(masked, JUMP * float(np.median(points[..., 2][mask])))
     notes = (f"scan {capture}, frame: {frame_of(store, cloud.model)}", *notes)
     name = f"{capture}_{cloud.model}{'_mesh' if settings.mesh else ''}.ply"
     with placed_file(store, settings.out, name) as (path, written):
-        chosen = choose_pixels(points, mask)
         write_ply(
             written,
-            chosen,
+            choose_pixels(points, mask),
             cloud.texture[mask],
             normals(points)[mask],
             cloud.sigmas(mask),
@@ -202,7 +191,10 @@ def _write_files(
             notes,
         )
         if settings.grid is not None:
-            write_grid(Path(settings.grid), points)
+            grid = Path(settings.grid)
+            grid.parent.mkdir(parents=True, exist_ok=True)
+            with open(grid, "wb") as file:  # a file object, so that NumPy adds no suffix of its own
+                np.save(file, points)
         yield path
 
 
@@ -217,7 +209,6 @@ def cloud_record(
     """Return what is stored of a capture's cloud, before edits and region; ``region`` (h, w) bool:
     of the board."""
     near, far = np.percentile(cloud.points[..., 2][cloud.mask], [1, 99])
-    assert cloud.texture is not None
     arrays = {
         "points": cloud.points,
         "sigma_z": cloud.sigma_z,
@@ -227,11 +218,9 @@ def cloud_record(
         "sigma_calibration": cloud.sigma_calibration,
         "sigma_edges": cloud.sigma_edges,
     }
+    known = {name: array for name, array in arrays.items() if array is not None}
     left = cloud.sigma_calibration
-    inputs = (
-        settings.capture,
-        *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}")),
-    )
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model.name}"))
     record = Reconstruction(
         operation="reconstruct",
         settings=plain_settings(settings),
@@ -246,20 +235,9 @@ def cloud_record(
         frame=frame_of(store, cloud.model),
         scale=describe_scale(store, cloud.model),
         scales={cloud.model: scale_factor(store, cloud.model)},
-        inputs=store.input_hashes(*inputs),
+        inputs=store.input_hashes(settings.capture, *calibrations),
     )
-    return Found(
-        settings.capture,
-        record,
-        {name: array for name, array in arrays.items() if array is not None},
-    )
-
-
-def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Faces (m, 3) int32 over the pixels ``mask`` (h, w) bool of organised points; surfaces end
-    where depth jumps."""
-    masked_points = np.where(mask[..., None], points, np.float32(np.nan))
-    return triangulate_grid(masked_points, JUMP * float(np.median(points[..., 2][mask])))
+    return Found(settings.capture, record, known)
 
 
 def segment_board(
@@ -267,41 +245,15 @@ def segment_board(
 ) -> np.ndarray | None:
     """Return the board's region (h, w) bool in a target pose; None, with a warning, where no board
     is detected."""
-    board = load_stereo(store).board
-    if not board:
+    if not (notation := load_stereo(store).board):
         return None
+    board = Board.parse(notation)
     try:
-        detection = detect(Board.parse(board), texture)
+        detection = detect(board, texture)
     except DetectionError as error:
         warn(f"{shot.name}: {error}")
         return None
-    return board_mask(Board.parse(board), detection, texture.shape[:2])
-
-
-def illuminated_pixels(phases: Mapping[Axis, PhaseMap], clouds: Mapping[str, Cloud]) -> np.ndarray:
-    """Return the pixels (h, w) bool that a perfect decoder could have measured on the axis that the
-    clouds came from."""
-    return phases[next(iter(clouds.values())).axis].illuminated
-
-
-def reconstruct_models(
-    store: Session,
-    chosen: Mapping[str, Model],
-    shot: Capture,
-    phases: Mapping[Axis, PhaseMap],
-    axis: Axis | None,
-    *,
-    accept_rejected: bool = False,
-    warn: Warn = ignore_warnings,
-) -> dict[str, Cloud]:
-    """One cloud a model, all from the same axis so that they can be compared pixel by pixel."""
-    clouds: dict[str, Cloud] = {}
-    for name, model in chosen.items():
-        clouds[name] = capture_cloud(
-            store, model, shot, phases, axis=axis, accept_rejected=accept_rejected, warn=warn
-        )
-        axis = axis or clouds[name].axis
-    return clouds
+    return board_mask(board, detection, texture.shape[:2])
 
 
 def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None = None) -> float | None:
@@ -317,8 +269,139 @@ def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None = None
     return float(1 - model.support(phase)[every].mean()) if every.any() else 0.0
 
 
-def write_grid(path: Path, points: np.ndarray) -> None:
-    """Write an organised cloud as .npy."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "wb") as file:  # a file object, so that NumPy adds no suffix of its own
-        np.save(file, points)
+@dataclass(frozen=True)
+class VerifySettings:
+    """How captures of a known shape are measured.
+
+    Args:
+        captures: Names of the captures.
+        shape: What the captures show.
+        models: Which calibrations to compare; by default all there are.
+        depth_range: Near and far end of the calibrated depths R2, mm; by default those of the board
+            poses.
+        radius: Nominal radius of the sphere, mm: helps to detect it; the fitted radius stays free.
+        axis: Which pattern axis gives the depth; by default the one with the smaller predicted
+            noise.
+        accept_rejected: Use the calibration although its verdict rejects it.
+
+    ``check``: also compare the frames with each other, and warn of those that do not fit.
+    """
+
+    UNRECORDED: ClassVar = ("check",)
+    captures: Sequence[str]
+    shape: Shape
+    models: Sequence[ModelName] = ()
+    depth_range: tuple[float, float] | None = None
+    radius: float | None = None
+    axis: Axis | None = None
+    accept_rejected: bool = False
+    check: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.captures:
+            raise UsageError(
+                "no capture named: give the captures to measure, for instance plane_01 plane_02"
+            )
+        if self.depth_range is not None and not 0 < self.depth_range[0] < self.depth_range[1]:
+            near, far = self.depth_range
+            raise UsageError(f"the range {near:g} {far:g} is empty: give near and far in mm")
+        if self.radius is not None and not self.radius > 0:
+            raise UsageError(f"a radius of {self.radius:g} mm is not possible: give a positive one")
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedCapture:
+    """A capture that models were compared on: its phases, what was found, and {model: share of the
+    shape's pixels that it masks, because no target pose illuminated what they look through} of
+    models that do."""
+
+    capture: Capture
+    frames: np.ndarray
+    phases: Mapping[Axis, PhaseMap]
+    found: Comparison
+    masked: Mapping[str, float]
+
+
+@operation("verify", Verification, VerifySettings)
+def verify(
+    job: Job, settings: VerifySettings
+) -> Iterator[Found[Verification] | Found[Reconstruction]]:
+    """Measure captures of a plane or a sphere with each model, over the pixels that all of them
+    measure, and compare.
+
+    The session stores the figures, the error maps, and the cloud of the model that it prefers, if
+    that is compared.
+    """
+    store = job.store
+    for each in compare_captures(job, settings):
+        name, models = each.capture.name, tuple(each.found.results)
+        record = each.found.record(
+            each.masked,
+            scales={model: scale_factor(store, model) for model in models},
+            inputs=store.input_hashes(name, *(f"calibration/{model}" for model in models)),
+        )
+        yield Found(
+            name, record, {f"error_{m}": r.error_map for m, r in each.found.results.items()}
+        )
+        if store.is_writable and (best := preferred_model(store)) in models:
+            # by its own best axis, as reconstruct
+            yield _reconstruct_best(store, load_model(store, best), each, settings)
+
+
+def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
+    """Yield the comparison of models on each capture."""
+    store, names = job.store, settings.captures
+    chosen = load_models(store, settings.models)
+    check_accepted(store, settings.accept_rejected)
+    warn_if_stale(store, job.warn)
+    check_capture_sizes(store, names)
+    depths = settings.depth_range or load_stereo(store).depth_range_mm
+    for i, (shot, frames, phases) in enumerate(
+        decode_captures(store, names, job.warn, check=settings.check)
+    ):
+        job.progress(i / len(names), f"measuring {shot.name}")
+        clouds: dict[str, Cloud] = {}
+        axis = settings.axis  # of the first, so that all can be compared pixel by pixel
+        accepts = settings.accept_rejected
+        for model, fitted in chosen.items():
+            clouds[model] = capture_cloud(
+                store, fitted, shot, phases, axis=axis, accept_rejected=accepts, warn=job.warn
+            )
+            axis = axis or clouds[model].axis
+        assert axis is not None
+        phase = phases[axis]
+        region: np.ndarray | None = None
+        if settings.shape == "plane" and shot.role == "calibration":
+            region = segment_board(store, shot, capture_texture(shot, frames), job.warn)
+        try:
+            found = fit_clouds(
+                settings.shape,
+                clouds,
+                phase.illuminated,
+                region=region,
+                depth_range=depths,
+                radius=settings.radius,
+            )
+        except InputError as error:
+            raise InputError(f"{shot.name}: {error}") from error
+        for message in found.warnings:
+            job.warn(f"{shot.name}: {message}")
+        shares = {name: masked_share(each, phase, found.region) for name, each in chosen.items()}
+        masked = {name: share for name, share in shares.items() if share is not None}
+        yield ComparedCapture(shot, frames, phases, found, masked)
+    job.progress(1.0, "measured")
+
+
+def _reconstruct_best(
+    store: Session, model: Model, each: ComparedCapture, settings: VerifySettings
+) -> Found[Reconstruction]:
+    """Return the cloud of a capture as `reconstruct` stores it."""
+    shot, found = each.capture, each.found
+    texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
+    axis, accepts = settings.axis, settings.accept_rejected
+    cloud = capture_cloud(
+        store, model, shot, each.phases, axis=axis, texture=texture, accept_rejected=accepts
+    )
+    region = None if found.is_searched else found.region
+    as_reconstructed = ReconstructSettings(shot.name, axis=axis, accept_rejected=accepts)
+    return cloud_record(store, as_reconstructed, model, cloud, each.phases[cloud.axis], region)

@@ -15,7 +15,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.measurements import section_lines
+from slviewer.pipeline.measure import section_lines
 from slviewer.pipeline.models import (
     available_models,
     load_model,
@@ -90,13 +90,12 @@ def report(
         title, subtitle = session_title(data)
         progress(0.7, "reading the frames")
         certificate = make_certificate(store)
-        sections = [*session_sections(data), certificate_section(certificate)]
         write_page(
             out,
             title,
             subtitle,
             session_headlines(data),
-            sections,
+            [*session_sections(data), certificate_section(certificate)],
             partial(certify_page, certificate),
         )
     progress(1.0, "written")
@@ -105,60 +104,41 @@ def report(
 
 def _collect_data(store: Session) -> SessionData:
     """Collect everything that a report shows of a session."""
-    stereo = load_stereo_if_complete(store)
-    observations = (
-        {o.name: o for o in load_observations(store, list(stereo.poses))}
-        if stereo and stereo.poses
-        else {}
-    )
+    stereo, there = load_stereo_if_complete(store), available_models(store)
     stale = [
         f"The {name} calibration was made from target poses that have since changed: run calibrate"
         " again."
-        for name in available_models(store)
+        for name in there
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     excluded = store.excluded()
-    verdict = load_last_verdict(store)
+    verdict, pixel_fits, models = load_last_verdict(store), list[PixelFitView](), None
+    if "pixelwise" in there:
+        pixelwise = load_model(store, "pixelwise")
+        assert isinstance(pixelwise, PixelwiseModel)
+        pixel_fits = [PixelFitView(axis, fit.rms_mm) for axis, fit in pixelwise.fits.items()]
+    if there:
+        scales = {name: words for name in there if (words := describe_scale(store, name))}
+        models = ModelsView(preferred_model(store), recommended_model(store), scales)
     judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
     records, outdated = _collect_records(store)
     region = load_region(store)
     return SessionData(
         name=store.folder.name,
         captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
-        calibration=None if stereo is None else _load_calibration(store, stereo, observations),
-        pixel_fits=[] if stereo is None else _load_pixel_fits(store),
+        calibration=None if stereo is None else calibration_view(store),
+        pixel_fits=pixel_fits,
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
         verdict_of_calibration=verdict is not None and verdict == judged,
-        models=_load_models(store),
+        models=models,
         region="" if region is None else region.text(),
         edits=[
             (scan, words)
             for scan in store.capture_names("scan")
             for words in list_edits(store, scan)[0]
         ],
-    )
-
-
-def _load_pixel_fits(store: Session) -> list[PixelFitView]:
-    """Return the pixel-wise fits by axis; none where there is no such calibration."""
-    if "pixelwise" not in available_models(store):
-        return []
-    model = load_model(store, "pixelwise")
-    assert isinstance(model, PixelwiseModel)
-    return [PixelFitView(axis, fit.rms_mm) for axis, fit in model.fits.items()]
-
-
-def _load_models(store: Session) -> ModelsView | None:
-    """Return which of the session's calibrations is used; None where there is no calibration."""
-    there = available_models(store)
-    if not there:
-        return None
-    return ModelsView(
-        used=preferred_model(store),
-        recommended=recommended_model(store),
-        scales={name: words for name in there if (words := describe_scale(store, name))},
     )
 
 
@@ -229,22 +209,13 @@ def calibration_view(store: Session) -> CalibrationFigures:
 
     Raises InputError where there is none.
     """
-    stereo = load_stereo(store)
-    return _load_calibration(
-        store, stereo, {o.name: o for o in load_observations(store, list(stereo.poses))}
-    )
-
-
-def _load_calibration(
-    store: Session, stereo: StereoModel, observations: Mapping[str, Observation]
-) -> CalibrationFigures:
-    """Return the stereo model with the residuals px of each pose that has an observation."""
-    residuals = {}
-    for name, r in load_residuals(store).items():
-        if name in observations:
-            o = observations[name]
-            residuals[name] = PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
-    return CalibrationFigures(stereo, residuals)
+    stereo, residuals = load_stereo(store), load_residuals(store)
+    views = {
+        o.name: PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
+        for o in load_observations(store, list(stereo.poses))
+        if (r := residuals.get(o.name)) is not None
+    }
+    return CalibrationFigures(stereo, views)
 
 
 def curve_at(

@@ -18,7 +18,8 @@ LARGEST_FACTOR = 1.25
 
 def load_scale_correction(store: Session, model: str) -> dict[str, Any] | None:
     """Return the scale correction of a calibration, as ``record_scale`` stored it; None where there
-    is none, or it is of another calibration."""
+    is none, or it is of another calibration. Its standard uncertainty is half of ``U_ppm``; without
+    a correction the scale is the target's."""
     name, calibration = f"scale/{model}", f"calibration/{model}"
     if not (store.has_result(name) and store.has_result(calibration)):
         return None
@@ -30,13 +31,6 @@ def scale_factor(store: Session, model: str) -> float:
     """Return the scale factor of a calibration's clouds: 1 where no correction was applied."""
     applied = load_scale_correction(store, model)
     return 1.0 if applied is None else float(applied["factor"])
-
-
-def scale_sigma(store: Session, model: str) -> float:
-    """The standard uncertainty of ``scale_factor``, from the acceptance test; 0 without a
-    correction, whose scale is the target's."""
-    applied = load_scale_correction(store, model)
-    return 0.0 if applied is None else 1e-6 * float(applied["U_ppm"]) / 2
 
 
 def describe_scale(store: Session, model: str) -> str:
@@ -52,18 +46,9 @@ def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
     """Return the cloud enlarged by a factor, with its noise."""
     if factor == 1.0:
         return cloud
-    return replace(
-        cloud,
-        points=cloud.points * np.float32(factor),
-        sigma_z=cloud.sigma_z * np.float32(factor),
-        sigma_calibration=(
-            None
-            if cloud.sigma_calibration is None
-            else cloud.sigma_calibration * np.float32(factor)
-        ),
-        sigma_edges=None if cloud.sigma_edges is None else cloud.sigma_edges * np.float32(factor),
-        texture=cloud.texture,
-    )
+    names = ("points", "sigma_z", "sigma_calibration", "sigma_edges")
+    known = {name: values for name in names if (values := getattr(cloud, name)) is not None}
+    return replace(cloud, **{name: values * np.float32(factor) for name, values in known.items()})
 
 
 def record_scale(store: Session, acceptance: Acceptance) -> float:
@@ -81,7 +66,6 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
             f" {LARGEST_FACTOR:g}): check the certificate's length, temperature and expansion, and"
             " that its captures show this artefact"
         )
-    calibration = f"calibration/{acceptance.model}"
     meta = {
         "factor": factor,
         "ppm": acceptance.scale.ppm,
@@ -91,7 +75,7 @@ def record_scale(store: Session, acceptance: Acceptance) -> float:
         "certificate": acceptance.artefact.certificate,
         "captures": [position.capture for position in acceptance.positions],
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "inputs": store.input_hashes(calibration),
+        "inputs": store.input_hashes(f"calibration/{acceptance.model}"),
     }
     store.save_result(f"scale/{acceptance.model}", meta, {})
     return factor

@@ -1,23 +1,21 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
-from slviewer.pipeline.edit import edit_scan, set_region
-from slviewer.pipeline.export import export
-from slviewer.pipeline.inspect import inspect
-from slviewer.pipeline.mesh import mesh
-from slviewer.pipeline.operations import (
+from slviewer.pipeline import (
     accept,
     align,
     calibrate,
     check,
     compare,
+    inspect_parts,
     measure,
     merge,
-    reconstruct,
-    run_plan,
     validate,
-    verify,
 )
-from slviewer.pipeline.plan import plan
+from slviewer.pipeline.edit import edit_scan, set_region
+from slviewer.pipeline.export import export
+from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.mesh import mesh
+from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.pipeline.report import report
 from slviewer.pipeline.stored_records import load_arrays
 from slviewer.session.store import Session
@@ -46,10 +44,10 @@ class SessionOperations(Session):
     measure = measure.measure
     merge = merge.merge
     mesh = mesh
-    plan = plan
-    reconstruct = reconstruct.reconstruct
+    plan = inspect_parts.plan
+    reconstruct = reconstruct
     report = report
-    run_plan = run_plan.run_plan
+    run_plan = inspect_parts.run_plan
     set_region = set_region
     validate = validate.validate
-    verify = verify.verify
+    verify = verify

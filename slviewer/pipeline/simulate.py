@@ -1,9 +1,7 @@
 """A session filled by the simulated rig, with the truth in a file of its own."""
 
 import json
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -12,7 +10,8 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.capture_phases import compute_ahead
+from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import save_imported_stereo
 from slviewer.session.capture import NewCapture
 from slviewer.session.ply import write_ply
@@ -44,7 +43,6 @@ def simulate(
     poses: int = 25,
     seed: int = 0,
     progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
 ) -> list[str]:
     """Fill a new session with captures of a simulated rig: target poses, planes, spheres, an object
     at three depths.
@@ -72,7 +70,6 @@ def simulate(
     rig = letter(scale, seed)
     plan = letter_plan(rig, board, poses) if preset == "letter" else turn_plan(rig, board, poses)
     both = p18(rig.projector.size)
-    only_x = one_axis(both, "x")
     truth: dict[str, Any] = {
         "preset": preset,
         "scale": scale,
@@ -80,38 +77,34 @@ def simulate(
         "target": TARGET,
         "rig": rig_record(rig),
     }
+    numbers = {name: i for i, name in enumerate(plan)}
 
-    def rendered(scenes: dict[str, Scene], sequence: PatternSequence) -> Iterator[NewCapture]:
+    def rendered(names: list[str], sequence: PatternSequence) -> Iterator[NewCapture]:
         """One capture after another; the next one is rendered while one is saved."""
+
+        def render(name: str) -> np.ndarray:
+            """Return the frames (n, h, w) of a capture."""
+            return Renderer(rig, plan[name]).capture(sequence, numbers[name])
+
         source = f"simulated: {preset}, scale {scale:g}, seed {seed}"
-        numbers = {name: i for i, name in enumerate(plan)}
-        with ThreadPoolExecutor(1) as renderer:
-            waiting = deque[Future[np.ndarray]]()
-            ahead = iter(scenes.items())
-            for name in scenes:
-                while len(waiting) < 2 and (following := next(ahead, None)):
-                    work = Renderer(rig, following[1]).capture
-                    waiting.append(renderer.submit(work, sequence, numbers[following[0]]))
-                progress(numbers[name] / len(plan), f"rendering {name}")
-                yield NewCapture(name, sequence, waiting.popleft().result(), None, source)
+        for name, frames in compute_ahead(render, names):
+            progress(numbers[name] / len(plan), f"rendering {name}")
+            yield NewCapture(name, sequence, frames.result(), None, source)
 
     with Session.create(session) as store:
-        groups = {
-            kind: {n: s for n, s in plan.items() if n.startswith(f"{kind}_")} for kind in KINDS
-        }
-        scans = {n: s for n, s in plan.items() if n not in groups["pose"]}
-        saved = store.save_captures(rendered(groups["pose"], both), "calibration", board=board)
-        saved += store.save_captures(rendered(scans, only_x), "scan")
-        for kind, scenes in groups.items():
-            if not scenes:
-                continue
-            truth[f"{kind}s"] = {name: scene_record(scene) for name, scene in scenes.items()}
+        groups = {kind: [n for n in plan if n.startswith(f"{kind}_")] for kind in KINDS}
+        scans = [n for n in plan if n not in groups["pose"]]
+        store.save_captures(rendered(groups["pose"], both), "calibration", board=board)
+        store.save_captures(rendered(scans, one_axis(both, "x")), "scan")
+        for kind, names in groups.items():
+            if names:
+                truth[f"{kind}s"] = {name: scene_record(plan[name]) for name in names}
         (store.folder / TRUTH).write_text(json.dumps(truth, indent=1) + "\n")
         if groups["turn"]:
             vertices, triangles = stone()
             write_ply(store.folder / NOMINAL, vertices, faces=triangles)
     progress(1.0, "simulated")
-    return [capture.name for capture in saved]
+    return list(plan)
 
 
 def turn_plan(rig: SimulatedRig, board: Board, poses: int) -> dict[str, Scene]:

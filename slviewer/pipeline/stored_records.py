@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.pipeline.open_session import SessionLike, numbered_results, opened
+from slviewer.pipeline.open_session import SessionLike, numbered_names, opened
 from slviewer.pipeline.scale import scale_factor
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
@@ -75,7 +75,7 @@ def load_stored(store: Session, kind: type[R], name: str) -> Stored[R]:
     of that name."""
     result = f"{kind.kind}/{name}"
     if not store.has_result(result):
-        there = [each.removeprefix(f"{kind.kind}/") for each in numbered_results(store, kind.kind)]
+        there = numbered_names(store, kind.kind)
         noun = kind.title.lower().removesuffix("s")
         raise InputError(f"there is no {noun} {name!r}: there are {', '.join(there) or 'none'}")
     record, labels = load_record(store, kind, name), store.valid_decision(kind.labels) or {}
@@ -88,8 +88,7 @@ def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:
     """Return the records of a kind in natural order of their names; those of deleted captures are
     skipped."""
     there = set(store.capture_names())
-    names = (result.removeprefix(f"{kind.kind}/") for result in numbered_results(store, kind.kind))
-    records = (load_stored(store, kind, name) for name in names)
+    records = (load_stored(store, kind, name) for name in numbered_names(store, kind.kind))
     return [each for each in records if there.issuperset(captures_of(each.name, each.record))]
 
 
@@ -104,10 +103,10 @@ def next_name(store: Session, kind: type[Record]) -> str:
 def name_records(found: Sequence[Stored[R]]) -> dict[str, R]:
     """Return records by their labels, with the name beside a label that several have."""
     counts = Counter(each.label for each in found)
-    names = (
-        each.label if counts[each.label] == 1 else f"{each.label} ({each.name})" for each in found
-    )
-    return {name: each.record for name, each in zip(names, found, strict=True)}
+    return {
+        each.label if counts[each.label] == 1 else f"{each.label} ({each.name})": each.record
+        for each in found
+    }
 
 
 def is_up_to_date(store: Session, result: str) -> bool:

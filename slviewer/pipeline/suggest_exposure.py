@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,12 @@ MAX_SUGGESTED = 4
 BUDGET_S = 20.0
 """What a capture may last by default."""
 Region = tuple[int, int, int, int]
-PixelState = Literal["unlit", "measured", "saturated", "dark"]
-STATES: tuple[PixelState, ...] = ("unlit", "measured", "saturated", "dark")
+Exposures = tuple[float, ...]
+Values = NDArray[np.float64]
+Levels = NDArray[np.float32]
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+STATES = ("unlit", "measured", "saturated", "dark")
 """States of a pixel, by their numbers in `ExposureSuggestion.state`."""
 
 _PIXELS = 150_000
@@ -64,14 +67,14 @@ class ExposureSuggestion:
     there.
     """
 
-    exposures_ms: tuple[float, ...]
+    exposures_ms: Exposures
     gain: float | None
     share: float
     share_before: float
     capture_s: float
-    state: NDArray[np.uint8]
-    state_before: NDArray[np.uint8]
-    image: NDArray[np.uint8]
+    state: Image
+    state_before: Image
+    image: Image
     stride: int
 
     def text(self) -> str:
@@ -91,10 +94,10 @@ class _Look:
     brightest sample; ``repeat`` (2, h, w): the same frame twice."""
 
     exposure_ms: float
-    modulation: NDArray[np.float32]
-    background: NDArray[np.float32]
-    peak: NDArray[np.float32]
-    repeat: NDArray[np.float32]
+    modulation: Levels
+    background: Levels
+    peak: Levels
+    repeat: Levels
 
 
 def suggest_exposure(
@@ -123,13 +126,9 @@ def suggest_exposure(
     if not budget_s > 0:
         raise InputError(f"a capture of {budget_s:g} s is impossible: give a time above 0")
     before = rig.camera.settings()
-    if before.exposure_ms is None:
-        raise DeviceError(
-            f"{rig.camera.name} does not report its exposure: set it by hand, at the camera"
-        )
-    bracket = _Bracket(rig, sequence, region, progress)
+    bracket = _Bracket(rig, sequence, region, budget_s, progress)
     try:
-        return bracket.choose(tuple(current_ms) or (before.exposure_ms,), before.gain, budget_s)
+        return bracket.choose(current_ms or (before.exposure_ms,), before.gain)
     finally:
         rig.camera.apply(before)
 
@@ -146,9 +145,14 @@ class _Bracket:
     """Looks at the fringes of a scene in several exposures, and the choice among them."""
 
     def __init__(
-        self, rig: Rig, sequence: PatternSequence, region: Region | None, progress: Progress
+        self,
+        rig: Rig,
+        sequence: PatternSequence,
+        region: Region | None,
+        budget_s: float,
+        progress: Progress,
     ) -> None:
-        self._rig, self._progress, self._grabs = rig, progress, 0
+        self._rig, self._budget_s, self._progress, self._grabs = rig, budget_s, progress, 0
         self._frames = len(sequence.frames)
         layout = axis_layout(sequence, sequence.axes[0])
         self._indices, self._is_fringe = _select_steps(layout)
@@ -157,17 +161,21 @@ class _Bracket:
         self._frame = np.empty((height, width), rig.camera.dtype)
         self._largest = 0
         self._stride = max(1, math.ceil(math.sqrt(width * height / _PIXELS)))
-        self._inside = _mask_region(region, (width, height))[:: self._stride, :: self._stride]
+        x, y, across, down = region or (0, 0, width, height)
+        if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
+            raise InputError(
+                f"the region {x} {y} {across} {down} is outside of the image of {width}x{height}"
+                " px: give x, y, width and height in px"
+            )
+        inside = np.zeros((height, width), bool)
+        inside[y : y + down, x : x + across] = True
+        self._inside = inside[:: self._stride, :: self._stride]
         self._overhead_ms = math.inf
         self._looks: dict[float, _Look] = {}
-        self._budget_s = BUDGET_S
         rig.projector.load(sequence)
 
-    def choose(
-        self, current_ms: tuple[float, ...], gain: float | None, budget_s: float
-    ) -> ExposureSuggestion:
+    def choose(self, current_ms: Sequence[float | None], gain: float | None) -> ExposureSuggestion:
         """Look, choose, try, and correct what saturates after all."""
-        self._budget_s = budget_s
         if gain is not None and gain > 1:
             gain = self._rig.camera.apply(CameraSettings(gain=1.0)).gain
         low, high, lit = self._examine(current_ms)
@@ -189,47 +197,43 @@ class _Bracket:
         chosen = self._choose(low[lit], high[lit])
         if not chosen:
             raise DeviceError(
-                f"no capture of {self._frames} frames fits into {budget_s:g} s: allow more time, or"
-                " choose patterns with fewer frames"
+                f"no capture of {self._frames} frames fits into {self._budget_s:g} s: allow more"
+                " time, or choose patterns with fewer frames"
             )
         for _ in range(_CORRECTIONS):
-            chosen = tuple(self._look(exposure).exposure_ms for exposure in chosen)
+            chosen = self._applied(chosen)
             clipped = self._looks[chosen[0]].peak >= self._clip
             expected = high < chosen[0]
             if np.count_nonzero(clipped & ~expected & lit) <= _FEW * np.count_nonzero(lit):
                 break
             chosen = tuple(_round(_FACTOR * exposure) for exposure in chosen)
-        chosen = tuple(self._look(exposure).exposure_ms for exposure in chosen)
+        chosen = self._applied(chosen)
         state, state_before = (
-            self._classify(chosen, lit),
-            self._classify(self._applied(current_ms), lit),
+            self._classify(each, lit) for each in (chosen, self._applied(current_ms))
         )
         share, share_before = (
-            np.count_nonzero(each == 1) / np.count_nonzero(lit) for each in (state, state_before)
+            float(np.mean(each[lit] == STATES.index("measured"))) for each in (state, state_before)
         )
         return ExposureSuggestion(
             chosen,
             gain,
             share,
             share_before,
-            self._duration_s(np.array(chosen)),
+            float(self._duration_ms(np.array(chosen))) / 1e3,
             state,
             state_before,
             self._draw_scene(chosen, lit),
             self._stride,
         )
 
-    def _draw_scene(
-        self, exposures_ms: tuple[float, ...], lit: NDArray[np.bool_]
-    ) -> NDArray[np.uint8]:
+    def _draw_scene(self, exposures_ms: Exposures, lit: Mask) -> Image:
         """The scene (h, w) as an image, each pixel from the longest of these exposures that does
         not saturate it."""
         best = self._looks[exposures_ms[0]].background
         for exposure in exposures_ms[1:]:
             look = self._looks[exposure]
-            best = np.where(
-                look.peak < self._clip, look.background * (exposures_ms[0] / exposure), best
-            )
+            scaled = look.background * (exposures_ms[0] / exposure)
+            best = np.where(look.peak < self._clip, scaled, best)
         tone = np.sqrt(np.clip(best / max(float(np.quantile(best[lit], 0.99)), 1e-6), 0, 1))
         return (255 * tone).astype(np.uint8)
 
@@ -243,11 +247,11 @@ class _Bracket:
         """Grey level from which a pixel counts as saturated."""
         return 0.99 * self._full
 
-    def _applied(self, exposures: Sequence[float]) -> tuple[float, ...]:
+    def _applied(self, exposures: Sequence[float | None]) -> Exposures:
         """The exposures that the camera set when these were requested, ascending."""
         return tuple(sorted(self._look(exposure).exposure_ms for exposure in exposures))
 
-    def _look(self, exposure_ms: float) -> _Look:
+    def _look(self, exposure_ms: float | None) -> _Look:
         """Capture the fringes in the exposure that the camera has nearest to this one, unless that
         was done."""
         with report_driver_faults(self._rig.camera):
@@ -278,11 +282,8 @@ class _Bracket:
         if self._is_fringe:
             _, modulation, background, peak = phase_shift(stack, tuple(range(n)), 1)
         else:
-            modulation, background, peak = (
-                abs(stack[0] - stack[1]) / 2,
-                stack[:2].mean(0),
-                stack[:2].max(0),
-            )
+            modulation, background = abs(stack[0] - stack[1]) / 2, stack[:2].mean(0)
+            peak = stack[:2].max(0)
         self._looks[set_ms] = look = _Look(set_ms, modulation, background, peak, stack[n - 1 :])
         return look
 
@@ -290,60 +291,44 @@ class _Bracket:
         """The longest exposure that a capture has time for."""
         return 1e3 * self._budget_s / self._frames - self._overhead_ms
 
-    def _examine(
-        self, current_ms: Sequence[float]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    def _examine(self, current_ms: Sequence[float | None]) -> tuple[Values, Values, Mask]:
         """Look at the present exposures, at shorter ones until nothing is saturated, and at longer
-        ones until all is or time allows for no more. Returns the `_limits`, and (h, w) the pixels
-        of the region that see the patterns.
+        ones until all is or time allows for no more.
+
+        Returns (h, w) each, in ms: the shortest exposure at which a pixel is modulated enough,
+        infinite where it sees no patterns, and the longest at which it is not saturated, from the
+        longest exposure that did not saturate it; and the pixels of the region that see the
+        patterns.
         """
         for exposure in current_ms:
             self._look(exposure)
-        look = self._look(min(self._looks))
-        for _ in range(_MAX_LOOKS):
-            if np.mean(look.peak[self._inside] >= self._clip) <= _FEW / 2:
-                break
-            shorter = self._look(look.exposure_ms / _STOP)
-            if shorter.exposure_ms >= look.exposure_ms:
-                break
-            look = shorter
-        look = self._look(max(self._looks))
-        for _ in range(_MAX_LOOKS):
-            # one more than time allows for, to see what is missed
-            next_ms = _STOP * look.exposure_ms
-            is_bright = np.mean(look.peak[self._inside] >= self._clip) > _ALL
-            if is_bright or next_ms > min(_STOP * self._longest_ms(), _LONGEST_LOOK_MS):
-                break
-            longer = self._look(next_ms)
-            if longer.exposure_ms <= look.exposure_ms:
-                break
-            look = longer
-        low, high = self._limits()
-        return low, high, np.isfinite(low) & self._inside
-
-    def _limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(h, w) ms each: the shortest exposure at which a pixel is modulated enough, infinite
-        where it sees no patterns, and the longest at which it is not saturated. From the longest
-        exposure that did not saturate it.
-        """
+        for start, factor in ((min, 1 / _STOP), (max, _STOP)):
+            look = self._look(start(self._looks))
+            for _ in range(_MAX_LOOKS):
+                saturated = float(np.mean(look.peak[self._inside] >= self._clip))
+                next_ms = factor * look.exposure_ms
+                enough = saturated <= _FEW / 2
+                if start is max:  # one more than time allows for, to see what is missed
+                    longest_ms = min(_STOP * self._longest_ms(), _LONGEST_LOOK_MS)
+                    enough = saturated > _ALL or next_ms > longest_ms
+                if enough:
+                    break
+                following = self._look(next_ms)
+                if (following.exposure_ms - look.exposure_ms) * (factor - 1) <= 0:
+                    break
+                look = following
         variance = self._noise()
-        shape = self._inside.shape
-        low, high = np.full(shape, np.inf), np.zeros(shape)
-        for exposure in sorted(self._looks):
-            look = self._looks[exposure]
-            free = (look.peak < self._clip) | (exposure == min(self._looks))
-            with np.errstate(divide="ignore"):
-                longest = exposure * _HEADROOM * self._full / np.maximum(look.peak, 1)
-                longest[look.peak >= self._clip] = 0.5 * exposure  # how far beyond is not known
-            shortest = exposure * _required_factor(
-                look, variance, self._sigmas, DARK_LEVELS * self._full / 255
-            )
-            shortest[look.peak >= self._clip] = (
-                exposure  # of what is saturated in all, to be counted
-            )
+        low, high = np.full(self._inside.shape, np.inf), np.zeros(self._inside.shape)
+        for exposure, look in sorted(self._looks.items()):
+            clipped = look.peak >= self._clip
+            free = ~clipped | (exposure == min(self._looks))
+            longest = exposure * _HEADROOM * self._full / np.maximum(look.peak, 1)
+            longest[clipped] = 0.5 * exposure  # how far beyond is not known
+            shortest = exposure * self._required_factor(look, variance)
+            shortest[clipped] = exposure  # of what is saturated in all, to be counted
             low[free] = np.where(shortest > _BEYOND * exposure, np.inf, shortest)[free]
             high[free] = longest[free]
-        return low, high
+        return low, high, np.isfinite(low) & self._inside
 
     def _noise(self) -> tuple[float, float]:
         """Variance of a grey level: at none, and its increase with each."""
@@ -355,22 +340,21 @@ class _Bracket:
         mean, square = np.concatenate(means), np.concatenate(squares)
         if mean.size < 100:
             return 1.0, 0.0
-        order = np.argsort(mean)
-        groups = [order[part] for part in np.array_split(np.arange(mean.size), 12)]
+        groups = np.array_split(np.argsort(mean), 12)
         level = np.array([mean[group].mean() for group in groups])
         spread = np.array(
             [np.mean(np.sort(square[group])[: max(1, int(0.99 * group.size))]) for group in groups]
         )
-        slope, offset = (
-            np.polyfit(level, spread, 1) if np.ptp(level) > 1 else (0.0, float(spread.mean()))
-        )
+        slope, offset = 0.0, float(spread.mean())
+        if np.ptp(level) > 1:
+            slope, offset = np.polyfit(level, spread, 1)
         return max(float(offset), 1 / 12), max(float(slope), 0.0)
 
-    def _duration_s(self, exposures_ms: NDArray[np.float64]) -> float:
-        """How long a capture in these exposures lasts."""
-        return float(self._frames * np.sum(exposures_ms + self._overhead_ms) / 1e3)
+    def _duration_ms(self, exposures_ms: Values) -> Values:
+        """How long captures in these exposures (..., n) last."""
+        return self._frames * np.sum(exposures_ms + self._overhead_ms, axis=-1)
 
-    def _choose(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[float, ...]:
+    def _choose(self, low: Values, high: Values) -> Exposures:
         """The exposures for pixels with limits (n,) ms; none where the time does not even allow for
         one."""
         first, most = max(min(self._looks), float(np.quantile(high, 0.001))), self._longest_ms()
@@ -379,11 +363,11 @@ class _Bracket:
             return ()
         grid = np.unique([_round(each) for each in np.geomspace(first, most, _CANDIDATES)])
         values, counts = _tabulate_values(grid, low, high)
-        best: list[tuple[float, tuple[float, ...]]] = []
+        best: list[tuple[float, Exposures]] = []
         for count in range(1, MAX_SUGGESTED + 1):
             sets = np.array(list(combinations(range(len(grid)), count))).reshape(-1, count)
             times = grid[sets]
-            fits = self._frames * (times.sum(1) + count * self._overhead_ms) <= 1e3 * self._budget_s
+            fits = self._duration_ms(times) <= 1e3 * self._budget_s
             sets = sets[fits & (times[:, 1:] >= _APART * times[:, :-1]).all(1)]
             if not len(sets):
                 break
@@ -391,27 +375,32 @@ class _Bracket:
             chosen = int(values[sets, following].sum(1).argmax())
             measured = float(counts[sets[chosen], following[chosen]].sum())
             best.append((measured, tuple(grid[sets[chosen]].tolist())))
-        if not best:
-            return ()
-        largest = max(measured for measured, _ in best)
-        return next(
-            exposures for measured, exposures in best if measured >= largest - _WORTH * low.size
-        )
+        largest = max((measured for measured, _ in best), default=0.0)
+        good = (each for measured, each in best if measured >= largest - _WORTH * low.size)
+        return next(good, ())
 
-    def _classify(self, exposures_ms: Sequence[float], lit: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def _classify(self, exposures_ms: Sequence[float], lit: Mask) -> Image:
         """State (h, w) of each pixel if it is used from the longest of these exposures that does
         not saturate it."""
         variance = self._noise()
-        looks = [self._looks[exposure] for exposure in exposures_ms]
         state = np.full(lit.shape, STATES.index("saturated"), np.uint8)
-        for look in looks:
-            factor = _required_factor(look, variance, self._sigmas, DARK_LEVELS * self._full / 255)
-            free = look.peak < self._clip
-            state[free] = np.where(factor <= 1, STATES.index("measured"), STATES.index("dark"))[
-                free
-            ]
+        for look in (self._looks[exposure] for exposure in exposures_ms):
+            is_measured = self._required_factor(look, variance) <= 1
+            reached = np.where(is_measured, STATES.index("measured"), STATES.index("dark"))
+            state = np.where(look.peak < self._clip, reached, state).astype(np.uint8)
         state[~lit] = STATES.index("unlit")
         return state
+
+    def _required_factor(self, look: _Look, variance: tuple[float, float]) -> Values:
+        """Factor (h, w) of the exposure at which a pixel's modulation exceeds the dark limit, in
+        grey levels and in standard deviations of a grey level, whose ``variance`` is an offset and
+        a slope."""
+        offset, slope = variance
+        least, factor = DARK_LEVELS * self._full / 255, self._sigmas**2
+        modulation = np.maximum(look.modulation.astype(np.float64), 1e-3)
+        square, linear = modulation**2, factor * slope * np.maximum(look.background, 0)
+        by_noise = (linear + np.sqrt(linear**2 + 4 * square * factor * offset)) / (2 * square)
+        return np.maximum(by_noise, least / modulation)
 
 
 def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
@@ -430,36 +419,7 @@ def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
     return (layout.white, layout.black), False
 
 
-def _mask_region(region: Region | None, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(height, width) bool, True inside of the region x, y, width, height; InputError where it is
-    outside."""
-    width, height = size
-    inside = np.zeros((height, width), bool)
-    x, y, across, down = region or (0, 0, width, height)
-    if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
-        raise InputError(
-            f"the region {x} {y} {across} {down} is outside of the image of {width}x{height} px: "
-            "give x, y, width and height in px"
-        )
-    inside[y : y + down, x : x + across] = True
-    return inside
-
-
-def _required_factor(
-    look: _Look, variance: tuple[float, float], sigmas: float, least: float
-) -> NDArray[np.float64]:
-    """Factor (h, w) of the exposure at which a pixel's modulation reaches ``least`` grey levels and
-    ``sigmas`` standard deviations of a grey level, whose ``variance`` is an offset and a slope."""
-    offset, slope = variance
-    modulation = np.maximum(look.modulation.astype(np.float64), 1e-3)
-    square, linear = modulation**2, sigmas**2 * slope * np.maximum(look.background, 0)
-    by_noise = (linear + np.sqrt(linear**2 + 4 * square * sigmas**2 * offset)) / (2 * square)
-    return np.maximum(by_noise, least / modulation)
-
-
-def _tabulate_values(
-    grid: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _tabulate_values(grid: Values, low: Values, high: Values) -> tuple[Values, Values]:
     """Value and number (n, n + 1) of the pixels that exposure i of the grid measures where exposure
     j, the next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is
     weakly modulated."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.protocols import Rig, Turntable
@@ -31,16 +31,14 @@ from slviewer.pipeline.capture import (
     warn_of_captured,
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import MergeSettings, StartKind
+from slviewer.pipeline.merge import MergeSettings
 from slviewer.pipeline.merge import merge as merge_operation
 from slviewer.pipeline.mesh import MeshResult
 from slviewer.pipeline.mesh import mesh as mesh_merge
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
 from slviewer.pipeline.open_session import opened_or_made
-from slviewer.pipeline.operation import Findings
-from slviewer.pipeline.rig_choice import RigSetup
-from slviewer.pipeline.rig_presets import RigLike, load_rig
-from slviewer.pipeline.settings import takes_settings
+from slviewer.pipeline.operation import Findings, takes_settings
+from slviewer.pipeline.rig_choice import RigLike, RigSetup, load_rig
 from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused
@@ -55,7 +53,6 @@ FULL_TURN_DEG = 360.0
 WATERTIGHT = MeshingPlan(watertight=True)
 """What stood on a table has a foot that no scan shows; it is closed flat."""
 _COUNT_LOST_DEG = 0.5
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +134,8 @@ def turn(settings: TurnSettings) -> Turn:
     Each scan is saved before the table turns on; a turn that was cancelled or failed can be
     resumed.
     """
-    model, progress, warn = settings.model, settings.progress, settings.warn
-    exposures, accepts = settings.exposures, settings.accept_rejected
+    progress, warn, exposures = settings.progress, settings.warn, settings.exposures
+    model, accepts = settings.model, settings.accept_rejected
     with opened_or_made(settings.session) as store:
         if settings.merge:  # refused before anything turns
             check_accepted(store, accepts)
@@ -153,34 +150,24 @@ def turn(settings: TurnSettings) -> Turn:
         place_object(bench)
         if (stereo := load_stereo_if_complete(store)) is not None:
             sequence = one_axis(sequence, depth_axis(stereo.rig))  # half of the frames
-        check_space(
-            store,
-            bench.rig.camera,
-            len(sequence.frames) * max(1, len(exposures)) * len(todo),
-            "the turn",
-        )
+        frames = len(sequence.frames) * max(1, len(exposures)) * len(todo)
+        check_space(store, bench.rig.camera, frames, "the turn")
         with bench.rig.opened() as devices:
             set_camera(devices, choice, settings)
 
             def capture_step(step: TurnStep, progress: Progress) -> None:
                 """Capture and save one step."""
-                captured = capture_with_texture(
-                    devices,
-                    sequence,
-                    exposures,
-                    progress=lambda done, n: progress(done / n, f"frame {done} of {n}"),
-                )
+
+                def report(done: int, n: int) -> None:
+                    """Report the frames that are captured."""
+                    progress(done / n, f"frame {done} of {n}")
+
+                captured = capture_with_texture(devices, sequence, exposures, progress=report)
                 save_frames(store, step.name, "scan", captured, turn_step=step)
                 warn_of_captured(step.name, captured, warn)
 
-            capture_turn(
-                devices,
-                todo,
-                capture_step,
-                recorded_steps(store, turn_name),
-                part(progress, 0, 0.5),
-                warn,
-            )
+            before, turning = recorded_steps(store, turn_name), part(progress, 0, 0.5)
+            capture_turn(devices, todo, capture_step, before, turning, warn)
         names = [step.name for step in recorded_steps(store, turn_name)]
         captures = tuple(map(store.load_capture, names))
         if not settings.merge:
@@ -188,13 +175,10 @@ def turn(settings: TurnSettings) -> Turn:
             return Turn(captures)
         merging = MergeSettings(names, names[0], model=model, accept_rejected=accepts)
         merged = merge_turn(store, merging, part(progress, 0.5, 0.8), warn)
-        out = (
-            settings.mesh if settings.mesh is not None else store.exports / f"{turn_name}_mesh.ply"
-        )
+        out = settings.mesh or store.exports / f"{turn_name}_mesh.ply"
         meshed = mesh_merge(
             store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model,
-            accept_rejected=accepts,
-            progress=part(progress, 0.8, 1.0), warn=warn,
+            accept_rejected=accepts, progress=part(progress, 0.8, 1.0), warn=warn,
         )  # fmt: skip
     return Turn(captures, merged, meshed)
 
@@ -241,22 +225,19 @@ def next_turn(store: Session) -> str:
 
 def recorded_steps(store: Session, name: str) -> list[TurnStep]:
     """List the captured steps of a turn, in their order."""
-    steps = (capture.turn_step for capture in store.captures("scan"))
-    return sorted(
-        (step for step in steps if step is not None and step.turn == name),
-        key=lambda step: step.step,
-    )
+    steps = [capture.turn_step for capture in store.captures("scan")]
+    turned = [step for step in steps if step is not None and step.turn == name]
+    return sorted(turned, key=lambda step: step.step)
 
 
 def missing_steps(store: Session, name: str | None = None) -> list[TurnStep]:
     """Return the steps of a turn, by default of the last one, that are not captured. Raises
     InputError if none is."""
-    turned = [capture for capture in store.captures("scan") if capture.turn_step is not None]
-    if name is None and turned:
-        last = max(turned, key=lambda capture: str(capture.meta.get("created", ""))).turn_step
-        assert last is not None
-        name = last.turn
-    recorded = recorded_steps(store, name) if name is not None else []
+    if name is None:
+        captures = sorted(store.captures("scan"), key=lambda each: str(each.meta.get("created")))
+        turns = [step.turn for each in captures if (step := each.turn_step) is not None]
+        name = turns[-1] if turns else ""
+    recorded = recorded_steps(store, name)
     if not recorded:
         raise InputError(f"there is no turn {name or 'yet'} to resume: begin a new one")
     first, taken = recorded[0], set(store.taken_names())
@@ -313,8 +294,8 @@ def capture_turn(
                 raise
             except SlviewerError as error:
                 saved = len(recorded) + k
-                kinds = (TurntableError, DeviceError, InputError)
-                kind = next((each for each in kinds if isinstance(error, each)), SlviewerError)
+                kinds = (TurntableError, DeviceError, InputError, SlviewerError)
+                kind = next(each for each in kinds if isinstance(error, each))
                 raise kind(
                     f"{label}, at {step.deg:g} degrees: {error}. {saved}"
                     f" scan{'s are' if saved != 1 else ' is'} saved: correct the cause, then resume"
@@ -328,28 +309,19 @@ def merge_turn(
     store: Session, settings: MergeSettings, progress: Progress, warn: Warn
 ) -> Findings[Merge]:
     """Merge the scans of a turn by the angles of its turntable; by features where the angles do not
-    fit the scans."""
-    return align_turn(
-        lambda start: merge_operation.run(store, replace(settings, start=start), progress, warn),
-        warn,
-    )
-
-
-def align_turn(merge: Callable[[StartKind], T], warn: Warn) -> T:
-    """Return ``merge("turntable")`` of the scans of a turn; by features where the angles do not fit
-    the scans.
+    fit the scans.
 
     They do not where the motor lost steps, the object slipped, or the table was moved while it was
     switched off.
     """
     try:
-        return merge("turntable")
+        return merge_operation.run(store, replace(settings, start="turntable"), progress, warn)
     except (Refused, InputError) as error:
         warn(
             "the angles of the turntable do not align the scans, they are aligned by features"
             f" instead: {error}"
         )
-    return merge("features")
+    return merge_operation.run(store, replace(settings, start="features"), progress, warn)
 
 
 def _origin(table: Turntable, recorded: Sequence[TurnStep], warn: Warn) -> float:

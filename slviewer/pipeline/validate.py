@@ -12,13 +12,9 @@ from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import CalibrationRejected, InputError, UsageError
-from slviewer.evaluation.crossvalidation import (
-    FOLDS,
-    gather_results,
-    measure_held_out,
-    split_folds,
-)
-from slviewer.pipeline.feedback import Progress, ignore_progress, part, stage
+from slviewer.evaluation.crossvalidation import FOLDS, gather_results, measure_held_out, split_folds
+from slviewer.geometry.rigid import move_points
+from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.models import (
     MODELS,
     ModelName,
@@ -99,13 +95,16 @@ def cross_validate(
     observations: Sequence[Observation],
     stereo: StereoModel,
     models: Sequence[str],
-    folds: int = FOLDS,
-    progress: Progress = ignore_progress,
+    folds: int,
+    progress: Progress,
 ) -> ModelComparison:
     """Cross-validate models on observations, with circles at their centres, and their stereo
     calibration."""
-    depths = {o.name: float(np.median(_board_depths(o, stereo))) for o in observations}
-    parts = split_folds(depths, folds)
+    depths = {
+        o.name: float(np.median(move_points(stereo.poses[o.name], o.points)[:, 2]))
+        for o in observations
+    }
+    parts, steps = split_folds(depths, folds), len(models) + 1
     axis = best_axis(observations, stereo)
     failed: dict[str, str] = {}
     measured: list[Mapping[str, Mapping[str, HeldOutPose]]] = []
@@ -122,24 +121,12 @@ def cross_validate(
         fitted: dict[str, Model] = {}
         for i, name in enumerate(n for n in models if n not in failed):
             doing = f"{name} without fold {k + 1} of {len(parts)}"
-            fitting = stage(report, i / (len(models) + 1), (i + 1) / (len(models) + 1), doing)
+            fitting = stage(report, i / steps, (i + 1) / steps, doing)
             try:
                 fitted[name] = FITS[name](training, without, fitting)
             except (CalibrationRejected, InputError) as error:
                 failed[name] = str(error)
-        report(len(models) / (len(models) + 1), f"measuring fold {k + 1} of {len(parts)}")
-        measured.append(
-            {
-                o.name: measure_held_out(fitted, o, axis, stereo.rig)
-                for o in observations
-                if o.name in fold
-            }
-        )
+        report(len(models) / steps, f"measuring fold {k + 1} of {len(parts)}")
+        held_out = [o for o in observations if o.name in fold]
+        measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in held_out})
     return gather_results(models, measured, parts, failed)
-
-
-def _board_depths(observation: Observation, stereo: StereoModel) -> np.ndarray:
-    """Return the depths (n,) mm in the camera's frame of a pose's board points, by the stereo
-    model."""
-    T = stereo.poses[observation.name]
-    return np.asarray((observation.points @ T[:3, :3].T + T[:3, 3])[:, 2])

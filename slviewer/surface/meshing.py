@@ -47,11 +47,20 @@ stood on a table."""
 class MeshingPlan:
     """How to mesh. Nothing needs to be given.
 
-    ``method``: triangles between the pixels of one scan (grid), one closed surface fitted to all
-    points (poisson), or the mean surface in small cells (volume); by default grid for a scan,
-    poisson for merged points. ``fill_holes_mm``: holes up to that far across are filled; by default
-    a few spacings of the points, and with poisson any if it is to be watertight. ``triangles``: at
-    most so many. ``smooth``: rounds of smoothing. ``watertight``: closed, or refused.
+    Args:
+        method: Of a mesh: grid joins the pixels of one scan; poisson fits one surface to all
+            points; volume averages them in small cells. By default grid for one scan and poisson
+            for merged ones.
+        fill_holes_mm: Of a mesh: fill holes of up to so many mm across; by default a few spacings
+            of the points.
+        triangles: Of a mesh: thin it to so many triangles.
+        smooth: Of a mesh: rounds of smoothing, 0 for none; how far it moved the surface is
+            reported.
+        watertight: Of a mesh: close the surface, or report why it cannot be closed. A gap that no
+            scan shows, such as the foot that an object stands on, is closed flat, and reported.
+
+    `slviewer mesh` and `export` show this. Poisson fills any hole by default where the mesh is to
+    be watertight.
     """
 
     method: Method | None = None

@@ -21,8 +21,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch
 from slviewer.pipeline.capture_phases import decode_frames, texture_8bit
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.pose_evidence import DecodedPose
-from slviewer.pipeline.poses import read_pose
+from slviewer.pipeline.poses import DecodedPose, read_pose
 from slviewer.pipeline.simulate import TARGET
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.multiway import Starts, register_all
@@ -183,6 +182,7 @@ def _time_poses(rig: SimulatedRig, plan: dict[str, Any]) -> list[Row]:
         read = read_pose(
             DecodedPose(name, sequence, frames, phases, texture_8bit(sequence, frames), board),
             Smoothing(),
+            examine=False,
         )
         if read.observation is not None:
             observations.append(read.observation)

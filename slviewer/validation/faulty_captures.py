@@ -19,8 +19,7 @@ from slviewer.fringe.patterns import profile
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.pose_evidence import DecodedPose
-from slviewer.pipeline.poses import Judged, read_pose
+from slviewer.pipeline.poses import DecodedPose, Judged, read_pose
 from slviewer.records.verdict import Cause
 from slviewer.simulation.boards import BoardShape, Pose, printed_board
 from slviewer.simulation.hostile_frames import delay_frames, drop_frame, show_instead
@@ -105,7 +104,7 @@ class FaultBench:
         name, sequence, board = f"pose_{i + 1:02d}", sequence or self.sequence, board or self.board
         phases = decode_frames(name, sequence, frames)
         pose = DecodedPose(name, sequence, frames, phases, texture(sequence, frames), board)
-        return read_pose(pose, Smoothing(), examine=True)
+        return read_pose(pose, Smoothing())
 
     def examine_clean(self, count: int | None = None) -> list[Judged]:
         """Read all captures, or the first ``count``, without a fault; cached."""

@@ -18,8 +18,12 @@ from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, load_last_verdict
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.operation import Job
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct_capture
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.verification import Shape
 from slviewer.session.store import Session
@@ -175,14 +179,16 @@ class HostileBench:
         shape: Shape = "plane" if name.startswith("plane") else "sphere"
         with Session.open(session) as store:
             job, out = Job(store, warn=report.warnings.append), self.folder / "cloud.ply"
-            done = reconstruct_capture(job, ReconstructSettings(name, self.models[-1], out=out))  # type: ignore[arg-type]
+            used = ReconstructSettings(name, self.models[-1], out=out)  # type: ignore[arg-type]
+            with reconstruct_capture(job, used) as made:
+                cloud = made.cloud
             try:
                 radius = SPHERE_RADIUS_MM if shape == "sphere" else None
                 settings = VerifySettings([name], shape, self.models, radius=radius)  # type: ignore[arg-type]
                 verify.run(store, settings, warn=job.warn)
             except SlviewerError as error:
                 report.warnings.append(str(error))
-        return match_with_truth(done.cloud, *truth)
+        return match_with_truth(cloud, *truth)
 
 
 def match_with_truth(cloud: Cloud, renderer: Renderer, clean: Renderer) -> MeasuredScan:

@@ -16,11 +16,11 @@ from slviewer.evaluation.compare import Comparison
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergeSettings, merge_scans
-from slviewer.pipeline.models import load_model, load_models, load_stereo
+from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.pipeline.verify import VerifySettings, compare_captures
 from slviewer.records.verification import centre_distances_mm
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
@@ -74,16 +74,19 @@ def reproduce(
     )
     round_ = VerifySettings(spheres, "sphere", radius=letter.SPHERE_RADIUS_MM)
     balls = _compare_models(session, round_, part(progress, 0.75, 0.82), warn)
-    with Session.open(session) as store:
-        settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
-        merged = merge_scans(Job(store, part(progress, 0.82, 0.9)), settings)
+    settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
+    with (
+        Session.open(session) as store,
+        merge_scans(Job(store, part(progress, 0.82, 0.9)), settings) as merged,
+    ):
+        spacings = _compare_spacings(session, balls)
     result = Reproduction(
         quick=quick,
         stereo=stereo,
         pixelwise=pixelwise,
         planes=flat,
         spheres=balls,
-        spacings_mm=_compare_spacings(session, balls),
+        spacings_mm=spacings,
         merged=merged,
         report=out / "report.html",
     )
@@ -100,9 +103,7 @@ def _compare_models(
     """Return the comparison of the models on each capture, in the Letter's depth ranges."""
     settings = replace(settings, models=MODELS, depth_range=letter.DEPTH_RANGE_MM)
     with Session.open(session) as store:
-        compared = compare_captures(
-            Job(store, progress, warn), settings, load_models(store, MODELS)
-        )
+        compared = compare_captures(Job(store, progress, warn), settings)
         return {each.capture.name: each.found for each in compared}
 
 

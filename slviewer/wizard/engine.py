@@ -24,8 +24,7 @@ from slviewer.pipeline.capture import measure_space, warn_of_captured
 from slviewer.pipeline.check_results import Preflight
 from slviewer.pipeline.examination import load_examination, load_or_save_examination
 from slviewer.pipeline.poses import read_stored_poses
-from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages
-from slviewer.pipeline.rig_presets import save_rig
+from slviewer.pipeline.rig_choice import Choice, RigSetup, SetUp, list_needed_pages, save_rig
 from slviewer.registration.refusal import Reason
 from slviewer.session.capture import Capture
 from slviewer.session.reading import expand_user
@@ -374,7 +373,7 @@ class Engine:
             self.publisher.mark_changed(session=True)
 
         poses = read_stored_poses(
-            session, [capture.name], Board.parse(target), Smoothing(), True, plan_next
+            session, [capture.name], Board.parse(target), Smoothing(), plan_next
         )
         judged = next(poses)
         if judged.observation is None:

@@ -11,17 +11,20 @@ from slviewer.errors import InputError
 from slviewer.evaluation.render import format_count
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.compare import CompareSettings, compare
-from slviewer.pipeline.measure import MeasureSettings, What, measure
-from slviewer.pipeline.measured_surface import LoadSurface, MeasuredSurface, Place
-from slviewer.pipeline.measurements import (
+from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
+from slviewer.pipeline.measure import (
+    MeasureSettings,
+    RelateSettings,
+    What,
     export_measurements,
+    measure,
+    relate,
     rename_measurement,
     restore_measurement,
     trash_measurement,
 )
-from slviewer.pipeline.plan import TOLERANCE_MM, make_plan
-from slviewer.pipeline.relate import RelateSettings, relate
-from slviewer.pipeline.run_plan import RunPlanSettings, run_plan
+from slviewer.pipeline.measured_surface import LoadSurface, MeasuredSurface, Place
+from slviewer.pipeline.operation import Job
 from slviewer.records.measurement import MeasuredRegion
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.session import atomic
@@ -199,9 +202,8 @@ class MeasureRequests(RequestHandler):
 
         def work(report: Reporter) -> str:
             """Write the plan into the exports; returns a sentence with what to do with it."""
-            made = make_plan(
-                store, TOLERANCE_MM, name=store.folder.name, warn=self._warner("measurements")
-            )
+            job = Job(store, warn=self._warner("measurements"))
+            made = make_plan(job, TOLERANCE_MM, store.folder.name)
             with store.guarded(report.saving).staged_export(PLAN) as path:
                 write_plan(made, path)
             report(1.0, "written")

@@ -19,9 +19,8 @@ from slviewer.pipeline.models import (
     check_accepted,
 )
 from slviewer.pipeline.operations import OPERATIONS
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct
+from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
 from slviewer.pipeline.validate import ValidateSettings, validate
-from slviewer.pipeline.verify import VerifySettings, verify
 from slviewer.records.verification import Shape
 from slviewer.session.names import clean_label
 from slviewer.surface.meshing import MeshingPlan

@@ -160,7 +160,7 @@ class RigRequests(RequestHandler):
 
     @request("Saving the rig")
     def save_rig(self, name: str, what: str = "") -> None:
-        """Save the rig in use, with its exposure, under a name in the session, where `rig_presets`
+        """Save the rig in use, with its exposure, under a name in the session, where `rig_choice`
         lists it."""
         self._engine.save_rig(name, what)
 

@@ -11,7 +11,7 @@ from slviewer.cli import main
 from slviewer.devices.drivers import Driver, drivers
 from slviewer.devices.protocols import CameraSettings, Openable
 from slviewer.devices.simulated import preset_rig
-from slviewer.pipeline.rig_presets import save_rig
+from slviewer.pipeline.rig_choice import save_rig
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 

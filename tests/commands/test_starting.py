@@ -37,7 +37,7 @@ def test_a_command_has_the_arguments_that_its_functions_docstring_describes(
     assert {"--reference", "--start", "--json"} <= set(said.split())
     assert not {"--picked", "--keep-background", "--progress"} & set(said.split())
     assert "three or more points" not in said  # what is behind the arguments is for Python
-    merge = inspect.signature(COMMANDS["merge"]).parameters
+    merge = inspect.signature(COMMANDS["merge"]()).parameters
     assert (
         merge["captures"].annotation.__origin__ == tuple[str, ...]
         and merge["model"].default is None

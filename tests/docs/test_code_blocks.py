@@ -21,8 +21,7 @@ import pytest
 from slviewer.cli import main
 from slviewer.devices.drivers import builtin_drivers
 from slviewer.pipeline import simulate as simulation
-from slviewer.pipeline.rig_choice import rig_factory
-from slviewer.pipeline.rig_presets import check_choice
+from slviewer.pipeline.rig_choice import check_choice, driver_factory
 from slviewer.session.store import Session
 from slviewer.simulation.plans import spheres
 from slviewer.simulation.renderer import Renderer
@@ -214,7 +213,7 @@ def test_the_page_of_rig_files_names_every_option() -> None:
     provided = {"board", "world", "page", "timing"}  # by the program
     for name, found in builtin_drivers().items():
         for part in ("camera", "projector", "turntable", "rig"):
-            make = rig_factory(found) if part == "rig" else getattr(found, part)
+            make = driver_factory(found, part)
             row = " ".join(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
             if make is not None:
                 missing = [

@@ -23,9 +23,8 @@ from slviewer.errors import Cancelled, SlviewerError, UsageError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.batch import batch, connect
-from slviewer.pipeline.reconstruct import reconstruct
+from slviewer.pipeline.reconstruct import reconstruct, verify
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.verify import verify
 from slviewer.records.plain import to_plain
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session

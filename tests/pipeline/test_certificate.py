@@ -16,10 +16,11 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
+from slviewer.pipeline.inspect_parts import run_plan
+from slviewer.pipeline.measure import relate
 from slviewer.pipeline.measured_surface import load_surface
-from slviewer.pipeline.relate import relate
+from slviewer.pipeline.operation import Job
 from slviewer.pipeline.report import report
-from slviewer.pipeline.run_plan import run_plan
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.records.inspection import Characteristic
 from slviewer.report.page import CERTIFICATE, split_page
@@ -67,7 +68,7 @@ def measured_report(folder: Path, model: str) -> Path:
         inputs = store.input_hashes(f"calibration/{model}")
         applied = {"factor": 1.001, "U_ppm": 20.0, "certificate": "lab 7", "inputs": inputs}
         store.save_result(f"scale/{model}", applied, {})
-        plane = load_surface(store, "plane_01")
+        plane = load_surface(Job(store), "plane_01")
         u, v = (int(value) for value in np.argwhere(plane.measured).mean(axis=0)[::-1])
         sl.measure(store, "plane_01", "plane", ball=(*plane.points[v, u].tolist(), 20.0))
         sl.measure(store, "plane_01", "distance", at=(u - 20, v, u + 20, v))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts, raises
+from operations import loaded
 from sound_checks import save_sound_checks
 from trimesh.creation import box
 
@@ -20,18 +21,21 @@ from slviewer.evaluation.region import find_spheres
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline import measurements
-from slviewer.pipeline.measured_surface import MeasuredSurface, load_surface
-from slviewer.pipeline.measurements import (
+from slviewer.pipeline.measure import (
+    describe_measurement,
+    export_measurements,
+    format_measurements,
+    relate,
     rename_measurement,
     restore_measurement,
+    section_lines,
     trash_measurement,
 )
+from slviewer.pipeline.measured_surface import MeasuredSurface
 from slviewer.pipeline.open_session import opened
-from slviewer.pipeline.relate import relate
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
-from slviewer.pipeline.stored_records import Stored, load_stored, save_record
+from slviewer.pipeline.stored_records import Stored, list_records, load_stored, save_record
 from slviewer.records.measurement import MeasuredRegion, Measurement
 from slviewer.records.merge import Merge
 from slviewer.records.plain import from_plain, to_plain
@@ -73,7 +77,7 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def balls(made) -> MeasuredSurface:
-    return load_surface(made, "balls")
+    return loaded(made, "balls")
 
 
 @pytest.fixture
@@ -129,9 +133,15 @@ def fit(
 
 
 def related(folder: Path, a: Stored[Measurement], b: Stored[Measurement]) -> Stored[Measurement]:
-    """Relate two measurements."""
+    """Relate two"""
     (name,) = relate(folder, a.name, b.name)
     return load(folder, name)
+
+
+def load_measurements(folder: Path | Session) -> list[Stored[Measurement]]:
+    """All measurements, in the order in which they were made."""
+    with opened(folder) as store:
+        return list_records(store, Measurement)
 
 
 def load(folder: Path | Session, name: str) -> Stored[Measurement]:
@@ -168,11 +178,11 @@ def test_what_is_measured_is_kept_listed_and_true(
     )
     assert abs(width.record.quantities[0].value - true) < 3 and width.record.quantities[0].sigma > 0
     assert abs(over.record.quantities[1].value) < 0.3  # the point lies on the ball's surface
-    plane, lines = measurements.section_lines(folder, cut.name)
+    plane, lines = section_lines(folder, cut.name)
     assert len(lines) >= 2 and max(np.ptp(line[:, 0]) for line in lines) < 2 * RADIUS
     assert np.allclose(plane.drawn(balls.points[a[1], a[0]][None].astype(float)), 0, atol=1e-3)
 
-    listed = measurements.load_measurements(folder)
+    listed = load_measurements(folder)
     assert [each.name for each in listed] == ["m1", "m2", "m3", "m4", "m5", "m6", "m7"]
     assert not any(each.stale for each in listed) and listed[2].label == "L – R"
     status, said, _ = run("inspect", folder)
@@ -181,7 +191,8 @@ def test_what_is_measured_is_kept_listed_and_true(
         and not missing_facts(said, "7 measurements", "L: sphere on balls")
         and "radius 25.0" in said
     )
-    assert measurements.export_measurements(folder, tmp_path / "m.csv") == 7
+    with opened(folder) as store:
+        assert export_measurements(store, tmp_path / "m.csv") == 7
     rows = list(csv.DictReader(io.StringIO((tmp_path / "m.csv").read_text("utf-8-sig"))))
     assert (
         rows[0]["name"] == "L" and rows[0]["unit"] == "mm" and rows[0]["calibration in U"] == "no"
@@ -196,16 +207,14 @@ def test_measurements_are_renamed_deleted_and_brought_back(folder, balls, tops) 
     with Session.open(folder, write=True) as store:
         assert rename_measurement(store, one.name, "=width").label == "=width"
         # no formula in a table
-        assert ",'=width," in measurements.format_measurements(
-            measurements.load_measurements(store)
-        ).replace("m1,'", "m1,'")
+        assert ",'=width," in format_measurements(load_measurements(store)).replace("m1,'", "m1,'")
         assert rename_measurement(store, one.name, "").label == "distance 1"
         two = measure(store, balls, "distance", b, a, name="back")
         trash_measurement(store, two.name)
         three = measure(store, balls, "distance", a, b)
         assert three.name == "m3"  # an id that was deleted can come back
         assert restore_measurement(store).label == "back"
-        assert [each.name for each in measurements.load_measurements(store)] == ["m1", "m2", "m3"]
+        assert [each.name for each in load_measurements(store)] == ["m1", "m2", "m3"]
         with raises(InputError):
             restore_measurement(store)
         with raises(InputError, "'m9'", "m1", "m2", "m3"):
@@ -220,17 +229,17 @@ def test_a_measurement_is_stale_when_its_scan_or_what_it_was_made_from_changed(
     related(folder, *fits)
     with Session.open(folder, write=True) as store:
         trash_measurement(store, fits[1].name)
-    assert [each.stale for each in measurements.load_measurements(folder)] == [False, True]
+    assert [each.stale for each in load_measurements(folder)] == [False, True]
     with Session.open(folder, write=True) as store:
-        restore_measurement(store, fits[1].name)
-    assert not any(each.stale for each in measurements.load_measurements(folder))
+        restore_measurement(store)
+    assert not any(each.stale for each in load_measurements(folder))
     with Session.open(folder, write=True) as store:
         other = store.load_capture("object")
         store.save_capture(
             "balls", "scan", other.sequence, other.frames[::1], source="again", force=True
         )
-    assert all(each.stale for each in measurements.load_measurements(folder))
-    assert "[stale" in measurements.describe_measurement(measurements.load_measurements(folder)[0])
+    assert all(each.stale for each in load_measurements(folder))
+    assert "[stale" in describe_measurement(load_measurements(folder)[0])
     with raises(InputError, "stale"):
         related(folder, *fits)
 
@@ -252,7 +261,7 @@ def test_what_cannot_be_measured_is_refused_and_nothing_is_kept(
     with raises(InputError, "point", "plane", "sphere"):
         point = measure(folder, balls, "point", tops[0])
         related(folder, one, point)
-    assert len(measurements.load_measurements(folder)) == 2
+    assert len(load_measurements(folder)) == 2
 
 
 @pytest.mark.slow
@@ -300,14 +309,14 @@ def test_a_scan_is_compared_with_its_nominal_from_the_command_line(
     (tmp_path / "broken.stl").write_bytes(b"\0" * 300)
     status, _, wrong = run("compare", folder, "object", tmp_path / "broken.stl")
     assert status == 1 and "broken.stl" in wrong
-    assert len(measurements.load_measurements(folder)) == 3
+    assert len(load_measurements(folder)) == 3
 
 
 def test_a_damaged_measurement_is_told_not_guessed(folder, balls, tops) -> None:
     one = measure(folder, balls, "section", *tops)
     next((folder / "results" / "measurements" / one.name).rglob("lines.npy")).write_bytes(b"x")
     with raises(SessionError):
-        measurements.section_lines(folder, one.name)
+        section_lines(folder, one.name)
 
 
 @pytest.mark.slow
@@ -378,7 +387,7 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
             inputs=inputs,
         )
         save_record(store, "1", made, {})
-    on = load_surface(folder, "merge/1")
+    on = loaded(folder, "merge/1")
     region = regions[0]
     one = fit(folder, on, "sphere", ball_about(balls, region))
     assert abs(one.record["radius"].value - RADIUS) < 0.05 and one.record.source == "merge/1"
@@ -389,7 +398,7 @@ def test_a_merge_is_measured_on_too(folder, balls, regions) -> None:
         for dx in (-15, 15)
     ]
     cut = measure(folder, on, "section", *ends)
-    plane, lines = measurements.section_lines(folder, cut.name)
+    plane, lines = section_lines(folder, cut.name)
     (middle,) = plane.drawn(CENTRES[:1])
     radii = np.concatenate([np.linalg.norm(line - middle, axis=1) for line in lines])
     apart = abs(float((CENTRES[0] - plane.origin) @ plane.normal))

@@ -9,7 +9,7 @@ from facts import raises
 
 from slviewer.errors import InputError, SessionError
 from slviewer.fringe.presets import complementary
-from slviewer.pipeline.replay import reel
+from slviewer.pipeline.rig_choice import reel
 from slviewer.session.exporters import write_pattern_folder
 from slviewer.session.store import Session
 from slviewer.wizard.operator import Operator

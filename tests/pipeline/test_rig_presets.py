@@ -9,8 +9,7 @@ from facts import raises
 
 from slviewer.devices.drivers import Driver, drivers
 from slviewer.errors import DeviceError, InputError
-from slviewer.pipeline.rig_choice import set_up
-from slviewer.pipeline.rig_presets import check_choice, load_rig, presets, rigs, save_rig
+from slviewer.pipeline.rig_choice import check_choice, load_rig, presets, rigs, save_rig, set_up
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 
@@ -152,4 +151,3 @@ def test_a_rig_that_cannot_be_used_is_listed_with_its_problem(fake: None, sessio
     listed = {preset.name: preset for preset in presets(session)}
     assert listed["far"].what == "Far away." and "pip install it" in listed["far"].problem
     assert "TOML" in listed["broken"].problem and listed["simulated"].problem == ""
-    assert "far: Far away." in rigs(session) and "no_such_package" in rigs(session)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts, raises
-from operations import merged, reconstructed
+from operations import loaded, merged, reconstructed
 from sound_checks import save_sound_checks
 
 from slviewer.cli import main
@@ -15,7 +15,6 @@ from slviewer.pipeline.certificate import verify_report
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
 from slviewer.pipeline.measure import measure
-from slviewer.pipeline.measured_surface import load_surface
 from slviewer.pipeline.merge import merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.report import report
@@ -94,9 +93,9 @@ def test_every_command_uses_the_region_of_the_session(
     made = reconstructed(session, "one", out=tmp_path / "cut.ply", grid=tmp_path / "cut.npy")
     assert made.points == wanted == len(read_ply(tmp_path / "cut.ply").points)
     assert count(np.load(tmp_path / "cut.npy")) == wanted
-    assert region.text() in " ".join(made.restrictions)
+    assert region.text() in " ".join(made.found.notes)
     assert len(read_ply(export(session, "cloud", "one").path).points) == wanted
-    assert count(load_surface(session, "one").points) == wanted
+    assert count(loaded(session, "one").points) == wanted
     vertices = read_ply(mesh(session, ["one"], tmp_path / "cut_mesh.ply").out).points
     assert region.contains(np.asarray(vertices, float)).mean() > 0.999
     cut = merged(session, ["two"], "one", out=tmp_path / "merged.ply", start="identity")
@@ -135,7 +134,7 @@ def test_a_region_beside_the_scan_is_refused_with_numbers(
 ) -> None:
     facts = {}
     for name in ("one", "two"):
-        cloud = load_surface(session, name).points
+        cloud = loaded(session, name).points
         depths = cloud[..., 2][np.isfinite(cloud[..., 2])]
         facts[name] = (
             name,

@@ -13,12 +13,14 @@ from facts import missing_facts, raises
 from faulty_rig import breakable
 
 from slviewer.errors import Cancelled, DeviceError, InputError, TurntableError, UsageError
-from slviewer.pipeline.merge import merge
+from slviewer.pipeline.feedback import ignore_progress
+from slviewer.pipeline.merge import MergeSettings, merge
 from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.turn import (
-    align_turn,
     capture_turn,
+    merge_operation,
+    merge_turn,
     missing_steps,
     next_turn,
     plan_turn,
@@ -228,17 +230,21 @@ def test_a_resumed_turn_goes_on_at_the_angle_where_it_stopped(
     ] == targets
 
 
-def test_angles_that_do_not_fit_the_scans_are_not_insisted_on() -> None:
+def test_angles_that_do_not_fit_the_scans_are_not_insisted_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     warnings: list[str] = []
 
-    def attempt(start: str) -> str:
-        if start == "turntable":
+    def attempt(store: Session, settings: MergeSettings, *_: object) -> str:
+        if settings.start == "turntable":
             raise Refused("overlap", "they do not overlap")
-        return start
+        return settings.start
 
-    assert (
-        align_turn(attempt, warnings.append) == "features" and "they do not overlap" in warnings[0]
-    )
+    monkeypatch.setattr(merge_operation, "run", attempt)
+    with Session.create(tmp_path / "session") as store:
+        settings = MergeSettings(["two"], "one")
+        merged = merge_turn(store, settings, ignore_progress, warnings.append)
+    assert merged == "features" and "they do not overlap" in warnings[0]
 
 
 @pytest.mark.computes

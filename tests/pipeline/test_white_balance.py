@@ -13,9 +13,8 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.errors import InputError, UsageError
 from slviewer.pipeline.capture import capture
-from slviewer.pipeline.mesh import mesh
+from slviewer.pipeline.mesh import balance, measure_white, mesh
 from slviewer.pipeline.rig_choice import RigSetup
-from slviewer.pipeline.white_balance import balance, measure_white
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
 from slviewer.validation.bench_live import true_calibration

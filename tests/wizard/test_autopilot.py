@@ -22,8 +22,7 @@ from slviewer.errors import Cancelled
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.merge import MergeSettings, merge
 from slviewer.pipeline.operation import Operation
-from slviewer.pipeline.reconstruct import ReconstructSettings, reconstruct
-from slviewer.pipeline.verify import VerifySettings, verify
+from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
 from slviewer.records.verification import Verification
 from slviewer.session.ply import read_ply
 from slviewer.session.store import Session

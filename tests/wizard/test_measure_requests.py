@@ -14,8 +14,9 @@ from slviewer.errors import InputError
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measurements import load_measurements
 from slviewer.pipeline.simulate import save_true_stereo
+from slviewer.pipeline.stored_records import list_records
+from slviewer.records.measurement import Measurement
 from slviewer.session.inspection_plan import read_plan
 from slviewer.session.store import Session
 from slviewer.simulation.assets import asset
@@ -67,7 +68,7 @@ def now(operator: Operator) -> SessionView:
     """The session, once all is done; what it says of measurements is what `measurements` says."""
     session = operator.wait_until_idle(HANG_S).session
     assert session is not None and operator.session is not None
-    assert list(session.measurements) == load_measurements(operator.session)
+    assert list(session.measurements) == list_records(operator.session, Measurement)
     return session
 
 

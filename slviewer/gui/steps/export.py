@@ -18,7 +18,7 @@ from slviewer.pipeline.export import (
     estimate_file_bytes,
     formats,
 )
-from slviewer.pipeline.white_balance import BOARD
+from slviewer.pipeline.mesh import BOARD
 from slviewer.records.kinds import RECORDS
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import mesh_formats, point_formats
