@@ -1,7 +1,7 @@
 """The acceptance test: artefacts with certificates against the session's calibration."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -20,20 +20,19 @@ from slviewer.evaluation.repeatability import repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.check import load_drift_history
-from slviewer.pipeline.feedback import part
 from slviewer.pipeline.models import (
     Model,
     ModelName,
     check_accepted,
     load_model,
     load_stereo,
-    preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import match_names, next_number
+from slviewer.pipeline.open_session import match_names
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.reconstruct import segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
+from slviewer.pipeline.stored_records import next_name
 from slviewer.records.acceptance import (
     AcceptanceTest,
     CertifiedArtefact,
@@ -44,7 +43,6 @@ from slviewer.records.acceptance import (
 )
 from slviewer.records.drift import Drift
 from slviewer.session.reading import read_toml
-from slviewer.session.store import Session
 
 
 @dataclass(frozen=True)
@@ -75,23 +73,23 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
     store, still = job.store, settings.still
     certified = read_artefact(settings.artefact)
     check_accepted(store)
-    name = settings.model or preferred_model(store)
-    chosen, factor = load_model(store, name), scale_factor(store, name)
+    chosen = load_model(store, settings.model)
+    name, factor = chosen.name, scale_factor(store, chosen.name)
     warn_if_stale(store, job.warn)
     if settings.apply_scale and certified.kind == "plane":
         raise InputError(
             "the scale cannot be measured on a plane: apply that of a ball bar or a sphere"
         )
-    captures = _match_captures(store, certified)
+    captures: dict[str, str] = {}  # {capture: position, its own name where several are in one}
+    for position, pattern in certified.positions.items():
+        matches = match_names(store.capture_names(), [pattern], "capture", InputError)
+        captures |= {each: position if len(matches) == 1 else each for each in matches}
     check_capture_sizes(store, [*captures, *still])
     positions = _measure_positions(job, certified, chosen, captures, 0.5 if still else 0.9)
     test = conclude_test(certified, name, positions)
     repeated = None
     if still:
-        repeated = repeatability(
-            _list_depths(replace(job, progress=part(job.progress, 0.5, 0.95)), chosen, still)
-        )
-    checks = load_drift_history(store)
+        repeated = repeatability(_list_depths(job, chosen, still))
     applied = record_scale(store, test) if settings.apply_scale else None
     found = AcceptanceTest(
         artefact=CertifiedArtefact(certified.name, certified.certificate, certified.kind),
@@ -103,12 +101,12 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
         lacks=list(test.lacks),
         scale_factor=factor,
         scale_applied=applied,
-        budget=_length_budget(test, applied, checks),
+        budget=_length_budget(test, applied, load_drift_history(store)),
         repeatability=None if repeated is None else StillCaptures(**repeated.to_json()),
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         inputs=store.input_hashes(f"calibration/{name}", *captures, *still),
     )
-    yield Found(str(next_number(store, AcceptanceTest.kind)), found)
+    yield Found(next_name(store, AcceptanceTest), found)
     job.progress(1.0, "tested")
 
 
@@ -121,8 +119,7 @@ def _measure_positions(
     depth_range = load_stereo(store).depth_range_mm
     for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), job.warn)):
         job.progress(end * i / len(captures), f"measuring {shot.name}")
-        cloud = capture_cloud(store, chosen, shot, phases, warn=job.warn)
-        plate = None
+        cloud, plate = capture_cloud(store, chosen, shot, phases, warn=job.warn), None
         if certified.kind == "plane" and shot.role == "calibration":
             plate = segment_board(store, shot, capture_texture(shot, frames), job.warn)
         try:
@@ -141,7 +138,7 @@ def _list_depths(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield depth and its standard deviation (h, w) mm of each capture of the still object."""
     for i, (shot, _, phases) in enumerate(decode_captures(job.store, list(still))):
-        job.progress(i / len(still), f"repeating {shot.name}")
+        job.progress(0.5 + 0.45 * i / len(still), f"repeating {shot.name}")
         cloud = capture_cloud(job.store, chosen, shot, phases, warn=job.warn)
         yield cloud.points[..., 2], cloud.sigma_z
 
@@ -153,15 +150,6 @@ def read_artefact(path: Path | str) -> Artefact:
         return Artefact.from_dict(given)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _match_captures(store: Session, artefact: Artefact) -> dict[str, str]:
-    """{capture: position}; the capture's own name where a pattern matches several."""
-    positions: dict[str, str] = {}
-    for position, pattern in artefact.positions.items():
-        names = match_names(store.capture_names(), [pattern], "capture", InputError)
-        positions |= {name: position if len(names) == 1 else name for name in names}
-    return positions
 
 
 def _length_budget(

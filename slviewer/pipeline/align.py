@@ -5,8 +5,8 @@ of the first one; one that could not has the reason. A merge of all starts from 
 the loops.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import msgspec
@@ -16,12 +16,10 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, move_points
-from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import decode_captures
-from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import check_accepted, load_model, preferred_model
+from slviewer.pipeline.capture_clouds import scan_cloud
+from slviewer.pipeline.feedback import Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.models import check_accepted
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.pipeline.stored_records import load_record
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals
@@ -29,7 +27,6 @@ from slviewer.records.merge import Placement
 from slviewer.records.record import to_matrix
 from slviewer.registration.refusal import Refused
 from slviewer.registration.static_scene import register_object
-from slviewer.session.scan_edits import load_region
 from slviewer.session.store import Session
 
 FOLDER = Placement.kind
@@ -88,7 +85,7 @@ def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
     store = job.store
     check_accepted(store, settings.accept_rejected)
     names = list(settings.captures) or [
-        name for name in list_scans(store) if load_placement(store, name) is None
+        name for name, each in list_placements(store).items() if each is None
     ]
     if settings.only_reconstructed:
         names = [name for name in names if store.state_of(f"clouds/{name}") == "fresh"]
@@ -116,9 +113,7 @@ def _align_scan(
     """
     store, refusals = job.store, list[str]()
     cloud = _load_cloud(store, name, clouds, job.warn)
-    inputs = store.input_hashes(
-        name, *dict.fromkeys(("calibration/stereo", f"calibration/{cloud.model}"))
-    )
+    inputs = store.input_hashes(name, "calibration/stereo", f"calibration/{cloud.model}")
     if not placed:
         return Placement(T_first_scan=to_matrix(np.eye(4)), inputs=inputs)
     for onto in [*reversed(list(placed))][:MOST_TRIED]:
@@ -146,30 +141,29 @@ def remove_placement(store: Session, name: str) -> None:
         store.trash_result(f"{FOLDER}/{name}")
 
 
-def list_scans(store: Session) -> list[str]:
-    """Names of the captures of objects, in the order in which they were captured; no planes and
-    spheres."""
-    scans = [
-        c
-        for c in store.captures("scan")
-        if c.meta.get("settings", {}).get("purpose", "scan") == "scan"
+def list_placements(store: Session) -> dict[str, Placement | None]:
+    """The placement of every scan of an object (no planes and spheres), in the order in which they
+    were captured; None where it has none, or one that a newer calibration or capture has
+    outdated."""
+    captures = [
+        capture
+        for capture in store.captures("scan")
+        if capture.meta.get("settings", {}).get("purpose", "scan") == "scan"
     ]
-    return [scan.name for scan in sorted(scans, key=lambda scan: str(scan.meta.get("created", "")))]
-
-
-def load_placement(store: Session, name: str) -> Placement | None:
-    """The placement of a scan; None where it has none, or one that a newer calibration or capture
-    has outdated."""
-    fresh = store.state_of(f"{FOLDER}/{name}") == "fresh"
-    return load_record(store, Placement, name) if fresh else None
+    captures.sort(key=lambda capture: str(capture.meta.get("created", "")))
+    return {
+        name: load_record(store, Placement, name)
+        if store.state_of(f"{FOLDER}/{name}") == "fresh"
+        else None
+        for name in (capture.name for capture in captures)
+    }
 
 
 def load_placements(store: Session) -> dict[str, Placement]:
     """The placement of every scan that has its place, in the order in which they were captured."""
-    placements = {name: load_placement(store, name) for name in list_scans(store)}
     return {
         name: each
-        for name, each in placements.items()
+        for name, each in list_placements(store).items()
         if each is not None and each.T_first_scan is not None
     }
 
@@ -197,53 +191,36 @@ def view_places(
         points, directions = points[::step], directions[::step]
         thinned[name] = move_points(np.array(each.T_first_scan), points)
         facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
-    together, seen_by = count_views(thinned)
+    together, seen_by = _count_views(thinned.values())
     return AlignedScans(
         tuple(thinned), together, seen_by, np.nan_to_num(np.concatenate(facing)).astype(np.float32)
     )
 
 
-def count_views(scans: Mapping[str, Floats]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _count_views(scans: Iterable[Floats]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return all points (n, 3) mm of scans in one frame, and for each how many of the scans have a
     point near it."""
-    trees = {name: cKDTree(points) for name, points in scans.items()}
-    spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees.values()]
+    trees = [cKDTree(points) for points in scans]
+    spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees]
     reach = _REACH * max(spacing, default=0.0)
-    counts = []
-    for name in trees:
-        seen = np.ones(trees[name].n, np.uint8)
-        for other in trees.keys() - {name}:
-            seen += np.isfinite(
-                trees[other].query(trees[name].data, distance_upper_bound=reach, workers=-1)[0]
-            )
-        counts.append(seen)
-    points = [tree.data for tree in trees.values()]
-    return (
-        np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32),
-        np.concatenate([np.zeros(0, np.uint8), *counts]),
-    )
+    points, counts = [np.zeros((0, 3))], [np.zeros(0)]
+    for tree in trees:
+        near = [
+            np.isfinite(other.query(tree.data, distance_upper_bound=reach, workers=-1)[0])
+            for other in trees
+            if other is not tree
+        ]
+        points.append(tree.data)
+        counts.append(np.sum([np.ones(tree.n), *near], axis=0))
+    return np.concatenate(points).astype(np.float32), np.concatenate(counts).astype(np.uint8)
 
 
 def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn) -> Cloud:
     """The cloud of a scan, of at most `_PIXELS` pixels: the saved one where it is fresh, else
     reconstructed."""
     if name not in clouds:
-        if store.state_of(f"clouds/{name}") == "fresh":
-            meta, arrays = store.load_result(f"clouds/{name}", only=("points", "sigma_z"))
-            cloud = Cloud(arrays["points"], meta["axis"], meta["model"], arrays["sigma_z"])
-        else:
-            check_capture_sizes(store, [name])
-            model = load_model(store, preferred_model(store))
-            ((shot, _, phases),) = decode_captures(store, [name], warn)
-            cloud = capture_cloud(store, model, shot, phases, warn=warn)
-        cloud = restrict_cloud(store, name, cloud, load_region(store))
+        cloud = scan_cloud(store, name, None, ignore_progress, warn)
         step = max(1, int(np.ceil(np.sqrt(cloud.sigma_z.size / _PIXELS))))
-        clouds[name] = replace(
-            cloud,
-            points=cloud.points[::step, ::step],
-            sigma_z=cloud.sigma_z[::step, ::step],
-            texture=None,
-            sigma_calibration=None,
-            sigma_edges=None,
-        )
+        points, sigma_z = cloud.points[::step, ::step], cloud.sigma_z[::step, ::step]
+        clouds[name] = Cloud(points, cloud.axis, cloud.model, sigma_z)
     return clouds[name]

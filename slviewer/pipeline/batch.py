@@ -1,34 +1,40 @@
 """Many captures at once, on Dask's distributed scheduler: a cluster of this machine's own cores, or
-one given."""
+one given. Its workers run the commands' own functions, on one capture at a time."""
 
 import os
 import secrets
+import tempfile
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import KW_ONLY, dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import KW_ONLY, dataclass, field, replace
+from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from slviewer.errors import InputError, SlviewerError, UsageError
+import numpy as np
+
+from slviewer import __version__
+from slviewer.errors import InputError, SessionError, SlviewerError, UsageError
 from slviewer.evaluation.render import render
-from slviewer.pipeline.batch_storage import absolute_address, remove_leftovers
-from slviewer.pipeline.batch_tasks import (
-    Do,
-    Task,
-    TaskResult,
-    describe_error,
-    list_captures,
-    run_task,
-    verification_file,
-    write_verification,
-)
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.operation import Callbacks, takes_settings
+from slviewer.pipeline.operation import Callbacks, Findings, Job, takes_settings
+from slviewer.pipeline.reconstruct import (
+    ReconstructSettings,
+    VerifySettings,
+    reconstruct_capture,
+    verify,
+)
 from slviewer.records.verification import Shape, Verification
+from slviewer.session.atomic import to_json, write_bytes
+from slviewer.session.layout import is_session
+from slviewer.session.reading import expand_user
+from slviewer.session.store import Session
 
+Do = Literal["reconstruct", "verify", "mesh"]
 INSTALL_COMMAND = "pip install 'slviewer[batch]'"
 CONNECT_TIMEOUT_S = 10.0
 """How long a scheduler may take to answer, and to find a worker."""
@@ -45,68 +51,9 @@ def dask_setup(worker):
 ends them."""
 
 
-@dataclass(frozen=True)
-class Batch:
-    """The result of every capture, in the order of the sessions. ``broken``: {session: why} of
-    those without any."""
-
-    done: tuple[TaskResult, ...]
-    broken: Mapping[str, str]
-    task: Task
-
-    @property
-    def failed(self) -> dict[str, str]:
-        """{session, or session and capture: why}."""
-        failed = {
-            f"{done.session} {done.capture}": done.failed for done in self.done if done.failed
-        }
-        return {**self.broken, **failed}
-
-    @property
-    def failure(self) -> str:
-        """How many captures and sessions failed; empty where none did."""
-        return (
-            f"{len(self.failed)} of the batch failed: the summary names them, and why"
-            if self.failed
-            else ""
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the published values of ``batch --json``."""
-        sessions: dict[str, Any] = {
-            address: {"failed": why, "captures": {}} for address, why in self.broken.items()
-        }
-        for done in self.done:
-            captures = sessions.setdefault(done.session, {"failed": None, "captures": {}})[
-                "captures"
-            ]
-            captures[done.capture] = {
-                **done.figures,
-                "failed": done.failed or None,
-                "warnings": list(done.warnings),
-            }
-        return {"do": self.task.do, "sessions": sessions}
-
-    def text(self) -> str:
-        """Return a report for the terminal: a table per session, then what failed and why."""
-        blocks = []
-        for address in dict.fromkeys(done.session for done in self.done):
-            rows = [
-                {"capture": d.capture, **d.figures}
-                for d in self.done
-                if d.session == address and not d.failed
-            ]
-            if rows:
-                wrote = (
-                    f" -> exports/{verification_file(self.task)}"
-                    if self.task.do == "verify"
-                    else ""
-                )
-                blocks.append(f"{address}{wrote}\n{render(rows)}\n")
-        failed = self.failed
-        blocks += [f"failed: {what}: {why}" for what, why in failed.items()]
-        good = sum(not done.failed for done in self.done)
-        return "\n".join([*blocks, f"{good} captures done, {len(failed)} failed"])
+_TASK_LOCK = threading.Lock()
+"""A process works on one capture at a time, however many threads its worker has: the kernels use
+its cores already, and each capture more would need as much memory again."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +98,87 @@ class BatchSettings(Callbacks):
             raise UsageError("no session named: give the folders or addresses of one or more")
 
 
+@dataclass(frozen=True)
+class Task:
+    """The same work for all captures of a batch, as its ``settings`` state it. ``batch``: its name,
+    ``version``: the submitting program's."""
+
+    settings: BatchSettings
+    batch: str
+    version: str = __version__
+
+    @property
+    def verification_file(self) -> str:
+        """Name of the verifications' file in the exports."""
+        return f"verification_{self.settings.shape}.json"
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """The result of one capture: its figures by name, or why it failed.
+
+    ``verification``: to be joined with those of the session's other captures.
+    """
+
+    session: str
+    capture: str
+    figures: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    failed: str = ""
+    verification: Verification | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The result of every capture, in the order of the sessions. ``broken``: {session: why} of
+    those without any."""
+
+    done: tuple[TaskResult, ...]
+    broken: Mapping[str, str]
+    task: Task
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """{session, or session and capture: why}."""
+        failed = {
+            f"{done.session} {done.capture}": done.failed for done in self.done if done.failed
+        }
+        return {**self.broken, **failed}
+
+    @property
+    def failure(self) -> str:
+        """How many captures and sessions failed; empty where none did."""
+        count = len(self.failed)
+        return f"{count} of the batch failed: the summary names them, and why" if count else ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the published values of ``batch --json``."""
+        sessions: dict[str, Any] = {
+            address: {"failed": why, "captures": {}} for address, why in self.broken.items()
+        }
+        for done in self.done:
+            session = sessions.setdefault(done.session, {"failed": None, "captures": {}})
+            session["captures"][done.capture] = {
+                **done.figures,
+                "failed": done.failed or None,
+                "warnings": list(done.warnings),
+            }
+        return {"do": self.task.settings.do, "sessions": sessions}
+
+    def text(self) -> str:
+        """Return a report for the terminal: a table per session, then what failed and why."""
+        good = [done for done in self.done if not done.failed]
+        is_verified = self.task.settings.do == "verify"
+        wrote = f" -> exports/{self.task.verification_file}" if is_verified else ""
+        blocks = []
+        for address in dict.fromkeys(done.session for done in good):
+            rows = [{"capture": d.capture, **d.figures} for d in good if d.session == address]
+            blocks.append(f"{address}{wrote}\n{render(rows)}\n")
+        failed = self.failed
+        blocks += [f"failed: {what}: {why}" for what, why in failed.items()]
+        return "\n".join([*blocks, f"{len(good)} captures done, {len(failed)} failed"])
+
+
 @takes_settings(BatchSettings)
 def batch(settings: BatchSettings) -> Batch:
     """Reconstruct, verify or mesh the captures of many sessions, on this machine's cores or a Dask
@@ -160,29 +188,40 @@ def batch(settings: BatchSettings) -> Batch:
     is named in the end, with status 1, and stops no other.
     """
     progress, warn, scheduler = settings.progress, settings.warn, settings.scheduler
-    addresses = list(dict.fromkeys(absolute_address(session) for session in settings.sessions))
-    task = Task(
-        settings.do,
-        secrets.token_hex(4),
-        settings.model,
-        settings.shape,
-        settings.radius,
-        settings.accept_rejected,
-    )
+    addresses = list(dict.fromkeys(map(_absolute_address, settings.sessions)))
+    sent = replace(settings, progress=ignore_progress, warn=ignore_warnings)
+    task = Task(sent, secrets.token_hex(4))
     progress(0.0, f"looking into {len(addresses)} sessions")
     try:
         with _start_cluster() if scheduler is None else connect(scheduler) as client:
-            captures = tuple(settings.captures)
-            listing = {
-                address: (list_captures, address, captures, task.version) for address in addresses
-            }
-            plans = _gather_results(client, listing, ignore_progress, warn)
+            listing = {address: (list_captures, address, task) for address in addresses}
+            plans = _gather_results(client, listing, warn)
             broken = {address: plan for address, plan in plans.items() if isinstance(plan, str)}
-            wanted = [
-                (a, name) for a, plan in plans.items() if not isinstance(plan, str) for name in plan
-            ]
-            done = _run_tasks(client, wanted, task, progress, warn)
-            broken |= _write_verifications(client, done, task, warn)
+            work = {
+                (address, name): (run_task, address, name, task)
+                for address, plan in plans.items()
+                if address not in broken
+                for name in plan
+            }
+            outcomes = _gather_results(client, work, warn, progress)
+            done = tuple(
+                came if isinstance(came, TaskResult) else TaskResult(address, name, failed=came)
+                for (address, name), came in outcomes.items()
+            )
+            for message in dict.fromkeys(
+                f"{one.session}: {words}" for one in done for words in one.warnings
+            ):
+                warn(message)
+            verified: dict[str, dict[str, Verification]] = {}
+            for one in done:
+                if one.verification is not None:
+                    verified.setdefault(one.session, {})[one.capture] = one.verification
+            writing = {
+                address: (write_verification, address, records, task)
+                for address, records in verified.items()
+            }
+            written = _gather_results(client, writing, warn)
+            broken |= {address: why for address, why in written.items() if why}
             progress(1.0, "done")
     finally:
         for address in addresses:
@@ -190,41 +229,99 @@ def batch(settings: BatchSettings) -> Batch:
     return Batch(done, broken, task)
 
 
-def _run_tasks(
-    client: Any, wanted: Sequence[tuple[str, str]], task: Task, progress: Progress, warn: Warn
-) -> tuple[TaskResult, ...]:
-    """Run the task for each (session, capture); return the results in their order."""
-    outcomes = _gather_results(
-        client, {(a, name): (run_task, a, name, task) for a, name in wanted}, progress, warn
-    )
-    done = tuple(
-        came if isinstance(came, TaskResult) else TaskResult(a, name, failed=came)
-        for (a, name), came in outcomes.items()
-    )
-    for sentence in dict.fromkeys(
-        f"{one.session}: {words}" for one in done for words in one.warnings
-    ):
-        warn(sentence)
-    return done
+def list_captures(address: str, task: Task) -> list[str]:
+    """Names of a session's captures that match any of the task's patterns, of its scans where there
+    is none. Raises SlviewerError where there are none."""
+    _check_version(task)
+    patterns = task.settings.captures
+    with _fetch_session(address) as folder, Session.open(folder) as store:
+        if not patterns:
+            if not (names := store.capture_names("scan")):
+                raise InputError("it holds no scan: name the captures, such as 'pose_*'")
+            return names
+        there = store.capture_names()
+        names = [name for name in there if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        if not names:
+            raise InputError(
+                f"no capture is called {' or '.join(patterns)}: there are"
+                f" {', '.join(there) or 'none'}"
+            )
+        return names
 
 
-def _write_verifications(
-    client: Any, done: Sequence[TaskResult], task: Task, warn: Warn
-) -> dict[str, str]:
-    """Have each session's verifications written; {session: why it could not be done}."""
-    parts: dict[str, dict[str, Verification]] = {}
-    for one in done:
-        if one.verification is not None:
-            parts.setdefault(one.session, {})[one.capture] = one.verification
-    writing = {
-        address: (write_verification, address, verified, task)
-        for address, verified in parts.items()
-    }
-    return {
-        address: why
-        for address, why in _gather_results(client, writing, ignore_progress, warn).items()
-        if why
-    }
+def run_task(address: str, capture: str, task: Task) -> TaskResult:
+    """Do the task with one capture; its files are in the session's exports when this returns."""
+    warnings, verification = list[str](), None
+    started = time.perf_counter()
+    try:
+        _check_version(task)
+        with _fetch_session(address, capture) as folder, _TASK_LOCK, Session.open(folder) as store:
+            job = Job(store, warn=warnings.append)
+            if task.settings.do == "verify":
+                verification = _verify(job, capture, task.settings)
+                figures: dict[str, Any] = {
+                    f"{model} RMS mm": fit.rms_mm for model, fit in verification.models.items()
+                }
+            else:
+                with export_folder(address, task.batch) as made:
+                    figures = _reconstruct(job, capture, task.settings, made)
+    except Exception as error:  # any error ends this capture alone
+        return TaskResult(address, capture, warnings=tuple(warnings), failed=describe_error(error))
+    figures["s"] = round(time.perf_counter() - started, 1)
+    return TaskResult(address, capture, figures, tuple(warnings), verification=verification)
+
+
+def write_verification(address: str, records: Mapping[str, Verification], task: Task) -> None:
+    """Write the verifications of one session, by capture, as ``verify --json`` does."""
+    with export_folder(address, task.batch) as made:
+        found = Findings(Verification, records)
+        write_bytes(made / task.verification_file, to_json(found.to_json()))
+
+
+def describe_error(error: Exception) -> str:
+    """Describe an error in words; of an unforeseen one its type too."""
+    return str(error) if isinstance(error, SlviewerError) else f"{type(error).__name__}: {error}"
+
+
+def _check_version(task: Task) -> None:
+    """Raise InputError where the batch was submitted by another version of slviewer than the
+    worker's."""
+    if task.version != __version__:
+        raise InputError(
+            f"the worker runs slviewer {__version__}, the batch {task.version}: install the same on"
+            " both"
+        )
+
+
+def _reconstruct(job: Job, capture: str, settings: BatchSettings, made: Path) -> dict[str, Any]:
+    """Reconstruct a capture to a cloud or mesh in the folder ``made``, and return its figures."""
+    is_mesh = settings.do == "mesh"
+    how = ReconstructSettings(
+        capture,
+        model=settings.model,
+        out=made / "cloud.ply",
+        mesh=is_mesh,
+        accept_rejected=settings.accept_rejected,
+    )
+    with reconstruct_capture(job, how) as result:
+        cloud = result.cloud
+    name = f"{capture}_{cloud.model}{'_mesh' if is_mesh else ''}.ply"
+    result.found.files[0].rename(made / name)
+    sigma = float(np.median(cloud.sigma_z[cloud.mask]))
+    return {"points": result.points, "noise mm": sigma, "file": name}
+
+
+def _verify(job: Job, capture: str, settings: BatchSettings) -> Verification:
+    """Verify one capture of a plane or a sphere."""
+    assert settings.shape is not None
+    how = VerifySettings(
+        (capture,),
+        settings.shape,
+        models=(settings.model,) if settings.model else (),
+        radius=settings.radius,
+        accept_rejected=settings.accept_rejected,
+    )
+    return verify.run(job.store, how, warn=job.warn)[capture]
 
 
 @contextmanager
@@ -298,7 +395,10 @@ def _check_installed() -> None:
 
 
 def _gather_results(
-    client: Any, calls: Mapping[Any, tuple[Any, ...]], progress: Progress, warn: Warn
+    client: Any,
+    calls: Mapping[Any, tuple[Any, ...]],
+    warn: Warn,
+    progress: Progress = ignore_progress,
 ) -> dict[Any, Any]:
     """What each call (function, arguments ...) returned, in their order; the reason as text where a
     worker could not.
@@ -349,3 +449,104 @@ def _result_or_error(future: Any) -> Any:
         ) from error
     except Exception as error:  # whatever a worker met with ends that capture alone
         return describe_error(error)
+
+
+def _is_remote(address: str) -> bool:
+    """Whether this is an fsspec address, such as ``s3://bucket/session``, and no folder."""
+    return "://" in address or "::" in address
+
+
+def _absolute_address(session: Path | str) -> str:
+    """The address of a session as every worker understands it: folders become absolute."""
+    address = os.fspath(session)
+    return address.rstrip("/") if _is_remote(address) else str(expand_user(address).absolute())
+
+
+@contextmanager
+def _fetch_session(address: str, capture: str = "") -> Iterator[Path]:
+    """Yield a folder with the session and the named capture's frames. Raises SessionError where it
+    is missing.
+
+    From an fsspec address it is copied, with the calibrations, and removed when the block ends.
+    """
+    if not _is_remote(address):
+        if not is_session(address):
+            raise SessionError(
+                f"{address} is not a session folder where the worker is: give one that all workers"
+                " share, or an address"
+            )
+        yield Path(address)
+        return
+    fs, root = _file_system(address)
+    whole = (f"captures/{capture}/", "results/calibration/", "results/scale/") if capture else ()
+    with tempfile.TemporaryDirectory(prefix="slviewer-") as folder:
+        try:
+            for path in fs.find(root):
+                inner = path[len(root) :].lstrip("/")
+                wanted = inner.startswith(whole) or inner.endswith(".json")
+                if wanted and not any(part.startswith(".") for part in inner.split("/")):
+                    target = Path(folder, inner)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    fs.get_file(path, str(target))
+        except OSError as error:
+            raise SessionError(
+                f"{address} cannot be read ({error}): check the address and its permissions"
+            ) from error
+        if not is_session(folder):
+            raise SessionError(
+                f"{address} is not a session (it holds no session.json): check the address"
+            )
+        for inner in ("captures", "results"):
+            Path(folder, inner).mkdir(exist_ok=True)
+        yield Path(folder)
+
+
+@contextmanager
+def export_folder(address: str, batch: str) -> Iterator[Path]:
+    """Yield a folder whose files are moved to the session's exports when the block ends; none if it
+    fails.
+
+    They replace files of their names. ``remove_leftovers`` removes what a killed worker leaves
+    behind.
+    """
+    fs, root = _file_system(address)
+    with tempfile.TemporaryDirectory(prefix="slviewer-") as folder:
+        yield Path(folder)
+        try:
+            fs.makedirs(f"{root}/exports", exist_ok=True)
+            for path in sorted(Path(folder).iterdir()):
+                arriving = f"{root}/exports/.batch-{batch}-{secrets.token_hex(4)}-{path.name}"
+                fs.put_file(str(path), arriving)
+                fs.mv(arriving, f"{root}/exports/{path.name}")
+        except FileNotFoundError as error:
+            raise SessionError(
+                f"a file for {address} disappeared while it was delivered ({error}): the batch was"
+                " ended meanwhile, or another program removes files there; run the batch again"
+            ) from error
+        except OSError as error:
+            raise SessionError(
+                f"{address} cannot be written ({error}): check its permissions and free space"
+            ) from error
+
+
+def remove_leftovers(address: str, batch: str) -> None:
+    """Remove what killed or cancelled workers of a batch did not finish, as far as it can be
+    reached from here."""
+    with suppress(OSError, InputError):
+        fs, root = _file_system(address)
+        for path in fs.ls(f"{root}/exports", detail=False):
+            if path.split("/")[-1].startswith(f".batch-{batch}"):
+                fs.rm(path)
+
+
+def _file_system(address: str) -> tuple[Any, str]:
+    """The fsspec file system of an address, and the root in it."""
+    try:
+        from fsspec.core import url_to_fs
+
+        fs, root = url_to_fs(address)
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"{address} cannot be reached ({error}): install what it needs where the workers are"
+        ) from error
+    return fs, root.rstrip("/")

@@ -1,29 +1,27 @@
-"""From a session's target poses to calibrations."""
+"""From a session's target poses to calibrations, and the verdict on them, which is stored too."""
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import ClassVar, Literal, TypeVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration
-from slviewer.calibration.diagnosis.rules import judge_splined
+from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
+from slviewer.calibration.diagnosis.evidence import Evidence
+from slviewer.calibration.diagnosis.rules import judge_evidence, judge_splined
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError, SessionError
+from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.calibration_verdict import (
-    calibrate_poses_with_evidence,
-    calibrate_with_evidence,
-    rejection_error,
-    save_verdict,
-)
 from slviewer.pipeline.capture_phases import decode_or_explain, texture_8bit
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
+    MODELS,
+    VERDICT,
     Model,
     ModelName,
     available_models,
@@ -36,17 +34,15 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import SessionLike, match_names, opened_or_made
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.poses import DecodedPose, Judged, read_pose
+from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
 from slviewer.pipeline.stored_records import load_record
 from slviewer.records.calibration import ModelCalibration
+from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Verdict
 from slviewer.session.store import Session
 from slviewer.target.board import Board
 
-DEFAULT_MODELS = ("stereo", "pixelwise", "splined")
 SmoothingKind = Literal["spline", "polynomial"]
-M = TypeVar("M", PixelwiseModel, SplinedModel)
-Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], M]
 
 
 @dataclass(frozen=True)
@@ -134,8 +130,14 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
         )
     before = preferred_model(store) if available_models(store) else ""
     names, excluded = _choose_poses(store, settings, job.warn)
-    reading = part(job.progress, 0, 0.65)
-    diagnosed = calibrate_with_evidence(store, names, board, settings.step_2, excluded, reading)
+    diagnosed = _diagnose_poses(
+        read_stored_poses(store, names, board, settings.step_2),
+        len(names),
+        store.load_capture(names[0]).sequence,
+        board,
+        excluded,
+        part(job.progress, 0, 0.65),
+    )
     if diagnosed.stereo is None:
         save_verdict(store, diagnosed.verdict, names)
         raise rejection_error(diagnosed.verdict, is_saved=False)
@@ -184,18 +186,21 @@ def calibrate_frames(
             "no target pose was given: capture the board in at least three positions and tilts"
         )
 
-    def read() -> Iterator[Judged]:
-        """Yield the examined pose of each set of frames, decoded one after the other."""
-        for name, frames in poses.items():
-            phases = decode_or_explain(name, sequence, frames)
-            pose = DecodedPose(
-                name, sequence, frames, phases, texture_8bit(sequence, frames), board
-            )
-            yield read_pose(pose, settings.step_2)
-
-    diagnosed = calibrate_poses_with_evidence(
-        read(), len(poses), sequence, board, {}, part(progress, 0, 0.65)
+    judged = (
+        read_pose(
+            DecodedPose(
+                name,
+                sequence,
+                frames,
+                decode_or_explain(name, sequence, frames),
+                texture_8bit(sequence, frames),
+                board,
+            ),
+            settings.step_2,
+        )
+        for name, frames in poses.items()
     )
+    diagnosed = _diagnose_poses(judged, len(poses), sequence, board, {}, part(progress, 0, 0.65))
     if diagnosed.stereo is None:
         raise rejection_error(diagnosed.verdict, is_saved=False)
     result = _fit_models(diagnosed, settings, part(progress, 0.66, 1.0), warn)
@@ -216,7 +221,8 @@ def save_calibration(session: SessionLike, result: CalibrationResult) -> None:
 def _choose_poses(
     store: Session, settings: CalibrateSettings, warn: Warn
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the target poses to calibrate from, and {pose: why} of those that are excluded."""
+    """Return the target poses to calibrate from, and {pose: why} of those that are excluded. Raises
+    UsageError for a name or pattern that fits no target pose."""
     captures, faults = store.read_captures()
     for fault in faults.values():
         warn(f"not used: {fault}")
@@ -231,7 +237,12 @@ def _choose_poses(
         for name, why in store.excluded().items()
         if name in names
     }
-    excluded |= _reasons_to_exclude(names, settings.poses, settings.exclude)
+    if settings.poses:
+        chosen = match_names(names, settings.poses, "target pose")
+        others = [name for name in names if name not in chosen]
+        excluded |= dict.fromkeys(others, "not among the poses that were named")
+    left_out = match_names(names, settings.exclude, "target pose")
+    excluded |= dict.fromkeys(left_out, "excluded for this calibration")
     names = [name for name in names if name not in excluded]
     if not names:
         raise InputError("every target pose is excluded: include some again")
@@ -246,9 +257,51 @@ def _changes_calibration(
     if "stereo" not in available_models(store):
         return True
     before = load_record(store, ModelCalibration, "stereo")
-    if not before.settings or before.inputs != dict(inputs):
+    if not before.settings or before.inputs != inputs:
         return True
     return CalibrateSettings(**before.settings).method != settings.method
+
+
+def _diagnose_poses(
+    poses: Iterable[Judged],
+    count: int,
+    sequence: PatternSequence,
+    board: Board,
+    excluded: Mapping[str, str],
+    progress: Progress,
+) -> DiagnosedCalibration:
+    """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``:
+    {pose: why}."""
+    if contradiction := _describe_period_conflict(sequence):
+        evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
+        return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(excluded))
+    observations, evidence_of_poses, refused = list[Observation](), [], dict(excluded)
+    for i, pose in enumerate(poses, 1):
+        progress(i / count, f"read {pose.name}")
+        if pose.observation is None:
+            refused[pose.name] = pose.refused
+        else:
+            observations.append(pose.observation)
+        if pose.evidence is not None:
+            evidence_of_poses.append(pose.evidence)
+    result = calibrate_with_diagnosis(
+        observations, evidence_of_poses, sequence.projector, board, refused
+    )
+    if result.stereo is None:
+        return result
+    return replace(result, stereo=replace(result.stereo, excluded=result.excluded))
+
+
+def _describe_period_conflict(sequence: PatternSequence) -> str:
+    """Describe why the fringe periods and the Gray code of a sequence conflict; empty where they do
+    not."""
+    for axis in sequence.axes:
+        if sequence.periods_px(axis) and sequence.find("gray", axis):
+            try:
+                axis_layout(sequence, axis)
+            except InputError as error:
+                return str(error)
+    return ""
 
 
 def _fit_models(
@@ -259,80 +312,80 @@ def _fit_models(
     excluded: Container[str] = (),
 ) -> CalibrationResult:
     """Fit the models that follow from a stereo calibration; return them with the verdict on all:
-    stereo alone where that rejects them.
+    stereo alone where that rejects them. One that cannot be fitted is a warning, and stops no
+    other.
 
     Warns of poses that were excluded, but for those ``excluded`` before, and of what is doubtful.
     """
-    stereo = diagnosed.stereo
+    stereo, observations, verdict = diagnosed.stereo, diagnosed.observations, diagnosed.verdict
     assert stereo is not None
-    if diagnosed.verdict.level == "rejected":
-        return CalibrationResult(stereo, verdict=diagnosed.verdict)
+    if verdict.level == "rejected":
+        return CalibrationResult(stereo, verdict=verdict)
     if diagnosed.warning:
         warn(diagnosed.warning)
     for name, why in stereo.excluded.items():
         if name not in excluded:
             warn(f"{name} is excluded: {why}")
-    for finding in diagnosed.verdict.findings:
+    for finding in verdict.findings:
         if finding.severity == "doubtful":
             warn(finding.text())
-    result = _fit_after_stereo(stereo, diagnosed.observations, settings, progress, warn)
-    verdict = (
-        judge_splined(diagnosed.verdict, result.splined.bundle.noise)
-        if result.splined
-        else diagnosed.verdict
-    )
+    models = settings.models or MODELS
+    pixelwise, splined, share = None, None, 0.0
+    if "pixelwise" in models:
+        share = 0.33 if "splined" in models else 1.0
+        with _warn_of_failure("pixel-wise", models, warn):
+            fitting = stage(progress, 0.0, share, "pixel-wise fit")
+            pixelwise = calibrate_pixelwise(observations, stereo, fitting)
+    if "splined" in models:
+        with _warn_of_failure("splined", models, warn):
+            fitting = stage(progress, share, 1.0, "joint adjustment")
+            splined = calibrate_splined(
+                observations, stereo, fitting, cells_across=settings.cells_across
+            )
+            for name, why in splined.bundle.excluded.items():
+                warn(f"{name} is excluded from the splined model: it {why}")
+            verdict = judge_splined(verdict, splined.bundle.noise)
     for finding in verdict.findings:
         if finding not in diagnosed.verdict.findings:
             warn(finding.text())
-    return (
-        CalibrationResult(stereo, verdict=verdict)
-        if verdict.level == "rejected"
-        else replace(result, verdict=verdict)
+    if verdict.level == "rejected":
+        return CalibrationResult(stereo, verdict=verdict)
+    return CalibrationResult(stereo, pixelwise, splined, verdict)
+
+
+@contextmanager
+def _warn_of_failure(name: str, models: Sequence[str], warn: Warn) -> Iterator[None]:
+    """Context manager that turns the failure of a fit into a warning, unless the model is the only
+    one of ``models`` that is wanted."""
+    try:
+        yield
+    except (CalibrationRejected, InputError) as error:
+        if len(models) == 1:
+            raise
+        warn(f"no {name} model: {error}")
+
+
+def save_verdict(store: Session, verdict: Verdict, poses: Sequence[str]) -> None:
+    """Save the verdict on an attempt to calibrate from these poses, whether or not it succeeded."""
+    store.save_result(
+        VERDICT, {"verdict": to_plain(verdict), "inputs": store.input_hashes(*poses)}, {}
     )
 
 
-def _reasons_to_exclude(
-    names: Sequence[str], poses: Sequence[str], exclude: Sequence[str]
-) -> dict[str, str]:
-    """{pose: why} of the target poses that are not among ``poses``, where any are named, or that
-    ``exclude`` names.
-
-    Raises UsageError for a name or pattern that fits no target pose.
-    """
-    chosen = match_names(names, poses, "target pose") if poses else names
-    out = {name: "not among the poses that were named" for name in names if name not in chosen}
-    return out | dict.fromkeys(
-        match_names(names, exclude, "target pose"), "excluded for this calibration"
+def load_last_verdict(store: Session) -> Verdict | None:
+    """Load the verdict on the last attempt to calibrate, also a failed one; None before the
+    first."""
+    if not store.has_result(VERDICT):
+        return None
+    return store.decode_result(
+        VERDICT, lambda meta, _: from_plain(meta["verdict"], Verdict), only=()
     )
 
 
-def _fit_after_stereo(
-    stereo: StereoModel,
-    observations: Sequence[Observation],
-    settings: CalibrateSettings,
-    progress: Progress,
-    warn: Warn,
-) -> CalibrationResult:
-    """Fit the models that follow from stereo; one that cannot be fitted is a warning, and stops no
-    other."""
-    models = settings.models or DEFAULT_MODELS
-
-    def fit(name: str, calibrate_model: Fit[M], start: float, end: float, doing: str) -> M | None:
-        """Fit one model if it is requested; None, with a warning, where it cannot be fitted."""
-        if name not in models:
-            return None
-        try:
-            return calibrate_model(observations, stereo, stage(progress, start, end, doing))
-        except (CalibrationRejected, InputError) as error:
-            if len(models) == 1:
-                raise
-            warn(f"no {'pixel-wise' if name == 'pixelwise' else name} model: {error}")
-            return None
-
-    pixelwise_end = 0.0 if "pixelwise" not in models else 0.33 if "splined" in models else 1.0
-    pixelwise = fit("pixelwise", calibrate_pixelwise, 0.0, pixelwise_end, "pixel-wise fit")
-    fit_splined = partial(calibrate_splined, cells_across=settings.cells_across)
-    splined = fit("splined", fit_splined, pixelwise_end, 1.0, "joint adjustment")
-    for name, why in splined.bundle.excluded.items() if splined else ():
-        warn(f"{name} is excluded from the splined model: it {why}")
-    return CalibrationResult(stereo, pixelwise, splined)
+def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:
+    """Return the error to raise for a rejected calibration; ``is_saved``: the session holds it for
+    inspection."""
+    first, more = verdict.findings[0], len(verdict.findings) - 1
+    others = f" (and {more} more finding{'s' * (more != 1)})" if more else ""
+    saved_note = "; the calibration is saved for inspection, and not used" if is_saved else ""
+    return CalibrationRejected(f"{first.text()}{others}{saved_note}")

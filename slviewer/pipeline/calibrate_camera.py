@@ -1,6 +1,6 @@
 """The camera alone, from the pictures of a board that a folder or a session holds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,15 +38,19 @@ def calibrate_camera_alone(
     CalibrationRejected for fewer than three.
     """
     board, source = Board.parse(target), Path(source)
-    names = _list_pictures(source)
+    if is_session(source):
+        with Session.open(source) as store:
+            names = store.capture_names("calibration")
+    elif source.is_dir():
+        names = [path.name for path in images_by_name(source)]
+    else:
+        raise InputError(
+            f"{source} is not a folder: give a folder of pictures of the board, or a session"
+        )
     without = match_names(names, exclude, "picture")
-    chosen = [
-        name
-        for name in (match_names(names, poses, "picture") if poses else names)
-        if name not in without
-    ]
-    detections: dict[str, Detection] = {}
-    excluded: dict[str, str] = {}
+    chosen = match_names(names, poses, "picture") if poses else names
+    chosen = [name for name in chosen if name not in without]
+    detections, excluded = dict[str, Detection](), dict[str, str]()
     size: tuple[int, int] | None = None
     for i, name in enumerate(chosen):
         progress(i / len(chosen), f"detecting the board in {name}")
@@ -67,21 +71,19 @@ def calibrate_camera_alone(
         raise InputError(f"{source} holds no picture to calibrate from: name some")
     calibration = calibrate_camera(board, detections, size, excluded)
     if out is not None:
-        write_calibration(Path(out), _file_entries(calibration), _MEANINGS)
+        entries = {
+            "program": f"slviewer {__version__}",
+            "target": calibration.board,
+            "camera_size": np.array(calibration.lens.size),
+            "K_camera": calibration.lens.K,
+            "D_camera": calibration.lens.D,
+            "focal_sigma_px": np.array(calibration.focal_sigma_px),
+            "reprojection_rms_px_camera": calibration.rms_px,
+            "verdict": calibration.verdict.level,
+        }
+        write_calibration(Path(out), entries, _MEANINGS)
     progress(1.0, "calibrated")
     return calibration
-
-
-def _list_pictures(source: Path) -> list[str]:
-    """Return the names of a folder's images, or of a session's calibration captures."""
-    if is_session(source):
-        with Session.open(source) as store:
-            return store.capture_names("calibration")
-    if not source.is_dir():
-        raise InputError(
-            f"{source} is not a folder: give a folder of pictures of the board, or a session"
-        )
-    return [path.name for path in images_by_name(source)]
 
 
 def _read_picture(source: Path, name: str) -> np.ndarray:
@@ -102,17 +104,3 @@ _MEANINGS = {
     "D_camera": "distortion: k1 k2 p1 p2 k3, as OpenCV orders them",
     "focal_sigma_px": "standard deviations of fx and fy, px",
 }
-
-
-def _file_entries(calibration: CameraCalibration) -> Mapping[str, object]:
-    """Return the entries of the calibration file by name: lens, sizes, accuracy and verdict."""
-    return {
-        "program": f"slviewer {__version__}",
-        "target": calibration.board,
-        "camera_size": np.array(calibration.lens.size),
-        "K_camera": calibration.lens.K,
-        "D_camera": calibration.lens.D,
-        "focal_sigma_px": np.array(calibration.focal_sigma_px),
-        "reprojection_rms_px_camera": calibration.rms_px,
-        "verdict": calibration.verdict.level,
-    }

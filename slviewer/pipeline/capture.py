@@ -130,7 +130,6 @@ class CaptureSettings(RigSettings):
 def capture(settings: CaptureSettings) -> Capture:
     """Capture with a rig, without the wizard."""
     name, progress, warn = settings.name, settings.progress, settings.warn
-    target = None if settings.board is None else Board.parse(settings.board)
     new_name(name)
     with opened_or_made(settings.session) as store:
         if name in store.taken_names() and not settings.force:
@@ -139,7 +138,8 @@ def capture(settings: CaptureSettings) -> Capture:
                 " --force"
             )
         choice = load_rig(settings.rig, store)
-        target = target or (Board.parse(known) if (known := store.decision("target")) else None)
+        notation = settings.board or store.decision("target")
+        target = Board.parse(notation) if notation else None
         bench, sequence = set_up_rig(store, choice, target, settings)
         exposures = settings.exposures
         most = MAX_SUGGESTED if settings.auto_exposure else max(1, len(exposures))
@@ -171,11 +171,21 @@ def capture(settings: CaptureSettings) -> Capture:
             ):
                 warn(note)
         progress(0.95, "saving")
-        if settings.role == "calibration":
-            saved = save_frames(store, name, "pose", captured, board=target, force=settings.force)
-        else:
-            saved = save_frames(store, name, "scan", captured, force=settings.force)
-        _check_saved(store, saved, captured, warn)
+        is_pose = settings.role == "calibration"
+        saved = save_frames(
+            store,
+            name,
+            "pose" if is_pose else "scan",
+            captured,
+            board=target if is_pose else None,
+            force=settings.force,
+        )
+        try:
+            for message in save_examination(store, saved).warnings():
+                warn(f"{name}: {message}")
+        except SlviewerError as error:  # it is saved, and can be looked at later
+            warn(f"{name} is saved, and its frames could not be checked: {error}")
+        warn_of_captured(name, captured, warn)
     progress(1.0, "captured")
     return saved
 
@@ -186,21 +196,12 @@ def set_up_rig(
     """Return the devices of a choice, not opened yet, and the sequence that they capture. What the
     settings or the choice state wrongly is refused before."""
     _camera_settings(choice, settings)
-    patterns = choose_patterns(store, choice, settings.patterns)
+    patterns = settings.patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
+    if choice.get("driver") != "replay":
+        _check_patterns(patterns)
     settings.progress(0.0, "opening the devices")
     bench = settings.set_up(choice, target)
     return bench, choose_sequence(bench, patterns)
-
-
-def _check_saved(store: Session, saved: Capture, captured: CapturedFrames, warn: Warn) -> None:
-    """Warn where the frames of a saved capture contradict each other, or are too bright or too
-    dark."""
-    try:
-        for sentence in save_examination(store, saved).warnings():
-            warn(f"{saved.name}: {sentence}")
-    except SlviewerError as error:  # it is saved, and can be looked at later
-        warn(f"{saved.name} is saved, and its frames could not be checked: {error}")
-    warn_of_captured(saved.name, captured, warn)
 
 
 def warn_of_captured(name: str, captured: CapturedFrames | Capture, warn: Warn) -> None:
@@ -238,15 +239,6 @@ def _camera_settings(choice: Choice, settings: RigSettings) -> CameraSettings:
     return CameraSettings(
         exposure_ms, choice.get("gain") if settings.gain is None else settings.gain
     )
-
-
-def choose_patterns(store: Session, choice: Choice, patterns: str | None) -> str:
-    """Return the name of the sequence to show, by default the session's. Raises InputError for an
-    unknown one, unless the rig plays back its own."""
-    patterns = patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
-    if choice.get("driver") != "replay":
-        _check_patterns(patterns)
-    return patterns
 
 
 def _check_patterns(patterns: str) -> None:

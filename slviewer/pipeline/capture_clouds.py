@@ -1,26 +1,32 @@
-"""The cloud of a capture by one of the session's calibrations, once it is known that they belong
-together."""
+"""The cloud of a capture, stored or by one of the session's calibrations, once it is known that
+they belong together; and the points of merges."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.models import Model, load_stereo
+from slviewer.pipeline.capture_phases import capture_texture, decode_captures
+from slviewer.pipeline.feedback import Progress, Warn, ignore_warnings
+from slviewer.pipeline.models import Model, load_model, load_stereo
+from slviewer.pipeline.open_session import numbered_names
 from slviewer.pipeline.scale import scale_cloud, scale_factor
+from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud
+from slviewer.pipeline.stored_records import is_up_to_date, load_record
 from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import reconstruct_cloud
 from slviewer.reconstruction.relative_phase import resolve_phase
+from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture
+from slviewer.session.ply import Ply, read_ply
 from slviewer.session.store import Session
+from slviewer.surface.shapes import PointSet
 
 
 def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
@@ -61,7 +67,17 @@ def capture_cloud(
         reconstruct_cloud(model, phases, axis=axis, texture=texture),
         scale_factor(store, model.name),
     )
-    return raise_uncertainty(cloud, check.sigma_factor, check.excess_px, phases)
+    if check.excess_px is not None:  # by tiles of the image, in addition to the noise
+        noise_px, known = phases[cloud.axis].sigma_px, cloud.sigma_edges
+        excess = cv2.resize(check.excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
+        return replace(cloud, sigma_edges=error if known is None else np.hypot(known, error))
+    factor, sigma = np.float32(check.sigma_factor), cloud.sigma_calibration
+    return replace(
+        cloud,
+        sigma_z=cloud.sigma_z * factor,
+        sigma_calibration=None if sigma is None else sigma * factor,
+    )
 
 
 def absolute_phases(
@@ -84,21 +100,17 @@ def absolute_phases(
             )
         return dict(phases)
     stereo = load_stereo(store)
-    near_far, whose = (
-        depth_range or stereo.depth_range_mm,
-        ("" if depth_range else ", the calibrated depths"),
-    )
+    near_far = depth_range or stereo.depth_range_mm
+    whose = "" if depth_range else ", the calibrated depths"
     if near_far is None:
         raise InputError(
             f"{name}: its phase is not absolute, and the calibration knows no depths: state those"
             " of the scene with --depth-range NEAR FAR, mm"
         )
-    absolute, refusals = (
-        {axis: phase for axis, phase in phases.items() if not phase.is_relative},
-        [],
-    )
+    absolute, refusals = dict[Axis, PhaseMap](), list[str]()
     for axis, phase in phases.items():
         if not phase.is_relative:
+            absolute[axis] = phase
             continue
         try:
             resolved = resolve_phase(stereo.rig, phase, near_far)
@@ -123,26 +135,76 @@ def absolute_phases(
     return absolute
 
 
-def raise_uncertainty(
-    cloud: Cloud,
-    factor: float,
-    excess_px: NDArray[np.float32] | None = None,
-    phases: Mapping[Axis, PhaseMap] | None = None,
+def scan_cloud(
+    store: Session,
+    name: str,
+    model: str | None,
+    progress: Progress,
+    warn: Warn,
+    accept_rejected: bool = False,
+    roi: str = "",
 ) -> Cloud:
-    """The cloud with sigmas larger by a factor, and, by tiles of the image, by an error of the
-    projector's coordinate in px in addition to the noise of the ``phases``."""
-    if excess_px is not None and phases is not None:
-        phase = phases[cloud.axis]
-        noise_px = phase.sigma_px
-        excess = cv2.resize(excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
-        known = cloud.sigma_edges
-        return replace(cloud, sigma_edges=error if known is None else np.hypot(known, error))
-    if factor == 1.0:
-        return cloud
-    sigma_calibration = (
-        None if cloud.sigma_calibration is None else cloud.sigma_calibration * np.float32(factor)
-    )
-    return replace(
-        cloud, sigma_z=cloud.sigma_z * np.float32(factor), sigma_calibration=sigma_calibration
+    """A capture's cloud: the stored one where it is up to date and of the requested model, else
+    reconstructed; without what was deleted from it, and what lies outside of the region ``roi``, as
+    `resolve_region` reads it.
+    """
+    region = resolve_region(store, roi)
+    capture, stored = store.load_capture(name), f"clouds/{name}"
+    meta = store.load_result(stored, only=())[0] if is_up_to_date(store, stored) else {}
+    if meta and (not model or model == meta["model"]):
+        names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"}
+        arrays = store.load_result(stored, only=names & set(meta["arrays"]))[1]
+        cloud = Cloud(axis=meta["axis"], model=meta["model"], **arrays)
+    else:
+        fitted = load_model(store, model)
+        progress(0.1, f"reading {name}")
+        check_capture_sizes(store, [name])
+        _, frames, phases = next(decode_captures(store, [name], warn))
+        progress(0.4, f"reconstructing {name}")
+        texture = capture_texture(capture, frames, stretch=False)
+        cloud = capture_cloud(
+            store,
+            fitted,
+            capture,
+            phases,
+            texture=texture,
+            accept_rejected=accept_rejected,
+            warn=warn,
+        )
+    return restrict_cloud(store, name, cloud, region)
+
+
+def merge_name(store: Session, name: str) -> str:
+    """The merge of that number, or the last one where none is named; raises InputError where it
+    does not exist."""
+    there = numbered_names(store, "merge")
+    if not there:
+        raise InputError("there is no merge yet: merge scans first")
+    if name and name not in there:
+        raise InputError(f"there is no merge {name!r}: the merges are {', '.join(there)}")
+    return name or there[-1]
+
+
+def read_merge(store: Session, result: str, warn: Warn) -> tuple[Merge, Ply]:
+    """The record and the points of a merge that the session stores as ``merge/<number>``; warns of
+    a stale one."""
+    if not is_up_to_date(store, result):
+        warn(f"{result} came from scans or a calibration that have changed since: merge again")
+    merge = load_record(store, Merge, result.removeprefix(f"{Merge.kind}/"))
+    return merge, read_ply(store.exports / merge.ply)
+
+
+def points_with_normals(merged: Ply) -> PointSet:
+    """Return the points of a merge whose normals are known, to make a mesh of; InputError for a
+    merge without any."""
+    if merged.normals is None:
+        raise InputError("the merged cloud has no normals: merge the scans again")
+    known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
+    if sigma is not None and not np.isfinite(sigma[known]).all():
+        sigma = None
+    return PointSet(
+        merged.points[known],
+        merged.normals[known],
+        None if merged.colours is None else merged.colours[known],
+        None if sigma is None else sigma[known],
     )

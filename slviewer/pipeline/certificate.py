@@ -9,9 +9,9 @@ import html
 import platform
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -24,7 +24,7 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.evaluation.render import format_count
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, ignore_progress
-from slviewer.pipeline.models import MODELS, available_models
+from slviewer.pipeline.models import available_models
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
@@ -36,6 +36,7 @@ from slviewer.records.record import Record
 from slviewer.records.table import Column, Table
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
+from slviewer.session.capture import Capture
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.nominal import NOMINALS
 from slviewer.session.reading import MAX_JSON_BYTES, expand_user, read_file
@@ -116,7 +117,7 @@ class ReportCheck:
 
     def to_json(self) -> dict[str, Any]:
         """Return the published values of ``verify-report --json``."""
-        return {"holds": not self.failure, "checks": [asdict(check) for check in self.checks]}
+        return {"holds": not self.failure, "checks": self.checks}
 
     def text(self) -> str:
         """Return the result as a report for the terminal."""
@@ -146,7 +147,7 @@ def make_certificate(store: Session) -> Certificate:
     }
     results = {name: store.input_hashes(name)[name] for name in store.result_names()}
     return Certificate(
-        SCHEMA, store.folder.name, _software(), captures, results, collect_figures(store)
+        SCHEMA, store.folder.name, _list_versions(), captures, results, collect_figures(store)
     )
 
 
@@ -175,15 +176,37 @@ def verify_report(
     """
     page, certificate = read_certificate(expand_user(report))
     with opened(session) as store:
-        checks = [_check_page(page, certificate), *_check_versions(certificate)]
+        is_same = page_digest(page) == certificate.page
+        checks = [
+            CheckedItem("page", "same", "as it was written")
+            if is_same
+            else CheckedItem(
+                "page", "differs", "its text, pictures or numbers were changed after it was written"
+            )
+        ]
+        changed = [
+            f"{name} {certificate.software.get(name, '?')} then, {now} now"
+            for name, now in _list_versions().items()
+            if certificate.software.get(name) != now
+        ]
+        if changed:
+            checks.append(CheckedItem("software", "not recomputed", "; ".join(changed)))
         progress(0.02, "reading the frames")
-        checks += _check_frames(store, certificate)
+        captures = {capture.name: capture for capture in store.captures()}
+        checks += [
+            CheckedItem(f"{FRAMES}{name}", *_check_frames(captures.get(name), given))
+            for name, given in certificate.captures.items()
+        ]
         if any(check.state != "same" for check in checks if check.what.startswith(FRAMES)):
             return ReportCheck(tuple(checks))
-        with tempfile.TemporaryDirectory(prefix="slviewer-") as folder:
-            made, why = _recompute(store, certificate, Path(folder, "session"), progress)
+        with (
+            tempfile.TemporaryDirectory(prefix="slviewer-") as folder,
+            Session.create(Path(folder, "session")) as fresh,
+        ):
+            repetition = _Repetition(store, fresh, certificate, progress)
+            made = repetition.compute_figures()
         checks += [
-            _compare(name, given, made.get(name), why)
+            _compare(name, given, made.get(name), repetition.why)
             for name, given in certificate.figures.items()
         ]
     progress(1.0, "compared")
@@ -219,77 +242,140 @@ def read_certificate(path: Path) -> tuple[str, Certificate]:
     return page, certificate
 
 
-def _software() -> dict[str, str]:
+def _list_versions() -> dict[str, str]:
     """Return the versions of Python, slviewer and what it computes with."""
     return {"slviewer": __version__, "python": platform.python_version()} | {
         name: version(name) for name in PACKAGES
     }
 
 
-def _check_page(page: str, certificate: Certificate) -> CheckedItem:
-    """Return whether the page is the one that was written with its certificate."""
-    if page_digest(page) == certificate.page:
-        return CheckedItem("page", "same", "as it was written")
-    return CheckedItem(
-        "page", "differs", "its text, pictures or numbers were changed after it was written"
-    )
+def _check_frames(capture: Capture | None, given: CertifiedCapture) -> tuple[State, str]:
+    """Read a capture that the report names, and compare the hash of each frame; returns what was
+    found, and a sentence on it."""
+    if capture is None:
+        return "missing", "the session has no such capture, or it is damaged"
+    try:
+        now = capture.verify()
+    except SlviewerError as error:
+        return "differs", str(error)
+    changed = [i for i, (a, b) in enumerate(zip(given["frames"], now, strict=False)) if a != b]
+    if changed or len(now) != len(given["frames"]) or capture.hash != given["hash"]:
+        where = f"frame {changed[0] + 1}" if changed else "the description of the capture"
+        return "differs", f"{where} is another than the report's"
+    return "same", f"{len(now)} frames"
 
 
-def _check_versions(certificate: Certificate) -> list[CheckedItem]:
-    """Return a line about the software, where it is another than the report's."""
-    changed = [
-        f"{name} {certificate.software.get(name, '?')} then, {now} now"
-        for name, now in _software().items()
-        if certificate.software.get(name) != now
-    ]
-    return [CheckedItem("software", "not recomputed", "; ".join(changed))] if changed else []
+@dataclass(frozen=True)
+class _Repetition:
+    """What a report shows of the session ``store``, computed from the frames alone in the new
+    session ``fresh``. ``why``: {result: why it was not}."""
 
+    store: Session
+    fresh: Session
+    certificate: Certificate
+    progress: Progress
+    why: dict[str, str] = field(default_factory=dict)
 
-def _check_frames(store: Session, certificate: Certificate) -> list[CheckedItem]:
-    """Read every capture that the report names, and compare the hash of each frame."""
-    captures = {capture.name: capture for capture in store.captures()}
-    checks = []
-    for name, given in certificate.captures.items():
-        what = f"{FRAMES}{name}"
-        if name not in captures:
-            checks.append(
-                CheckedItem(what, "missing", "the session has no such capture, or it is damaged")
-            )
-            continue
-        try:
-            now = captures[name].verify()
-        except SlviewerError as error:
-            checks.append(CheckedItem(what, "differs", str(error)))
-            continue
-        changed = [i for i, (a, b) in enumerate(zip(given["frames"], now, strict=False)) if a != b]
-        if changed or len(now) != len(given["frames"]) or captures[name].hash != given["hash"]:
-            where = f"frame {changed[0] + 1}" if changed else "the description of the capture"
-            checks.append(CheckedItem(what, "differs", f"{where} is another than the report's"))
-        else:
-            checks.append(CheckedItem(what, "same", f"{len(now)} frames"))
-    return checks
-
-
-def _recompute(
-    store: Session, certificate: Certificate, folder: Path, progress: Progress
-) -> tuple[Figures, dict[str, str]]:
-    """Compute what the report shows from the frames alone, in a session of its own; second,
-    {result: why not}."""
-    why: dict[str, str] = {}
-    with Session.create(folder) as fresh:
-        for name in certificate.captures:
+    def compute_figures(self) -> Figures:
+        """Calibrate, run the operations again, and return the figures that they find."""
+        store, fresh = self.store, self.fresh
+        for name in self.certificate.captures:
             _link(store.load_capture(name).folder, fresh.folder / "captures" / name)
         for name in fresh.capture_names("scan"):
             save_edits(fresh, name, load_edits(store, name))
         save_region(fresh, load_region(store))
         if (store.folder / NOMINALS).is_dir():
             _link(store.folder / NOMINALS, fresh.folder / NOMINALS)
-        if "calibration/stereo" in certificate.figures:
-            progress(0.1, "calibrating")
-            _calibrate_again(store, fresh, why)
-        figures = collect_figures(fresh)
-        figures |= _run_again(store, fresh, certificate, why, progress)
-    return figures, why
+        if "calibration/stereo" in self.certificate.figures:
+            self.progress(0.1, "calibrating")
+            self._calibrate()
+        return collect_figures(fresh) | self._run_operations()
+
+    def _calibrate(self) -> None:
+        """Calibrate from the frames with the settings of the session's calibration, and take over
+        its scale."""
+        store, fresh, models = self.store, self.fresh, available_models(self.store)
+        results = [f"calibration/{name}" for name in models]
+        record = load_record(store, ModelCalibration, "stereo")
+        stereo = record.fit
+        if isinstance(stereo, StereoFit) and record.settings:
+            poses = [
+                name
+                for name in (*stereo.poses, *stereo.excluded)
+                if name in fresh.taken_names()
+                and not stereo.excluded.get(name, "").startswith(_BY_OPERATOR)
+            ]
+            settings = CalibrateSettings(**record.settings)
+            with self._note_failure(*results):
+                calibrate.run(fresh, replace(settings, models=models, poses=poses, exclude=()))
+        else:
+            self.why.update(
+                dict.fromkeys(
+                    results, "it was imported: its figures are not from the session's frames"
+                )
+            )
+            for result in results:
+                saved, arrays = store.load_result(result)
+                fresh.save_result(result, _without_own(saved), arrays)
+        for model in available_models(fresh):
+            if (applied := load_scale_correction(store, model)) is not None:
+                inputs = fresh.input_hashes(f"calibration/{model}")
+                fresh.save_result(f"scale/{model}", {**_without_own(applied), "inputs": inputs}, {})
+
+    def _run_operations(self) -> Figures:
+        """Run the operations that found the session's records again, with their settings; return
+        the figures."""
+        runs: dict[tuple[str, bytes], dict[str, Record]] = {}
+        for result in self.certificate.figures:
+            kind, _, name = result.partition("/")
+            if kind not in RECORDS or kind == ModelCalibration.kind:
+                continue
+            with self._note_failure(result):
+                record = load_record(self.store, RECORDS[kind], name)
+                if record.operation not in OPERATIONS:
+                    raise InputError(
+                        "an older version of slviewer made it: make it again, and write the report"
+                        " again"
+                    )
+                _check_restrictions(self.store, record)
+                run = record.operation, to_json(record.settings)
+                runs.setdefault(run, {})[result] = record
+        figures: Figures = {}
+        for k, ((name, settings), records) in enumerate(runs.items()):
+            self.progress(0.6 + 0.4 * k / len(runs), f"repeating {name}")
+            operation = OPERATIONS[name]
+            # the session is read alone: its files stay as they are
+            with self._note_failure(*records), Session.open(self.fresh.folder) as reading:
+                missing = [
+                    each
+                    for each in next(iter(records.values())).inputs
+                    if each.partition("/")[0] in RECORDS and not reading.has_result(each)
+                ]
+                if missing:
+                    raise InputError(
+                        f"{', '.join(missing)}, which it was made from, is not made again"
+                    )
+                for found in operation.find(
+                    Job(reading), operation.settings(**msgspec.json.decode(settings))
+                ):
+                    # a number here may be another than that of before
+                    is_numbered = found.record.is_number(found.name)
+                    names = records if is_numbered else [f"{found.record.kind}/{found.name}"]
+                    figures |= dict.fromkeys(names, found.record.figures())
+                    if is_numbered and not found.files:  # others may be made from it
+                        for each in names:
+                            save_record(
+                                self.fresh, each.partition("/")[2], found.record, found.arrays
+                            )
+        return figures
+
+    @contextmanager
+    def _note_failure(self, *results: str) -> Iterator[None]:
+        """Context manager that notes why these results failed, and goes on."""
+        try:
+            yield
+        except SlviewerError as error:
+            self.why.update(dict.fromkeys(results, str(error)))
 
 
 def _link(folder: Path, place: Path) -> None:
@@ -300,96 +386,9 @@ def _link(folder: Path, place: Path) -> None:
         shutil.copytree(folder, place)
 
 
-def _calibrate_again(store: Session, fresh: Session, why: dict[str, str]) -> None:
-    """Calibrate a session from the frames with the settings of another's calibration, and take over
-    its scale."""
-    models = available_models(store)
-    record = load_record(store, ModelCalibration, "stereo")
-    if not isinstance(record.fit, StereoFit) or not record.settings:
-        why |= {
-            f"calibration/{name}": "it was imported: its figures are not from the session's frames"
-            for name in models
-        }
-        for name in models:
-            saved, arrays = store.load_result(f"calibration/{name}")
-            fresh.save_result(f"calibration/{name}", _without_own(saved), arrays)
-    else:
-        _repeat_calibration(record.fit, record.settings, models, fresh, why)
-    for model in available_models(fresh):
-        if (applied := load_scale_correction(store, model)) is not None:
-            inputs = fresh.input_hashes(f"calibration/{model}")
-            fresh.save_result(f"scale/{model}", {**_without_own(applied), "inputs": inputs}, {})
-
-
 def _without_own(meta: Mapping[str, Any]) -> dict[str, Any]:
     """Return a stored meta without what the session writes itself."""
     return {key: value for key, value in meta.items() if key not in ("hash", "arrays", "checksums")}
-
-
-def _repeat_calibration(
-    stereo: StereoFit,
-    settings: Mapping[str, Any],
-    models: Sequence[str],
-    fresh: Session,
-    why: dict[str, str],
-) -> None:
-    """Calibrate from the frames of the poses that a stereo model was made from, with its
-    settings."""
-    excluded = [name for name, reason in stereo.excluded.items() if reason.startswith(_BY_OPERATOR)]
-    poses = [
-        name
-        for name in (*stereo.poses, *stereo.excluded)
-        if name not in excluded and name in fresh.taken_names()
-    ]
-    with _note_failure(why, *(f"calibration/{name}" for name in models)):
-        chosen = [name for name in MODELS if name in models]
-        calibrate.run(
-            fresh, replace(CalibrateSettings(**settings), models=chosen, poses=poses, exclude=())
-        )
-
-
-def _run_again(
-    store: Session,
-    fresh: Session,
-    certificate: Certificate,
-    why: dict[str, str],
-    progress: Progress,
-) -> Figures:
-    """Run the operations that found the session's records again, with their settings; return the
-    figures."""
-    runs: dict[tuple[str, bytes], list[str]] = {}
-    records: dict[str, Record] = {}
-    for result in certificate.figures:
-        kind, _, name = result.partition("/")
-        if kind not in RECORDS or kind == ModelCalibration.kind:
-            continue
-        with _note_failure(why, result):
-            record = records[result] = load_record(store, RECORDS[kind], name)
-            if record.operation not in OPERATIONS:
-                raise InputError(
-                    "an older version of slviewer made it: make it again, and write the report"
-                    " again"
-                )
-            _check_restrictions(store, record)
-            runs.setdefault((record.operation, to_json(record.settings)), []).append(result)
-    figures: Figures = {}
-    for k, ((name, settings), results) in enumerate(runs.items()):
-        progress(0.6 + 0.4 * k / len(runs), f"repeating {name}")
-        operation = OPERATIONS[name]
-        # the session is read alone: its files stay as they are
-        with _note_failure(why, *results), Session.open(fresh.folder) as reading:
-            _check_made_from(reading, records[results[0]])
-            for found in operation.find(
-                Job(reading), operation.settings(**msgspec.json.decode(settings))
-            ):
-                # a number here may be another than that of before
-                is_numbered = found.record.is_number(found.name)
-                names = results if is_numbered else [f"{found.record.kind}/{found.name}"]
-                figures |= dict.fromkeys(names, found.record.figures())
-                if is_numbered and not found.files:  # others may be made from it
-                    for each in names:
-                        save_record(fresh, each.partition("/")[2], found.record, found.arrays)
-    return figures
 
 
 def _check_restrictions(store: Session, record: Record) -> None:
@@ -408,22 +407,6 @@ def _check_restrictions(store: Session, record: Record) -> None:
     now = restriction_inputs(store, scans)
     if any(now[name] != value for name, value in used.items()):
         raise InputError(f"edits of {', '.join(scans)}, or the region, have changed since")
-
-
-def _check_made_from(fresh: Session, record: Record) -> None:
-    """Raise InputError where a record was made from others that are not made again."""
-    of = [name for name in record.inputs if name.partition("/")[0] in RECORDS]
-    if missing := [name for name in of if not fresh.has_result(name)]:
-        raise InputError(f"{', '.join(missing)}, which it was made from, is not made again")
-
-
-@contextmanager
-def _note_failure(why: dict[str, str], *results: str) -> Iterator[None]:
-    """Note the reason of a failure for these results, and go on."""
-    try:
-        yield
-    except SlviewerError as error:
-        why |= dict.fromkeys(results, str(error))
 
 
 def _compare(

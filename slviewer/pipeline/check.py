@@ -9,16 +9,15 @@ import msgspec
 
 from slviewer.calibration.drift.check import DriftReference, build_reference, check_drift
 from slviewer.calibration.drift.view import DriftView
-from slviewer.calibration.observe import Smoothing, observe
+from slviewer.calibration.observe import observe
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.pipeline.calibrate import CalibrateSettings
 from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
 from slviewer.pipeline.models import load_stereo, warn_if_stale
-from slviewer.pipeline.open_session import next_number
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.stored_records import list_records, load_record
+from slviewer.pipeline.stored_records import list_records, load_record, next_name
 from slviewer.reconstruction.axis_agreement import check_sizes
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.drift import Drift
@@ -65,11 +64,9 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     check_capture(capture, shot.sequence, frames, phases, files=shot.files)
     check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
     board = Board.parse(stereo.board)
-    detection, smoothing = (
-        detect(board, capture_texture(shot, frames)),
-        _calibration_smoothing(store),
-    )
-    observation = observe(capture, board, detection, phases, smoothing)
+    detection = detect(board, capture_texture(shot, frames))
+    calibrated = CalibrateSettings(**load_record(store, ModelCalibration, "stereo").settings)
+    observation = observe(capture, board, detection, phases, calibrated.step_2)
     job.progress(0.3, "fitting the calibration's own poses")
     drift = check_drift(
         _drift_reference(store, stereo, capture), DriftView.from_observation(observation)
@@ -82,7 +79,7 @@ def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
     )
     notes = ["earlier checks of this calibration:"] if before else []
     notes += [f"  {each.time[:16].replace('T', ' ')}  {each.summary()}" for each in before]
-    yield Found(str(next_number(store, Drift.kind)), found, notes=tuple(notes))
+    yield Found(next_name(store, Drift), found, notes=tuple(notes))
     job.progress(1.0, "checked")
 
 
@@ -110,8 +107,3 @@ def load_drift_history(store: Session) -> list[Drift]:
     now = store.input_hashes("calibration/stereo")["calibration/stereo"]
     checks = [each.record for each in list_records(store, Drift)]
     return [each for each in checks if each.inputs.get("calibration/stereo") == now]
-
-
-def _calibration_smoothing(store: Session) -> Smoothing:
-    """The smoothing of the calibration's own poses."""
-    return CalibrateSettings(**load_record(store, ModelCalibration, "stereo").settings).step_2

@@ -1,7 +1,9 @@
 """Results of the checks of a rig or of a capture."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
+
+from slviewer.records.plain import to_plain
 
 CheckVerdict = Literal["good", "warning", "bad", "unknown"]
 """Fit to capture; with reservations; not before it is corrected; could not be determined."""
@@ -11,7 +13,6 @@ CheckName = Literal[
     "motion",
     "turntable", "description", "noise", "decoding",
 ]  # fmt: skip
-CHECK_NAMES: tuple[CheckName, ...] = get_args(CheckName)
 
 _WORST_FIRST: tuple[CheckVerdict, ...] = ("bad", "warning", "good")
 
@@ -57,14 +58,7 @@ class Preflight:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "verdict": self.verdict,
-            "settle_ms": self.settle_ms,
-            "exposure_ms": self.exposure_ms,
-            "levels": None if self.levels is None else list(self.levels),
-            "seconds": round(self.seconds, 2),
-            "checks": [vars(check) for check in self.checks],
-        }
+        return to_plain(self) | {"verdict": self.verdict, "seconds": round(self.seconds, 2)}
 
     def text(self) -> str:
         """Each check with its remedy, then what to set."""

@@ -1,5 +1,6 @@
 """A scan against a nominal model: aligned, compared, judged."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,11 @@ from slviewer.errors import InputError, UsageError
 from slviewer.inspection.deviation import (
     Deviation,
     colour_limit,
-    deviation,
     deviation_colours,
     judge_deviation,
 )
 from slviewer.pipeline.feedback import part, stage
+from slviewer.pipeline.inspect_parts import fit_to_nominal
 from slviewer.pipeline.measure import provenance
 from slviewer.pipeline.measured_surface import (
     LoadSurface,
@@ -35,14 +36,12 @@ from slviewer.records.measurement import (
     ToleranceVerdict,
 )
 from slviewer.records.record import to_matrix, to_vector
-from slviewer.session.nominal import NOMINALS, Nominal, Units, check_size, read_nominal
+from slviewer.session.nominal import NOMINALS, Nominal, Units, read_nominal
 from slviewer.session.ply import write_ply
-from slviewer.session.store import Session
 
 MAX_STORED_POINTS = 120_000
 """Points that a session keeps of a deviation, for pictures of it; the figures are of all."""
 LIKELY_COVERAGE = 0.05
-SCALARS = "deviation"
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,9 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     The session stores the result as a measurement.
     """
     store = job.store
-    path = _find_nominal(store, settings.nominal)
+    path = Path(settings.nominal)
+    if path.parts[:1] == (NOMINALS,) and (store.folder / path).is_file():
+        path = store.folder / path  # the session's own, as nominal/part.stl
     nominal = read_nominal(path, settings.units)  # a wrong file is refused before minutes of work
     if settings.content not in ("", nominal.hash):
         raise InputError(f"{path.name} is not the nominal model that it was: it has changed since")
@@ -104,9 +105,13 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     on = load_surface(
         loading, settings.scan, settings.model, "", settings.accept_rejected, settings.load
     )
-    points = on.points[on.measured].astype(np.float64)
-    check_size(nominal, points)
-    result = _measure_deviation(job, settings.reach, on, nominal)
+    aligning = stage(job.progress, 0.4, 0.9, "aligning")
+    result = fit_to_nominal(on, nominal, settings.reach, aligning)
+    if result.coverage < LIKELY_COVERAGE:
+        job.warn(
+            f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is"
+            " the same part"
+        )
     towards = np.nan_to_num(result.normals.astype(np.float64))
     verdict = None
     if settings.tolerance is not None:
@@ -132,38 +137,9 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
     with placed_file(store, settings.out, file_name) as (place, written):
         _write_points(written, on, result, nominal, settings.tolerance)
         note = f"coloured points -> {place}"
-        arrays = _list_arrays(points, result)
+        arrays = _list_arrays(on.points[on.measured], result)
         yield Found(next_name(store, Measurement), record, arrays, (place,), (note,), settings=used)
     job.progress(1.0, "compared")
-
-
-def _find_nominal(store: Session, nominal: Path | str) -> Path:
-    """Return the file of a nominal model: that of the session, as ``nominal/part.stl``, or any
-    other."""
-    own = store.folder / nominal
-    is_own = Path(nominal).parts[:1] == (NOMINALS,) and own.is_file()
-    return own if is_own else Path(nominal)
-
-
-def _measure_deviation(
-    job: Job, reach_mm: float | None, on: MeasuredSurface, nominal: Nominal
-) -> Deviation:
-    """Align a surface with a nominal model, and measure the deviation of its points."""
-    sigma = on.sigma_mm[on.measured]
-    result = deviation(
-        on.points[on.measured].astype(np.float64),
-        nominal.mesh,
-        normals=None if on.normals is None else on.normals[on.measured],
-        sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
-        reach_mm=reach_mm,
-        progress=stage(job.progress, 0.4, 0.9, "aligning"),
-    )
-    if result.coverage < LIKELY_COVERAGE:
-        job.warn(
-            f"only {100 * result.coverage:.1f} % of {nominal.name} were measured: see that it is"
-            " the same part"
-        )
-    return result
 
 
 def _describe(
@@ -210,7 +186,7 @@ def _write_points(
         on.points[on.measured][counted],
         colours=deviation_colours(signed, limit),
         normals=None if on.normals is None else on.normals[on.measured][counted],
-        scalars={SCALARS: signed},
+        scalars={"deviation": signed},
         faces=faces,
         notes=[
             f"{on.source} against {nominal.name}",
@@ -238,4 +214,4 @@ def _list_arrays(points: np.ndarray, result: Deviation) -> dict[str, np.ndarray]
 def _safe_name(name: str) -> str:
     """Return a file name that is valid on every system: ASCII letters, digits, '-' and '_', 60 at
     most."""
-    return "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)[:60]
+    return re.sub(r"[^A-Za-z0-9_-]", "-", name)[:60]

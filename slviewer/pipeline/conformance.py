@@ -68,7 +68,7 @@ def check_camera(camera: Camera) -> Iterator[str]:
         return
     width, height = camera.size
     frame = np.zeros((height, width), camera.dtype)
-    yield from _check_opening(camera, lambda: camera.grab(frame))
+    yield from _check_opening(camera, camera.grab, frame)
     camera.open()
     try:
         frames = [
@@ -94,18 +94,12 @@ def check_camera(camera: Camera) -> Iterator[str]:
                 " they clip"
             )
         wrong = np.zeros((height + 1, width), camera.dtype)
-        yield from _expect(
-            InputError, lambda: camera.grab(wrong), "grab into an array of another shape"
-        )
-        other = np.zeros((height, width), np.float32)
-        yield from _expect(
-            InputError, lambda: camera.grab(other), "grab into an array of another type"
-        )
-        for name, call in (
-            ("settings", camera.settings),
-            ("apply", lambda: camera.apply(CameraSettings())),
-        ):
-            if not isinstance(call(), CameraSettings):
+        yield from _expect(InputError, "grab into an array of another shape", camera.grab, wrong)
+        wrong = np.zeros((height, width), np.float32)
+        yield from _expect(InputError, "grab into an array of another type", camera.grab, wrong)
+        returned = {"settings": camera.settings(), "apply": camera.apply(CameraSettings())}
+        for name, settings in returned.items():
+            if not isinstance(settings, CameraSettings):
                 yield f"{name} does not return CameraSettings"
         exposure = camera.settings().exposure_ms
         applied = camera.apply(CameraSettings(exposure_ms=exposure)).exposure_ms
@@ -127,10 +121,10 @@ def check_projector(projector: Projector) -> Iterator[str]:
     """List what a closed projector does against the protocol `Projector`. It is opened, shows a
     sequence, and is closed."""
     yield from _check_size(projector)
-    yield from _check_opening(projector, lambda: projector.show_level(0))
+    yield from _check_opening(projector, projector.show_level, 0)
     projector.open()
     try:
-        yield from _expect(DeviceError, lambda: projector.show(0), "show before load")
+        yield from _expect(DeviceError, "show before load", projector.show, 0)
         width, height = projector.size
         frames = (
             Frame("white"),
@@ -139,25 +133,19 @@ def check_projector(projector: Projector) -> Iterator[str]:
             *phase_steps("y", 3, 16.0),
         )
         other = PatternSequence((width + 1, height), frames)
-        yield from _expect(
-            InputError, lambda: projector.load(other), "load of patterns of another size"
-        )
+        yield from _expect(InputError, "load of patterns of another size", projector.load, other)
         for sequence in (complementary((width, height)), PatternSequence((width, height), frames)):
             projector.load(sequence)
             for index in (0, len(sequence.frames) - 1):
                 projector.show(index)
         for index in (-1, len(frames)):
-            yield from _expect(InputError, partial(projector.show, index), f"show of frame {index}")
+            yield from _expect(InputError, f"show of frame {index}", projector.show, index)
         for level in (0, 128, 255, None):
             projector.show_level(level)
         for level in (-1, 256):
-            yield from _expect(
-                InputError, partial(projector.show_level, level), f"show_level of {level}"
-            )
+            yield from _expect(InputError, f"show_level of {level}", projector.show_level, level)
         yield from _expect(
-            None,
-            lambda: projector.show(0),
-            "show after show_level, where the sequence stays loaded,",
+            None, "show after show_level, where the sequence stays loaded,", projector.show, 0
         )
     finally:
         projector.close()
@@ -174,25 +162,23 @@ def check_turntable(turntable: Turntable, turn_deg: float = 5.0) -> Iterator[str
     try:
         start = turntable.position_deg()
         limits = turntable.limits_deg
-        to = (
-            start - turn_deg
-            if limits is not None and start + turn_deg > limits[1]
-            else start + turn_deg
-        )
+        to = start + turn_deg
+        if limits is not None and to > limits[1]:
+            to = start - turn_deg
         for angle in (to, start):
             turntable.turn_to(angle)
             if abs(turntable.position_deg() - angle) > _ANGLE_TOLERANCE_DEG:
                 yield f"after turn_to({angle:g}) it stands at {turntable.position_deg():g} degrees"
         if limits is not None:
             yield from _expect(
-                InputError, lambda: turntable.turn_to(limits[1] + 1), "turn_to beyond the limits"
+                InputError, "turn_to beyond the limits", turntable.turn_to, limits[1] + 1
             )
 
         def cancel() -> None:
             raise Cancelled("cancelled")
 
         yield from _expect(
-            Cancelled, lambda: turntable.turn_to(to, cancel), "turn_to with a check that raises"
+            Cancelled, "turn_to with a check that raises", turntable.turn_to, to, cancel
         )
         turntable.turn_to(start)
     finally:
@@ -232,7 +218,7 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Itera
         if layout.is_capture(empty):
             yield "is_capture is True for an empty folder"
         yield from _expect(
-            InputError, lambda: layout.read(empty, **options), "read of an empty folder"
+            InputError, "read of an empty folder", partial(layout.read, empty, **options)
         )
         shorter = Path(folder) / "captures" / capture.name
         shutil.copytree(capture, shorter)
@@ -259,9 +245,7 @@ def check_board(notation: str) -> Iterator[str]:
         yield "some features have the same coordinates"
     for level in (0, 128, 255):
         blank = np.full((480, 640), level, np.uint8)
-        yield from _expect(
-            DetectionError, partial(detect, board, blank), "detection in an empty image"
-        )
+        yield from _expect(DetectionError, "detection in an empty image", detect, board, blank)
 
 
 @_listed
@@ -301,24 +285,28 @@ def _check_size(device: Camera | Projector) -> list[str]:
     return faults
 
 
-def _check_opening(device: Camera | Projector | Turntable, use: Callable[[], object]) -> list[str]:
+def _check_opening(
+    device: Camera | Projector | Turntable, use: Callable[..., object], *arguments: Any
+) -> list[str]:
     """List faults of `open` and `close`: using a closed device is an error, closing it twice and
     reopening are not."""
-    faults = _expect(DeviceError, use, "use before open")
-    faults += _expect(None, device.close, "close before open")
+    faults = _expect(DeviceError, "use before open", use, *arguments)
+    faults += _expect(None, "close before open", device.close)
     device.open()
     try:
-        faults += _expect(DeviceError, device.open, "a second open")
+        faults += _expect(DeviceError, "a second open", device.open)
     finally:
         device.close()
-    faults += _expect(None, device.close, "a second close")
-    return faults + _expect(DeviceError, use, "use after close")
+    faults += _expect(None, "a second close", device.close)
+    return faults + _expect(DeviceError, "use after close", use, *arguments)
 
 
-def _expect(error: type[SlviewerError] | None, call: Callable[[], object], what: str) -> list[str]:
+def _expect(
+    error: type[SlviewerError] | None, what: str, call: Callable[..., object], *arguments: Any
+) -> list[str]:
     """Return a fault unless the call raises the error, or with None nothing."""
     try:
-        call()
+        call(*arguments)
     except Exception as raised:
         if error is not None and isinstance(raised, error):
             return []

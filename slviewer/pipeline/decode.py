@@ -127,14 +127,17 @@ def axis_figures(phase: PhaseMap) -> dict[str, Any]:
     if not valid.any():
         return figures | dict.fromkeys(names)
     coordinate = phase.coordinate[valid]
-    background = float(np.median(phase.background[valid]))
+    modulation, background, sigma = (
+        float(np.median(each[valid]))
+        for each in (phase.modulation, phase.background, phase.sigma_px)
+    )
     a, b = phase.noise
     values = (
         [float(coordinate.min()), float(coordinate.max())],
-        float(np.median(phase.modulation[valid])),
+        modulation,
         background,
         float(np.sqrt(a + b * background)),
-        float(np.median(phase.sigma_px[valid])),
+        sigma,
     )
     return figures | dict(zip(names, values, strict=True))
 
@@ -177,15 +180,15 @@ def write_decoded(
             "coordinate": phase.coordinate,
             "sigma": phase.sigma_px,
             "modulation": phase.modulation,
+            "reason": phase.reason,
         }
         for name, values in maps.items():
-            files[f"{name}_{axis}"] = file = f"{name}_{axis}.{file_format}"
-            save(folder / file, values)
-        files[f"reason_{axis}"] = file = f"reason_{axis}.{'png' if file_format == 'exr' else 'npy'}"
-        if file_format == "exr":
-            (folder / file).write_bytes(cv2.imencode(".png", phase.reason)[1].tobytes())
-        else:
-            np.save(folder / file, phase.reason)
+            suffix = "png" if name == "reason" and file_format == "exr" else file_format
+            files[f"{name}_{axis}"] = file = f"{name}_{axis}.{suffix}"
+            if suffix == "png":
+                (folder / file).write_bytes(cv2.imencode(".png", values)[1].tobytes())
+            else:
+                save(folder / file, values)
     files["picture"] = "decoded.png"
     (folder / "decoded.png").write_bytes(phase_maps(capture, phases).png)
     result = DecodedFiles(capture, phases, folder, files)

@@ -7,10 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.printable import format_csv
+from slviewer.session.atomic import replace_file
 from slviewer.session.importers.images import read_image
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
@@ -52,24 +54,21 @@ class BoardsDetected:
     @property
     def failure(self) -> str:
         """In how many photographs the board was not detected; empty where it was in all."""
-        missing = len(self.images) - self.detected
-        return (
-            f"{self.board} not detected in {missing} of {len(self.images)} images"
-            if missing
-            else ""
-        )
+        count = len(self.images)
+        missing = count - self.detected
+        return f"{self.board} not detected in {missing} of {count} images" if missing else ""
 
     def rows(self) -> list[tuple[str, int, float, float, float, float]]:
         """The table: image, index of the feature, its place on the board in mm, and in the image in
         px."""
         return [
-            (image.path.name, int(index), x, y, u, v)
+            (image.path.name, index, x, y, u, v)
             for image in self.images
-            if image.detection is not None
+            if (found := image.detection) is not None
             for index, (x, y), (u, v) in zip(
-                image.detection.ids,
-                self.board.points[image.detection.ids][:, :2].tolist(),
-                image.detection.pixels.tolist(),
+                found.ids.tolist(),
+                self.board.points[found.ids][:, :2].tolist(),
+                found.pixels.tolist(),
                 strict=True,
             )
         ]
@@ -89,21 +88,21 @@ class BoardsDetected:
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as plain values."""
-        return {
-            "target": str(self.board),
-            "images": [
+        images = []
+        for image in self.images:
+            found = image.detection
+            images.append(
                 {
                     "image": str(image.path),
-                    "detected": image.detection is not None,
+                    "detected": found is not None,
                     "refusal": image.refusal,
-                    "marked": bool(image.detection and image.detection.marked),
-                    "rms_px": image.rms_px if image.detection is not None else None,
-                    "index": image.detection.ids.tolist() if image.detection else [],
-                    "pixels": image.detection.pixels.tolist() if image.detection else [],
+                    "marked": bool(found and found.marked),
+                    "rms_px": image.rms_px if found else None,
+                    "index": found.ids.tolist() if found else [],
+                    "pixels": found.pixels.tolist() if found else [],
                 }
-                for image in self.images
-            ],
-        }
+            )
+        return {"target": str(self.board), "images": images}
 
 
 def detect_board(
@@ -136,19 +135,26 @@ def detect_board(
     for path in paths:
         try:
             picture = read_image(path)
-            result = _detect_board_in(board, path, picture)
         except InputError as error:
             results.append(BoardImageResult(path, None, str(error)))
             continue
+        result = _detect_board_in(board, path, picture)
         results.append(result)
         if out is not None:
-            _write_picture(
-                _overlay_path(Path(out), path, len(paths)),
-                draw_detection(board, picture, result.detection),
-            )
+            overlay = Path(out)
+            if len(paths) > 1 or overlay.suffix.lower() not in IMAGE_SUFFIXES:
+                overlay = overlay / f"{path.stem}_board.png"
+            drawn = draw_detection(board, picture, result.detection)
+            done, data = cv2.imencode(overlay.suffix, drawn)
+            if not done:
+                raise InputError(
+                    f"{overlay.name} cannot be written as an image: give a name that ends in .png"
+                )
+            replace_file(overlay, data.tobytes())
     detected = BoardsDetected(board, tuple(results))
     if csv_out is not None:
-        _write_csv(Path(csv_out), detected)
+        rows = [(*row, f"{u:.4f}", f"{v:.4f}") for *row, u, v in detected.rows()]
+        replace_file(Path(csv_out), format_csv([COLUMNS, *rows]).encode())
     return detected
 
 
@@ -166,32 +172,25 @@ def draw_detection(board: Board, image: np.ndarray, detection: Detection | None)
     if detection is None:
         return picture
     pixels = (detection.pixels + 0.5) * scale - 0.5
-    places = [(round(float(u)), round(float(v))) for u, v in pixels]
-    apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    size = float(np.clip(np.median(apart.min(1)) / 90, 0.3, 0.8))
-    for index, place in zip(detection.ids.tolist(), places, strict=True):
-        cv2.drawMarker(picture, place, _BLUE, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
+    apart = cKDTree(pixels).query(pixels, k=2)[0][:, 1]
+    size = float(np.clip(np.median(apart) / 90, 0.3, 0.8))
+    for index, (u, v) in zip(detection.ids.tolist(), _round_to_pixels(pixels), strict=True):
+        cv2.drawMarker(picture, (u, v), _BLUE, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
         for colour, width in ((_BLACK, 3), (_BLUE, 1)):
-            cv2.putText(
-                picture,
-                str(index),
-                (place[0] + 4, place[1] - 4),
-                0,
-                size,
-                colour,
-                width,
-                cv2.LINE_AA,
-            )
+            place = u + 4, v - 4
+            cv2.putText(picture, str(index), place, 0, size, colour, width, cv2.LINE_AA)
     to_px = fit_grid_map(board.points[detection.ids][:, :2] / board.pitch_mm, pixels)
-    axes = to_px.to_image(
-        np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) * (2 if board.kind == "acircles" else 1)
-    )
-    origin, *tips = [(round(float(u)), round(float(v))) for u, v in axes]
+    axes = np.eye(3)[:, 1:] * (2 if board.kind == "acircles" else 1)
+    origin, *tips = _round_to_pixels(to_px.to_image(axes))
     for tip, colour, name in zip(tips, (_RED, _GREEN), "xy", strict=True):
         cv2.arrowedLine(picture, origin, tip, colour, 3, cv2.LINE_AA, tipLength=0.25)
         cv2.putText(picture, name, (tip[0] + 6, tip[1] + 14), 0, 0.8, colour, 2, cv2.LINE_AA)
     return picture
+
+
+def _round_to_pixels(points: np.ndarray) -> list[list[int]]:
+    """Return points (n, 2) px as whole numbers."""
+    return np.rint(points).astype(int).tolist()
 
 
 def _list_photographs(given: list[Path]) -> list[Path]:
@@ -239,33 +238,3 @@ def _describe_result(board: Board, image: BoardImageResult) -> str:
         f"{image.path.name}: {len(image.detection.ids)} of {len(board.points)} {features} detected,"
         f" {image.rms_px:.3f} px RMS from a flat grid{mark}"
     )
-
-
-def _overlay_path(out: Path, photograph: Path, count: int) -> Path:
-    """Return the file for a photograph's overlay: ``out`` itself for a single image, else a PNG in
-    that folder."""
-    return (
-        out
-        if count == 1 and out.suffix.lower() in IMAGE_SUFFIXES
-        else out / f"{photograph.stem}_board.png"
-    )
-
-
-def _write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write an image in the format of the suffix; InputError where that is not an image format."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(path.suffix, picture)
-    if not done:
-        raise InputError(
-            f"{path.name} cannot be written as an image: give a name that ends in .png"
-        )
-    path.write_bytes(data.tobytes())
-
-
-def _write_csv(path: Path, detected: BoardsDetected) -> None:
-    """Write the detected features of all photographs as CSV, one row each."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = (
-        (name, index, x, y, f"{u:.4f}", f"{v:.4f}") for name, index, x, y, u, v in detected.rows()
-    )
-    path.write_text(format_csv([COLUMNS, *rows]), encoding="utf-8", newline="")

@@ -1,15 +1,14 @@
 """Setting the region of interest of a session, and deleting points of a scan so that they can be
 brought back."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.pipeline.export_shapes import scan_cloud
+from slviewer.pipeline.capture_clouds import scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName, check_accepted
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -40,15 +39,6 @@ class ScanEdits:
     edits: tuple[str, ...]
     undone: int
     remaining: int | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """The contract of ``edit --json``."""
-        return {
-            "scan": self.scan,
-            "edits": list(self.edits),
-            "undone": self.undone,
-            "remaining": self.remaining,
-        }
 
     def text(self) -> str:
         """List the edits, numbered in their order."""
@@ -96,11 +86,12 @@ class EditSettings(Callbacks):
     accept_rejected: bool = False
 
     def __post_init__(self) -> None:
-        if self.selections + bool(self.undo) + bool(self.redo) > 1:
+        requests = (self.polygon, self.part, self.support, self.undo, self.redo)
+        if sum(map(bool, requests)) > 1:
             raise UsageError(
                 "do one thing at a time: --polygon, --part, --support, --undo or --redo"
             )
-        if (self.invert and not self.selections) or (self.margin is not None and not self.support):
+        if (self.invert and not self.selects) or (self.margin is not None and not self.support):
             raise UsageError(
                 "--invert needs --polygon, --part or --support, and --margin needs --support"
             )
@@ -115,9 +106,9 @@ class EditSettings(Callbacks):
             )
 
     @property
-    def selections(self) -> int:
-        """In how many ways points are selected."""
-        return sum((bool(self.polygon), bool(self.part), self.support))
+    def selects(self) -> bool:
+        """Whether points are selected."""
+        return bool(self.polygon or self.part or self.support)
 
 
 @takes_settings(EditSettings)
@@ -129,12 +120,13 @@ def edit_scan(settings: EditSettings) -> ScanEdits:
     calibration too.
     """
     scan, undo, redo, remaining = settings.scan, settings.undo, settings.redo, None
-    with opened(settings.session, write=bool(settings.selections or undo or redo)) as store:
-        if settings.selections:
+    with opened(settings.session, write=bool(settings.selects or undo or redo)) as store:
+        if settings.selects:
             remaining = _delete_selected(store, settings)
             settings.progress(1.0, "edited")
         elif undo or redo:
-            change_history(store, scan, undo=undo, redo=redo)
+            history = load_edits(store, scan)
+            save_edits(store, scan, history.undo(undo) if undo else history.redo(redo))
         else:
             store.load_capture(scan)
         return ScanEdits(scan, *list_edits(store, scan), remaining)
@@ -153,18 +145,14 @@ def _delete_selected(store: Session, settings: EditSettings) -> int:
     )
     plane = None
     if settings.support:
-        (plane, selected), what = (
-            select_support(cloud.points, cloud.sigma_z, settings.margin),
-            SUPPORT,
-        )
+        plane, selected = select_support(cloud.points, cloud.sigma_z, settings.margin)
+        what = SUPPORT
     elif settings.part:
         u, v = settings.part
         selected, what = select_connected(cloud.points, (u, v)), "connected part"
     else:
-        selected, what = (
-            select_polygon(cloud.sigma_z.shape, np.reshape(settings.polygon, (-1, 2))),
-            "polygon",
-        )
+        corners = np.reshape(settings.polygon, (-1, 2))
+        selected, what = select_polygon(cloud.sigma_z.shape, corners), "polygon"
     if settings.invert:
         selected, what, plane = ~selected, f"all but {what}", None
     delete_points(store, [Selection(settings.scan, cloud.points, selected, plane)], what)
@@ -208,36 +196,23 @@ def delete_points(store: Session, selections: Sequence[Selection], what: str) ->
     return {scan: edit.points for scan, edit in edits.items()}
 
 
-def change_history(store: Session, scan: str, *, undo: int = 0, redo: int = 0) -> None:
-    """Undo or redo so many edits of a scan. InputError where there are fewer."""
-    history = load_edits(store, scan)
-    save_edits(store, scan, history.undo(undo) if undo else history.redo(redo))
-
-
-def undo_last(store: Session, scans: Sequence[str]) -> None:
-    """Undo the last edit among those of several scans, of all scans that it was made of. InputError
-    where none is."""
-    made = {scan: edits[-1].made for scan in scans if (edits := load_edits(store, scan).active)}
-    _change_together(store, made, max(made.values(), default=""), undo=1)
-
-
-def redo_next(store: Session, scans: Sequence[str]) -> None:
-    """Bring back what `undo_last` undid last. InputError where nothing was undone."""
-    made = {scan: edits[0].made for scan in scans if (edits := load_edits(store, scan).undone)}
-    _change_together(store, made, min(made.values(), default=""), redo=1)
-
-
-def _change_together(
-    store: Session, made: Mapping[str, str], when: str, *, undo: int = 0, redo: int = 0
-) -> None:
-    """Undo or redo an edit of each of the scans whose edit was ``made`` at that time; the first
-    one's where none is known. InputError without scans."""
-    scans = [scan for scan, time in made.items() if time == when][: None if when else 1]
-    if not scans:
-        raise InputError(f"no edit can be {'undone' if undo else 'redone'}: there is none")
+def step_history(store: Session, scans: Sequence[str], *, redo: bool = False) -> None:
+    """Undo the last edit among those of several scans, of all scans that it was made of; or bring
+    back (``redo``) what was undone last. InputError where there is none."""
+    histories = {scan: load_edits(store, scan) for scan in scans}
+    made = {
+        scan: edit.made
+        for scan, history in histories.items()
+        for edit in (history.undone[:1] if redo else history.active[-1:])
+    }
+    if not made:
+        raise InputError(f"no edit can be {'redone' if redo else 'undone'}: there is none")
+    when = min(made.values()) if redo else max(made.values())
     with store.together():
-        for scan in scans:
-            change_history(store, scan, undo=undo, redo=redo)
+        # of edits whose time is not known, the first one's alone
+        for scan in [scan for scan, time in made.items() if time == when][: None if when else 1]:
+            history = histories[scan]
+            save_edits(store, scan, history.redo(1) if redo else history.undo(1))
 
 
 def set_region(
@@ -269,15 +244,12 @@ def set_region(
         raise UsageError(
             "state the region with --roi, or take it from a scan with --around: one of both"
         )
-    if not roi and not around:
-        with opened(session) as store:
-            return describe_region(store)
-    with opened(session, write=True) as store:
+    with opened(session, write=bool(roi or around)) as store:
         if around:
             check_accepted(store, accept_rejected)
             cloud = scan_cloud(store, around, model, progress, warn, accept_rejected, OFF)
             save_region(store, RegionOfInterest.around(cloud.points))
-        else:
+        elif roi:
             known = load_region(store, even_if_off=True)
             if roi == "on" and known is None:
                 raise InputError(

@@ -5,20 +5,36 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
 from slviewer.errors import InputError
+from slviewer.pipeline.capture_clouds import (
+    merge_name,
+    points_with_normals,
+    read_merge,
+    scan_cloud,
+)
 from slviewer.pipeline.export_documents import (
     write_calibration_file,
     write_coefficients,
     write_poses,
     write_table,
 )
-from slviewer.pipeline.export_shapes import DescribedShape, merge_name, merge_shape, scan_shape
-from slviewer.pipeline.feedback import Progress, part
-from slviewer.pipeline.models import ModelName, check_accepted, preferred_model, warn_if_stale
+from slviewer.pipeline.feedback import part
+from slviewer.pipeline.models import (
+    ModelName,
+    check_accepted,
+    frame_of,
+    preferred_model,
+    warn_if_stale,
+)
 from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.report import report
-from slviewer.pipeline.scan_edits import refuse_region
+from slviewer.pipeline.scale import describe_scale
+from slviewer.pipeline.scan_edits import refuse_region, resolve_region, restriction_notes
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.session.atomic import format_bytes
 from slviewer.session.mesh_files import (
     IN_WORDS,
@@ -30,7 +46,8 @@ from slviewer.session.mesh_files import (
 )
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
-from slviewer.surface.meshing import MeshingPlan
+from slviewer.surface.meshing import MeshingPlan, build_mesh
+from slviewer.surface.shapes import PointSet
 
 What = Literal[
     "cloud",
@@ -63,6 +80,8 @@ DOCUMENTS = {
 }
 """What the other formats are, and in which units."""
 _ALIASES = {"yaml": "yml", "htm": "html"}
+_ALONG_NORMAL = "sigma: expected error along the normal, mm"
+_SCANS, _MERGES = ("cloud", "mesh"), ("merge", "merged-mesh")
 
 
 def formats(what: What) -> tuple[str, ...]:
@@ -125,10 +144,8 @@ def default_file_name(what: What, name: str, file_format: str) -> str:
         "mesh": f"{name}_mesh",
         "merge": f"merged_{name}",
         "table": "figures",
-    }
-    stems |= {
         "merged-mesh": f"merged_{name}_mesh",
-        "coefficients": f"coefficients_{name}" if name else "coefficients",
+        "coefficients": f"coefficients_{name}".removesuffix("_"),
     }
     return f"{stems.get(what, what)}.{file_format}"
 
@@ -176,35 +193,21 @@ class ExportSettings(Callbacks):
 def export(settings: ExportSettings) -> Exported:
     """Write a file for other programs: shapes in mm (.ply .stl .obj .3mf .xyz) or m (.glb .e57),
     calibration, poses."""
-    what, roi, accept_rejected = settings.what, settings.roi, settings.accept_rejected
-    progress, warn = settings.progress, settings.warn
+    what, progress, warn = settings.what, settings.progress, settings.warn
     with opened(settings.session) as store:
         chosen = settings.file_format.lower().removeprefix(".")
         check_export(what, chosen or formats(what)[0])
         name = _resolve_name(store, what, settings.name)
         target = _output_path(store, what, name, settings.out, chosen)
         if what not in ("report", "table"):
-            check_accepted(store, accept_rejected)
+            check_accepted(store, settings.accept_rejected)
         # reading a merge warns by itself
-        if what not in (
-            "report",
-            "table",
-            "merge",
-            "merged-mesh",
-        ):
+        if what not in ("report", "table", *_MERGES):
             warn_if_stale(store, warn)
-        plan, making = (
-            (settings.plan or MeshingPlan()) if "mesh" in what else None,
-            part(progress, 0, 0.8),
-        )
-        if what in ("cloud", "mesh"):
-            shape = scan_shape(
-                store, name, settings.model, plan, making, warn, accept_rejected, roi
-            )
-            words = _write_shape(shape, target, progress)
-        elif what in ("merge", "merged-mesh"):
-            refuse_region(f"merge/{name}", roi)
-            words = _write_shape(merge_shape(store, name, plan, making, warn), target, progress)
+        if what in _SCANS:
+            words = _write_scan(store, name, target, settings)
+        elif what in _MERGES:
+            words = _write_merge(store, name, target, settings)
         elif what == "report":
             report(store, target, progress=progress, warn=warn)
             words = "report"
@@ -215,11 +218,86 @@ def export(settings: ExportSettings) -> Exported:
     return Exported(target, target.stat().st_size, words)
 
 
-def _write_shape(shape: DescribedShape, target: Path, progress: Progress) -> str:
-    """Write a scan or a merge as points or a mesh, and return a description of what was written."""
+def _write_scan(store: Session, name: str, target: Path, settings: ExportSettings) -> str:
+    """Write a scan's measured points with normals, colours and sigmas, or a mesh of them; return a
+    description of what was written."""
+    progress, roi = settings.progress, settings.roi
+    cloud = scan_cloud(
+        store,
+        name,
+        settings.model,
+        part(progress, 0, 0.4),
+        settings.warn,
+        settings.accept_rejected,
+        roi,
+    )
+    mask = cloud.mask
+    if not mask.any():
+        raise InputError(
+            f"{name}: no pixel was measured: does the calibration belong to this camera and"
+            " projector?"
+        )
+    notes = (
+        f"scan {name}, frame: {frame_of(store, cloud.model)}, x right, y down, z away",
+        *_model_notes(store, cloud.model),
+        *restriction_notes(store, [name], resolve_region(store, roi)),
+    )
+    if settings.what == "mesh":
+        return _write_mesh(name, cloud, notes, target, settings)
+    progress(0.56, "normals")
+    normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
+    if colours is not None and colours.ndim == 1:
+        colours = np.repeat(colours[:, None], 3, axis=1)
     progress(0.85, f"writing {target.name}")
-    write_shape(target, shape.shape, scalars=shape.scalars, notes=shape.notes)
-    return shape.text()
+    points = PointSet(cloud.measured, normals, colours)
+    notes = (*notes, "sigma: expected error of the depth, mm")
+    write_shape(target, points, scalars=cloud.sigmas(mask), notes=notes)
+    return f"{name}: {len(points)} points"
+
+
+def _write_merge(store: Session, name: str, target: Path, settings: ExportSettings) -> str:
+    """Write the points of the merge of that number, or one mesh through them; return a description
+    of what was written."""
+    refuse_region(f"merge/{name}", settings.roi)
+    settings.progress(0.08, "reading the merged points")
+    merge, merged = read_merge(store, f"merge/{name}", settings.warn)
+    notes = (
+        (
+            f"merge {name} of {', '.join(merge.scans)}, frame: {frame_of(store, merge.model)}, at"
+            f" {merge.reference}"
+        ),
+        *_model_notes(store, merge.model),
+        *merge.restrictions,
+    )
+    if settings.what == "merged-mesh":
+        return _write_mesh(f"merge {name}", points_with_normals(merged), notes, target, settings)
+    settings.progress(0.85, f"writing {target.name}")
+    points = PointSet(merged.points, merged.normals, merged.colours)
+    notes = (*notes, _ALONG_NORMAL)
+    write_shape(target, points, scalars=merged.scalars, notes=notes)
+    return f"merge {name}: {len(points)} points"
+
+
+def _write_mesh(
+    whose: str,
+    source: Cloud | PointSet,
+    notes: tuple[str, ...],
+    target: Path,
+    settings: ExportSettings,
+) -> str:
+    """Write a mesh of a scan or of merged points, and return a description of it."""
+    progress = settings.progress
+    made = build_mesh(source, settings.plan or MeshingPlan(), part(progress, 0.4, 0.8))
+    done = made.text().splitlines()
+    progress(0.85, f"writing {target.name}")
+    write_shape(target, made.mesh, notes=(*notes, _ALONG_NORMAL, *done))
+    return f"{whose}: {'; '.join(done)}"
+
+
+def _model_notes(store: Session, model: str) -> tuple[str, ...]:
+    """Return file comments that name the calibration and its scale correction; none without a
+    model."""
+    return tuple(filter(None, (model and f"calibration {model}", describe_scale(store, model))))
 
 
 def _write_document(store: Session, what: What, name: str, target: Path, model: str | None) -> str:
@@ -242,9 +320,9 @@ def _write_document(store: Session, what: What, name: str, target: Path, model: 
 
 def _resolve_name(store: Session, what: What, name: str) -> str:
     """Return the requested name, or by default that of the only scan, or of the last merge."""
-    if what in ("merge", "merged-mesh"):
+    if what in _MERGES:
         return merge_name(store, name)
-    if what not in ("cloud", "mesh"):
+    if what not in _SCANS:
         return name
     if name:
         return store.load_capture(name).name

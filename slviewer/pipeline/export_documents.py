@@ -105,7 +105,7 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
         depths, count = fitted.bundle.depth_range_mm, len(fitted.bundle.poses)
     elif isinstance(fitted, PixelwiseModel):
         fits = {"camera": pixelwise_residuals(fitted, rig.camera)}
-    T = _scaled_transform(rig.T_projector_camera, factor)
+    T = rigid_transform(rig.R, factor * rig.t)
     entries: dict[str, Any] = {
         "program": f"slviewer {__version__}",
         "units": "mm, px",
@@ -135,9 +135,7 @@ def write_calibration_file(store: Session, path: Path, model: str) -> str:
             f"reprojection_rms_px_{name}": float(value)
             for name, value in stereo.reprojection_rms_px.items()
         }
-    write_calibration(
-        path, entries, {name: meaning for name, meaning in _CALIBRATION.items() if name in entries}
-    )
+    write_calibration(path, entries, _CALIBRATION)
     errors = ", ".join(
         f"{fit.rms_px:.3f} px RMS and {fit.max_px:.3f} px at most in the {device}"
         for device, fit in fits.items()
@@ -227,9 +225,7 @@ def write_poses(store: Session, model: str, path: Path) -> None:
         entries["targets"] = targets
     if merges := list_records(store, Merge):
         entries["merges"] = [_merge_entry(store, each) for each in merges]
-    write_calibration(
-        path, entries, {name: meaning for name, meaning in _POSES.items() if name in entries}
-    )
+    write_calibration(path, entries, _POSES)
 
 
 def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
@@ -243,18 +239,14 @@ def _target_pose_entries(store: Session, model: str) -> list[dict[str, Any]]:
     else:
         stereo = load_stereo(store)
         poses, rms = dict(stereo.poses), dict(stereo.pose_rms_px)
-    targets = []
+    targets, factor = [], scale_factor(store, model)
     for name in sorted(poses, key=natural_key):
         figures = dict(
             zip(("camera_rms_px", "projector_rms_px"), map(float, rms.get(name, ())), strict=False)
         )
-        targets.append(
-            {
-                "name": name,
-                "T_camera_board": _scaled_transform(poses[name], scale_factor(store, model)),
-                **figures,
-            }
-        )
+        T = np.array(poses[name], float)
+        T[:3, 3] *= factor
+        targets.append({"name": name, "T_camera_board": T, **figures})
     return targets
 
 
@@ -282,36 +274,23 @@ def _merge_entry(store: Session, each: Stored[Merge]) -> dict[str, Any]:
 
 def _projector_transform(store: Session, model: str) -> np.ndarray:
     """T_projector_camera (4, 4) mm by a model, with its correction of scale."""
-    if model != "splined":
-        return _scaled_transform(
-            load_stereo(store).rig.T_projector_camera, scale_factor(store, model)
-        )
-    splined = load_model(store, model)
-    assert isinstance(splined, SplinedModel)
-    return _scaled_transform(
-        rigid_transform(splined.rig.R, splined.rig.t), scale_factor(store, model)
-    )
-
-
-def _scaled_transform(T: np.ndarray, factor: float) -> np.ndarray:
-    """A transform in a space that is larger by a factor."""
-    larger = np.array(T, float)
-    larger[:3, 3] *= factor
-    return larger
+    fitted = load_model(store, model)
+    rig = fitted.rig if isinstance(fitted, SplinedModel) else load_stereo(store).rig
+    return rigid_transform(rig.R, scale_factor(store, model) * rig.t)
 
 
 def write_table(store: Session, path: Path) -> None:
     """Write the tables of all records as one CSV: a line for each of theirs, the kind and whether
     it is up to date."""
-    every = [(kind, each) for kind in RECORDS.values() for each in list_records(store, kind)]
+    every = [each for kind in RECORDS.values() for each in list_records(store, kind)]
     if not every:
         raise InputError("nothing was found yet: verify, reconstruct or merge captures first")
     rows: list[dict[str, Value]] = []
-    for kind, each in every:
-        for table in kind.tables({each.name: each.record}):
+    for each in every:
+        for table in each.record.tables({each.name: each.record}):
             headings = [column.heading for column in table.columns]
             start = {
-                "kind": kind.kind,
+                "kind": each.record.kind,
                 "record": each.name,
                 "label": each.label,
                 "up to date": "no" if each.stale else "yes",

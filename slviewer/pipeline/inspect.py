@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SlviewerError
 from slviewer.evaluation.render import render
-from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measure import describe_measurement
 from slviewer.pipeline.models import available_models, load_stereo, preferred_model

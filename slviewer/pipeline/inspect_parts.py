@@ -357,9 +357,14 @@ class AlignedPart:
         return face_towards(fit, T[:3, 3] - fit.feature.place)
 
 
-def fit_to_nominal(surface: MeasuredSurface, nominal: Nominal) -> Deviation:
-    """Align a surface by the best fit to the nominal model. Raises SlviewerError where that cannot
-    be trusted."""
+def fit_to_nominal(
+    surface: MeasuredSurface,
+    nominal: Nominal,
+    reach_mm: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Deviation:
+    """Align a surface by the best fit to the nominal model; ``reach_mm`` as in `deviation`. Raises
+    SlviewerError where that cannot be trusted."""
     points = surface.points[surface.measured].astype(np.float64)
     normals = (
         None if surface.normals is None else surface.normals[surface.measured].astype(np.float64)
@@ -367,7 +372,14 @@ def fit_to_nominal(surface: MeasuredSurface, nominal: Nominal) -> Deviation:
     check_size(nominal, points)
     sigma = surface.sigma_mm[surface.measured]
     typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
-    return deviation(points, nominal.mesh, normals=normals, sigma_mm=typical)
+    return deviation(
+        points,
+        nominal.mesh,
+        normals=normals,
+        sigma_mm=typical,
+        reach_mm=reach_mm,
+        progress=progress,
+    )
 
 
 def _measure(wanted: Characteristic, part: AlignedPart) -> CharacteristicResult:

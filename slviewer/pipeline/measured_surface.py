@@ -10,7 +10,7 @@ from slviewer.errors import InputError
 from slviewer.inspection.features import Feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
-from slviewer.pipeline.export_shapes import read_merge, scan_cloud
+from slviewer.pipeline.capture_clouds import read_merge, scan_cloud
 from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
@@ -192,17 +192,16 @@ def load_merged_surface(
     store: Session, merge: str, warn: Warn = ignore_warnings
 ) -> MeasuredSurface:
     """A stored merge ``merge/<number>``, in the frame of its reference's camera."""
-    meta, points = read_merge(store, merge, warn)
+    record, points = read_merge(store, merge, warn)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
-    model = str(meta.get("model", ""))
     return MeasuredSurface(
         points.points,
         sigma,
         merge,
-        model,
+        record.model,
         store.input_hashes(merge),
         normals=points.normals,
         faces=points.faces,
         texture=points.colours,
-        scale=float(meta.get("scales", {}).get(model, 1.0)),
+        scale=record.scales.get(record.model, 1.0),
     )

@@ -11,8 +11,13 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.fringe.layout import to_eight_bits
+from slviewer.pipeline.capture_clouds import (
+    merge_name,
+    points_with_normals,
+    read_merge,
+    scan_cloud,
+)
 from slviewer.pipeline.export import check_export
-from slviewer.pipeline.export_shapes import merge_name, merged_points, scan_cloud
 from slviewer.pipeline.feedback import ignore_progress, part, stage
 from slviewer.pipeline.measured_surface import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
@@ -167,8 +172,8 @@ def mesh(settings: MeshSettings) -> MeshResult:
         elif sources[0].startswith(MERGED):
             refuse_region(sources[0], settings.roi)
             name = merge_name(store, sources[0].removeprefix(MERGED))
-            shape = merged_points(store, name, warn)
-            restrictions = tuple(load_record(store, Merge, name).restrictions)
+            stored, points = read_merge(store, f"merge/{name}", warn)
+            shape, restrictions = points_with_normals(points), tuple(stored.restrictions)
         else:
             warn_if_stale(store, warn)
             shape = scan_cloud(

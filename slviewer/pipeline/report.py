@@ -12,7 +12,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel, pixel_samples
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.certificate import certificate_section, certify_page, make_certificate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.measure import section_lines

@@ -25,14 +25,14 @@ def write_calibration(
 
     .yml, .yaml and .xml are OpenCV FileStorage, .json is plain JSON with matrices as nested lists;
     `import opencv-calibration` reads them all. ``meanings``: {name: meaning and unit of the entry},
-    as comments; JSON, which knows none, gets them under "meanings". Replaces a file of that name in
-    one step.
+    as comments; JSON, which knows none, gets those of its entries under "meanings". Replaces a file
+    of that name in one step.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    meanings = meanings or {}
+    meanings = {name: each for name, each in (meanings or {}).items() if name in entries}
     if suffix == ".json":
-        data = to_json({"meanings": dict(meanings), **entries} if meanings else dict(entries))
+        data = to_json({"meanings": meanings, **entries} if meanings else dict(entries))
     elif suffix in (".yml", ".yaml", ".xml"):
         data = _format_file_storage(suffix, entries, meanings).encode()
     else:

@@ -26,8 +26,7 @@ from slviewer.examination.examine import examine
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.geometry.rigid import fit_rigid, move_points
-from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.import_captures import import_captures
 from slviewer.pipeline.models import ModelName

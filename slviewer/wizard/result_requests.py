@@ -9,7 +9,7 @@ from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.pipeline.align import FOLDER as PLACEMENTS
 from slviewer.pipeline.align import AlignSettings, align, remove_placement
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
-from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, redo_next, undo_last
+from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_history
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
 from slviewer.pipeline.feedback import Progress, Warn, part
 from slviewer.pipeline.measured_surface import MERGED
@@ -347,12 +347,12 @@ class ResultRequests(Engine):
     @request("Undoing the edit")
     def undo_edit(self, *scans: str) -> None:
         """Undo the last edit of scans, of all those that it was made of."""
-        undo_last(self._store, scans)
+        step_history(self._store, scans)
 
     @request("Redoing the edit")
     def redo_edit(self, *scans: str) -> None:
         """Bring the last edit of scans that was undone back."""
-        redo_next(self._store, scans)
+        step_history(self._store, scans, redo=True)
 
     # files
 

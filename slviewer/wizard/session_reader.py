@@ -13,7 +13,7 @@ from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import DamagedError, SessionError
 from slviewer.fringe.presets import PRESETS
-from slviewer.pipeline.calibration_verdict import load_last_verdict
+from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.capture import DEFAULT_PATTERNS
 from slviewer.pipeline.models import (
     POSES_FOR_PIXELWISE,

@@ -37,7 +37,7 @@ from slviewer.gui.steps.calibrate import named_poses, verdict_html
 from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
-from slviewer.pipeline.calibration_verdict import save_verdict
+from slviewer.pipeline.calibrate import save_verdict
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import Measurement
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison

@@ -12,8 +12,7 @@ from copies import copy_session
 from facts import missing_facts
 
 from slviewer.calibration.observe import Smoothing
-from slviewer.pipeline.calibrate import calibrate
-from slviewer.pipeline.calibration_verdict import load_last_verdict, save_verdict
+from slviewer.pipeline.calibrate import calibrate, load_last_verdict, save_verdict
 from slviewer.pipeline.models import (
     available_models,
     load_stereo,
