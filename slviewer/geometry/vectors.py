@@ -1,7 +1,8 @@
-"""Lengths, directions and means of many vectors."""
+"""Lengths, directions, means and distances of many vectors."""
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
@@ -25,8 +26,8 @@ def box_middle(points: np.ndarray) -> np.ndarray:
 
 
 def rms(values: ArrayLike) -> float:
-    """Return the root mean square of values."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    """Return the root mean square of values; NaN without any."""
+    return float(np.sqrt(np.mean(np.square(values)))) if np.size(values) else float("nan")
 
 
 def rms_length(vectors: np.ndarray) -> float:
@@ -40,3 +41,10 @@ def finite_rows(*arrays: np.ndarray) -> np.ndarray:
     for other in others:
         first &= other
     return first
+
+
+def median_spacing(tree: cKDTree, samples: int) -> float:
+    """Return the median distance of points of a search tree to their nearest other point, over some
+    ``samples`` of them; infinite for a single point."""
+    distance, _ = tree.query(tree.data[:: max(1, tree.n // samples)], k=2)
+    return float(np.median(distance[:, 1]))

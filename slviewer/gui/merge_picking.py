@@ -18,7 +18,7 @@ from slviewer.gui.pictures import Painter
 from slviewer.gui.viewpoints import TO_THE_RIGHT
 from slviewer.gui.widgets import Html, Text, alert, coloured, paragraph, table, to_html
 from slviewer.registration.multiway import Pair
-from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
+from slviewer.registration.start import LEAST_PICKS, fit_picked_start
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import ScanCloud, load_scan_cloud, nearest
 

@@ -9,14 +9,10 @@ import numpy as np
 from slviewer.errors import SlviewerError
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.inspection.nominal_surface import NominalSurface
-from slviewer.registration.pairwise import (
-    MOST_ATTEMPTS,
-    Registration,
-    register_prepared,
-    search_starts,
-)
-from slviewer.registration.prepared import PreparedScan, prepare_scan
+from slviewer.registration.pairwise import MOST_ATTEMPTS, Registration, register_prepared
 from slviewer.registration.refusal import Refused
+from slviewer.registration.scan import PreparedScan, prepare_scan
+from slviewer.registration.start import search_starts
 
 SAMPLES = 60_000
 """Points of the nominal that a scan is aligned with, all around it."""
@@ -101,14 +97,14 @@ def _register_symmetric(scan: PreparedScan, reference: PreparedScan) -> Registra
     residuals: the choice among them does not change the deviations."""
     size = min(scan.size, reference.size)
     starts = search_starts(scan, reference, size)
-    if not starts or starts[0].score < LEAST_SCORE:
-        best = 100 * starts[0].score if starts else 0.0
+    if starts[0].score < LEAST_SCORE:
         raise Refused(
             "overlap",
-            f"At most {best:.0f} % of the scan lies on a side of the model, in any of its poses.",
+            f"At most {100 * starts[0].score:.0f} % of the scan lies on a side of the model, in any"
+            " of its poses.",
         )
     try:
-        return register_prepared(scan, reference, size=size, starts=starts)
+        return register_prepared(scan, reference, size, starts)
     except Refused as error:
         if error.reason != "ambiguous":
             raise
@@ -116,7 +112,8 @@ def _register_symmetric(scan: PreparedScan, reference: PreparedScan) -> Registra
     alike = []
     for start in starts[:MOST_ATTEMPTS]:
         try:
-            alike.append(register_prepared(scan, reference, size=size, initial=start.T))
+            given = replace(start, start="initial")
+            alike.append(register_prepared(scan, reference, size, given))
         except Refused:
             continue
     if not alike:

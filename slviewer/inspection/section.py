@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
+from slviewer.geometry.vectors import finite_rows, lengths, median_spacing, unit_vectors
 from slviewer.records.quantities import Quantity
 from slviewer.registration.open3d_loader import open3d
 
@@ -90,10 +90,7 @@ def triangulate_near(
     """
     known = finite_rows(normals)
     points, normals = points[known].astype(np.float64), normals[known].astype(np.float64)
-    some = points[:: max(1, len(points) // 2000)]
-    spacing = (
-        float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
-    )
+    spacing = median_spacing(cKDTree(points), 2000) if len(points) > 1 else 0.0
     near = np.abs((points - plane.origin) @ plane.normal) < BAND * spacing
     if np.count_nonzero(near) < 3:
         raise InputError("The section's plane does not meet the surface: pick two points on it.")

@@ -47,9 +47,8 @@ from slviewer.registration.markers import (
 )
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
-from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import Candidate
+from slviewer.registration.start import Candidate, fit_picked_start
 from slviewer.registration.static_scene import ObjectAlignment, register_object
 from slviewer.registration.turntable import TurntableAxis, shortest_turn
 from slviewer.session.ply import write_ply

@@ -20,8 +20,8 @@ from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d
 from slviewer.registration.pairwise import Progress
-from slviewer.registration.prepared import LEAST_POINTS, measure_size, sort_spatially
 from slviewer.registration.refusal import Refused
+from slviewer.registration.scan import LEAST_POINTS, measure_size, sort_spatially
 
 SIGMAS = 5.0
 """A point violates free space where its height exceeds this many standard deviations of the pair's
@@ -110,9 +110,8 @@ def register_object(
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
-    report = progress or (lambda share: None)
+    report, starts = progress or (lambda share: None), starts or Starts()
     all_samples = _sample_clouds(clouds)
-    markers = starts.markers if starts is not None else None
     alignment, static = _register_once(clouds, all_samples, reference, starts, report)
     first_start = {pair: registration.start for pair, registration in alignment.pairs.items()}
     moving, samples = clouds, all_samples
@@ -120,7 +119,7 @@ def register_object(
         if not _has_points(static):
             break
         candidate = remove_points(clouds, static)
-        again = Starts(poses=alignment.T_reference_scan, markers=markers)
+        again = Starts(poses=alignment.T_reference_scan, markers=starts.markers)
         refined = _try_register(candidate, reference, again, lambda share: report(0.9))
         # too few points remain of a scan: its background may be needed to determine its pose
         if refined is None:
@@ -130,11 +129,8 @@ def register_object(
             pair: replace(r, start=first_start.get(pair, r.start))
             for pair, r in refined.pairs.items()
         }
-        alignment, moving, samples = (
-            replace(refined, pairs=pairs),
-            candidate,
-            _sample_clouds(candidate),
-        )
+        alignment = replace(refined, pairs=pairs)
+        moving, samples = candidate, _sample_clouds(candidate)
         before, static = static, detect_static_points(clouds, all_samples, alignment)
         if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
             static = before
@@ -154,7 +150,7 @@ def _register_once(
     clouds: Mapping[str, Cloud],
     samples: Mapping[str, SurfaceSamples],
     reference: str,
-    starts: Starts | None,
+    starts: Starts,
     report: Progress,
 ) -> tuple[MultiwayAlignment, dict[str, np.ndarray]]:
     """Register the scans without what agrees without motion, or as they are where that does not
@@ -163,8 +159,7 @@ def _register_once(
     Returns the alignment and the static points, (h, w) bool by scan.
     """
     # markers tell how the object moved, also where a plane in its own plane seems to stand still
-    is_marked = starts is not None and starts.markers
-    unmoved = _no_points(clouds) if is_marked else _detect_unmoved_points(clouds, samples)
+    unmoved = _no_points(clouds) if starts.markers else _detect_unmoved_points(clouds, samples)
     if _has_points(unmoved):
         first = _try_register(
             remove_points(clouds, unmoved), reference, starts, lambda share: report(0.5 * share)
@@ -214,7 +209,7 @@ def remove_points(
 
 
 def _try_register(
-    clouds: Mapping[str, Cloud], reference: str, starts: Starts | None, progress: Progress
+    clouds: Mapping[str, Cloud], reference: str, starts: Starts, progress: Progress
 ) -> MultiwayAlignment | None:
     """Return ``register_all`` of the clouds, or None where it refuses."""
     try:
@@ -232,9 +227,12 @@ def _detect_unmoved_points(
     All False where they are less than LEAST_PART of a scan, or leave too few points to register.
     """
     votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
-    sigma = {name: float(np.nanmedian(cloud.sigma_z[cloud.mask])) for name, cloud in clouds.items()}
+    sigma = {
+        name: np.nan_to_num(np.nanmedian(cloud.sigma_z[cloud.mask]))
+        for name, cloud in clouds.items()
+    }
     for first, second in pairwise(clouds):
-        gate = SIGMAS * float(np.hypot(np.nan_to_num(sigma[first]), np.nan_to_num(sigma[second])))
+        gate = SIGMAS * float(np.hypot(sigma[first], sigma[second]))
         for scan, onto in ((first, second), (second, first)):
             height = np.abs(heights_above(samples[scan], samples[onto], np.eye(4)))
             with np.errstate(invalid="ignore"):
@@ -275,13 +273,8 @@ def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> 
     medians over each sample's neighbourhood; NaN outside the other scan's view. Cached.
     """
     key = onto, T.tobytes()
-    if key not in scan.heights:
-        scan.heights[key] = _compute_heights(scan, onto, T)
-    return scan.heights[key]
-
-
-def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
-    """Compute ``heights_above``."""
+    if key in scan.heights:
+        return scan.heights[key]
     points = move_points(T, scan.points)
     in_front = points[:, 2] > 0
     rays = points[:, :2] / np.where(in_front, points[:, 2], 1.0)[:, None]
@@ -299,6 +292,7 @@ def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) 
     count = np.count_nonzero(np.isfinite(neighbourhood), axis=1)
     row = np.arange(len(count))
     height[in_view] = 0.5 * (neighbourhood[row, (count - 1) // 2] + neighbourhood[row, count // 2])
+    scan.heights[key] = height
     return height
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.geometry.cubes import occupied_cubes
+from slviewer.geometry.vectors import lengths, median_spacing
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.surface.topology import label_connected
 
@@ -65,9 +66,8 @@ def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels
 def viewing_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(h, w): cosine between normals (h, w, 3) and directions from points (h, w, 3) to the camera
     at the origin."""
-    away = np.linalg.norm(points, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / away)
+        return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / lengths(points))
 
 
 def close_pinholes(mask: np.ndarray) -> np.ndarray:
@@ -108,12 +108,7 @@ def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
     chosen = choose_pixels(points, mask).astype(np.float64)
     if len(chosen) < 2:
         return far
-    subset = chosen[:: max(1, len(chosen) // 5000)]
-    spacing = float(
-        np.median(
-            cKDTree(chosen, balanced_tree=False, compact_nodes=False).query(subset, k=2)[0][:, 1]
-        )
-    )
+    spacing = median_spacing(cKDTree(chosen, balanced_tree=False, compact_nodes=False), 5000)
     if not spacing > 0:
         return far
     cubes, which = occupied_cubes(chosen, FAR_SPACINGS * spacing)

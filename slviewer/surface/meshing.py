@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, SlviewerError
+from slviewer.geometry.vectors import lengths, median_spacing
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
@@ -207,8 +208,7 @@ def measure_spacing(points: PointSet) -> float:
         raise InputError(f"{len(points)} points make no surface.")
     if not np.isfinite(points.points).all():
         raise InputError("Some points are NaN: select the valid ones first.")
-    distance, _ = cKDTree(points.points).query(points.points[:: max(1, len(points) // 20_000)], k=2)
-    median_mm = float(np.median(distance[:, 1]))
+    median_mm = median_spacing(cKDTree(points.points), 20_000)
     if not median_mm > 0:
         raise InputError("Most points are there twice: merge the scans instead of joining them.")
     return median_mm
@@ -250,7 +250,7 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
         raise InputError(
             "No two neighbouring pixels of this scan lie on a surface: reconstruct it again."
         )
-    along = viewing_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
+    along = viewing_cosines(points, normals) * lengths(points) / points[..., 2]
     sigma = (cloud.sigma * along)[cleaned]
     colours = None if cloud.texture is None else cloud.texture[cleaned]
     if colours is not None and colours.ndim == 1:

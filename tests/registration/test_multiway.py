@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from slviewer.errors import Cancelled, InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration import graph
-from slviewer.registration.consistency import select_consistent_edges
-from slviewer.registration.graph import Edge
+from slviewer.registration.graph import Edge, select_consistent_edges
 from slviewer.registration.multiway import MultiwayAlignment, Scan, Starts, register_all
 from slviewer.registration.refusal import Refused
 from slviewer.registration.turntable import TurntableAxis, fit_turntable_axis
@@ -210,7 +209,7 @@ def test_poses_are_as_sure_as_the_pairs_that_lead_there() -> None:
     )
 
 
-def never(edge: Edge, T: np.ndarray) -> bool:
+def never(edge: Edge, poses: np.ndarray) -> bool:
     return False
 
 
@@ -236,7 +235,8 @@ def test_of_three_that_contradict_the_surfaces_decide_or_it_is_refused() -> None
     with pytest.raises(SlviewerError):
         select_consistent_edges(3, three, 0, [1.0] * 3, never)
 
-    def lies_well(edge: Edge, T: np.ndarray) -> bool:
-        return off(T, np.linalg.inv(poses[edge.onto]) @ poses[edge.scan])[0] < 0.1
+    def lies_well(edge: Edge, tried: np.ndarray) -> bool:
+        T, true = (np.linalg.inv(each[edge.onto]) @ each[edge.scan] for each in (tried, poses))
+        return off(T, true)[0] < 0.1
 
     assert list(select_consistent_edges(3, three, 0, [1.0] * 3, lies_well)[1]) == [1]
