@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import finite_rows, lengths, median_spacing, unit_vectors
 from slviewer.records.quantities import Quantity
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import open3d, point_cloud
 
 BAND = 12.0
 """Spacings from the plane within which points are joined to triangles."""
@@ -95,8 +95,7 @@ def triangulate_near(
     if np.count_nonzero(near) < 3:
         raise InputError("The section's plane does not meet the surface: pick two points on it.")
     o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[near]))
-    cloud.normals = o3d.utility.Vector3dVector(normals[near])
+    cloud = point_cloud(points[near], normals[near])
     radii = o3d.utility.DoubleVector([3.0 * spacing, 6.0 * spacing])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
     return points[near], np.asarray(mesh.triangles, np.int64)

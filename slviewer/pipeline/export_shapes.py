@@ -67,9 +67,8 @@ def scan_shape(
     if plan is not None:
         return _describe_mesh(name, build_mesh(cloud, plan, part(progress, 0.5, 1)), notes)
     progress(0.7, "normals")
-    normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
-    if colours is not None and colours.ndim == 1:
-        colours = np.repeat(colours[:, None], 3, axis=1)
+    normals = grid_normals(cloud.points)[mask]
+    colours = None if (rgb := cloud.rgb) is None else rgb[mask]
     note = "sigma: expected error of the depth, mm"
     return DescribedShape(
         PointSet(cloud.measured, normals, colours), name, cloud.sigmas(mask), (*notes, note)

@@ -220,8 +220,8 @@ def _merging(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     ]:
         warn(why)
     clouds = clouds if background else dict(registered.clouds)
-    left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
-    fused = fuse(clouds, alignment.T_reference_scan, stage(job.progress, 0.75, 0.9, "fusing"), left)
+    progress = stage(job.progress, 0.75, 0.9, "fusing")
+    fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
     job.progress(0.9, "writing")
     with _write_merge(store, settings, fitted.name, registered, fused, cuts) as found:
         yield MergedScans(alignment, fused, clouds, found)

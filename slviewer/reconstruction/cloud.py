@@ -94,6 +94,14 @@ class Cloud:
             }
         return scalars
 
+    @property
+    def rgb(self) -> np.ndarray | None:
+        """(h, w, 3) uint8: the texture in colours, also where it is grey; None without a
+        texture."""
+        if self.texture is None or self.texture.ndim == 3:
+            return self.texture
+        return np.repeat(self.texture[..., None], 3, axis=2)
+
     def colours(self) -> np.ndarray | None:
         """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None
         without a texture."""

@@ -13,7 +13,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.vectors import lengths, median_spacing
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import open3d, point_cloud
 
 LEAST_POINTS = 500
 FINEST_MM = 0.5
@@ -223,19 +223,16 @@ def sort_spatially(cloud: Any) -> Any:
 def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
     """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
     origin."""
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     if normals is not None:
         # a NaN normal weighs nothing in a voxel's mean
         finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))
-        cloud.normals = o3d.utility.Vector3dVector(finite)
-        cloud = cloud.voxel_down_sample(voxel)
+        cloud = point_cloud(points, finite).voxel_down_sample(voxel)
         known = lengths(np.asarray(cloud.normals)) > 0.1
         cloud = cloud.select_by_index(np.flatnonzero(known))
         cloud.normalize_normals()
     else:
-        cloud = cloud.voxel_down_sample(voxel)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
+        cloud = point_cloud(points).voxel_down_sample(voxel)
+        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
         cloud.orient_normals_towards_camera_location(np.zeros(3))
     seen = np.asarray(cloud.points)
     facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)

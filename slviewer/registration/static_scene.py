@@ -18,7 +18,7 @@ from slviewer.geometry.rigid import move_points
 from slviewer.geometry.vectors import lengths
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.registration.pairwise import Progress
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import LEAST_POINTS, measure_size, sort_spatially
@@ -248,12 +248,10 @@ def _detect_unmoved_points(
 def sample_surface(points: np.ndarray) -> SurfaceSamples:
     """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are
     removed."""
-    o3d = open3d()
     points = np.asarray(points, np.float64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud = cloud.voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
+    cloud = point_cloud(points).voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
     cloud = sort_spatially(cloud)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
+    cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * lengths(samples)

@@ -14,7 +14,6 @@ from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.mesh import triangulate_grid
 from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import clean, viewing_cosines
 from slviewer.surface.edit import (
     DroppedParts,
     FilledHoles,
@@ -26,9 +25,8 @@ from slviewer.surface.edit import (
 )
 from slviewer.surface.fuse import fuse
 from slviewer.surface.poisson import TrimmedPatches, poisson_surface, trim_far_patches
-from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import select_faces
-from slviewer.surface.topology import Topology, analyse_topology
+from slviewer.surface.shapes import Mesh, PointSet, Topology, analyse_topology, select_faces
+from slviewer.surface.view import clean, viewing_cosines
 from slviewer.surface.volume import volume_surface
 
 Method = Literal["grid", "poisson", "volume"]
@@ -252,14 +250,7 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
         )
     along = viewing_cosines(points, normals) * lengths(points) / points[..., 2]
     sigma = (cloud.sigma * along)[cleaned]
-    colours = None if cloud.texture is None else cloud.texture[cleaned]
-    if colours is not None and colours.ndim == 1:
-        colours = np.repeat(colours[:, None], 3, axis=1)
-    mesh = Mesh(
-        points[cleaned],
-        faces,
-        normals[cleaned],
-        colours,
-        sigma if np.isfinite(sigma).all() else None,
-    )
+    colours = None if (rgb := cloud.rgb) is None else rgb[cleaned]
+    known = sigma if np.isfinite(sigma).all() else None
+    mesh = Mesh(points[cleaned], faces, normals[cleaned], colours, known)
     return select_faces(mesh, np.ones(len(faces), bool))

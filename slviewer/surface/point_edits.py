@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
+from slviewer.geometry.vectors import finite_rows
 from slviewer.surface.selection import Mask, SupportPlane
 
 _MAX_PIXELS = 1 << 32
@@ -115,7 +116,7 @@ class EditHistory:
 
     def keep_mask(self, points: np.ndarray) -> Mask:
         """Mask (h, w) of the measured points (h, w, 3) mm that no edit in effect deletes."""
-        kept = np.asarray(np.isfinite(points).all(axis=-1))
+        kept = finite_rows(points)
         for edit in self.active:
             kept &= ~edit.select(points)
         return kept
@@ -130,7 +131,7 @@ def make_edit(
     ``plane``: what the selection is everything below of, where it is; the edit is then stored as
     this plane. InputError where nothing is selected.
     """
-    count = int(np.count_nonzero(selected & np.isfinite(points).all(axis=-1)))
+    count = int(np.count_nonzero(selected & finite_rows(points)))
     if not count:
         raise InputError("no point is selected: select some first")
     return Edit(what, count, selected if plane is None else None, plane, made)

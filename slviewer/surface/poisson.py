@@ -6,11 +6,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.registration.open3d_loader import open3d
+from slviewer.geometry.vectors import finite_rows, lengths
+from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.surface.edit import fill_holes
-from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import select_faces, transfer_attributes
-from slviewer.surface.topology import extent_across, face_areas, face_groups, opening_loops
+from slviewer.surface.shapes import (
+    Mesh,
+    PointSet,
+    extent_across,
+    face_areas,
+    face_groups,
+    opening_loops,
+    select_faces,
+    transfer_attributes,
+)
 
 LEAST_POINTS = 100
 DEEPEST = 11
@@ -52,16 +60,14 @@ def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
         raise InputError(
             f"{len(points)} points make no surface: at least {LEAST_POINTS} are needed."
         )
-    o3d = open3d()
-    known = np.isfinite(points.normals).all(axis=1)
+    known = finite_rows(points.normals)
     middle = points.points.mean(axis=0, dtype=np.float64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.points[known] - middle))
-    cloud.normals = o3d.utility.Vector3dVector(points.normals[known].astype(np.float64))
+    cloud = point_cloud(points.points[known] - middle, points.normals[known].astype(np.float64))
     extent = float(np.ptp(points.points, axis=0).max())
     depth = int(np.clip(np.ceil(np.log2(1.1 * extent / cell_mm)), 4, DEEPEST))
     # one thread: its own pool spins, and where other programs hold the cores it takes a hundred
     # times as long
-    surface, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+    surface, _ = open3d().geometry.TriangleMesh.create_from_point_cloud_poisson(
         cloud, depth=depth, n_threads=1
     )
     mesh = transfer_attributes(
@@ -91,10 +97,9 @@ def trim_far_patches(
     measured[mesh.faces[~imagined]] = True
     area = face_areas(mesh)
     is_near, filled, flattened, largest = ~imagined, 0, 0, 0.0
-    order = np.argsort(groups, kind="stable")
-    starts = np.searchsorted(groups[order], np.arange(groups.max() + 2))
-    for k in range(groups.max() + 1):
-        patch = order[starts[k] : starts[k + 1]]
+    order, count = np.argsort(groups, kind="stable"), int(groups.max()) + 1
+    starts = np.searchsorted(groups[order], np.arange(count))
+    for patch in np.split(order, starts)[1:]:  # the first holds what was measured
         corners = np.unique(mesh.faces[patch])
         rim = corners[measured[corners]]
         across = extent_across(mesh.vertices[rim]) if len(rim) else np.inf
@@ -102,7 +107,7 @@ def trim_far_patches(
             bulges = area[patch].sum() > BULGE * _flat_area(mesh.vertices, mesh.faces[patch])
             is_near[patch] = not bulges
             filled, flattened, largest = filled + 1, flattened + bulges, max(largest, across)
-    trimmed, cut = select_faces(mesh, is_near), int(groups.max() + 1 - filled)
+    trimmed, cut = select_faces(mesh, is_near), count - filled
     invented = area[is_near & imagined].sum()
     if flattened:
         open_area = face_areas(trimmed).sum()
@@ -121,4 +126,4 @@ def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
         return float("inf")
     around = vertices[longest].astype(np.float64)
     arms = around - around.mean(axis=0)
-    return float(np.linalg.norm(np.cross(arms, np.roll(arms, -1, axis=0)), axis=1).sum() / 2)
+    return float(lengths(np.cross(arms, np.roll(arms, -1, axis=0))).sum() / 2)

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.geometry.ransac import ransac_plane
+from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.reconstruction.reconstruct import JUMP
-from slviewer.surface.topology import label_connected
+from slviewer.surface.shapes import label_connected
 
 PLANE_SHARE = 0.1
 """Of the points that must lie on a plane for it to be taken as what supports the object."""
@@ -101,7 +103,7 @@ def select_connected(
     of their depth. ``candidates`` (h, w): the points to consider, by default all. InputError for a
     seed that is none of them.
     """
-    valid = np.isfinite(points).all(axis=-1)
+    valid = finite_rows(points)
     if candidates is not None:
         valid &= candidates
     u, v = seed
@@ -111,11 +113,11 @@ def select_connected(
     index = np.arange(h * w).reshape(h, w)
     pairs = []
     for down, right in _STEPS:
-        a = (slice(0, h - down), slice(max(0, -right), w - max(0, right)))
-        b = (slice(down, h), slice(max(0, right), w + min(0, right)))
+        a = np.s_[: h - down, max(0, -right) : w - max(0, right)]
+        b = np.s_[down:, max(0, right) : w + min(0, right)]
         with np.errstate(invalid="ignore"):
             depth = np.minimum(points[a][..., 2], points[b][..., 2])
-            near = np.linalg.norm(points[a] - points[b], axis=-1) < JUMP * depth
+            near = lengths(points[a] - points[b]) < JUMP * depth
         joined = near & valid[a] & valid[b]
         pairs.append(np.stack([index[a][joined], index[b][joined]], axis=1))
     labels = label_connected(np.concatenate(pairs), h * w).reshape(h, w)
@@ -146,24 +148,22 @@ def detect_support(
     ``PLANE_TOLERANCE`` of their depth. InputError where less than ``PLANE_SHARE`` of the points lie
     on any plane.
     """
-    flat = points[np.isfinite(points).all(axis=-1)].astype(np.float64)
+    flat = points[finite_rows(points)].astype(np.float64)
     depth = float(np.median(flat[:, 2])) if len(flat) else 0.0
     tolerance = max(PLANE_TOLERANCE * depth, 3 * sigma_mm if np.isfinite(sigma_mm) else 0.0, 1e-6)
     plane, inliers = ransac_plane(flat, tolerance)
-    share = float(inliers.mean())
+    share = inliers.mean()
     if share < PLANE_SHARE:
         raise InputError(
             f"no supporting plane: at most {100 * share:.0f} % of the {len(flat)} points lie on one"
             f" plane to {tolerance:.2f} mm, {100 * PLANE_SHARE:.0f} % are needed: select the points"
             " with an outline"
         )
-    residuals = plane.distance(flat[inliers])
-    normal, offset = plane.normal, plane.offset
-    if offset > 0:  # the camera, in the origin, is on the positive side
-        normal, offset = -normal, -offset
-    scatter = 3 * 1.4826 * float(np.median(np.abs(residuals)))
-    margin = max(scatter, tolerance) if margin_mm is None else margin_mm
-    return SupportPlane((float(normal[0]), float(normal[1]), float(normal[2])), offset, margin)
+    if margin_mm is None:
+        margin_mm = max(3 * robust_sigma(plane.distance(flat[inliers]), about=0.0), tolerance)
+    side = -1 if plane.offset > 0 else 1  # the camera, in the origin, is on the positive side
+    x, y, z = (side * plane.normal).tolist()
+    return SupportPlane((x, y, z), side * plane.offset, margin_mm)
 
 
 def select_support(

@@ -18,11 +18,11 @@ from scipy.ndimage import distance_transform_edt
 from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.agreement import Views, colour_gains, compare_views
-from slviewer.surface.shapes import Mesh, pick_attributes
-from slviewer.surface.topology import face_areas, half_edges
+from slviewer.surface.fuse import Views, colour_gains, compare_views
+from slviewer.surface.shapes import Mesh, count_edges, face_areas, pick_attributes
 from slviewer.surface.view import View, prepare_view
 
 SIZES_PX = (512, 8192)
@@ -160,7 +160,7 @@ def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
         size, {"positions", "normals"}, margin=1, fill=float("nan"), update_material=False
     )
     normals = baked["normals"].numpy()
-    return baked["positions"].numpy(), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return baked["positions"].numpy(), unit_vectors(normals)
 
 
 def _blend(
@@ -192,7 +192,7 @@ def _look(
     of what it misses."""
     points = move_points(np.linalg.inv(view.T), places.astype(np.float64))
     facing = normals @ view.T[:3, :3]
-    cosine = -np.sum(facing * points, axis=1) / np.linalg.norm(points, axis=1)
+    cosine = -np.sum(facing * points, axis=1) / lengths(points)
     rays = (points[:, :2] / points[:, 2:] - view.to_pixel[:2]) / view.to_pixel[2:4]
     A = monomials(rays, _DEGREE)
     pixels = (A @ view.to_pixel[4:].reshape(2, -1).T).astype(np.float32)
@@ -217,13 +217,13 @@ def _look(
     )
     if light is not None:
         to_light = light - points
-        distance = np.linalg.norm(to_light, axis=1)
+        distance = lengths(to_light)
         lit = np.sum(facing * to_light, axis=1) / distance
         with np.errstate(invalid="ignore"):
             sees &= lit > _MIN_COSINE
         colours *= ((distance / _NOMINAL_MM) ** 2 / np.maximum(lit, _MIN_COSINE))[:, None]
         weight *= np.maximum(lit, 0.0) ** 2  # the noise grows as the shading is divided out
-    sees &= np.isfinite(weight) & np.isfinite(colours).all(axis=1)
+    sees &= np.isfinite(weight) & finite_rows(colours)
     return np.where(sees[:, None], colours, 0.0), np.where(sees, weight, 0.0)
 
 
@@ -248,10 +248,5 @@ def _split_vertices(
 def _seam_share(before: np.ndarray, after: np.ndarray) -> float:
     """Return the share of a mesh's edges along which its unfolded triangles ``after`` (m, 3) come
     apart."""
-
-    def edges(faces: np.ndarray) -> int:
-        """Return the number of different edges."""
-        return len(np.unique(np.sort(half_edges(faces), axis=1), axis=0))
-
-    whole = edges(before)
-    return (edges(after) - whole) / whole
+    whole, split = (len(count_edges(faces)[1]) for faces in (before, after))
+    return (split - whole) / whole

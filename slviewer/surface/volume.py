@@ -6,8 +6,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.jit import kernel
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import transfer_attributes
+from slviewer.surface.shapes import Mesh, PointSet, transfer_attributes
 
 BLOCK = 8
 REACH = 2.0
@@ -40,30 +39,22 @@ def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
     touched = np.zeros(tuple(shape), bool)
     _mark_blocks(at, BLOCK, REACH, touched)
     keys = np.argwhere(touched).astype(np.int32)
-    core, kinds = o3d.core, (o3d.core.float32, o3d.core.float32)
+    kinds = (o3d.core.float32, o3d.core.float32)
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), kinds, ((1,), (1,)), 1.0, BLOCK, len(keys)
     )
-    buffers, _ = grid.hashmap().activate(core.Tensor(keys))
+    buffers, _ = grid.hashmap().activate(o3d.core.Tensor(keys))
     lookup = np.full(tuple(shape), -1, np.int32)
     lookup[tuple(keys.T)] = buffers.numpy()
-    height = grid.attribute("tsdf").numpy().reshape(-1, BLOCK**3)
-    weight = grid.attribute("weight").numpy().reshape(-1, BLOCK**3)
+    height, weight = (
+        grid.attribute(name).numpy().reshape(-1, BLOCK**3) for name in ("tsdf", "weight")
+    )
     height[:], weight[:] = 0, 0
-    sigma = points.sigma_mm
-    share = (
-        np.ones(len(points)) if sigma is None else (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
-    )
-    _add_planes(
-        at,
-        points.normals.astype(np.float64),
-        share.astype(np.float64),
-        BLOCK,
-        REACH,
-        lookup,
-        height,
-        weight,
-    )
+    sigma, share = points.sigma_mm, np.ones(len(points))
+    if sigma is not None:
+        share[:] = (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
+    normals = points.normals.astype(np.float64)
+    _add_planes(at, normals, share, BLOCK, REACH, lookup, height, weight)
     known = weight > 0
     height[known] /= weight[known]
     weight[known] = 1.0
