@@ -14,8 +14,14 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.fit import Fitted
-from slviewer.geometry.ransac import ransac_plane, ransac_sphere
-from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+from slviewer.geometry.shapes import (
+    Plane,
+    Sphere,
+    fit_plane,
+    fit_sphere,
+    ransac_plane,
+    ransac_sphere,
+)
 from slviewer.geometry.vectors import finite_rows
 
 RANSAC_TOLERANCE_MM = 1.0  # or twice the noise

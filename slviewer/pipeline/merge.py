@@ -32,7 +32,6 @@ from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restric
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import (
     ContradictingPair,
-    LoopClosure,
     MarkerPair,
     Merge,
     RefusedPair,
@@ -48,9 +47,8 @@ from slviewer.registration.markers import (
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import Candidate, fit_picked_start
+from slviewer.registration.start import Candidate, TurntableAxis, fit_picked_start, shortest_turn
 from slviewer.registration.static_scene import ObjectAlignment, register_object
-from slviewer.registration.turntable import TurntableAxis, shortest_turn
 from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
@@ -415,16 +413,7 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
         registered=[
             _make_registered(*pair, registration) for pair, registration in alignment.pairs.items()
         ],
-        loops=[
-            LoopClosure(
-                list(loop.names),
-                loop.before.shift_mm,
-                loop.before.turn_deg,
-                loop.after.shift_mm,
-                loop.after.turn_deg,
-            )
-            for loop in alignment.loops
-        ],
+        loops=alignment.loops,
         dropped=[RefusedPair(*pair, why) for pair, why in alignment.dropped.items()],
         refused=[RefusedPair(*pair, why) for pair, why in alignment.refused.items()],
         markers=[

@@ -30,9 +30,8 @@ from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation, plain_settings
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.reconstruction.mesh import triangulate_grid
-from slviewer.reconstruction.reconstruct import JUMP, normals
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.reconstruct import normals, triangulate_grid
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.table import render_text
 from slviewer.records.verification import Verification
@@ -258,8 +257,7 @@ def cloud_record(
 def triangulate_points(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Faces (m, 3) int32 over the pixels ``mask`` (h, w) bool of organised points; surfaces end
     where depth jumps."""
-    masked_points = np.where(mask[..., None], points, np.float32(np.nan))
-    return triangulate_grid(masked_points, JUMP * float(np.median(points[..., 2][mask])))
+    return triangulate_grid(keep_pixels(points, mask))
 
 
 def segment_board(

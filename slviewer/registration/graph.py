@@ -33,7 +33,7 @@ class Edge:
     ``onto``.
 
     ``covariance`` (6, 6): of a small rotation (rad) about ``centre`` (3,) mm and a translation
-    (mm), in that frame.
+    (mm), in that frame. ``gate_mm``: of the registration.
     """
 
     scan: int
@@ -41,6 +41,7 @@ class Edge:
     T: np.ndarray
     covariance: np.ndarray
     centre: np.ndarray
+    gate_mm: float = 1.0
 
     @property
     def variance(self) -> float:
@@ -108,20 +109,16 @@ def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[i
 
 
 def select_consistent_edges(
-    nodes: int,
-    edges: Sequence[Edge],
-    root: int,
-    gates: Sequence[float],
-    is_good_fit: Callable[[Edge, np.ndarray], bool],
+    nodes: int, edges: Sequence[Edge], root: int, is_good_fit: Callable[[Edge, np.ndarray], bool]
 ) -> tuple[list[int], dict[int, LoopGap]]:
     """Select the edges that are consistent with one another and still connect all nodes.
 
     Returns their indices, and the gap of each edge to drop. Random spanning trees are tried; the
     right one has the fewest inconsistent edges. Among several such, it is the one at whose poses
     the scans of its inconsistent edges fit each other, by ``is_good_fit(edge, poses)``. Raises
-    ``Refused`` where that does not decide. ``gates``: registration gate of each edge, mm.
+    ``Refused`` where that does not decide.
     """
-    hypotheses = _list_hypotheses(nodes, edges, root, gates)
+    hypotheses = _list_hypotheses(nodes, edges, root)
     gaps = {
         dropped: {k: loop_gap(edges[k], poses) for k in dropped}
         for dropped, poses in hypotheses.items()
@@ -146,7 +143,7 @@ def select_consistent_edges(
 
 
 def _list_hypotheses(
-    nodes: int, edges: Sequence[Edge], root: int, gates: Sequence[float]
+    nodes: int, edges: Sequence[Edge], root: int
 ) -> dict[frozenset[int], np.ndarray]:
     """Return the edges that are inconsistent with random spanning trees, with the poses (n, 4, 4)
     by the first of each.
@@ -161,8 +158,8 @@ def _list_hypotheses(
         poses, tree = spanning_poses(nodes, edges, root, drawn)
         inconsistent = frozenset(
             k
-            for k, (edge, gate) in enumerate(zip(edges, gates, strict=True))
-            if k not in tree and not _is_consistent(edge, edges, tree, poses, gate)
+            for k, edge in enumerate(edges)
+            if k not in tree and not _is_consistent(edge, edges, tree, poses)
         )
         if not inconsistent:
             return {inconsistent: poses}
@@ -171,7 +168,7 @@ def _list_hypotheses(
 
 
 def _is_consistent(
-    edge: Edge, edges: Sequence[Edge], tree: Sequence[int], poses: np.ndarray, gate_mm: float
+    edge: Edge, edges: Sequence[Edge], tree: Sequence[int], poses: np.ndarray
 ) -> bool:
     """Whether the loop that an edge closes with the tree has a plausible gap at the rim of the
     overlap, for the variances of the loop's edges."""
@@ -183,7 +180,7 @@ def _is_consistent(
     )
     gap = loop_gap(edge, poses)
     at_rim = gap.shift_mm + np.radians(gap.turn_deg) * _RIM_MM
-    return bool(at_rim <= max(_GAP_SIGMAS * np.sqrt(variance), _GAP_GATES * gate_mm))
+    return bool(at_rim <= max(_GAP_SIGMAS * np.sqrt(variance), _GAP_GATES * edge.gate_mm))
 
 
 def optimise_poses(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:

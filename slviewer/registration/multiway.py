@@ -9,7 +9,7 @@ others are dropped; the poses are then optimised together.
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from threading import Lock
 
@@ -18,17 +18,19 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Uncertainty, move_points
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.merge import LoopClosure
 from slviewer.registration import graph
-from slviewer.registration.graph import Edge, LoopGap
+from slviewer.registration.graph import Edge
 from slviewer.registration.markers import MarkerPose, MeasuredMarkers, fit_marker_pose
 from slviewer.registration.pairwise import Progress, Registration, register_prepared
 from slviewer.registration.refusal import Refused
 from slviewer.registration.scan import LEAST_POINTS, PreparedScan, Scan, prepare_scan
-from slviewer.registration.start import Candidate, search_starts
-from slviewer.registration.turntable import (
+from slviewer.registration.start import (
+    Candidate,
     TurntableAxis,
     determines_axis,
     fit_turntable_axis,
+    search_starts,
     shortest_turn,
 )
 
@@ -63,18 +65,6 @@ class Starts:
     markers: Mapping[str, MeasuredMarkers] | None = None
 
 
-@dataclass(frozen=True)
-class Loop:
-    """A loop of the pose graph through the scans ``names`` and back to the first, with its gap.
-
-    ``before``, ``after``: the gap before and after the poses were optimised.
-    """
-
-    names: tuple[str, ...]
-    before: LoopGap
-    after: LoopGap
-
-
 @dataclass(frozen=True, eq=False)
 class MultiwayAlignment:
     """Result of a multiway registration.
@@ -90,10 +80,10 @@ class MultiwayAlignment:
     T_reference_scan: Mapping[str, np.ndarray]
     uncertainties: Mapping[str, Uncertainty]
     pairs: Mapping[Pair, Registration]
-    loops: tuple[Loop, ...]
+    loops: list[LoopClosure]
     dropped: Mapping[Pair, str]
     refused: Mapping[Pair, str]
-    markers: Mapping[Pair, MarkerPose] = field(default_factory=dict)
+    markers: Mapping[Pair, MarkerPose]
 
     def on_reference(self) -> dict[str, Registration]:
         """Return a registration onto the reference for every other scan, with its optimised pose
@@ -233,13 +223,12 @@ class _PoseGraphBuilder:
         `_MARKER_PAIRS` best."""
         poses: dict[Pair, MarkerPose] = {}
         seen = self.starts.markers or {}
-        for i, a in enumerate(self.names):
-            for b in self.names[:i]:
-                if a not in seen or b not in seen:
-                    continue
+        shown = [name for name in self.names if name in seen]
+        for i, a in enumerate(shown):
+            for b in shown[:i]:
                 pair = (b, a) if a == self.reference else (a, b)
                 try:
-                    pose = fit_marker_pose(seen[pair[0]], seen[pair[1]])
+                    pose = fit_marker_pose(*(seen[name] for name in pair))
                 except Refused as error:
                     self.refused[pair] = error
                     continue
@@ -394,7 +383,7 @@ class _PoseGraphBuilder:
         return [
             Edge(
                 self.names.index(scan), self.names.index(onto), result.T_reference_scan,
-                result.uncertainty.covariance, result.uncertainty.centre,
+                result.uncertainty.covariance, result.uncertainty.centre, result.gate_mm,
             )
             for (scan, onto), result in self.registered.items()
         ]  # fmt: skip
@@ -407,9 +396,8 @@ class _PoseGraphBuilder:
         """Drop contradicting pairs and optimise the poses of all scans."""
         self._report(0.92)
         pairs, edges = list(self.registered), self._edges()
-        gates = [registration.gate_mm for registration in self.registered.values()]
         consistent, gaps = graph.select_consistent_edges(
-            len(self.names), edges, self.root, gates, self._is_good_fit
+            len(self.names), edges, self.root, self._is_good_fit
         )
         dropped = {
             pairs[k]: (
@@ -424,10 +412,10 @@ class _PoseGraphBuilder:
         if len(edges) >= len(self.names):
             poses = graph.optimise_poses(start, edges, self.root)
         loops = [
-            Loop(
-                tuple(self.names[node] for node in graph.loop_nodes(edge, edges, tree)),
-                graph.loop_gap(edge, start),
-                graph.loop_gap(edge, poses),
+            LoopClosure(
+                [self.names[node] for node in graph.loop_nodes(edge, edges, tree)],
+                *graph.loop_gap(edge, start),
+                *graph.loop_gap(edge, poses),
             )
             for k, edge in enumerate(edges)
             if k not in tree
@@ -438,7 +426,7 @@ class _PoseGraphBuilder:
             dict(zip(self.names, poses, strict=True)),
             dict(zip(self.names, graph.pose_uncertainties(poses, edges, self.root), strict=True)),
             {pairs[k]: self.registered[pairs[k]] for k in consistent},
-            tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
+            sorted(loops, key=lambda loop: -loop.error_mm),
             dropped,
             {pair: str(error) for pair, error in self.refused.items()},
             self.markers,

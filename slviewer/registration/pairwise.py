@@ -78,7 +78,7 @@ def register_prepared(
     size: float,
     start: Candidate | list[Candidate] | None = None,
     markers: MarkerPose | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda share: None,
 ) -> Registration:
     """Align a scan with a reference that shows part of the same object, of ``size`` mm.
 
@@ -90,14 +90,13 @@ def register_prepared(
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
     hold the pose, or where a second pose fits alike.
     """
-    report = progress or (lambda share: None)
     if markers is not None:
-        report(0.4)
+        progress(0.4)
         return _register_by_markers(scan, reference, markers, size)
     starts = start if isinstance(start, list) else search_starts(scan, reference, size, start)
     refusals: list[Refused] = []
     for attempt, candidate in enumerate(starts[:MOST_ATTEMPTS]):
-        report(0.4 + 0.15 * attempt)
+        progress(0.4 + 0.15 * attempt)
         try:
             result = _refine_start(scan, reference, candidate, size)
         except Refused as error:
@@ -109,7 +108,7 @@ def register_prepared(
         if candidate.start in SEARCHED:
             others = starts[attempt + 1 : MOST_ATTEMPTS + 1]
             _refuse_rivals(scan, reference, result, candidate, others, size)
-        report(1.0)
+        progress(1.0)
         return result
     raise refusals[0]  # the best start's refusal says most
 

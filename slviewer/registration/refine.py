@@ -19,10 +19,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, rms_length
+from slviewer.geometry.vectors import diagonal, occupied_cubes, rms_length
 from slviewer.registration.markers import MarkerPose
 from slviewer.registration.scan import PreparedScan
 

@@ -214,12 +214,6 @@ def measure_size(points: np.ndarray) -> float:
     return float((high - low).max())
 
 
-def sort_spatially(cloud: Any) -> Any:
-    """Return Open3D's cloud with neighbours beside each other in memory, which halves the time of
-    searches in it."""
-    return cloud.select_by_index(cKDTree(np.asarray(cloud.points)).indices)
-
-
 def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
     """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
     origin."""

@@ -54,8 +54,6 @@ class SurfaceShift:
 def drop_small_parts(mesh: Mesh, most_mm2: float) -> tuple[Mesh, DroppedParts]:
     """Remove the connected parts of at most ``most_mm2`` that have less than 1 % of the largest
     part's area."""
-    if not len(mesh.faces):
-        return mesh, DroppedParts(0, 0.0)
     groups = face_groups(mesh.faces, len(mesh.vertices))
     sizes = np.bincount(groups, weights=face_areas(mesh))
     small = (sizes < LEAST_SHARE * sizes.max()) & (sizes <= most_mm2)

@@ -19,7 +19,7 @@ from slviewer.errors import InputError
 from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import lengths, rms, unit_vectors
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes, measure_heights
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, prepare_view, viewing_cosines
@@ -101,8 +101,7 @@ def fuse(
     for name in scans:
         if name not in T_reference_scan:
             raise InputError(f"{name} has no pose: register it first, or exclude it.")
-    report = progress or (lambda share: None)
-    views = {}
+    report, views = progress or (lambda share: None), {}
     for i, (name, cloud) in enumerate(scans.items()):
         report(0.3 * i / len(scans))
         views[name] = prepare_view(name, cloud, T_reference_scan[name])
@@ -113,7 +112,8 @@ def fuse(
         views, pairs, lambda share: report(0.4 + 0.1 * share)
     ).items():
         excluded[name]["unconfirmed"] = int(violations.sum())
-        views[name] = views[name].without(violations)
+        kept = keep_pixels(views[name].points, ~violations)
+        views[name] = replace(views[name], points=kept)
     gains = colour_gains(views, pairs)
     parts = []
     for i, name in enumerate(names):
@@ -149,7 +149,7 @@ def _detect_violations(
         progress(i / len(views))
         mask = view.mask
         points = choose_pixels(view.points, mask)
-        confirming, contradicting = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
+        votes = np.zeros(len(points), np.int16)
         for other, there in views.items():
             if other != name:
                 T = np.linalg.inv(there.T) @ view.T
@@ -158,13 +158,10 @@ def _detect_violations(
                 gate = 2.0 * max(
                     _gate_mm(pairs, name, other, view, there), view.spacing, there.spacing
                 )
-                add_votes(
-                    move_points(T, points), gate, there.points, witnesses[other], there.to_pixel,
-                    confirming,
-                    contradicting,
-                )  # fmt: skip
+                moved = move_points(T, points)
+                add_votes(moved, gate, there.points, witnesses[other], there.to_pixel, votes)
         violations[name] = np.zeros(mask.shape, bool)
-        violations[name][mask] = contradicting > confirming
+        violations[name][mask] = votes < 0
     return violations
 
 
@@ -173,7 +170,7 @@ def _select_witnesses(view: View) -> np.ndarray:
     grazing angles."""
     inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     facing = viewing_cosines(view.points, view.normals) > 0.25
-    return np.asarray(inside & (view.inner > MIN_WITNESS_WEIGHT) & facing)
+    return inside & (view.inner > MIN_WITNESS_WEIGHT) & facing
 
 
 def _gate_mm(pairs: Agreements, a: str, b: str, first: View, second: View) -> float:
@@ -209,12 +206,10 @@ def _fuse_scan(
         share = inner * -np.einsum("ij,ij->i", points, normals) / lengths(points)
         sums[:, 8] = share
         sums[:, 9:] = share[:, None] * gains[name] * own_colours
-    scans = np.ones(len(points), np.uint8)
     inferior = np.zeros(len(points), bool)
     for other, there in views.items():
         if (name, other) not in pairs and (other, name) not in pairs:
             continue
-        overlap = np.zeros((len(points), FIELDS))
         add_surface(
             *view.move_into(there, points, normals),
             view.quality[mask],
@@ -225,16 +220,12 @@ def _fuse_scan(
             there.colours if own_colours is not None else np.zeros((0, 0, 3), np.uint8),
             1.0 if gains is None else gains[other],
             order.index(other) < order.index(name),
-            overlap,
+            sums,
             inferior,
         )
-        scans += (overlap[:, 7] > 0).astype(np.uint8)
-        sums += overlap
     best = ~inferior
-    return (
-        _average(view, points[best], normals[best], sums[best], own_colours is not None),
-        scans[best],
-    )
+    averages = _average(view, points[best], normals[best], sums[best], own_colours is not None)
+    return averages, (1 + sums[best, 7]).astype(np.uint8)
 
 
 def _average(

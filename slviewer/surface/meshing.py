@@ -10,10 +10,9 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.vectors import lengths, median_spacing
-from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.mesh import triangulate_grid
-from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.reconstruction.cloud import Cloud, keep_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.reconstruction.reconstruct import triangulate_grid
 from slviewer.surface.edit import (
     DroppedParts,
     FilledHoles,
@@ -24,10 +23,14 @@ from slviewer.surface.edit import (
     smooth,
 )
 from slviewer.surface.fuse import fuse
-from slviewer.surface.poisson import TrimmedPatches, poisson_surface, trim_far_patches
+from slviewer.surface.implicit import (
+    TrimmedPatches,
+    poisson_surface,
+    trim_far_patches,
+    volume_surface,
+)
 from slviewer.surface.shapes import Mesh, PointSet, Topology, analyse_topology, select_faces
 from slviewer.surface.view import clean, viewing_cosines
-from slviewer.surface.volume import volume_surface
 
 Method = Literal["grid", "poisson", "volume"]
 Progress = Callable[[float, str], None]
@@ -147,7 +150,9 @@ class BuiltMesh:
 
 
 def build_mesh(
-    shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None
+    shape: Cloud | PointSet,
+    plan: MeshingPlan | None = None,
+    progress: Progress | None = None,
 ) -> BuiltMesh:
     """Mesh one scan's organised cloud, or the points of a merge (with normals), as planned.
 
@@ -171,6 +176,11 @@ def build_mesh(
     trimmed = filled = smoothed = thinned = None
     if method == "grid":
         mesh = grid_mesh(shape)
+    elif points.normals is None:
+        raise InputError(
+            "These points have no normals: a surface through them needs to know its outside; merge"
+            " the scans again."
+        )
     elif method == "volume":
         mesh = volume_surface(points, cell)
     else:
@@ -241,9 +251,8 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
         )
     normals = grid_normals(cloud.points)
     cleaned, _ = clean(cloud, normals)
-    points = np.where(cleaned[..., None], cloud.points, np.float32(np.nan))
-    depth = float(np.median(points[..., 2][cleaned])) if cleaned.any() else np.inf
-    faces = triangulate_grid(points, JUMP * depth)
+    points = keep_pixels(cloud.points, cleaned)
+    faces = triangulate_grid(points)
     if not len(faces):
         raise InputError(
             "No two neighbouring pixels of this scan lie on a surface: reconstruct it again."

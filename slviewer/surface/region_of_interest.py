@@ -127,4 +127,4 @@ def box_edges(centre: np.ndarray, size: np.ndarray, axes: np.ndarray) -> np.ndar
     corners = np.array(list(product((-0.5, 0.5), repeat=3)))
     apart = np.abs(corners[:, None] - corners).sum(axis=-1)
     pairs = np.argwhere(np.tril(apart == 1))
-    return np.asarray((corners[pairs] * size) @ axes + centre)
+    return (corners[pairs] * size) @ axes + centre

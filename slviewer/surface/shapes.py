@@ -168,8 +168,6 @@ class Topology:
 
 def analyse_topology(mesh: Mesh) -> Topology:
     """Analyse the topology of a mesh."""
-    if not len(mesh.faces):
-        return Topology((), 0, 0, 0.0)
     half, _, which, count = count_edges(mesh.faces)
     balance = np.bincount(which, weights=np.where(half[:, 0] < half[:, 1], 1, -1))
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -195,7 +193,7 @@ def label_connected(pairs: np.ndarray, count: int) -> np.ndarray:
     """Return the connected part (count,) int of each of ``count`` nodes that ``pairs`` (k, 2) of
     them join."""
     graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    return connected_components(graph, directed=False)[1]
 
 
 def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = None) -> np.ndarray:
@@ -218,7 +216,7 @@ def face_vectors(mesh: Mesh) -> np.ndarray:
 
 def face_areas(mesh: Mesh) -> np.ndarray:
     """Return the area (m,) mm2 of each face."""
-    return np.asarray(lengths(face_vectors(mesh)) / 2)
+    return lengths(face_vectors(mesh)) / 2
 
 
 def extent_across(points: np.ndarray) -> float:

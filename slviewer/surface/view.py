@@ -1,7 +1,7 @@
 """Preparation of a scan for fusion: cleaning of flying pixels at depth edges, grazing pixels, and
 small or distant groups; standard deviations along the normals, weights, and a pixel map."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -9,11 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
-from slviewer.geometry.vectors import lengths, median_spacing, rms
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.geometry.vectors import lengths, median_spacing, occupied_cubes, rms
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.surface.overlap_kernels import SurfaceGrid
 from slviewer.surface.shapes import label_connected
@@ -98,10 +97,6 @@ class View:
             normals @ T[:3, :3].T
         )
 
-    def without(self, pixels: np.ndarray) -> "View":
-        """Return the view without the points at ``pixels`` (h, w) bool."""
-        return replace(self, points=np.where(pixels[..., None], np.float32(np.nan), self.points))
-
 
 def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     """Prepare a scan with its pose (4, 4) for fusion.
@@ -121,9 +116,10 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
             f"{name}: only {np.count_nonzero(surface)} of its pixels lie on a surface: "
             "reconstruct it again, or exclude it."
         )
-    crop = _bounding_box(surface)
+    x, y, width, height = cv2.boundingRect(surface.astype(np.uint8))
+    crop = np.s_[y : y + height, x : x + width]
     surface, normals = surface[crop], normals[crop]
-    points = np.where(surface[..., None], cloud.points[crop], np.float32(np.nan))
+    points = keep_pixels(cloud.points[crop], surface)
     cosine = viewing_cosines(points, normals)
     noise = _fill_noise(cloud.sigma_z[crop], points, cosine, surface)
     systematic = (
@@ -177,13 +173,6 @@ def _fill_noise(
     return np.where(known, sigma_z, scale * shape)
 
 
-def _bounding_box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Return the rows and columns of the smallest rectangle around a mask (h, w) that is not
-    empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-
-
 def _border_weights(surface: np.ndarray) -> np.ndarray:
     """(h, w) float32: weights that rise smoothly from 0 at the border of a mask (h, w) to 1;
     pinholes are closed."""
@@ -201,7 +190,7 @@ def _pixel_areas(points: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     across, down = (
         float(np.nanmedian(np.abs(np.diff(points[..., k] / z, axis=1 - k)))) for k in (0, 1)
     )
-    return np.asarray(across * down * z**2 / np.maximum(cosine, 0.05))
+    return across * down * z**2 / np.maximum(cosine, 0.05)
 
 
 def _smooth(quality: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -263,15 +252,13 @@ def viewing_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(h, w): cosine between normals (h, w, 3) and directions from points (h, w, 3) to the camera
     at the origin."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(-np.einsum("ijk,ijk->ij", points, normals) / lengths(points))
+        return -np.einsum("ijk,ijk->ij", points, normals) / lengths(points)
 
 
 def close_pinholes(mask: np.ndarray) -> np.ndarray:
     """Close gaps of up to four pixels in a mask (h, w) bool; returns (h, w) uint8, 0 or 1."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-    return np.asarray(
-        cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2]
-    )
+    return cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2]
 
 
 def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
@@ -320,4 +307,4 @@ def _select_large_groups(mask: np.ndarray) -> np.ndarray:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= least
     large[0] = False
-    return np.asarray(large[labels])
+    return large[labels]

@@ -209,7 +209,7 @@ def check_registration(depths: RegisteredScans, turn: RegisteredScans) -> list[B
             )
             checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
             checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
-    adjusted = max((loop.after.shift_mm for loop in turn.alignment.loops), default=float("nan"))
+    adjusted = max((loop.left_mm for loop in turn.alignment.loops), default=float("nan"))
     rows = depths.rows() + turn.rows()
     checks += [
         BandCheck("three depths", "seconds to register", depths.seconds, 0.0, SECONDS),

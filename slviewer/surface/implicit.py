@@ -1,11 +1,14 @@
-"""Screened Poisson surface reconstruction, trimmed to the measured region."""
+"""Surfaces of points: by screened Poisson reconstruction, trimmed to the measured region, or by a
+signed distance field of mean heights above the points' tangent planes, and marching cubes."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.jit import kernel
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.surface.edit import fill_holes
@@ -48,14 +51,10 @@ class TrimmedPatches:
 def poisson_surface(points: PointSet, cell_mm: float) -> Mesh:
     """Reconstruct a closed surface from points with normals, with cells of ``cell_mm`` or larger.
 
-    It is extrapolated where there are no points. Raises InputError for points without normals, or
-    too few.
+    It is extrapolated where there are no points. Raises InputError for too few
+    points.
     """
-    if points.normals is None:
-        raise InputError(
-            "These points have no normals: a surface through them needs to know its outside; merge"
-            " again."
-        )
+    assert points.normals is not None
     if len(points) < LEAST_POINTS:
         raise InputError(
             f"{len(points)} points make no surface: at least {LEAST_POINTS} are needed."
@@ -127,3 +126,98 @@ def _flat_area(vertices: np.ndarray, patch: np.ndarray) -> float:
     around = vertices[longest].astype(np.float64)
     arms = around - around.mean(axis=0)
     return float(lengths(np.cross(arms, np.roll(arms, -1, axis=0))).sum() / 2)
+
+
+BLOCK = 8
+PLANE_REACH = 2.0
+"""Radius in cells within which a point's tangent plane contributes to the field."""
+_MOST_BLOCKS = 20_000_000
+
+
+def volume_surface(points: PointSet, cell_mm: float) -> Mesh:
+    """Reconstruct the surface of points with normals on a grid of ``cell_mm``; it extends two cells
+    beyond the points.
+
+    Points are weighted by 1 / sigma2 where known. Memory grows with the surface's area, not with
+    the bounding box. Raises InputError for points without normals, for a bounding box of too many
+    cells, and without a surface.
+    """
+    assert points.normals is not None
+    o3d = open3d()
+    origin = points.points.min(axis=0).astype(np.float64) - 4 * cell_mm
+    at = (points.points - origin) / cell_mm
+    shape = np.ceil(at.max(axis=0) / BLOCK).astype(np.int64) + 2
+    if np.prod(shape) > _MOST_BLOCKS:
+        raise InputError(
+            f"The points fill {np.ptp(points.points, axis=0).max():.0f} mm, too much for cells of"
+            f" {cell_mm:.3g} mm: exclude stray scans."
+        )
+    touched = np.zeros(tuple(shape), bool)
+    low, high = (
+        (at + reach).astype(np.int64) // BLOCK for reach in (-PLANE_REACH, PLANE_REACH + 1)
+    )
+    for corner in product((False, True), repeat=3):  # at most two blocks along each axis
+        touched[tuple(np.where(corner, high, low).T)] = True
+    keys = np.argwhere(touched).astype(np.int32)
+    kinds = (o3d.core.float32, o3d.core.float32)
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), kinds, ((1,), (1,)), 1.0, BLOCK, len(keys)
+    )
+    buffers, _ = grid.hashmap().activate(o3d.core.Tensor(keys))
+    lookup = np.full(tuple(shape), -1, np.int32)
+    lookup[tuple(keys.T)] = buffers.numpy()
+    height, weight = (
+        grid.attribute(name).numpy().reshape(-1, BLOCK**3) for name in ("tsdf", "weight")
+    )
+    height[:], weight[:] = 0, 0
+    sigma, share = points.sigma_mm, np.ones(len(points))
+    if sigma is not None:
+        share[:] = (np.median(sigma) / np.maximum(sigma, 1e-6)) ** 2
+    normals = points.normals.astype(np.float64)
+    _add_planes(at, normals, share, BLOCK, PLANE_REACH, lookup, height, weight)
+    known = weight > 0
+    height[known] /= weight[known]
+    weight[known] = 1.0
+    mesh = grid.extract_triangle_mesh(weight_threshold=0.5)
+    if not len(mesh.vertex.positions):
+        raise InputError(
+            "No surface was found between the points: the cells are too fine for them."
+        )
+    vertices, faces = _sort_mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy())
+    return transfer_attributes(points, vertices.astype(np.float64) * cell_mm + origin, faces)
+
+
+def _sort_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sort vertices (n, 3) by position and faces (m, 3) by vertex, so that the result does not
+    depend on threads."""
+    order = np.lexsort(vertices.T)
+    faces = np.argsort(order)[faces]
+    first = faces.argmin(axis=1)[:, None]
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    return vertices[order], faces[np.lexsort(faces.T[::-1])]
+
+
+@kernel()
+def _add_planes(at, normals, share, block, reach, lookup, height, weight):
+    """Add the signed distances to each point's tangent plane to the grid nodes around it, and their
+    weights.
+
+    ``at`` (n, 3) in cells; ``share`` (n,): the points' weights; ``lookup`` (a, b, c): index of each
+    block; ``height`` and ``weight`` (blocks, block^3): sums.
+    """
+    for i in range(len(at)):
+        p0, p1, p2 = at[i, 0], at[i, 1], at[i, 2]
+        for z in range(int(np.ceil(p2 - reach)), int(np.floor(p2 + reach)) + 1):
+            for y in range(int(np.ceil(p1 - reach)), int(np.floor(p1 + reach)) + 1):
+                for x in range(int(np.ceil(p0 - reach)), int(np.floor(p0 + reach)) + 1):
+                    d0, d1, d2 = x - p0, y - p1, z - p2
+                    near = 1.0 - (d0 * d0 + d1 * d1 + d2 * d2) / (reach * reach)
+                    if near <= 0.0:
+                        continue
+                    w = share[i] * near * near
+                    b = lookup[x // block, y // block, z // block]
+                    k = x % block + block * (y % block + block * (z % block))
+                    height[b, k] += w * (
+                        d0 * normals[i, 0] + d1 * normals[i, 1] + d2 * normals[i, 2]
+                    )
+                    weight[b, k] += w
