@@ -229,8 +229,8 @@ def _detect_unmoved_points(
             height = np.abs(heights_above(samples[scan], samples[onto], np.eye(4)))
             votes[scan] += (height <= gate).astype(float) - (height > gate)
     static = _classify_pixels(clouds, samples, votes)
-    for name, cloud in clouds.items():
-        measured, unmoved = int(cloud.mask.sum()), int(static[name].sum())
+    for name, mask in static.items():
+        measured, unmoved = int(clouds[name].mask.sum()), int(mask.sum())
         if unmoved < LEAST_PART * measured or measured - unmoved < 2 * LEAST_POINTS:
             return {}
     return static
