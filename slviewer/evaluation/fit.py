@@ -16,9 +16,15 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.ransac import ransac_plane, ransac_sphere
 from slviewer.geometry.robust import robust_sigma
-from slviewer.geometry.shapes import Plane, Sphere, fit_plane, fit_sphere
+from slviewer.geometry.shapes import (
+    Plane,
+    Sphere,
+    fit_plane,
+    fit_sphere,
+    ransac_plane,
+    ransac_sphere,
+)
 from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
 from slviewer.records.verification import MAX_EXCLUDED, Shape
 

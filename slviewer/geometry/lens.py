@@ -1,7 +1,7 @@
 """A camera or a projector as a pinhole with Brown distortion: from points to pixels and from pixels
 to rays."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -95,18 +95,12 @@ class Lens:
         NaN for NaN points, behind the device, and past the radius where the distortion polynomial
         folds over.
         """
-        flat = _flatten(points, 3, "points")
-        pixels = np.empty((len(flat), 2))
-        project_all(flat, self.parameters, pixels)
-        return pixels.reshape(*np.shape(points)[:-1], 2)
+        return self._map(project_all, points, 3)
 
     def distort(self, normalised: np.ndarray) -> np.ndarray:
         """Undistorted normalised coordinates (..., 2) to pixels (..., 2) (eq. 3); NaN past the
         fold."""
-        flat = _flatten(normalised, 2, "normalised coordinates")
-        pixels = np.empty((len(flat), 2))
-        distort_all(flat, self.parameters, pixels)
-        return pixels.reshape(np.shape(normalised))
+        return self._map(distort_all, normalised, 2)
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Pixels (..., 2) to undistorted normalised coordinates (..., 2) (eq. 4, 5), exact to 1e-9.
@@ -114,15 +108,23 @@ class Lens:
         NaN for NaN pixels, and where no ray within the fold of the distortion polynomial meets the
         pixel.
         """
-        flat = _flatten(pixels, 2, "pixels")
-        normalised = np.empty((len(flat), 2))
-        undistort_all(flat, self.parameters, normalised)
-        return normalised.reshape(np.shape(pixels))
+        return self._map(undistort_all, pixels, 2)
+
+    def _map(self, fill: Callable[..., None], values: np.ndarray, last: int) -> np.ndarray:
+        """Map values (..., last) to (..., 2) float64 by a compiled function of ``geometry.brown``;
+        InputError where the last dimension differs."""
+        values = np.ascontiguousarray(values, dtype=np.float64)
+        if values.shape[-1:] != (last,):
+            raise InputError(
+                f"An array of shape {values.shape} was given: the last dimension must be {last}."
+            )
+        mapped = np.empty((*values.shape[:-1], 2))
+        fill(values.reshape(-1, last), self.parameters, mapped.reshape(-1, 2))
+        return mapped
 
     def contains(self, pixels: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
         """(...,) bool: pixels (..., 2) inside the image less a margin; False for NaN."""
-        with np.errstate(invalid="ignore"):
-            inside = (pixels > margin_px - 0.5) & (pixels < np.array(self.size) - 0.5 - margin_px)
+        inside = (pixels > margin_px - 0.5) & (pixels < np.array(self.size) - 0.5 - margin_px)
         return np.asarray(inside.all(axis=-1))
 
     def rays(self) -> np.ndarray:
@@ -145,14 +147,3 @@ class Lens:
         K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5
         width, height = self.size
         return Lens(K, self.D, (round(width * factor), round(height * factor)))
-
-
-def _flatten(values: np.ndarray, last: int, what: str) -> np.ndarray:
-    """(n, last) contiguous float64; InputError where the last dimension differs."""
-    values = np.asarray(values, dtype=np.float64)
-    if values.ndim < 1 or values.shape[-1] != last:
-        raise InputError(
-            f"An array of shape {values.shape} was given as {what}: the last dimension must be"
-            f" {last}."
-        )
-    return np.ascontiguousarray(values.reshape(-1, last))

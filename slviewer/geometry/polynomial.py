@@ -39,9 +39,8 @@ class Polynomial2D:
             origin[0] + np.arange(width), origin[1] + np.arange(height), self.box
         )
         degree = len(self.coefficients) - 1
-        out = (
-            chebyshev.chebvander(t, degree) @ self.coefficients @ chebyshev.chebvander(s, degree).T
-        )
+        down, along = chebyshev.chebvander(t, degree), chebyshev.chebvander(s, degree)
+        out = down @ self.coefficients @ along.T
         out[np.abs(t) > 1.0], out[:, np.abs(s) > 1.0] = np.nan, np.nan
         return out
 
@@ -135,21 +134,11 @@ def parse_box(extent: Sequence[float]) -> Box:
 def select_valid_samples(
     u: np.ndarray, v: np.ndarray, values: np.ndarray, weights: np.ndarray | None, box: Box
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The finite samples of positive weight inside the box, as float64 (n,); InputError for unequal
-    lengths."""
-    arrays = [np.asarray(a, dtype=np.float64).ravel() for a in (u, v, values)]
-    arrays.append(
-        np.ones(len(arrays[2]))
-        if weights is None
-        else np.asarray(weights, dtype=np.float64).ravel()
-    )
+    """The finite samples of positive weight inside the box, as float64 (n,)."""
+    weights = np.ones(np.size(values)) if weights is None else weights
+    arrays = [np.asarray(a, dtype=np.float64).ravel() for a in (u, v, values, weights)]
     u, v, values, w = arrays
-    if len({len(a) for a in arrays}) != 1:
-        raise InputError(
-            f"A surface fit was given {[len(a) for a in arrays]} of u, v, values, weights: equal"
-            " numbers needed."
-        )
-    selected = np.isfinite(u) & np.isfinite(v) & np.isfinite(values) & np.isfinite(w) & (w > 0)
+    selected = np.isfinite(arrays).all(axis=0) & (w > 0)
     selected &= (u >= box[0]) & (u <= box[2]) & (v >= box[1]) & (v <= box[3])
     return u[selected], v[selected], values[selected], w[selected]
 

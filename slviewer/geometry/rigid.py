@@ -1,4 +1,7 @@
-"""Rigid motions as matrices (4, 4): ``T_b_a`` maps points of frame a into frame b."""
+"""Rigid motions as matrices (4, 4), and their uncertainty: ``T_b_a`` maps points of frame a into
+frame b."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -7,6 +10,28 @@ from scipy.spatial.transform import Rotation
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Uncertainty of a registered pose (1 sigma).
+
+    ``covariance`` (6, 6): of a small rotation vector (rad) about ``centre`` (3,) mm, the middle of
+    the overlap in the reference's frame, and of the translation (mm) there.
+    """
+
+    covariance: np.ndarray
+    centre: np.ndarray
+
+    @property
+    def shift_mm(self) -> float:
+        """Root of the expected squared translation of the overlap's middle."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def turn_deg(self) -> float:
+        """Root of the expected squared rotation angle."""
+        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
 
 def rigid_transform(R: Floats, t: Floats) -> Floats:
@@ -48,6 +73,15 @@ def motion_jacobian(arm: Floats) -> Floats:
     return J
 
 
+def distance_jacobian(arm: Floats, normals: Floats) -> Floats:
+    """Return the derivatives (n, 6) of points' distances along ``normals`` (n, 3), by a small
+    rotation (rad) about a centre and a shift (mm).
+
+    ``arm`` (n, 3) mm: the points less the centre.
+    """
+    return np.hstack([np.cross(arm, normals), normals])
+
+
 def nearest_rotation(M: Floats) -> Floats:
     """(3, 3): the rotation nearest to a matrix (3, 3) in the Frobenius norm."""
     U, _, Vt = np.linalg.svd(M)
@@ -64,15 +98,18 @@ def largest_angle_deg(directions: Floats) -> float:
     return float(np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1).min())))
 
 
-def fit_rigid(points: Floats, targets: Floats) -> Floats:
+def fit_rigid(points: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
     """(..., 4, 4): the motion of least squares that brings points (..., n, 3) onto ``targets``
     (..., n, 3), in order.
 
-    Kabsch's algorithm; the points must be finite, three or more and not on one line.
+    Kabsch's algorithm; the points must be finite, three or more and not on one line. ``weights``:
+    (n,), one over each pair's variance.
     """
-    p0, q0 = points.mean(axis=-2), targets.mean(axis=-2)
-    H = np.swapaxes(points - p0[..., None, :], -1, -2) @ (targets - q0[..., None, :])
-    U, _, Vt = np.linalg.svd(H)
+    p0, q0 = (np.average(each, axis=-2, weights=weights) for each in (points, targets))
+    p, q = points - p0[..., None, :], targets - q0[..., None, :]
+    if weights is not None:
+        p = p * weights[:, None]
+    U, _, Vt = np.linalg.svd(np.swapaxes(p, -1, -2) @ q)
     Vt[..., 2, :] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
     R = np.swapaxes(U @ Vt, -1, -2)
     return rigid_transform(R, q0 - (R @ p0[..., None])[..., 0])

@@ -1,12 +1,15 @@
-"""Planes and spheres fitted to points: least squares of the orthogonal distances."""
+"""Planes and spheres: fitted to points by least squares of the orthogonal distances, and detected
+in a cluttered cloud by RANSAC, for initial values of these fits."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.geometry.vectors import finite_rows
+from slviewer.geometry.vectors import diagonal, finite_rows, lengths, unit_vectors
 
 MIN_CAP_HEIGHT_RATIO = 4.0
 """A patch is fitted by a sphere only if its height over a plane is at least this many times the
@@ -38,23 +41,17 @@ class Sphere:
         return _norms(np.asarray(points, dtype=np.float64) - self.centre) - self.radius
 
 
-def fit_plane(points: np.ndarray, weights: np.ndarray | None = None) -> Plane:
+def fit_plane(points: np.ndarray) -> Plane:
     """Total least squares plane of points (n, 3) mm (Letter eq. 12), through their moments; NaN
     rows are excluded.
 
-    ``weights``: (n,), one over each point's variance. Raises InputError for fewer than three
-    points, and for points on one line or in a clump, which define no plane.
+    Raises InputError for fewer than three points, and for points on one line or in a clump, which
+    define no plane.
     """
-    points, finite = _select_finite(points, 3, "a plane")
-    w = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)[finite]
-    if not w.sum() > 0:
-        raise InputError(
-            "All points of a plane fit have weight 0: give at least three of them a positive"
-            " weight."
-        )
-    centroid = w @ points / w.sum()
+    points = _select_finite(points, 3, "a plane")
+    centroid = points.mean(axis=0)
     centred = points - centroid
-    spread, directions = np.linalg.eigh((centred * w[:, None]).T @ centred)
+    spread, directions = np.linalg.eigh(centred.T @ centred)
     if spread[1] <= 1e-10 * spread[2] or spread[0] > 0.5 * spread[1]:
         raise InputError(
             f"The {len(points)} points lie on a line or in a clump, not on a plane: select a wider"
@@ -73,7 +70,7 @@ def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
     Levenberg-Marquardt from the algebraic fit. Raises InputError for fewer than four points, and
     for a patch that is flat, exactly or within its noise.
     """
-    points, _ = _select_finite(points, 4, "a sphere")
+    points = _select_finite(points, 4, "a sphere")
     origin = points.mean(axis=0)
     points = points - origin  # better conditioned, and the size of the patch sets the scale
     spread = np.linalg.eigvalsh(points.T @ points / len(points))
@@ -84,20 +81,32 @@ def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
     if not spread[0] > 1e-14 * spread[2]:
         raise flat
     centre, start = _algebraic_sphere(points)
-    centre, r, rms = _refine_sphere(
-        points, centre, start if radius is None else radius, radius is not None
-    )
 
+    def distances(unknowns: np.ndarray) -> np.ndarray:
+        """Return the radial distances (n,) mm of the points from the sphere of the unknowns."""
+        return _norms(points - unknowns[:3]) - (unknowns[3] if radius is None else radius)
+
+    def jacobian(unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivatives (n, 3 or 4) of the radial distances by centre and radius."""
+        offsets = points - unknowns[:3]
+        derivatives = np.full((len(points), len(unknowns)), -1.0)
+        derivatives[:, :3] = -offsets / np.maximum(_norms(offsets), 1e-300)[:, None]
+        return derivatives
+
+    unknowns = np.append(centre, start) if radius is None else centre
+    fit = least_squares(
+        distances, unknowns, jacobian, method="lm", ftol=1e-14, xtol=1e-12, max_nfev=200
+    )
+    r, rms = float(fit.x[3]) if radius is None else radius, np.sqrt(2 * fit.cost / len(points))
     if not (
         np.isfinite(r) and 2.0 * np.sqrt(spread[1] * spread[2]) / r > MIN_CAP_HEIGHT_RATIO * rms
     ):
         raise flat
-    return Sphere(centre + origin, r)
+    return Sphere(fit.x[:3] + origin, r)
 
 
-def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """The finite rows as float64, and which they are; InputError for another shape or too few of
-    them."""
+def _select_finite(points: np.ndarray, least: int, what: str) -> np.ndarray:
+    """The finite rows as float64; InputError for another shape or too few of them."""
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(
@@ -109,7 +118,7 @@ def _select_finite(points: np.ndarray, least: int, what: str) -> tuple[np.ndarra
             f"{finite.sum()} points were measured, and {what} needs {least} at least: select a"
             " wider region."
         )
-    return (points if finite.all() else points[finite]), finite
+    return points[finite]
 
 
 def _norms(vectors: np.ndarray) -> np.ndarray:
@@ -129,28 +138,162 @@ def _algebraic_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
     return centre * scale, float(np.sqrt(max(solution[3] + centre @ centre, 1e-12)) * scale)
 
 
-def _refine_sphere(
-    points: np.ndarray, centre: np.ndarray, radius: float, fixed: bool
-) -> tuple[np.ndarray, float, float]:
-    """Levenberg-Marquardt on centre (and radius): (centre, radius, RMS of the radial distances)."""
+SAMPLE_SIZE = 3000
+"""Points of the subsample that hypotheses are drawn from and scored on."""
+HYPOTHESES = 400
+REFINED_HYPOTHESES = 12
+"""How many of the best hypotheses are refined by least squares before the best is chosen."""
 
-    def distances(unknowns: np.ndarray) -> np.ndarray:
-        """Return the radial distances (n,) mm of the points from the sphere of the unknowns."""
-        return _norms(points - unknowns[:3]) - (radius if fixed else unknowns[3])
 
-    def jacobian(unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivatives (n, 3 or 4) of the radial distances by centre and radius."""
-        offsets = points - unknowns[:3]
-        derivatives = np.full((len(points), len(unknowns)), -1.0)
-        derivatives[:, :3] = -offsets / np.maximum(_norms(offsets), 1e-300)[:, None]
-        return derivatives
+def ransac_plane(points: np.ndarray, tolerance: float) -> tuple[Plane, np.ndarray]:
+    """The plane with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask
+    (n,) bool.
 
-    start = centre if fixed else np.append(centre, radius)
-    fit = least_squares(
-        distances, start, jacobian, method="lm", ftol=1e-14, xtol=1e-12, max_nfev=200
+    Draws from a subsample and ends with least squares over all inliers; deterministic. NaN rows are
+    excluded. Raises InputError where no plane is detected.
+    """
+
+    def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3,
+        3)."""
+        a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
+        normals = np.cross(b - a, c - a)
+        regular = lengths(normals) > 0
+        normals = unit_vectors(normals[regular])
+        return normals, np.einsum("ij,ij->i", normals, a[regular])
+
+    def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
+        return normal @ sample.T - offset[:, None]
+
+    return _search(points, 3, tolerance, hypotheses, distances, fit_plane, "plane")
+
+
+def ransac_sphere(
+    points: np.ndarray, tolerance: float, radius: float | None = None
+) -> tuple[Sphere, np.ndarray]:
+    """The sphere with most inliers among points (n, 3), to ``tolerance`` mm, and its inlier mask
+    (n,) bool.
+
+    With ``radius`` (mm), only spheres of about that size are considered and the result has exactly
+    that radius; without, spheres larger than the cloud are excluded, because any flat patch would
+    fit one.
+    """
+    finite = np.asarray(points, dtype=np.float64)[finite_rows(points)]
+    extent = diagonal(finite) if len(finite) else 0.0
+    low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
+
+    def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4,
+        3)."""
+        origin = quads[:, :1]
+        edges = quads[:, 1:] - origin
+        regular = np.abs(np.linalg.det(edges)) > 1e-12 * lengths(edges).prod(axis=1)
+        edges, origin = edges[regular], origin[regular, 0]
+        offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=2)[..., None])[..., 0]
+        radii = lengths(offset)
+        sized = (radii >= low) & (radii <= high)
+        return (origin + offset)[sized], radii[sized]
+
+    def distances(sample: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
+        """Return the signed radial distances (k, n) mm of the sample (n, 3) from each sphere."""
+        middle = sample.mean(axis=0)  # centred: the difference of squares loses no digits
+        x, c = sample - middle, centre - middle
+        squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
+        return np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
+
+    def fit(chosen: np.ndarray) -> Sphere:
+        """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed
+        range."""
+        sphere = fit_sphere(chosen, radius)
+        if not low <= sphere.radius <= high:
+            raise InputError(
+                f"The detected sphere has a radius of {sphere.radius:.1f} mm, too large for its"
+                " cloud."
+            )
+        return sphere
+
+    return _search(points, 4, tolerance, hypotheses, distances, fit, "sphere")
+
+
+def _search(
+    points: np.ndarray,
+    needed: int,
+    tolerance: float,
+    hypotheses: Callable[[np.ndarray], tuple[np.ndarray, ...]],
+    distances: Callable[..., np.ndarray],
+    fit: Callable,
+    what: str,
+) -> tuple:
+    """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few
+    refined."""
+    points = np.asarray(points, dtype=np.float64)
+    finite = finite_rows(points)
+    valid = points[finite]
+    if len(valid) < 3 * needed:
+        raise InputError(
+            f"{len(valid)} points were measured, too few to detect a {what}: check the capture's"
+            " exposure."
+        )
+    rng = np.random.default_rng(0)
+    sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
+    parameters = hypotheses(_minimal_sets(sample, needed, rng))
+    # score in slices, so that the table of distances stays small
+    scores = np.concatenate(
+        [
+            _score(distances(sample, *(p[i : i + 50] for p in parameters)), tolerance)
+            for i in range(0, len(parameters[0]), 50)
+        ]
+        or [np.empty(0)]
     )
-    return (
-        fit.x[:3],
-        radius if fixed else float(fit.x[3]),
-        float(np.sqrt(2 * fit.cost / len(points))),
-    )
+    best, best_score = None, np.inf
+    for index in np.argsort(scores)[:REFINED_HYPOTHESES]:
+        chosen = (
+            np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
+        )
+        try:
+            for _ in range(5):
+                before, shape = chosen, fit(sample[chosen])
+                chosen = np.abs(shape.distance(sample)) <= tolerance
+                if np.array_equal(chosen, before):
+                    break
+        except InputError:  # too few, or flat: this hypothesis was chance
+            continue
+        score = float(_score(shape.distance(sample), tolerance))
+        if score < best_score:
+            best, best_score = shape, score
+    if best is None:
+        raise InputError(
+            f"No {what} was detected among {len(valid)} points to {tolerance:g} mm: "
+            "check that it fills a good part of the view."
+        )
+    inliers = np.abs(best.distance(points)) <= tolerance
+    shape = fit(points[inliers])
+    return shape, np.abs(shape.distance(points)) <= tolerance
+
+
+def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+    """(HYPOTHESES, size, 3): each a random point and some of its nearest 1, 3, 10 or 25 % of the
+    sample.
+
+    Four points drawn anywhere lie on a shape that fills a tenth of the cloud once in ten thousand
+    draws; four neighbours, often.
+    """
+    seeds = rng.choice(len(sample), HYPOTHESES)
+    tree = cKDTree(sample)
+    sets = np.empty((HYPOTHESES, size, 3))
+    for share, group in zip(
+        (0.01, 0.03, 0.1, 0.25), np.array_split(np.arange(HYPOTHESES), 4), strict=True
+    ):
+        count = min(max(3 * size, round(share * len(sample))), len(sample))
+        _, neighbours = tree.query(sample[seeds[group]], k=count)
+        picks = rng.integers(1, count, (len(group), size - 1))
+        sets[group, 0] = sample[seeds[group]]
+        sets[group, 1:] = sample[np.take_along_axis(neighbours, picks, axis=1)]
+    return sets
+
+
+def _score(residuals: np.ndarray, tolerance: float) -> np.ndarray:
+    """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals
+    cost more."""
+    return np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)

@@ -42,25 +42,29 @@ class SplineSurface:
     trend: Polynomial2D
     coefficients: np.ndarray
 
+    @property
+    def _spans(self) -> tuple[tuple[float, float, int], tuple[float, float, int]]:
+        """Start, end and number of cells of the box along u and v."""
+        rows, columns = self.coefficients.shape
+        u0, v0, u1, v1 = self.trend.box
+        return (u0, u1, columns - 3), (v0, v1, rows - 3)
+
     def evaluate(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Values at scattered pixels ``u``, ``v``, in their shape; NaN outside the box."""
         u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
         values = self.trend.evaluate(u, v).ravel()
         inside = np.isfinite(values)
-        ny, nx = (n - 3 for n in self.coefficients.shape)
-        u0, v0, u1, v1 = self.trend.box
-        cells_u, basis_u = cubic_basis(u.ravel()[inside], u0, u1, nx)
-        cells_v, basis_v = cubic_basis(v.ravel()[inside], v0, v1, ny)
-        values[inside] += _spline_at(cells_u, basis_u, cells_v, basis_v, self.coefficients)
+        along, down = self._spans
+        bases = *cubic_basis(u.ravel()[inside], *along), *cubic_basis(v.ravel()[inside], *down)
+        values[inside] += _spline_at(*bases, self.coefficients)
         return values.reshape(u.shape)
 
     def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
-        height, width = shape
-        ny, nx = (n - 3 for n in self.coefficients.shape)
-        u0, v0, u1, v1 = self.trend.box
-        along = basis_matrix(origin[0] + np.arange(width, dtype=np.float64), u0, u1, nx)
-        down = basis_matrix(origin[1] + np.arange(height, dtype=np.float64), v0, v1, ny)
+        along, down = (
+            basis_matrix(first + np.arange(count, dtype=np.float64), *span)
+            for first, count, span in zip(origin, shape[::-1], self._spans, strict=True)
+        )
         return self.trend.evaluate_grid(shape, origin) + down @ self.coefficients @ along.T
 
 
@@ -97,6 +101,7 @@ def fit_spline(
     rest = values - trend.evaluate(u, v)
     cells_u, basis_u = cubic_basis(u, box[0], box[2], nx)
     cells_v, basis_v = cubic_basis(v, box[1], box[3], ny)
+    bases = cells_u, basis_u, cells_v, basis_v
     reached = len(np.unique(cells_v * nx + cells_u))
     columns, count = nx + 3, (nx + 3) * (ny + 3)
     penalty = sp.tril(bending_energy(columns, ny + 3), format="coo")
@@ -110,12 +115,12 @@ def fit_spline(
         (n,)."""
         band = prior.copy()
         right = np.zeros(count)
-        _accumulate(cells_u, basis_u, cells_v, basis_v, w, rest, columns, band, right)
+        _accumulate(*bases, w, rest, columns, band, right)
         solution = solveh_banded(
             band, right, lower=True, overwrite_ab=True, overwrite_b=True, check_finite=False
         )
         coefficients = solution.reshape(-1, columns)
-        return coefficients, _spline_at(cells_u, basis_u, cells_v, basis_v, coefficients)
+        return coefficients, _spline_at(*bases, coefficients)
 
     return SplineSurface(
         trend, fit_reweighted(solve, rest, weights) if robust else solve(weights)[0]

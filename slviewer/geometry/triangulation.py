@@ -12,21 +12,19 @@ from slviewer.geometry.brown import distort_point
 from slviewer.geometry.jit import kernel, read_only
 from slviewer.geometry.rig import StereoRig
 
+Axis = Literal["x", "y"]
 TOLERANCE_PX = 1e-7
 """How far the distorted projection of the result may be from the measured coordinate."""
 MAX_STEPS = 25
+_NOWHERE = (math.nan,) * 5
+_NO_DEPTH = (math.nan, 0.0, math.nan)
 CHUNK = 1024
 MARGIN = 0.1
 """A point may fall outside the projector's image by this share of its width and height: a
 calibration's own error is smaller, and points further out were never illuminated."""
 
 
-def triangulate(
-    rig: StereoRig,
-    coordinate: np.ndarray,
-    axis: Literal["x", "y"],
-    z_range: tuple[float, float] | None = None,
-) -> np.ndarray:
+def triangulate(rig: StereoRig, coordinate: np.ndarray, axis: Axis) -> np.ndarray:
     """Depth (h, w) float64 mm of each camera pixel from its projector column (axis x) or row (axis
     y).
 
@@ -34,36 +32,28 @@ def triangulate(
     coordinate is normalised without undistorting it (that needs the other coordinate, not known
     yet), then Newton steps on z until the *distorted* projection meets the measured coordinate. NaN
     where the coordinate is invalid, the point would lie behind a device, more than a tenth outside
-    the projector's image or past the fold of a lens, the steps do not converge, or z lies outside
-    ``z_range`` (mm). Raises InputError where the map has not the camera's image size.
+    the projector's image or past the fold of a lens, or the steps do not converge. Raises
+    InputError where the map has not the camera's image size.
     """
     check_map(rig.camera.size, coordinate, "projector coordinates")
     z = _solve(rig, rig.camera.rays().reshape(-1, 2), np.asarray(coordinate).reshape(-1), axis)
-    if z_range is not None:
-        z[~((z >= z_range[0]) & (z <= z_range[1]))] = np.nan
     return z.reshape(np.shape(coordinate))
 
 
 def triangulate_pixels(
-    rig: StereoRig, pixels: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]
+    rig: StereoRig, pixels: np.ndarray, coordinate: np.ndarray, axis: Axis
 ) -> np.ndarray:
     """Points (n, 3) mm in the camera's frame of scattered camera pixels (n, 2) and their projector
     coordinate (n,) px.
 
     NaN rows under the same conditions as ``triangulate``.
     """
-    pixels, coordinate = np.asarray(pixels), np.asarray(coordinate)
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or coordinate.shape != pixels.shape[:1]:
-        raise InputError(
-            f"Pixels of shape {pixels.shape} and coordinates of shape {coordinate.shape} were"
-            " given: they must be (n, 2) and (n,)."
-        )
     rays = rig.camera.undistort(pixels)
     z = _solve(rig, rays, coordinate, axis)
     return np.column_stack([rays * z[:, None], z])
 
 
-def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.ndarray:
+def depth_per_px(rig: StereoRig, axis: Axis, z: np.ndarray) -> np.ndarray:
     """|dz/du_p| (h, w) float64, mm per projector px, along each camera pixel's ray at its depth
     ``z`` (h, w) mm.
 
@@ -72,13 +62,8 @@ def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.n
     """
     check_map(rig.camera.size, z, "depths")
     slopes = np.empty(np.size(z))
-    rays, depths = (
-        _as_read_only(rig.camera.rays().reshape(-1, 2)),
-        _as_read_only(np.asarray(z).reshape(-1)),
-    )
-    _coordinate_slopes(
-        rays, depths, rig.R.copy(), rig.t.copy(), rig.projector.parameters, _axis_row(axis), slopes
-    )
+    rays = _as_read_only(rig.camera.rays().reshape(-1, 2))
+    _coordinate_slopes(rays, _as_read_only(np.ravel(z)), *_projector(rig, axis), slopes)
     with np.errstate(divide="ignore"):
         return np.abs(1.0 / slopes).reshape(np.shape(z))
 
@@ -86,45 +71,27 @@ def depth_per_px(rig: StereoRig, axis: Literal["x", "y"], z: np.ndarray) -> np.n
 def points_from_depth(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Camera-frame points (h, w, 3) float32 mm from rays (h, w, 2) and depths (h, w) mm: eq. 7,
     8."""
-    if rays.shape != (*z.shape, 2):
-        raise InputError(
-            f"Rays of shape {rays.shape} and depths of shape {z.shape} do not belong to the same"
-            " image."
-        )
     points = np.empty((*z.shape, 3), dtype=np.float32)
-    points[..., 0] = rays[..., 0] * z
-    points[..., 1] = rays[..., 1] * z
+    points[..., :2] = rays * z[..., None]
     # a pixel without a ray is invalid as a whole
     points[..., 2] = np.where(np.isnan(points[..., 0]), np.nan, z)
     return points
 
 
-def _solve(
-    rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Literal["x", "y"]
-) -> np.ndarray:
+def _solve(rig: StereoRig, rays: np.ndarray, coordinate: np.ndarray, axis: Axis) -> np.ndarray:
     """Depths (n,) of rays (n, 2) at projector coordinates (n,)."""
     z = np.empty(len(rays))
     extent = np.array(rig.projector.size, dtype=np.float64)
     _triangulate_all(
-        _as_read_only(rays),
-        _as_read_only(coordinate),
-        rig.R.copy(),
-        rig.t.copy(),
-        rig.projector.parameters,
-        _axis_row(axis),
-        extent,
-        z,
+        _as_read_only(rays), _as_read_only(coordinate), *_projector(rig, axis), extent, z
     )
     return z
 
 
-def _axis_row(axis: str) -> int:
-    """Return the projector coordinate's index of an axis: 0 for x (columns), 1 for y (rows)."""
-    if axis not in ("x", "y"):
-        raise InputError(
-            f"The axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)."
-        )
-    return 0 if axis == "x" else 1
+def _projector(rig: StereoRig, axis: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return the projector as the kernels take it: R, t, the lens's parameters, and the index of
+    the axis' coordinate, 0 for x (columns), 1 for y (rows)."""
+    return rig.R.copy(), rig.t.copy(), rig.projector.parameters, 0 if axis == "x" else 1
 
 
 def check_map(size: Iterable[float], values: np.ndarray, what: str) -> None:
@@ -164,11 +131,11 @@ def _projection(z, a0, a1, a2, t, parameters, row):
     """
     depth = z * a2 + t[2]
     if not (z > 0.0 and depth > 0.0):
-        return math.nan, math.nan, math.nan, math.nan, math.nan
+        return _NOWHERE
     inverse = 1.0 / depth
     x, y = (z * a0 + t[0]) * inverse, (z * a1 + t[1]) * inverse
     if not x * x + y * y < parameters[9]:
-        return math.nan, math.nan, math.nan, math.nan, math.nan
+        return _NOWHERE
     dx = (a0 * t[2] - t[0] * a2) * inverse * inverse
     dy = (a1 * t[2] - t[1] * a2) * inverse * inverse
     xd, yd, dxx, dxy, dyy = distort_point(x, y, parameters)
@@ -191,7 +158,7 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
     up = reading + shift
     denominator = a - a2 * up
     if denominator == 0.0:
-        return math.nan, 0.0, math.nan
+        return _NO_DEPTH
     z = -(t[row] - t[2] * up) / denominator  # Letter eq. 6; rows 2 and 3 of M for axis y
     u, other, slope, straight, undistorted = _projection(z, a0, a1, a2, t, parameters, row)
     error = measured - u
@@ -199,12 +166,12 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
         if abs(error) <= TOLERANCE_PX:
             size = extent[1 - row]
             if not -0.5 - MARGIN * size <= other <= (1.0 + MARGIN) * size - 0.5:
-                return math.nan, 0.0, math.nan
+                return _NO_DEPTH
             # where distortion turns the coordinate back along the ray, two depths share it:
             # ambiguous, so invalid
             return (z if slope * straight > 0.0 else math.nan), undistorted - reading, slope
         if not abs(error) < math.inf or slope == 0.0:
-            return math.nan, 0.0, math.nan
+            return _NO_DEPTH
         step = error / slope
         damping = 1.0
         while True:  # shorten the step until it stays in view and comes nearer
@@ -216,9 +183,9 @@ def ray_depth(uc, vc, measured, shift, R, t, parameters, row, extent):
                 break
             damping *= 0.5
             if damping < 1e-3:
-                return math.nan, 0.0, math.nan
+                return _NO_DEPTH
         z, error = nz, measured - nu
-    return math.nan, 0.0, math.nan
+    return _NO_DEPTH
 
 
 @kernel(parallel=True)

@@ -14,7 +14,7 @@ from slviewer.gui.panel import Choice, PanelPart, StepPanel
 from slviewer.gui.scene import TO_THE_RIGHT, Click
 from slviewer.gui.widgets import Html, Text, alert, note, table, to_html
 from slviewer.registration.multiway import Pair
-from slviewer.registration.picked import LEAST_PICKS, fit_picked_start
+from slviewer.registration.start import LEAST_PICKS, fit_picked_start
 from slviewer.session.store import Session
 from slviewer.wizard.result_views import load_scan_cloud
 

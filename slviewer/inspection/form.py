@@ -23,9 +23,8 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from slviewer.errors import InputError
-from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.robust import robust_sigma
-from slviewer.geometry.vectors import finite_rows, unit_vectors
+from slviewer.geometry.vectors import finite_rows, occupied_cubes, unit_vectors
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.uncertainty import (

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
+from slviewer.geometry.vectors import finite_rows, lengths, median_spacing, unit_vectors
 from slviewer.records.measurement import Quantity
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import open3d, point_cloud
 
 BAND = 12.0
 """Spacings from the plane within which points are joined to triangles."""
@@ -92,16 +92,12 @@ def triangulate_near(
     """
     known = finite_rows(normals)
     points, normals = points[known].astype(np.float64), normals[known].astype(np.float64)
-    some = points[:: max(1, len(points) // 2000)]
-    spacing = (
-        float(np.median(cKDTree(points).query(some, k=2)[0][:, 1])) if len(points) > 1 else 0.0
-    )
+    spacing = median_spacing(cKDTree(points), 2000) if len(points) > 1 else 0.0
     near = np.abs((points - plane.origin) @ plane.normal) < BAND * spacing
     if np.count_nonzero(near) < 3:
         raise InputError("The section's plane does not meet the surface: pick two points on it.")
     o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[near]))
-    cloud.normals = o3d.utility.Vector3dVector(normals[near])
+    cloud = point_cloud(points[near], normals[near])
     radii = o3d.utility.DoubleVector([3.0 * spacing, 6.0 * spacing])
     mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, radii)
     return points[near], np.asarray(mesh.triangles, np.int64)

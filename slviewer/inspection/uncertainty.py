@@ -10,9 +10,8 @@ from slviewer.calibration.splined.bundle import Bundle
 from slviewer.calibration.splined.uncertainty import extrapolation_factor
 from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels, working_volume
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.cubes import occupied_cubes
 from slviewer.geometry.polynomial import grid_points
-from slviewer.geometry.vectors import finite_rows
+from slviewer.geometry.vectors import finite_rows, occupied_cubes
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p),

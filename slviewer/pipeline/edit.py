@@ -16,11 +16,12 @@ from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.scan_edits import OFF, parse_region
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
-from slviewer.surface.point_edits import Edit, make_edit
 from slviewer.surface.region_of_interest import RegionOfInterest
 from slviewer.surface.selection import (
+    Edit,
     Mask,
     SupportPlane,
+    make_edit,
     select_connected,
     select_polygon,
     select_support,

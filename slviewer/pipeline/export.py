@@ -5,8 +5,6 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-
 from slviewer.errors import InputError
 from slviewer.pipeline.capture_clouds import (
     merge_name,
@@ -245,9 +243,8 @@ def _write_scan(store: Session, name: str, target: Path, settings: ExportSetting
     if settings.what == "mesh":
         return _write_mesh(name, cloud, notes, target, settings)
     progress(0.56, "normals")
-    normals, colours = grid_normals(cloud.points)[mask], cloud.colours()
-    if colours is not None and colours.ndim == 1:
-        colours = np.repeat(colours[:, None], 3, axis=1)
+    normals = grid_normals(cloud.points)[mask]
+    colours = None if (rgb := cloud.rgb) is None else rgb[mask]
     progress(0.85, f"writing {target.name}")
     points = PointSet(cloud.measured, normals, colours)
     notes = (*notes, "sigma: expected error of the depth, mm")

@@ -23,9 +23,8 @@ from slviewer.pipeline.operation import Job
 from slviewer.pipeline.scale import load_scale_correction
 from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.mesh import triangulate_grid
-from slviewer.reconstruction.reconstruct import JUMP
 from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.reconstruction.reconstruct import triangulate_grid
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 
@@ -126,7 +125,7 @@ def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(on.points, np.float64), on.faces
     if not on.organised:
         raise InputError(f"{on.source} is a cloud without triangles: mesh it first")
-    faces = triangulate_grid(on.points, JUMP * float(np.median(on.points[..., 2][on.measured])))
+    faces = triangulate_grid(on.points)
     return on.points[on.measured].astype(np.float64), faces
 
 

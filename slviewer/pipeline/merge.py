@@ -25,7 +25,6 @@ from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restric
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import (
     ContradictingPair,
-    LoopClosure,
     MarkerPair,
     Merge,
     RefusedPair,
@@ -40,11 +39,9 @@ from slviewer.registration.markers import (
 )
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts
 from slviewer.registration.pairwise import Registration
-from slviewer.registration.picked import fit_picked_start
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import Candidate
+from slviewer.registration.start import Candidate, TurntableAxis, fit_picked_start, shortest_turn
 from slviewer.registration.static_scene import ObjectAlignment, register_object
-from slviewer.registration.turntable import TurntableAxis, shortest_turn
 from slviewer.session.ply import write_ply
 from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
@@ -208,8 +205,8 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     for why in _list_warnings(clouds, registered, background):
         warn(why)
     clouds = clouds if background else dict(registered.clouds)
-    left = {name: (each.covariance, each.centre) for name, each in alignment.uncertainties.items()}
-    fused = fuse(clouds, alignment.T_reference_scan, stage(job.progress, 0.75, 0.9, "fusing"), left)
+    progress = stage(job.progress, 0.75, 0.9, "fusing")
+    fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
     job.progress(0.9, "writing")
     calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{fitted.name}"))
     record = _make_record(
@@ -343,16 +340,7 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
         registered=[
             _make_registered(*pair, registration) for pair, registration in alignment.pairs.items()
         ],
-        loops=[
-            LoopClosure(
-                list(loop.names),
-                loop.before.shift_mm,
-                loop.before.turn_deg,
-                loop.after.shift_mm,
-                loop.after.turn_deg,
-            )
-            for loop in alignment.loops
-        ],
+        loops=alignment.loops,
         dropped=[RefusedPair(*pair, why) for pair, why in alignment.dropped.items()],
         refused=[RefusedPair(*pair, why) for pair, why in alignment.refused.items()],
         markers=[

@@ -31,9 +31,8 @@ from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation, plain_settings
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.reconstruction.mesh import triangulate_grid
-from slviewer.reconstruction.reconstruct import JUMP, normals
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.reconstruct import normals, triangulate_grid
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.table import render_text
 from slviewer.records.verification import Shape, Verification
@@ -176,8 +175,7 @@ def _write_files(
     assert cloud.texture is not None
     faces = None
     if settings.mesh:  # surfaces end where depth jumps
-        masked = np.where(mask[..., None], points, np.float32(np.nan))
-        faces = triangulate_grid(masked, JUMP * float(np.median(points[..., 2][mask])))
+        faces = triangulate_grid(keep_pixels(points, mask))
     notes = (f"scan {capture}, frame: {frame_of(store, cloud.model)}", *notes)
     name = f"{capture}_{cloud.model}{'_mesh' if settings.mesh else ''}.ply"
     with placed_file(store, settings.out, name) as (path, written):

@@ -18,7 +18,9 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.triangulation import triangulate_pixels
+from slviewer.geometry.vectors import lengths
 
 SAMPLE = 20_000
 """Pixels compared; more do not change a median."""
@@ -115,10 +117,14 @@ class AxisAgreement:
         return self.misfit_px / self.predicted_px
 
     @property
+    def limit_px(self) -> float:
+        """The misfit beyond which the capture cannot belong to the calibration."""
+        return max(REFUSED_PX, REFUSED_RATIO * self.predicted_px)
+
+    @property
     def is_refused(self) -> bool:
         """Whether the capture cannot belong to the calibration."""
-        beyond = self.misfit_px > max(REFUSED_PX, REFUSED_RATIO * self.predicted_px)
-        return beyond or self.in_front < LEAST_IN_FRONT
+        return self.misfit_px > self.limit_px or self.in_front < LEAST_IN_FRONT
 
 
 @dataclass(frozen=True)
@@ -137,17 +143,21 @@ class CaptureCheck:
 def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: StereoRig) -> None:
     """Raise InputError where a capture's camera or projector has not the size that was
     calibrated."""
-    use_camera = (
-        "use captures of the calibrated camera, at the same resolution and without cropping, or"
-        " calibrate at this one"
-    )
-    use_size = (
-        "import the capture with the projector's true size, or calibrate with patterns of the same"
-        " size"
-    )
     for what, size, wanted, remedy in (
-        ("camera image", camera, calibrated.camera.size, use_camera),
-        ("projector", projector, calibrated.projector.size, use_size),
+        (
+            "camera image",
+            camera,
+            calibrated.camera.size,
+            "use captures of the calibrated camera, at the same resolution and without cropping, or"
+            " calibrate at this one",
+        ),
+        (
+            "projector",
+            projector,
+            calibrated.projector.size,
+            "import the capture with the projector's true size, or calibrate with patterns of the"
+            " same size",
+        ),
     ):
         if size is not None and tuple(size) != wanted:
             raise InputError(
@@ -239,18 +249,13 @@ def local_misfit(
     disturbs one axis disturbs the other about as much.
     """
     rig = calibration.pinholes
-    distance, normal = epipolar_distance(rig, *calibration.undistort_pairs(pixels, measured))
-    known = np.isfinite(distance)
-    distance, noise = np.abs(distance[known]), np.sum((normal[known] * sigma[known]) ** 2, axis=1)
-    tile = (pixels[known, ::-1] * TILES / np.array(rig.camera.size[::-1])).astype(int) @ (
-        TILES[1],
-        1,
-    )
+    known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
+    tile = (pixels[known, ::-1] * TILES / rig.camera.size[::-1]).astype(int) @ (TILES[1], 1)
     order = np.argsort(tile, kind="stable")
     excess = np.zeros(TILES, np.float32)
     for group in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
         predicted = float(np.median(noise[group])) + calibration.residual_px**2
-        misfit = (1.4826 * float(np.median(distance[group]))) ** 2
+        misfit = robust_sigma(distance[group], about=0.0) ** 2
         if len(group) >= LEAST_IN_TILE and misfit > RAISED_RATIO**2 * predicted:
             excess.flat[tile[group[0]]] = np.sqrt(misfit - predicted)
     return excess if excess.any() else None
@@ -274,21 +279,28 @@ def epipolar_distance(
     """Return signed distances (n,) px of projector points from the epipolar lines of their camera
     rays, and the lines' unit normals (n, 2). ``camera``, ``projector`` (n, 2): undistorted
     normalised coordinates."""
-    along = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
-    line = np.cross(rig.t, along)
-    K = rig.projector.K
-    normal = line[:, :2] / np.array([K[0, 0], K[1, 1]])
-    length = np.linalg.norm(normal, axis=1)
+    line = np.cross(rig.t, _rays(camera) @ rig.R.T)
+    normal = line[:, :2] / np.diag(rig.projector.K)[:2]
+    length = lengths(normal)
     with np.errstate(invalid="ignore", divide="ignore"):
-        offset = np.einsum("ni,ni->n", line, np.column_stack([projector, np.ones(len(projector))]))
+        offset = np.einsum("ni,ni->n", line, _rays(projector))
         return offset / length, normal / length[:, None]
+
+
+def _misfit(
+    rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which pixels (n,) bool are calibrated, and the ``epipolar_distance`` (m,) px of these
+    and its variance (m,) by the noise ``sigma`` (n, 2) px."""
+    distance, normal = epipolar_distance(rig, camera, projector)
+    known = np.isfinite(distance)
+    return known, distance[known], np.sum((normal[known] * sigma[known]) ** 2, axis=1)
 
 
 def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
     """(n, 2) mm: depths before camera and projector at which the rays of undistorted normalised
     coordinates (n, 2) come nearest to each other; negative behind a device."""
-    a = np.column_stack([camera, np.ones(len(camera))]) @ rig.R.T
-    b = np.column_stack([projector, np.ones(len(projector))])
+    a, b = _rays(camera) @ rig.R.T, _rays(projector)
     aa, bb, ab = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (b, b), (a, b)))
     at, bt = a @ rig.t, b @ rig.t
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -298,27 +310,28 @@ def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.
         )
 
 
+def _rays(normalised: np.ndarray) -> np.ndarray:
+    """Return the rays (n, 3) of undistorted normalised coordinates (n, 2)."""
+    return np.column_stack([normalised, np.ones(len(normalised))])
+
+
 def _compute_agreement(
     rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray, residual_px: float
 ) -> AxisAgreement:
     """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2)
     px."""
-    distance, normal = epipolar_distance(rig, camera, projector)
-    known = np.isfinite(distance)
+    known, distance, noise = _misfit(rig, camera, projector, sigma)
     if not known.any():
         return AxisAgreement(np.inf, 1.0, 0.0, np.empty(0), 0)
-    d = distance[known]
-    predicted = float(
-        np.sqrt(np.median(np.sum((normal[known] * sigma[known]) ** 2, axis=1)) + residual_px**2)
-    )
+    predicted = float(np.sqrt(np.median(noise) + residual_px**2))
     depths = ray_depths(rig, camera[known], projector[known])
     front = (depths > 0).all(axis=1)
     return AxisAgreement(
-        misfit_px=1.4826 * float(np.median(np.abs(d))),
+        misfit_px=robust_sigma(distance, about=0.0),
         predicted_px=max(predicted, 1e-6),
         in_front=float(front.mean()),
         depths_mm=depths[front, 0],
-        pixels=len(d),
+        pixels=len(distance),
     )
 
 
@@ -332,12 +345,10 @@ def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, n
     """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their
     errors (n, 2) px by noise and by blur at edges."""
     v, u = _sample_pixels(np.logical_and.reduce([phase.mask for phase in phases.values()]))
-    measured, sigma = np.empty((2, len(v), 2))
-    for column, axis in enumerate(("x", "y")):
-        phase = phases[axis]  # type: ignore[index]
-        measured[:, column] = phase.coordinate[v, u]
-        sigma[:, column] = np.hypot(phase.sigma_px[v, u], phase.edge_error_px[v, u])
-    return np.column_stack([u, v]).astype(float), measured, sigma
+    both = phases["x"], phases["y"]
+    measured = np.column_stack([phase.coordinate[v, u] for phase in both]).astype(float)
+    errors = [np.hypot(phase.sigma_px[v, u], phase.edge_error_px[v, u]) for phase in both]
+    return np.column_stack([u, v]).astype(float), measured, np.column_stack(errors).astype(float)
 
 
 def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.ndarray, float]:
@@ -376,7 +387,7 @@ def _depth_warning(
 
 def _describe_contradiction(agreement: AxisAgreement) -> str:
     """Describe how the capture contradicts the calibration: epipolar misfit or negative depths."""
-    if agreement.misfit_px > max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px):
+    if agreement.misfit_px > agreement.limit_px:
         return (
             f"the x and y patterns disagree by {agreement.misfit_px:.1f} px with this calibration,"
             f" and noise explains {agreement.predicted_px:.2f} px"
@@ -401,7 +412,7 @@ def _likely_reason(
         enough = tried.pixels > 0.5 * agreement.pixels and tried.in_front >= LEAST_IN_FRONT
         if enough and tried.misfit_px < best:
             best, reason = tried.misfit_px, words
-    explained = max(REFUSED_PX, REFUSED_RATIO * agreement.predicted_px)
+    explained = agreement.limit_px
     if agreement.misfit_px > explained:
         explained = max(explained, EXPLAINED * agreement.misfit_px)
     if best < explained:

@@ -1,12 +1,12 @@
 """A cloud that keeps the camera's grid: neighbours in the image are neighbours on the surface."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
+from slviewer.fringe.sequence import Axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Cloud:
     """
 
     points: np.ndarray
-    axis: Literal["x", "y"]
+    axis: Axis
     model: str
     sigma_z: np.ndarray
     texture: np.ndarray | None = None
@@ -32,26 +32,23 @@ class Cloud:
     sigma_edges: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        points = np.asarray(self.points, dtype=np.float32)
-        sigma_z = np.asarray(self.sigma_z, dtype=np.float32)
-        if points.ndim != 3 or points.shape[2] != 3 or sigma_z.shape != points.shape[:2]:
+        for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges"):
+            if (values := getattr(self, name)) is not None:
+                vars(self)[name] = np.asarray(values, dtype=np.float32)
+        points, shape = self.points, self.sigma_z.shape
+        if points.ndim != 3 or points.shape[2] != 3 or shape != points.shape[:2]:
             raise InputError(
-                f"Points of shape {points.shape} and sigma_z of shape {sigma_z.shape} make no"
-                " cloud: (h, w, 3) and (h, w) are needed."
+                f"Points of shape {points.shape} and sigma_z of shape {shape} make no cloud: (h, w,"
+                " 3) and (h, w) are needed."
             )
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "sigma_z", sigma_z)
         for name in ("sigma_calibration", "sigma_edges"):
-            if getattr(self, name) is not None:
-                systematic = np.asarray(getattr(self, name), dtype=np.float32)
-                if systematic.shape != sigma_z.shape:
-                    raise InputError(
-                        f"{name} of shape {systematic.shape} does not belong to {sigma_z.shape}"
-                        " pixels."
-                    )
-                object.__setattr__(self, name, systematic)
+            values = getattr(self, name)
+            if values is not None and values.shape != shape:
+                raise InputError(
+                    f"{name} of shape {values.shape} does not belong to {shape} pixels."
+                )
         if self.texture is not None:
-            object.__setattr__(self, "texture", _convert_texture(self.texture, points.shape[:2]))
+            vars(self)["texture"] = _convert_texture(self.texture, shape)
 
     @property
     def mask(self) -> np.ndarray:
@@ -80,7 +77,7 @@ class Cloud:
         None if not known."""
         if self.sigma_calibration is None or self.sigma_edges is None:
             return self.sigma_edges if self.sigma_calibration is None else self.sigma_calibration
-        return np.asarray(np.hypot(self.sigma_calibration, self.sigma_edges))
+        return np.hypot(self.sigma_calibration, self.sigma_edges)
 
     def sigmas(self, chosen: np.ndarray) -> dict[str, np.ndarray]:
         """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them:
@@ -94,6 +91,14 @@ class Cloud:
             }
         return scalars
 
+    @property
+    def rgb(self) -> np.ndarray | None:
+        """(h, w, 3) uint8: the texture in colours, also where it is grey; None without a
+        texture."""
+        if self.texture is None or self.texture.ndim == 3:
+            return self.texture
+        return np.repeat(self.texture[..., None], 3, axis=2)
+
     def colours(self) -> np.ndarray | None:
         """(n,) grey or (n, 3) RGB uint8 of the measured points, in the order of ``mask``; None
         without a texture."""
@@ -104,6 +109,11 @@ def choose_pixels(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """The values (n, k) of the ``chosen`` pixels (h, w) bool of an image (h, w, k), as indexing
     gives them, in a sixth of its time."""
     return np.compress(chosen.ravel(), values.reshape(-1, values.shape[-1]), axis=0)
+
+
+def keep_pixels(points: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return points (h, w, 3) float32 mm with NaN outside the pixels ``kept`` (h, w) bool."""
+    return np.where(kept[..., None], points, np.float32(np.nan))
 
 
 def _convert_texture(texture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -2,25 +2,28 @@
 many captures."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from slviewer.calibration.pixelwise import MAX_EXTRAPOLATION, PixelwiseModel
 from slviewer.calibration.splined.model import SplinedModel
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.fringe import kernels_spikes as spikes
 from slviewer.fringe.decode import code_rules, grey_scale, pack_levels, pack_shifts
-from slviewer.fringe.kernels_levels import Ladder
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, clip_level, white_level
 from slviewer.fringe.levels import unambiguous_px
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.fringe.threshold import MIDDLE, fringe_mean
+from slviewer.geometry import cuda_device
 from slviewer.geometry.jit import read_only, run_rows
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.triangulation import check_map
 from slviewer.reconstruction import onepass_kernels as kernels
 from slviewer.reconstruction.cloud import Cloud
+
+Fast = PixelwiseModel | SplinedModel | StereoModel
 
 
 @dataclass(frozen=True)
@@ -56,24 +59,14 @@ class PassResult:
     texture: np.ndarray
     light: LightLevels
 
+    @property
+    def maps(self) -> kernels.Maps:
+        """The arrays as the compiled kernels take them."""
+        return kernels.Maps(*(getattr(self, name) for name in kernels.Maps._fields))
+
     def cloud(self) -> Cloud:
         """Return the organised cloud; it shares this scan's arrays."""
         return Cloud(self.points, self.axis, self.model, self.sigma_z, self.texture)
-
-
-@dataclass(frozen=True, eq=False)
-class PassTask:
-    """Description of the work that a device is prepared for: the ``shape`` (h, w) of a camera's
-    frames, their layout, all ``frames`` that the axis is decoded from, whether the texture is the
-    background of the fringes (``is_shaded``), and the calibration."""
-
-    shape: tuple[int, int]
-    axis: Axis
-    layout: Layout
-    frames: tuple[int, ...]
-    ladder: Ladder
-    depths: kernels.Depths | StereoRig
-    is_shaded: bool
 
 
 class OnePass:
@@ -82,44 +75,47 @@ class OnePass:
 
     The results are those of `fringe.decode.decode` and the model's ``points``. Raises InputError
     for other models, an axis that sequence or model lacks, and Gray code without phase steps.
+
+    ``shape``: (h, w) of the frames that the calibration belongs to; ``frames``: those that the axis
+    is decoded from; ``texture``: the one that shows the scene under white light, or -1; ``depths``:
+    the calibration as the kernels take it.
     """
 
-    def __init__(
-        self, sequence: PatternSequence, model: PixelwiseModel | SplinedModel, axis: Axis
-    ) -> None:
+    def __init__(self, sequence: PatternSequence, model: Fast, axis: Axis) -> None:
         self.sequence, self.model, self.axis = sequence, model, axis
-        self._layout = one_pass_layout(self.sequence, self.axis)
-        if self.axis not in self.model.axes:
+        self.layout = one_pass_layout(sequence, axis)
+        if axis not in model.axes:
             raise InputError(
-                f"The {self.model.name} calibration has no axis {self.axis}: choose another axis."
+                f"The {model.name} calibration has no axis {axis}: choose another axis."
             )
+        self.depths, self.shape = self._pack_depths()
+        kinds = [frame.kind for frame in sequence.frames]
+        white = (kinds.index(kind) for kind in ("texture", "white") if kind in kinds)
+        self.frames, self.texture = sequence.select(axis), next(white, -1)
+        self._shifts, self.ladder = pack_shifts(self.layout), pack_levels(self.layout)
+        self._lists = spikes.allocate_lists(self.shape)
+
+    def _pack_depths(self) -> tuple[kernels.Depths | StereoRig, tuple[int, int]]:
+        """Return the calibration as the kernels take it, and the size (h, w) of its frames."""
         if isinstance(self.model, PixelwiseModel):
-            self._depths = _pixelwise(self.model, self.axis, self._layout.period_px)
+            depths = _pixelwise(self.model, self.axis, self.layout.period_px)
         elif isinstance(self.model, SplinedModel):
-            self._depths = _splined(self.model, self.axis, self._layout.period_px)
+            depths = _splined(self.model, self.axis, self.layout.period_px)
         else:
             raise InputError(
                 f"A {self.model.name} calibration measures no cloud in one pass: use the pixelwise"
                 " or the splined one."
             )
-        self._texture = texture_frame(self.sequence)
-        self._shifts = pack_shifts(self._layout)
-        self._ladder = pack_levels(self._layout)
-        self._lists = spikes.allocate_lists(self.shape)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(h, w) of the frames that the calibration belongs to."""
-        _, height, width = self._depths.c.shape
-        return height, width
+        _, height, width = depths.c.shape
+        return depths, (height, width)
 
     def light(self, frames: np.ndarray) -> LightLevels:
         """Estimate noise and light levels of frames (n, h, w) from a sample of their pixels; of
         uint16 frames the largest grey level is searched in all of them."""
         self._check(frames)
-        white = white_level(self.sequence, frames, self.sequence.select(self.axis))
-        mean = fringe_mean(self._layout, frames) if self._layout.is_plain else MIDDLE
-        return LightLevels(measure_noise(self._layout, frames, white), mean, white)
+        white = white_level(self.sequence, frames, self.frames)
+        mean = fringe_mean(self.layout, frames) if self.layout.is_plain else MIDDLE
+        return LightLevels(measure_noise(self.layout, frames, white), mean, white)
 
     def run(
         self, frames: np.ndarray, light: LightLevels | None = None, out: PassResult | None = None
@@ -145,34 +141,30 @@ class OnePass:
             self.shape[0],
             read_only(frames),
             self._shifts,
-            self._ladder,
-            code_rules(self._layout, scan.light.mean),
-            grey_scale(self._layout, scan.light.noise, scan.light.white),
-            self._depths,
-            _collect_maps(scan),
-            self._texture,
-            np.array(self.sequence.select(self.axis)),
+            self.ladder,
+            code_rules(self.layout, scan.light.mean),
+            grey_scale(self.layout, scan.light.noise, scan.light.white),
+            self.depths,
+            scan.maps,
+            self.texture,
+            np.array(self.frames),
             peaks,
             multiple=kernels.ROWS,
         )
         # a camera may turn out to have more bits than it seemed
-        if (
-            deep
-            and clip_level(frames.dtype, int(peaks.max()), self.sequence.full_scale)
-            > scan.light.white
-        ):
+        if deep and self._clips_higher(scan, int(peaks.max())):
             return self.sweep(frames, self.light(frames), scan)
         return scan
 
     def repair_spikes(self, scan: PassResult) -> None:
         """The second pass, over few pixels: spikes of one period are moved, lonely and outside
         pixels masked."""
-        rules, maps = spikes.spike_rules(self._layout), _collect_maps(scan)
+        rules, maps = spikes.spike_rules(self.layout), scan.maps
         columns, words, counts = self._lists
         if rules.is_plain:
             spikes.list_changes(scan.phase, rules, False, columns, words, counts)
             spikes.move_phases(columns, words, counts, scan.phase)
-            kernels.measure_moved(columns, words, counts, self._depths, maps)
+            kernels.measure_moved(columns, words, counts, self.depths, maps)
         spikes.list_changes(scan.phase, rules, True, columns, words, counts)
         spikes.mask_phases(columns, words, counts, scan.phase, scan.reason)
         kernels.mask_points(columns, counts, maps)
@@ -181,17 +173,11 @@ class OnePass:
         """Raise InputError unless the frames (n, h, w) fit the sequence and the calibrated
         resolution."""
         check_stack(self.sequence, frames)
-        if frames.shape[1:] != self.shape:
-            height, width = self.shape
-            raise InputError(
-                f"Frames of {frames.shape[2]}x{frames.shape[1]} px were given, and the camera was"
-                f" calibrated at {width}x{height}: use captures of the same camera, at the same"
-                " resolution and without cropping."
-            )
+        check_map(self.shape[::-1], frames[0], "grey levels")
 
-    def _empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """Return an uninitialised array."""
-        return np.empty(shape, dtype)
+    def _clips_higher(self, scan: PassResult, peak: int) -> bool:
+        """Whether a largest grey level shows that the camera clips above the light's white."""
+        return clip_level(scan.texture.dtype, peak, self.sequence.full_scale) > scan.light.white
 
     def _begun(
         self, frames: np.ndarray, light: LightLevels | None, out: PassResult | None
@@ -211,12 +197,12 @@ class OnePass:
     def _allocate(self, dtype: np.dtype, light: LightLevels) -> PassResult:
         """Return a result with uninitialised arrays of the camera's size, the texture of
         ``dtype``."""
-        phase, sigma_z, modulation = (self._empty(self.shape, np.float32) for _ in range(3))
-        points, reason = (
-            self._empty((*self.shape, 3), np.float32),
-            self._empty(self.shape, np.uint8),
+        single = np.float32
+        points = cuda_device.allocate_frames((*self.shape, 3), single)
+        phase, reason, sigma_z, modulation, texture = (
+            cuda_device.allocate_frames(self.shape, kind)
+            for kind in (single, np.uint8, single, single, dtype)
         )
-        texture = self._empty(self.shape, dtype)
         return PassResult(
             self.axis, self.model.name, points, phase, reason, sigma_z, modulation, texture, light
         )
@@ -235,19 +221,6 @@ def one_pass_layout(sequence: PatternSequence, axis: Axis) -> Layout:
     else:
         return layout
     raise InputError(f"{what} is not measured in one pass: decode and reconstruct it")
-
-
-def _collect_maps(scan: PassResult) -> kernels.Maps:
-    """Return the arrays of a result as the compiled kernels take them."""
-    return kernels.Maps(
-        scan.phase, scan.reason, scan.modulation, scan.points, scan.sigma_z, scan.texture
-    )
-
-
-def texture_frame(sequence: PatternSequence) -> int:
-    """The frame that shows the scene under white light, or -1."""
-    kinds = [frame.kind for frame in sequence.frames]
-    return next((kinds.index(kind) for kind in ("texture", "white") if kind in kinds), -1)
 
 
 def _pixelwise(model: PixelwiseModel, axis: Axis, period_px: float) -> kernels.Depths:
@@ -275,14 +248,6 @@ def _splined(model: SplinedModel, axis: Axis, period_px: float) -> kernels.Depth
     fast = model.fast_axis(axis)
     c = np.concatenate([fast.coefficients, model.single_rays])
     per_mm = (fast.supported_grid.shape[2] - 1) / (fast.far - fast.near)
-    bounds = np.empty((2, 0, 0), np.float32)
-    return kernels.Depths(
-        c,
-        period_px / (2 * np.pi),
-        fast.centre,
-        bounds,
-        fast.supported_grid,
-        fast.step,
-        fast.near,
-        per_mm,
-    )
+    bounds, gain = np.empty((2, 0, 0), np.float32), period_px / (2 * np.pi)
+    grid = fast.supported_grid
+    return kernels.Depths(c, gain, fast.centre, bounds, grid, fast.step, fast.near, per_mm)

@@ -1,151 +1,147 @@
-"""What lies on a CUDA device for one pass: coefficients, frames, maps and kernels. Imported only
-where there is one."""
+"""What lies on a CUDA device for one pass: coefficients, frames, maps and kernels, a twin of
+`onepass_kernels` and of `fringe.kernels`. Imported only where there is a device.
 
-from collections.abc import Callable, Iterator
+A kernel is compiled for one sequence, so that loops over steps and bits have a known length and are
+unrolled, and for one way to measure depth, with one thread a pixel. Everything is float32 but the
+sums that `fringe.kernels_levels` takes in float64, and the absolute phase.
+"""
+
+import math
+from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numba import cuda
 
-from slviewer.fringe import limits
-from slviewer.fringe.kernels_spikes import spike_rules
+from slviewer.fringe import kernels_spikes, limits
+from slviewer.fringe.kernels import (
+    DARK,
+    ENDLESS,
+    HALF,
+    INCONSISTENT,
+    NAN,
+    ONE,
+    PER_TURN,
+    QUARTER,
+    SATURATED,
+    THREE_QUARTERS,
+    VALID,
+    ZERO,
+)
+from slviewer.fringe.kernels_coded import EDGE, FAR_EDGE, UNDECIDED, WEAK, WEAKER
+from slviewer.fringe.kernels_spikes import INVALID, TURN, UNCHANGED, UP, SpikeRules, spike_rules
+from slviewer.fringe.layout import Layout
 from slviewer.fringe.reference import dark_sigmas
 from slviewer.geometry.cuda_device import device_function
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import MARGIN, ray_depth
-from slviewer.reconstruction.onepass import LightLevels, PassResult, PassTask
-from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
-from slviewer.reconstruction.onepass_cuda_sweep import frame_slots, sweep_kernel
-from slviewer.reconstruction.pixel_depths import INVALID, pixelwise_point, splined_point
+from slviewer.reconstruction.onepass import LightLevels, OnePass, PassResult
+from slviewer.reconstruction.onepass_kernels import Maps
+from slviewer.reconstruction.pixel_depths import pixelwise_point, splined_point
+
+# its own annotations are not those of what a kernel may call
+cuda: Any = import_module("numba.cuda")
 
 THREADS = 256
 """Of a block: eight warps, which leave every scheduler of a multiprocessor with work, whatever
 registers they need."""
+TWO_PI = 2 * math.pi
+NOISE_A, NOISE_B, DARK_LEVELS, DARK_SIGMAS, WHITE, MEAN = range(6)
+"""What a light is, float32: see `fringe.kernels.Scale`, and `threshold` for the mean."""
 
 
 class Card:
-    """Buffers and kernels on the CUDA device for one job and one dtype of frames, uint8 or uint16.
+    """Buffers and kernels on the CUDA device for one pass and one dtype of frames, uint8 or uint16.
 
     All that it does is queued in ``stream``; only `fetch` waits. Errors are those of numba's CUDA.
     """
 
-    def __init__(self, job: PassTask, dtype: np.dtype) -> None:
-        layout, deep = job.layout, dtype == np.uint16
+    def __init__(self, job: OnePass, dtype: np.dtype) -> None:
         pixels = job.shape[0] * job.shape[1]
-        self.dtype, self._dark_sigmas = dtype, dark_sigmas(layout)
-        slots = frame_slots(layout)
-        slots += [i for i in job.frames if i not in slots] if deep else []
+        self.dtype, self._deep, self._shaded = dtype, dtype == np.uint16, job.texture < 0
+        self._dark_sigmas, self._rules = dark_sigmas(job.layout), spike_rules(job.layout)
+        slots = frame_slots(job.layout)
+        slots += [i for i in job.frames if i not in slots] if self._deep else []
         measure, c, extra = _depths(job)
-        rules = spike_rules(layout)
-        self._is_plain, self._shaded = rules.is_plain, job.is_shaded
-        self._sweep = sweep_kernel(job, len(slots), measure, deep)
-        self._spikes = spike_kernels(rules, job.shape, measure)
+        self._sweep = sweep_kernel(job, len(slots), measure, self._deep)
+        self._spikes = spike_kernels(self._rules, job.shape, measure)
 
         self.stream = cuda.stream()
         self._grid = -(-pixels // THREADS), THREADS, self.stream
         self._c = cuda.to_device(np.ascontiguousarray(c.reshape(len(c), pixels)))
         self._extra = cuda.to_device(np.ascontiguousarray(extra))
         self._frames = cuda.device_array(len(slots) * pixels, dtype)
-        self._list_runs = [
-            (first, last, self._frames[at * pixels : (at + last - first) * pixels])
-            for at, first, last in _list_runs(slots)
+        # runs of consecutive frames of the capture
+        breaks = np.flatnonzero(np.diff(slots) != 1) + 1
+        self._runs = [
+            (run, self._frames[at * pixels : (at + len(run)) * pixels])
+            for at, run in zip([0, *breaks.tolist()], np.split(slots, breaks), strict=True)
         ]
-        self._phase, self._modulation, self._sigma_z = (
-            cuda.device_array(pixels, np.float32) for _ in range(3)
-        )
-        self._phase_map = self._phase.reshape(job.shape)
-        self._points = cuda.device_array((pixels, 3), np.float32)
-        self._reason, self._words = (cuda.device_array(pixels, np.uint8) for _ in range(2))
-        self._texture = cuda.device_array(pixels if self._shaded else 1, dtype)
-        self._deep, self._none = deep, np.zeros(1, np.int32)
+        phase, modulation, sigma_z = (cuda.device_array(pixels, np.float32) for _ in range(3))
+        reason, self._words = (cuda.device_array(pixels, np.uint8) for _ in range(2))
+        points = cuda.device_array((pixels, 3), np.float32)
+        texture = cuda.device_array(pixels if self._shaded else 1, dtype)
+        self._maps = Maps(phase, reason, modulation, points, sigma_z, texture)
+        self._phase_map = phase.reshape(job.shape)
+        self._none = np.zeros(1, np.int32)
         self._highest = cuda.to_device(self._none)
 
     @property
     def bytes_moved(self) -> int:
         """Bytes that the first pass reads and writes in the device's memory, each number once."""
-        read = self._frames, self._c, self._extra
-        written = (
-            self._phase,
-            self._modulation,
-            self._sigma_z,
-            self._points,
-            self._reason,
-            self._texture,
-        )
-        return sum(array.size * array.dtype.itemsize for array in (*read, *written))
+        arrays = self._frames, self._c, self._extra, *self._maps
+        return sum(array.size * array.dtype.itemsize for array in arrays)
 
     def load(self, frames: np.ndarray) -> None:
         """Copy the frames (n, h, w) that are read, each once."""
-        for first, last, room in self._list_runs:
-            room.copy_to_device(frames[first:last].reshape(-1), stream=self.stream)
+        for run, room in self._runs:
+            room.copy_to_device(frames[run[0] : run[-1] + 1].reshape(-1), stream=self.stream)
 
     def sweep(self, light: LightLevels) -> None:
         """Run the first pass over the loaded frames."""
         if self._deep:
             self._highest.copy_to_device(self._none, stream=self.stream)
-        numbers = (
-            *light.noise,
-            limits.DARK_LEVELS * light.white / 255,
-            self._dark_sigmas,
-            light.white,
-            light.mean,
-        )
+        dark = limits.DARK_LEVELS * light.white / 255
+        numbers = *light.noise, dark, self._dark_sigmas, light.white, light.mean
+        lights = tuple(map(np.float32, numbers))
         self._sweep[self._grid](
-            self._frames, tuple(np.float32(number) for number in numbers), self._c, self._extra,
-            self._phase,
-            self._reason, self._modulation, self._points, self._sigma_z, self._texture,
-            self._highest,
-        )  # fmt: skip
+            self._frames, lights, self._c, self._extra, *self._maps, self._highest
+        )
 
     def repair_spikes(self) -> None:
         """Run the second pass on the device: see `OnePass.repair_spikes`."""
         list_moves, move, list_masked, mask = self._spikes
-        if self._is_plain:
+        phase, reason, _, points, sigma_z, _ = self._maps
+        if self._rules.is_plain:
             list_moves[self._grid](self._phase_map, self._words)
-            move[self._grid](
-                self._words, self._c, self._extra, self._phase, self._points, self._sigma_z
-            )
+            move[self._grid](self._words, self._c, self._extra, phase, points, sigma_z)
         list_masked[self._grid](self._phase_map, self._words)
-        mask[self._grid](self._words, self._phase, self._reason, self._points, self._sigma_z)
+        mask[self._grid](self._words, phase, reason, points, sigma_z)
 
     def fetch(self, scan: PassResult) -> int:
         """Copy the maps into a scan's arrays, the texture only where it is computed from fringes;
         returns the largest grey level, 0 for uint8 frames."""
-        pairs = [
-            (self._points, scan.points),
-            (self._phase, scan.phase),
-            (self._reason, scan.reason),
-            (self._sigma_z, scan.sigma_z),
-            (self._modulation, scan.modulation),
-            (self._highest, highest := np.zeros(1, np.int32)),
-        ]
-        if self._shaded:
-            pairs.append((self._texture, scan.texture))
+        highest = np.zeros(1, np.int32)
+        pairs = [*zip(self._maps, scan.maps, strict=True), (self._highest, highest)]
         for there, here in pairs:
-            there.copy_to_host(here.reshape(there.shape), stream=self.stream)
+            if self._shaded or here is not scan.texture:
+                there.copy_to_host(here.reshape(there.shape), stream=self.stream)
         self.stream.synchronize()
         return int(highest[0])
 
 
-def _depths(job: PassTask) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
+def _depths(job: OnePass) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
     """Return the device function (pixel, phase, c, extra) that measures a pixel like
     `pixel_depths`, and two arrays: ``c`` (m, h, w) of the camera's pixels, and ``extra``. The pixel
     is a uint64, so that indices are not tested for their sign."""
     width, d = job.shape[1], job.depths
     if isinstance(d, StereoRig):
         extra = np.zeros((6, 10))
-        for row, numbers in zip(
-            extra, (*d.R, d.t, d.projector.parameters, d.projector.size), strict=True
-        ):
-            row[: len(numbers)] = numbers
-        return (
-            _compile_stereo(0 if job.axis == "x" else 1, job.layout.period_px),
-            np.moveaxis(d.camera.rays(), 2, 0),
-            extra,
-        )
-    gain, centre, near, per_mm = (
-        np.float32(number) for number in (d.gain, d.centre, d.near, d.per_mm)
-    )
+        extra[:3, :3], extra[3, :3] = d.R, d.t
+        extra[4], extra[5, :2] = d.projector.parameters, d.projector.size
+        measure = _compile_stereo(0 if job.axis == "x" else 1, job.layout.period_px)
+        return measure, np.moveaxis(d.camera.rays(), 2, 0), extra
+    gain, centre, near, per_mm = map(np.float32, (d.gain, d.centre, d.near, d.per_mm))
     if d.grid.size:
         splined, step = device_function(splined_point), d.step
 
@@ -193,11 +189,296 @@ def _compile_stereo(row: int, period_px: float) -> Callable[..., Any]:
     return measure
 
 
-def _list_runs(slots: list[int]) -> Iterator[tuple[int, int, int]]:
-    """Return (slot, first frame, frame after the last) of each run of consecutive frames of the
-    capture."""
-    at = 0
-    for k in range(1, len(slots) + 1):
-        if k == len(slots) or slots[k] != slots[k - 1] + 1:
-            yield at, slots[at], slots[k - 1] + 1
-            at = k
+def spike_kernels(
+    rules: SpikeRules, shape: tuple[int, int], measure: Callable[..., Any]
+) -> tuple[Any, ...]:
+    """Kernels (list what is to be moved by a period, move it, list what is to be masked, mask it).
+
+    Those that list take the phase (h, w) and fill ``words`` (n,) uint8; the others take maps
+    flattened. ``measure`` is one of `_depths`. What changes is listed before the first pixel is
+    changed, because each one's neighbours vote with the phase that they had.
+    """
+    height, width = shape
+    per_cell = np.float32(1 / rules.cell_rad)
+    is_suspect = device_function(kernels_spikes.is_suspect)
+    period_change = device_function(kernels_spikes.period_change)
+    masking_reason = device_function(kernels_spikes.masking_reason)
+
+    @cuda.jit(device=True)
+    def find_move(phase, row, x):
+        """Return whether the phase of a pixel moves up or down a period, if it is suspect."""
+        if is_suspect(phase, row, x, per_cell):
+            return period_change(phase, row, x, rules)
+        return UNCHANGED
+
+    @cuda.jit(device=True)
+    def find_mask(phase, row, x):
+        """Return the reason to mask a pixel, or UNCHANGED."""
+        return masking_reason(phase, row, x, is_suspect(phase, row, x, per_cell), rules)
+
+    def compile_list(find: Callable[..., Any]) -> Any:
+        """Compile the kernel that writes to ``words`` (h w,) what is found for each pixel."""
+
+        @cuda.jit
+        def list_changes(phase, words):
+            """Kernel: write one pixel's word."""
+            i = cuda.grid(1)
+            if i < height * width:
+                row = i // width
+                x = i - row * width
+                words[i] = UNCHANGED
+                if phase[row, x] == phase[row, x]:  # False for NaN
+                    words[i] = find(phase, row, x)
+
+        return list_changes
+
+    @cuda.jit
+    def move(words, c, extra, phase, points, sigma_z):
+        """Kernel: move the phases listed in ``words`` by one period, and update their points and
+        sigma_z."""
+        i = cuda.grid(1)
+        if i >= height * width or words[i] == UNCHANGED:
+            return
+        before, at = phase[i], np.uint64(i)
+        after = before + (TURN if words[i] == UP else -TURN)
+        _, _, _, old_slope = measure(at, before, c, extra)
+        x, y, z, slope = measure(at, after, c, extra)
+        phase[i] = after
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
+        sigma_z[i] = sigma_z[i] * (slope / old_slope)
+
+    @cuda.jit
+    def mask(words, phase, reason, points, sigma_z):
+        """Kernel: mask the pixels listed in ``words``: store the reason, set phase, point and
+        sigma_z to NaN."""
+        i = cuda.grid(1)
+        if i >= height * width or words[i] == UNCHANGED:
+            return
+        phase[i], reason[i] = INVALID, words[i]
+        points[i, 0] = points[i, 1] = points[i, 2] = sigma_z[i] = INVALID
+
+    return compile_list(find_move), move, compile_list(find_mask), mask
+
+
+def frame_slots(layout: Layout) -> list[int]:
+    """The frames that are decoded, in the order in which the kernel reads them: phase steps,
+    longest period first; Gray bits; their inverses; the complementary bit."""
+    steps = [i for shift in layout.shifts for i in shift.indices]
+    last = [] if layout.complementary is None else [layout.complementary]
+    return [*steps, *layout.gray, *layout.inverse, *last]
+
+
+def sweep_kernel(job: OnePass, slots: int, measure: Callable[..., Any], deep: bool) -> Any:
+    """The kernel for one pass and one of the ways of `_depths` to measure depth.
+
+    ``slots``: frames on the device, those of `frame_slots` first. ``deep``: the largest grey level
+    of all is needed, as of uint16 frames. It takes frames of n pixels, (slots n,), the light, the
+    two arrays of ``measure`` and what it writes: maps (n,), points (n, 3), and the largest grey
+    level (1,) int32.
+    """
+    pixels, shaded = job.shape[0] * job.shape[1], job.texture < 0
+    decode = _compile_coded(job.layout, pixels) if job.layout.gray else _compile_levels(job, pixels)
+    per_step = np.float32(2.0 / job.layout.steps)
+    least, stride = np.float32(1e-6), np.uint64(pixels)
+
+    @cuda.jit
+    def sweep(stack, light, c, extra, phase, reason, modulation, points, sigma_z, texture, highest):
+        """Kernel: decode one pixel per thread, measure its point, and fill all maps."""
+        i = np.uint64(cuda.grid(1))  # signed indices would be tested for counting from the end
+        if i >= stride:
+            return
+        absolute, why, B, A = decode(stack, i, light)
+        if deep:
+            brightest = np.int32(0)
+            at = i
+            for _ in range(slots):
+                brightest = max(brightest, np.int32(stack[at]))
+                at = at + stride
+            if brightest > highest[0]:  # perhaps an old value; the next line settles it
+                cuda.atomic.max(highest, 0, brightest)
+        x, y, z, sigma = NAN, NAN, NAN, NAN
+        if why == VALID:
+            x, y, z, slope = measure(i, absolute, c, extra)
+            variance = light[NOISE_A] + light[NOISE_B] * A
+            sigma = slope * (np.float32(math.sqrt(variance * per_step)) / max(B, least))
+        phase[i] = absolute
+        reason[i] = why
+        modulation[i] = B
+        points[i, 0] = x
+        points[i, 1] = y
+        points[i, 2] = z
+        sigma_z[i] = sigma
+        if shaded:
+            texture[i] = np.int32(A + HALF)
+
+    return sweep
+
+
+def _count_steps(layout: Layout) -> list[int]:
+    """Return the number of phase steps of each period."""
+    return [len(shift.indices) for shift in layout.shifts]
+
+
+def _compile_shift(layout: Layout, pixels: int) -> Any:
+    """Compile the device function that returns wrapped phase, modulation, background and largest
+    sample of one period's frames."""
+    angles = np.concatenate([TWO_PI * layout.sign * np.arange(n) / n for n in _count_steps(layout)])
+    cosines, sines = (f(angles + layout.offset_rad).astype(np.float32) for f in (np.cos, np.sin))
+    stride = np.uint64(pixels)
+
+    @cuda.jit(device=True)
+    def shift(stack, i, first, last):
+        """Return (wrapped phase, modulation, background, largest sample) of pixel ``i`` from frames
+        ``first`` to ``last``, the last one excluded."""
+        cosine_of, sine_of = cuda.const.array_like(cosines), cuda.const.array_like(sines)
+        at = i + np.uint64(first) * stride
+        base = np.float32(stack[at])
+        cosine, sine, total, peak = ZERO, ZERO, ZERO, base
+        for k in range(first + 1, last):
+            at = at + stride
+            value = np.float32(stack[at])
+            peak = max(peak, value)
+            value = value - base
+            cosine = cosine + cosine_of[k] * value
+            sine = sine + sine_of[k] * value
+            total = total + value
+        steps = np.float32(last - first)
+        wrapped = np.float32(math.atan2(ZERO - sine, cosine))
+        length = np.float32(math.sqrt(cosine * cosine + sine * sine))
+        return wrapped, length * (np.float32(2) / steps), base + total * (ONE / steps), peak
+
+    return shift
+
+
+@cuda.jit(device=True)
+def _verdict(B, A, clipped, inconsistent, light):
+    """Return the reason to mask a pixel, the first that applies: saturated, dark, inconsistent;
+    VALID without one."""
+    sigma = np.float32(math.sqrt(light[NOISE_A] + light[NOISE_B] * A))
+    if clipped:
+        return SATURATED
+    if max(light[DARK_LEVELS], light[DARK_SIGMAS] * sigma) > B:
+        return DARK
+    return INCONSISTENT if inconsistent else VALID
+
+
+def _compile_coded(layout: Layout, pixels: int) -> Any:
+    """Compile the device function that decodes a pixel by Gray code: (absolute phase, reason,
+    modulation, background)."""
+    shift = _compile_shift(layout, pixels)
+    steps, bits = layout.steps, len(layout.gray)
+    inverses, complementary = bool(layout.inverse), not layout.is_plain
+    stride, code_from, inverse_from = map(np.uint64, (pixels, steps, steps + bits))
+    extra_at = np.uint64(steps + bits + len(layout.inverse))
+    origin = np.float32(layout.gray_origin_px / layout.period_px)
+
+    @cuda.jit(device=True)
+    def height_of(stack, i, bit, threshold):
+        """Return the signed grey level of a Gray code bit: half the difference to its inverse
+        frame, or the level above the threshold."""
+        slot = np.uint64(bit)
+        value = np.float32(stack[(code_from + slot) * stride + i])
+        if inverses:
+            return (value - np.float32(stack[(inverse_from + slot) * stride + i])) * HALF
+        return value - threshold
+
+    @cuda.jit(device=True)
+    def misread(stack, i, threshold, top, bottom, code, part, mean):
+        """Return the correction (-1, 0 or 1) of a code whose bit that switches next to the pixel is
+        weak."""
+        contrast = max(top / (ONE - mean), -bottom / mean)
+        middle = (HALF - mean) * contrast
+        zeros, ones = 0, 0
+        while zeros < bits and not (code >> zeros) & 1:
+            zeros += 1
+        while ones < bits and (code >> ones) & 1:
+            ones += 1
+        lower, upper = ENDLESS, ENDLESS
+        if zeros < bits:
+            lower = abs(height_of(stack, i, bits - 1 - zeros, threshold) - middle)
+        if ones < bits:
+            upper = abs(height_of(stack, i, bits - 1 - ones, threshold) - middle)
+        weak = WEAK * contrast
+        if part < HALF:
+            return 1 if upper < weak and upper < WEAKER * lower else 0
+        return -1 if lower < weak and lower < WEAKER * upper else 0
+
+    @cuda.jit(device=True)
+    def decode(stack, i, light):
+        """Return (absolute phase, reason, modulation, background) of pixel ``i``."""
+        psi, B, A, peak = shift(stack, i, 0, steps)
+        code, digit = 0, 0
+        least, top, bottom = ENDLESS, ZERO, ZERO
+        for b in range(bits):
+            height = height_of(stack, i, b, A)
+            digit = digit ^ (1 if height > ZERO else 0)
+            code = 2 * code + digit
+            least = min(least, abs(height))
+            top = max(top, height)
+            bottom = min(bottom, height)
+        turns = psi * PER_TURN - origin
+        whole = np.float32(math.floor(turns))
+        part = turns - whole
+        if complementary:
+            last = np.float32(stack[extra_at * stride + i]) - A
+            half = 2 * code + (digit ^ (1 if last > ZERO else 0))
+            middle = QUARTER <= part < THREE_QUARTERS
+            order = (
+                half >> 1 if middle else ((half + 1) >> 1) - (1 if part >= THREE_QUARTERS else 0)
+            )
+            unclear = (least if middle else abs(last)) < UNDECIDED * B
+        else:
+            beside = part < EDGE or part >= FAR_EDGE
+            order = code
+            unclear = not beside and least < UNDECIDED * B
+            if beside:
+                order = code + misread(stack, i, A, top, bottom, code, part, light[MEAN])
+        clipped = peak >= light[WHITE] and light[WHITE] <= A + B
+        why = _verdict(B, A, clipped, unclear, light)
+        absolute = np.float32(np.float64(psi) + TWO_PI * (np.float64(order) - np.float64(whole)))
+        return absolute if why == VALID else NAN, why, B, A
+
+    return decode
+
+
+def _compile_levels(job: OnePass, pixels: int) -> Any:
+    """Compile the device function that decodes a pixel by several periods: (absolute phase, reason,
+    modulation, background)."""
+    shift, ladder = _compile_shift(job.layout, pixels), job.ladder
+    count, levels = len(job.layout.shifts), len(ladder.periods)
+    starts = np.cumsum([0, *_count_steps(job.layout)]).astype(np.int32)
+    weights, periods = ladder.weights, ladder.periods
+    per_px, per_rad = 1.0 / periods, periods / TWO_PI
+    low, misfit = float(ladder.low), float(ladder.misfit)
+
+    @cuda.jit(device=True)
+    def decode(stack, i, light):
+        """Return (absolute phase, reason, modulation, background) of pixel ``i``."""
+        begin, weight_of = cuda.const.array_like(starts), cuda.const.array_like(weights)
+        period_of = cuda.const.array_like(periods)
+        turns_of, px_of = cuda.const.array_like(per_px), cuda.const.array_like(per_rad)
+        psi = cuda.local.array(count, np.float32)
+        weakest, clipped, A, B = ENDLESS, False, ZERO, ZERO
+        for p in range(count):
+            wrapped, B, A, peak = shift(stack, i, begin[p], begin[p + 1])
+            psi[p] = wrapped
+            weakest = min(weakest, B)
+            clipped = clipped or (peak >= light[WHITE] and light[WHITE] <= A + B)
+        coordinate, order, worst = 0.0, 0.0, 0.0
+        for level in range(levels):
+            own = 0.0
+            for p in range(count):
+                own = own + weight_of[level, p] * np.float64(psi[p])
+            position = own * px_of[level]
+            if level == 0:
+                order = -np.float64(math.floor((position - low) * turns_of[level]))
+            else:
+                turns = (coordinate - position) * turns_of[level]
+                order = np.float64(round(turns))
+                worst = max(worst, abs(turns - order))
+            coordinate = position + order * period_of[level]
+        why = _verdict(weakest, A, clipped, worst > misfit, light)
+        absolute = np.float32(np.float64(psi[count - 1]) + TWO_PI * order)
+        return absolute if why == VALID else NAN, why, B, A
+
+    return decode

@@ -1,21 +1,17 @@
-"""From absolute phase and a calibration to an organised cloud."""
-
-from __future__ import annotations
+"""From absolute phase and a calibration to an organised cloud, and to the triangles of its grid."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numba
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.fringe.phase import PhaseMap
+from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
+from slviewer.geometry.vectors import finite_rows
 from slviewer.reconstruction.cloud import Cloud
-
-if TYPE_CHECKING:
-    from slviewer.fringe.phase import PhaseMap
-
-Axis = Literal["x", "y"]
 
 EDGE_SIGMAS = 10.0
 """Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel;
@@ -46,16 +42,11 @@ class Model(Protocol):
 
 
 @runtime_checkable
-class Scattered(Protocol):
-    """A calibration that knows the scatter of phases beyond their predicted noise."""
+class KnowsErrors(Protocol):
+    """A calibration that knows its own uncertainty."""
 
     def excess_px(self, axis: Axis) -> float:
         """Scatter of the phase beyond its predicted noise, in projector px (1 sigma)."""
-
-
-@runtime_checkable
-class HasCalibrationSigma(Protocol):
-    """A calibration that knows its own uncertainty."""
 
     def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
         """(h, w) float32 mm: standard deviation of the depth of organised points due to the
@@ -88,13 +79,18 @@ def reconstruct_cloud(
                 f"The {model.name} calibration has no axis {axis}, only {_join_axes(model.axes)}: "
                 f"choose one of these, or calibrate with captures of axis {axis}."
             )
-        points, sigma_z, edges = _measure(model, phases[axis])
-    else:
-        measured = _measure_all(model, phases)
-        axis = _select_axis(measured)
-        points, sigma_z, edges = measured[axis]
+    axes = [shared for shared in model.axes if shared in phases] if axis is None else [axis]
+    if not axes:
+        raise InputError(
+            f"The capture holds axis {_join_axes(phases)} and the {model.name} calibration"
+            f" {_join_axes(model.axes)}: capture along an axis that is calibrated, or calibrate"
+            " with the captured one."
+        )
+    measured = {each: _measure(model, phases[each]) for each in axes}
+    axis = _select_axis(measured)
+    points, sigma_z, edges = measured[axis]
     sigma_calibration = (
-        model.sigma_calibration(axis, points) if isinstance(model, HasCalibrationSigma) else None
+        model.sigma_calibration(axis, points) if isinstance(model, KnowsErrors) else None
     )
     return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
 
@@ -108,11 +104,6 @@ def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
     neighbours alone would show little but their noise. Neighbours across a depth jump are excluded.
     """
     points = np.ascontiguousarray(points, dtype=np.float32)
-    if points.ndim != 3 or points.shape[2] != 3:
-        raise InputError(
-            f"Points of shape {points.shape} were given: normals need an organised cloud, (h,"
-            " w, 3)."
-        )
     out = np.empty_like(points)
     _normals(points, reach, out)
     return out
@@ -133,7 +124,7 @@ def _measure(model: Model, phase: PhaseMap) -> Measured:
     sigma = model.sigma_z(phase, points)
     noise_px = np.maximum(phase.sigma_px, np.float32(1e-9))
     per_px = sigma / noise_px
-    excess = model.excess_px(phase.axis) if isinstance(model, Scattered) else 0.0
+    excess = model.excess_px(phase.axis) if isinstance(model, KnowsErrors) else 0.0
     if excess > 0.0:
         noise_px = np.hypot(noise_px, np.float32(excess))
         sigma = per_px * noise_px
@@ -142,18 +133,6 @@ def _measure(model: Model, phase: PhaseMap) -> Measured:
     spoilt = remaining_px > EDGE_SIGMAS * noise_px
     points[spoilt], sigma[spoilt] = np.nan, np.nan
     return points, sigma, per_px * remaining_px
-
-
-def _measure_all(model: Model, phases: Mapping[Axis, PhaseMap]) -> dict[Axis, Measured]:
-    """Measure points and sigmas along each axis that both the capture and the calibration have."""
-    shared = [axis for axis in model.axes if axis in phases]
-    if not shared:
-        raise InputError(
-            f"The capture holds axis {_join_axes(phases)} and the {model.name} calibration"
-            f" {_join_axes(model.axes)}: capture along an axis that is calibrated, or calibrate"
-            " with the captured one."
-        )
-    return {axis: _measure(model, phases[axis]) for axis in shared}
 
 
 def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
@@ -220,3 +199,37 @@ def _normals(points, reach, out):
             if n0 * points[y, x, 0] + n1 * points[y, x, 1] + n2 * z > 0.0:
                 length = -length
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = n0 / length, n1 / length, n2 / length
+
+
+def triangulate_grid(points: np.ndarray, max_jump: float | None = None) -> np.ndarray:
+    """Faces (m, 3) int32 of an organised cloud (h, w, 3) mm, numbering its valid points row by row.
+
+    (The vertices are ``points[np.isfinite(points).all(axis=-1)]``.) Each square of four
+    neighbouring pixels gives two triangles, cut along the diagonal with the smaller step in depth,
+    or one where only three are valid. Triangles whose depths differ by more than ``max_jump`` mm,
+    by default ``JUMP`` of the median depth, are excluded: there the surface ends. Faces turn
+    counter-clockwise as the camera sees them from outside: their normals point towards it.
+    """
+    valid = finite_rows(points)
+    index = np.cumsum(valid, dtype=np.int32).reshape(valid.shape) - 1
+    z = np.where(valid, points[..., 2], np.nan)
+    if max_jump is None:
+        max_jump = JUMP * float(np.median(z[valid])) if valid.any() else 0.0
+    corners = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
+    z00, z01, z10, z11 = (z[corner] for corner in corners)
+    falling, rising = np.abs(z00 - z11), np.abs(z01 - z10)
+    # a diagonal with an invalid end has a NaN step: the other one is cut along
+    along_rising = np.isfinite(rising) & ~(falling < rising)
+    along_falling = np.isfinite(falling) & ~along_rising
+    faces = []
+    for chosen, a, b, c in (
+        (along_rising, 0, 2, 1),
+        (along_rising, 1, 2, 3),
+        (along_falling, 0, 2, 3),
+        (along_falling, 0, 3, 1),
+    ):
+        triangle = [corners[k] for k in (a, b, c)]
+        spread = np.ptp([z[corner] for corner in triangle], axis=0)
+        selected = chosen & (spread <= max_jump)  # False where a corner is NaN
+        faces.append(np.stack([index[corner][selected] for corner in triangle], axis=1))
+    return np.concatenate(faces)

@@ -8,7 +8,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.triangulation import points_from_depth
+from slviewer.geometry.triangulation import check_map, points_from_depth
 
 SAMPLE = 4000
 """Pixels for which the largest unique depth range is computed; neighbours differ little."""
@@ -24,7 +24,6 @@ class Resolved:
     """
 
     phase: PhaseMap
-    depth_range_mm: tuple[float, float]
     outside: float
     spacing_mm: float
 
@@ -44,15 +43,10 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
         )
     reach = phase.unambiguous_px
     rays = rig.camera.rays()
-    if phase.phase.shape != rays.shape[:2]:
-        height, width = phase.phase.shape
-        raise InputError(
-            f"the capture has {width}x{height} px and the camera was calibrated at"
-            f" {rays.shape[1]}x{rays.shape[0]}: use captures of the same camera, at the same"
-            " resolution and without cropping"
-        )
+    check_map(rig.camera.size, phase.phase, "phases")
     low, high = _coordinate_range(rig, rays, near, far, phase.axis)
-    longest = float(np.nanmax(np.where(phase.mask, high - low, np.nan), initial=0.0))
+    stretch = (high - low)[phase.mask]
+    longest = float(np.nanmax(stretch, initial=0.0))
     if longest >= reach:
         limit = _unique_far(rig, rays[phase.mask], near, far, phase.axis, reach)
         narrower = f", such as {near:.0f} to {limit:.0f} mm" if limit - near >= 1 else ""
@@ -62,16 +56,14 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
             f" {int(longest // reach) + 1} depths fit. State a narrower depth range{narrower}, or"
             " capture with Gray code or a longer period"
         )
-    with np.errstate(invalid="ignore"):
-        coordinate = phase.coordinate.astype(np.float64)
-        order = np.ceil((low - coordinate) / reach)
-        inside = phase.mask & (coordinate + order * reach <= high)
-        absolute = phase.phase + np.float32(2 * np.pi / phase.period_px) * (order * reach).astype(
-            np.float32
-        )
+    coordinate = phase.coordinate.astype(np.float64)
+    order = np.ceil((low - coordinate) / reach)
+    inside = phase.mask & (coordinate + order * reach <= high)
+    turns = (order * reach).astype(np.float32)
+    absolute = phase.phase + np.float32(2 * np.pi / phase.period_px) * turns
     reason = np.where(phase.mask & ~inside, np.uint8(Reason.OUTSIDE), phase.reason)
-    outside = float(np.mean(~inside[phase.mask])) if phase.mask.any() else 0.0
-    stretch = float(np.nanmedian((high - low)[phase.mask])) if phase.mask.any() else np.nan
+    outside = float(np.mean(~inside[phase.mask])) if stretch.size else 0.0
+    usual = float(np.nanmedian(stretch)) if stretch.size else np.nan
     return Resolved(
         replace(
             phase,
@@ -79,9 +71,8 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
             reason=reason,
             unambiguous_px=float(np.inf),
         ),
-        depth_range_mm,
         outside,
-        (far - near) * reach / stretch if stretch > 0 else np.inf,
+        (far - near) * reach / usual if usual > 0 else np.inf,
     )
 
 

@@ -1,9 +1,10 @@
-"""Pose graph: scans are nodes, registered pairs are edges; initial poses, loop gaps, and
-optimisation."""
+"""Pose graph: scans are nodes, registered pairs are edges; initial poses, loop gaps, selection of
+the edges that agree with one another, and optimisation."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -11,13 +12,19 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
-from slviewer.geometry.rigid import move_points, rigid_transform
-from slviewer.registration.uncertainty import Uncertainty
+from slviewer.geometry.rigid import Uncertainty, move_points, rigid_transform
+from slviewer.registration.refusal import Refused
 
 _FLOOR_MM, _FLOOR_DEG = 0.003, 0.002
 """Least standard deviation of an edge, however many points it has."""
 _LEVER_MM = 100.0
 """Length that converts angles to mm, so that all unknowns are of one scale."""
+_TREES = 200
+_RIM_MM = 50.0
+_GAP_SIGMAS = 8.0
+_GAP_GATES = 0.5
+"""A loop is inconsistent where its gap exceeds both 8 times the expected gap and half the
+registration's gate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +33,7 @@ class Edge:
     ``onto``.
 
     ``covariance`` (6, 6): of a small rotation (rad) about ``centre`` (3,) mm and a translation
-    (mm), in that frame.
+    (mm), in that frame. ``gate_mm``: of the registration.
     """
 
     scan: int
@@ -34,6 +41,7 @@ class Edge:
     T: np.ndarray
     covariance: np.ndarray
     centre: np.ndarray
+    gate_mm: float = 1.0
 
     @property
     def variance(self) -> float:
@@ -42,14 +50,11 @@ class Edge:
         return float(total + _FLOOR_MM**2 + (_LEVER_MM * np.radians(_FLOOR_DEG)) ** 2)
 
 
-@dataclass(frozen=True)
-class LoopGap:
-    """The gap of a loop: translation at the middle of the overlap, rotation, and the expected
-    translation."""
+class LoopGap(NamedTuple):
+    """The gap of a loop: translation at the middle of the overlap, and rotation."""
 
     shift_mm: float
     turn_deg: float
-    expected_mm: float
 
 
 def spanning_poses(
@@ -65,35 +70,24 @@ def spanning_poses(
     poses = np.full((nodes, 4, 4), np.nan)
     poses[root] = np.eye(4)
     tree = [-1] * nodes
-    if not edges:
-        return poses, tree
-    best: dict[tuple[int, int], int] = {}
-    for k, edge in enumerate(edges):
-        key = min(edge.scan, edge.onto), max(edge.scan, edge.onto)
-        if key not in best or costs[k] < costs[best[key]]:
-            best[key] = k
-    chosen = list(best.values())
-    ends = np.array([(edges[k].scan, edges[k].onto) for k in chosen])
-    graph = coo_matrix((costs[chosen], (ends[:, 0], ends[:, 1])), shape=(nodes, nodes)).tocsr()
+    ends = np.array([(edge.scan, edge.onto) for edge in edges], int).reshape(-1, 2)
+    index = {frozenset(pair): k for k, pair in enumerate(ends.tolist())}
+    graph = coo_matrix((costs, tuple(ends.T)), shape=(nodes, nodes)).tocsr()
     distance, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
     for node in np.argsort(distance):
         if node == root or not np.isfinite(distance[node]):
             continue
         child, parent = int(node), int(before[node])
-        k = best[min(child, parent), max(child, parent)]
+        k = index[frozenset((child, parent))]
         step = edges[k].T if edges[k].scan == child else np.linalg.inv(edges[k].T)
         poses[child], tree[child] = poses[parent] @ step, k
     return poses, tree
 
 
-def loop_gap(edge: Edge, poses: np.ndarray, expected_mm: float = float("nan")) -> LoopGap:
+def loop_gap(edge: Edge, poses: np.ndarray) -> LoopGap:
     """Return the gap between an edge and the relative pose of its nodes by ``poses`` (n, 4, 4)."""
-    residual = edge_residuals([edge], poses)[0]
-    return LoopGap(
-        float(np.linalg.norm(residual[3:])),
-        float(np.degrees(np.linalg.norm(residual[:3]))),
-        expected_mm,
-    )
+    turn, shift = np.linalg.norm(edge_residuals([edge], poses).reshape(2, 3), axis=1)
+    return LoopGap(float(shift), float(np.degrees(turn)))
 
 
 def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[int]:
@@ -114,16 +108,79 @@ def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[i
     return first + second[-2::-1]
 
 
-def expected_gap_mm(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> float:
-    """Return the expected gap in mm of the loop that an edge closes, from the variances of its
-    edges."""
+def select_consistent_edges(
+    nodes: int, edges: Sequence[Edge], root: int, is_good_fit: Callable[[Edge, np.ndarray], bool]
+) -> tuple[list[int], dict[int, LoopGap]]:
+    """Select the edges that are consistent with one another and still connect all nodes.
+
+    Returns their indices, and the gap of each edge to drop. Random spanning trees are tried; the
+    right one has the fewest inconsistent edges. Among several such, it is the one at whose poses
+    the scans of its inconsistent edges fit each other, by ``is_good_fit(edge, poses)``. Raises
+    ``Refused`` where that does not decide.
+    """
+    hypotheses = _list_hypotheses(nodes, edges, root)
+    gaps = {
+        dropped: {k: loop_gap(edges[k], poses) for k in dropped}
+        for dropped, poses in hypotheses.items()
+    }
+    fewest = min(map(len, hypotheses))
+    best = [dropped for dropped in hypotheses if len(dropped) == fewest]
+    if len(best) > 1:
+        best = [
+            dropped
+            for dropped in best
+            if all(is_good_fit(edges[k], hypotheses[dropped]) for k in dropped)
+        ]
+    if len(best) != 1:
+        worst = max(gap for each in gaps.values() for gap in each.values())
+        raise Refused(
+            "ambiguous",
+            f"Pairs of scans contradict one another by {worst.shift_mm:.1f} mm and"
+            f" {worst.turn_deg:.1f} degrees, and nothing tells which is wrong: take scans that"
+            " overlap more, pick point pairs, or give the turntable's angle.",
+        )
+    return [k for k in range(len(edges)) if k not in best[0]], gaps[best[0]]
+
+
+def _list_hypotheses(
+    nodes: int, edges: Sequence[Edge], root: int
+) -> dict[frozenset[int], np.ndarray]:
+    """Return the edges that are inconsistent with random spanning trees, with the poses (n, 4, 4)
+    by the first of each.
+
+    Only the empty set where one tree is consistent with all edges.
+    """
+    rng = np.random.default_rng(0)
+    costs = np.array([edge.variance for edge in edges])
+    hypotheses: dict[frozenset[int], np.ndarray] = {}
+    for trial in range(_TREES):
+        drawn = costs if trial == 0 else costs * np.exp(rng.normal(0, 3, len(edges)))
+        poses, tree = spanning_poses(nodes, edges, root, drawn)
+        inconsistent = frozenset(
+            k
+            for k, edge in enumerate(edges)
+            if k not in tree and not _is_consistent(edge, edges, tree, poses)
+        )
+        if not inconsistent:
+            return {inconsistent: poses}
+        hypotheses.setdefault(inconsistent, poses)
+    return hypotheses
+
+
+def _is_consistent(
+    edge: Edge, edges: Sequence[Edge], tree: Sequence[int], poses: np.ndarray
+) -> bool:
+    """Whether the loop that an edge closes with the tree has a plausible gap at the rim of the
+    overlap, for the variances of the loop's edges."""
     pairs = {frozenset(pair) for pair in pairwise(loop_nodes(edge, edges, tree))}
-    variances = [
+    variance = edge.variance + sum(
         edges[k].variance
         for k in tree
         if k >= 0 and frozenset((edges[k].scan, edges[k].onto)) in pairs
-    ]
-    return float(np.sqrt(sum(variances) + edge.variance))
+    )
+    gap = loop_gap(edge, poses)
+    at_rim = gap.shift_mm + np.radians(gap.turn_deg) * _RIM_MM
+    return bool(at_rim <= max(_GAP_SIGMAS * np.sqrt(variance), _GAP_GATES * edge.gate_mm))
 
 
 def optimise_poses(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:

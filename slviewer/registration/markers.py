@@ -5,19 +5,17 @@ sight; so neither the marker's own print nor the few points at its edges decide.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Floats, fit_rigid, motion_jacobian, move_points
+from slviewer.geometry.rigid import Floats, Uncertainty, fit_rigid, motion_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma, tukey_weights
 from slviewer.geometry.vectors import diagonal, lengths, rms_length
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.refusal import Refused
-from slviewer.registration.uncertainty import Uncertainty
 from slviewer.target.coded import detect_markers
 
 CORNER_PX = 0.05
@@ -65,9 +63,11 @@ class MarkerPose:
 
     def inverse(self) -> "MarkerPose":
         """The pose of the reference on the scan."""
-        T = np.asarray(np.linalg.inv(self.T), np.float64)
-        return MarkerPose(
-            T, self.ids, self.moved, self.reference_corners, self.scan_corners, self.sigma_mm
+        return replace(
+            self,
+            T=np.asarray(np.linalg.inv(self.T), np.float64),
+            scan_corners=self.reference_corners,
+            reference_corners=self.scan_corners,
         )
 
     def normal_equations(self, T: Floats, centre: Floats, sigma_mm: float) -> tuple[Floats, Floats]:
@@ -101,17 +101,17 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
     seen = detect_markers(np.asarray(grey, np.uint8))
     ids, corners, sigmas = [], [], []
     for number, quad in zip(seen.ids, seen.corners, strict=True):
-        measured = [_measure_corner(cloud, corner, quad) for corner in quad]
-        if all(one is not None for one in measured):
+        measured = [one for corner in quad if (one := _measure_corner(cloud, corner, quad))]
+        if len(measured) == len(quad):
             ids.append(int(number))
-            corners.append([one[0] for one in measured if one is not None])
-            sigmas.append([one[1] for one in measured if one is not None])
-    shape = (len(ids), 4)
+            corners.append([corner for corner, _ in measured])
+            sigmas.append([sigma for _, sigma in measured])
     return MeasuredMarkers(
-        np.array(ids, int), np.reshape(corners, (*shape, 3)).astype(float),
-        np.reshape(sigmas, shape).astype(float),
+        np.array(ids, int),
+        np.reshape(corners, (-1, 4, 3)).astype(float),
+        np.reshape(sigmas, (-1, 4)).astype(float),
         seen.repeated,
-    )  # fmt: skip
+    )
 
 
 def _measure_corner(
@@ -120,27 +120,23 @@ def _measure_corner(
     """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard
     deviation; None where too little of the surface around it was measured."""
     reach = _FIT_REACH * float(lengths(quad - np.roll(quad, 1, axis=0)).mean())
-    height, width = cloud.points.shape[:2]
-    (left, top), (right, bottom) = (
-        np.floor(corner - reach).astype(int),
-        np.ceil(corner + reach).astype(int) + 1,
-    )
-    left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
-    v, u = np.mgrid[top:bottom, left:right]
-    points = cloud.points[top:bottom, left:right].astype(np.float64)
+    left, top = np.maximum(np.floor(corner - reach).astype(int), 0)
+    right, bottom = np.ceil(corner + reach).astype(int) + 1
+    window = np.s_[top:bottom, left:right]
+    points = cloud.points[window].astype(np.float64)
+    v, u = np.indices(points.shape[:2]) + np.array([top, left])[:, None, None]
     known = np.isfinite(points[..., 2]) & (np.hypot(u - corner[0], v - corner[1]) <= reach)
     if np.count_nonzero(known) < LEAST_CORNER_POINTS:
         return None
     x, y = (u[known] - corner[0]) / reach, (v[known] - corner[1]) / reach
-    quadrants = {(bool(a), bool(b)) for a, b in zip(x > 0, y > 0, strict=True)}
-    if len(quadrants) < 4:  # the surface ends here: it would be extrapolated
+    if (
+        len({*zip(x > 0, y > 0, strict=True)}) < 4
+    ):  # the surface ends here: it would be extrapolated
         return None
     points = points[known]
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    noise = (
-        np.maximum(np.nan_to_num(cloud.sigma[top:bottom, left:right][known], nan=1.0), 1e-6)
-        / points[:, 2] ** 2
-    )
+    sigma = np.nan_to_num(cloud.sigma[window][known], nan=1.0)
+    noise = np.maximum(sigma, 1e-6) / points[:, 2] ** 2
     weight = noise**-2.0
     for _ in range(3):  # a plane's 1/z is linear in the image
         A = basis * weight[:, None]
@@ -175,27 +171,12 @@ def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> Marker
             f"Of {len(common)} common markers only {int(steady.sum())} keep their places: glue the"
             " markers on, or scan without moving those beside the object.",
         )
+    T = _fit_pose(p[steady], q[steady], sigma[steady])
     p, q, s = p[steady].reshape(-1, 3), q[steady].reshape(-1, 3), sigma[steady].ravel()
-    ids = tuple(int(number) for number in common[steady])
-    T = fit_weighted(p, q, s)
     gap = np.sum((move_points(T, p) - q) ** 2, axis=1) / (3 * s**2)
     s = s * np.sqrt(max(1.0, float(np.sum(gap)) / max(1.0, len(gap) - 2.0)))
-    return MarkerPose(T, ids, tuple(int(k) for k in common[~steady]), p, q, s)
-
-
-def fit_weighted(points: Floats, targets: Floats, sigma_mm: Floats) -> Floats:
-    """(4, 4): the motion of weighted least squares that brings points (m, 3) mm onto ``targets``
-    (m, 3)."""
-    T = fit_rigid(points, targets)
-    w = sigma_mm**-2.0 / np.sum(sigma_mm**-2.0)
-    p0, q0 = w @ points, w @ targets
-    root = np.sqrt(w)[:, None]
-    R = fit_rigid(
-        np.concatenate([root * (points - p0), -root * (points - p0)]),
-        np.concatenate([root * (targets - q0), -root * (targets - q0)]),
-    )[:3, :3]
-    T[:3, :3], T[:3, 3] = R, q0 - R @ p0
-    return T
+    ids, moved = (tuple(common[which].tolist()) for which in (steady, ~steady))
+    return MarkerPose(T, ids, moved, p, q, s)
 
 
 def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
@@ -206,16 +187,14 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
     n = len(p)
     if n == 1:
         return np.ones(1, bool)
-    pairs = list(combinations(range(n), 2))
+    pairs = np.stack(np.triu_indices(n, 1), axis=1)
     pairs = pairs[:: -(-len(pairs) // _MOST_HYPOTHESES)]
-    starts = (
-        fit_rigid(p[list(pair)].reshape(-1, 3), q[list(pair)].reshape(-1, 3)) for pair in pairs
-    )
-    gap = min((_largest_gaps(T, p, q) for T in starts), key=lambda gap: float(np.median(gap)))
+    starts = fit_rigid(p[pairs].reshape(-1, 8, 3), q[pairs].reshape(-1, 8, 3))
+    gaps = _largest_gaps(starts, p, q)
+    gap = gaps[np.median(gaps, axis=1).argmin()]
     steady = gap <= np.median(gap)
-    limit = np.zeros(n)
     for _ in range(4):
-        T = fit_weighted(p[steady].reshape(-1, 3), q[steady].reshape(-1, 3), sigma[steady].ravel())
+        T = _fit_pose(p[steady], q[steady], sigma[steady])
         gap = _largest_gaps(T, p, q)
         usual = float(np.median(gap))
         limit = np.maximum(MOVED_SIGMAS * sigma.max(axis=1), max(MOVED_MM, MOVED_MEDIANS * usual))
@@ -226,9 +205,17 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
     return steady & (usual < max(MOVED_MM, MOST_GAP * extent))
 
 
+def _fit_pose(p: Floats, q: Floats, sigma: Floats) -> Floats:
+    """Return the motion (4, 4) of weighted least squares that brings markers' corners (n, 4, 3) mm
+    onto others."""
+    return fit_rigid(p.reshape(-1, 3), q.reshape(-1, 3), sigma.ravel() ** -2.0)
+
+
 def _largest_gaps(T: Floats, p: Floats, q: Floats) -> Floats:
-    """Return the largest gap (n,) mm of each marker's corners after a motion (4, 4)."""
-    return lengths(move_points(T, p) - q).max(axis=1)
+    """Return the largest gap (..., n) mm of each marker's corners (n, 4, 3) after motions (..., 4,
+    4)."""
+    gaps = lengths(move_points(T, p.reshape(-1, 3)) - q.reshape(-1, 3))
+    return gaps.reshape(*T.shape[:-2], -1, 4).max(axis=-1)
 
 
 def marker_notes(measured: Mapping[str, MeasuredMarkers]) -> list[str]:

@@ -7,37 +7,33 @@ others are dropped; the poses are then optimised together.
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from threading import Lock
-from typing import TypeVar
 
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import move_points
+from slviewer.geometry.rigid import Uncertainty, move_points
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.merge import LoopClosure
 from slviewer.registration import graph
-from slviewer.registration.consistency import select_consistent_edges
-from slviewer.registration.graph import Edge, LoopGap
+from slviewer.registration.graph import Edge
 from slviewer.registration.markers import MarkerPose, MeasuredMarkers, fit_marker_pose
-from slviewer.registration.pairwise import Progress, Registration, register_prepared, search_starts
-from slviewer.registration.prepared import LEAST_POINTS, PreparedScan, prepare_scan
+from slviewer.registration.pairwise import Progress, Registration, register_prepared
 from slviewer.registration.refusal import Refused
-from slviewer.registration.scan import Scan
-from slviewer.registration.start import Candidate, Start
-from slviewer.registration.turntable import (
+from slviewer.registration.scan import LEAST_POINTS, PreparedScan, Scan, prepare_scan
+from slviewer.registration.start import (
+    Candidate,
     TurntableAxis,
     determines_axis,
     fit_turntable_axis,
+    search_starts,
     shortest_turn,
 )
-from slviewer.registration.uncertainty import Uncertainty
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 Pair = tuple[str, str]
 """Names of a scan and of the scan whose frame it is registered to."""
 
@@ -69,18 +65,6 @@ class Starts:
     markers: Mapping[str, MeasuredMarkers] | None = None
 
 
-@dataclass(frozen=True)
-class Loop:
-    """A loop of the pose graph through the scans ``names`` and back to the first, with its gap.
-
-    ``before``, ``after``: the gap before and after the poses were optimised.
-    """
-
-    names: tuple[str, ...]
-    before: LoopGap
-    after: LoopGap
-
-
 @dataclass(frozen=True, eq=False)
 class MultiwayAlignment:
     """Result of a multiway registration.
@@ -96,10 +80,10 @@ class MultiwayAlignment:
     T_reference_scan: Mapping[str, np.ndarray]
     uncertainties: Mapping[str, Uncertainty]
     pairs: Mapping[Pair, Registration]
-    loops: tuple[Loop, ...]
+    loops: list[LoopClosure]
     dropped: Mapping[Pair, str]
     refused: Mapping[Pair, str]
-    markers: Mapping[Pair, MarkerPose] = field(default_factory=dict)
+    markers: Mapping[Pair, MarkerPose]
 
     def on_reference(self) -> dict[str, Registration]:
         """Return a registration onto the reference for every other scan, with its optimised pose
@@ -149,40 +133,21 @@ def register_all(
     ).build()
 
 
-def _check_trusted(name: str, scan: Scan) -> None:
-    """Raise InputError where too few points of a scan are away from edges, so that a registration
-    would fail later."""
-    if (
-        scan.trusted is None
-        or np.count_nonzero(scan.trusted) >= LEAST_POINTS
-        or len(scan.points) < LEAST_POINTS
-    ):
-        return
-    raise InputError(
-        f"{name} has {len(scan.points)} points, and all but {np.count_nonzero(scan.trusted)} lie"
-        " beside holes or depth steps: the cloud is too sparse or too noisy to be aligned; capture"
-        " it with more light and longer exposure, or with more phase steps"
-    )
-
-
 class _PoseGraphBuilder:
     """Builds the pose graph of one call of ``register_all``, pair by pair, and optimises it."""
 
     def __init__(
         self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, progress: Progress
     ) -> None:
-        self.names, self.reference, self.starts, self._progress = (
-            list(scans),
-            reference,
-            starts,
-            progress,
-        )
+        self.names, self.reference = list(scans), reference
+        self.starts, self._progress = starts, progress
         self._share, self._progress_lock = 0.0, Lock()
         self.root = self.names.index(reference)
         self.registered: dict[Pair, Registration] = {}
         self.refused: dict[Pair, Refused] = {}
         self._report(0.0)
-        self.scans = _map_parallel(self._prepare, list(scans.items()))
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            self.scans = list(threads.map(self._prepare, self.names, scans.values()))
         self.size = min(scan.size for scan in self.scans)
         self.markers = self._fit_markers()
         self.expected = len(self._list_first_pairs()) + (
@@ -195,7 +160,7 @@ class _PoseGraphBuilder:
             self._register(pair, start)
         known = self._initial_poses()
         self._register_all(
-            [(pair, self._relative_pose(known, *pair)) for pair in self._list_first_pairs()]
+            {pair: _relative_pose(known, *pair) for pair in self._list_first_pairs()}
         )
         self._connect()
         poses = self._spanning_poses()[0]
@@ -218,23 +183,17 @@ class _PoseGraphBuilder:
         pairs = [(b, a) if a == self.reference else (a, b) for a, b in pairs]
         return pairs + [pair for pair in self.markers if not {pair, pair[::-1]} & {*pairs}]
 
-    def _initial_poses(self) -> dict[str, tuple[np.ndarray, Start]]:
+    def _initial_poses(self) -> dict[str, Candidate]:
         """Return T_world_scan (4, 4) mm by name from given poses or the turntable, and its origin;
         {} without these."""
         if self.starts.poses is not None:
-            return {
-                name: (np.asarray(T, dtype=np.float64), "initial")
-                for name, T in self.starts.poses.items()
-            }
-        if not self.starts.table_deg:
+            return {name: Candidate(T, "initial") for name, T in self.starts.poses.items()}
+        table_deg = self.starts.table_deg
+        if not table_deg:
             return {}
-        angles = {
-            name: self.starts.table_deg[name]
-            for name in self.names
-            if name in self.starts.table_deg
-        }
+        angles = {name: table_deg[name] for name in self.names if name in table_deg}
         axis = self.starts.axis or self._estimate_axis(angles)
-        return {name: (axis.rotation(-deg), "turntable") for name, deg in angles.items()}
+        return {name: Candidate(axis.rotation(-deg), "turntable") for name, deg in angles.items()}
 
     def _estimate_axis(self, angles: Mapping[str, float]) -> TurntableAxis:
         """Estimate the turntable's axis from the first two consecutive pairs that register by
@@ -264,13 +223,12 @@ class _PoseGraphBuilder:
         `_MARKER_PAIRS` best."""
         poses: dict[Pair, MarkerPose] = {}
         seen = self.starts.markers or {}
-        for i, a in enumerate(self.names):
-            for b in self.names[:i]:
-                if a not in seen or b not in seen:
-                    continue
+        shown = [name for name in self.names if name in seen]
+        for i, a in enumerate(shown):
+            for b in shown[:i]:
                 pair = (b, a) if a == self.reference else (a, b)
                 try:
-                    pose = fit_marker_pose(seen[pair[0]], seen[pair[1]])
+                    pose = fit_marker_pose(*(seen[name] for name in pair))
                 except Refused as error:
                     self.refused[pair] = error
                     continue
@@ -291,36 +249,27 @@ class _PoseGraphBuilder:
         turned = self.markers.get(pair[::-1])
         return self.markers.get(pair) or (None if turned is None else turned.inverse())
 
-    def _relative_pose(
-        self, known: Mapping[str, tuple[np.ndarray, Start]], scan: str, onto: str
-    ) -> Candidate | None:
-        """Return the initial pose of a pair from poses in a common frame; None where one of them is
-        not known."""
-        if scan not in known or onto not in known:
-            return None
-        return Candidate(np.linalg.inv(known[onto][0]) @ known[scan][0], known[scan][1])
-
     def _connect(self) -> None:
         """Register further pairs, the most promising first, until every scan is connected to the
         reference.
 
         Raises ``Refused`` where no pair is left to try.
         """
-        while unconnected := [
-            k for k, T in enumerate(self._spanning_poses()[0]) if not np.isfinite(T).all()
-        ]:
-            candidates = []
-            for a in unconnected:
-                for b in sorted(set(range(len(self.names))) - set(unconnected)):
+        while True:
+            joined = np.isfinite(self._spanning_poses()[0]).all(axis=(1, 2))
+            if joined.all():
+                return
+            candidates = {}
+            for a in np.flatnonzero(~joined):
+                for b in np.flatnonzero(joined):
                     pair = self.names[a], self.names[b]
                     if not self._was_tried(pair):
-                        starts = search_starts(self.scans[a], self.scans[b], self.size)
-                        candidates.append((starts[0].score if starts else 0.0, pair, starts))
-            for _, pair, starts in sorted(candidates, key=lambda candidate: -candidate[0]):
-                if self._register(pair, starts=starts):
+                        candidates[pair] = search_starts(self.scans[a], self.scans[b], self.size)
+            for pair, starts in sorted(candidates.items(), key=lambda item: -item[1][0].score):
+                if self._register(pair, starts):
                     break
             else:
-                names = [self.names[k] for k in unconnected]
+                names = [self.names[k] for k in np.flatnonzero(~joined)]
                 error = next(
                     error for pair, error in self.refused.items() if set(pair) & set(names)
                 )
@@ -339,11 +288,11 @@ class _PoseGraphBuilder:
                     self._report(self._share)  # it may raise to cancel
                     T = np.linalg.inv(poses[j]) @ poses[i]
                     overlaps.append((_estimate_overlap(self.scans[i], self.scans[j], T), (a, b), T))
-        count, pairs = dict.fromkeys(self.names, 0), []
+        count, pairs = dict.fromkeys(self.names, 0), {}
         for overlap, (a, b), T in sorted(overlaps, key=lambda entry: -entry[0]):
             if overlap >= _LOOP_OVERLAP and max(count[a], count[b]) < _LOOP_PAIRS:
                 count[a], count[b] = count[a] + 1, count[b] + 1
-                pairs.append(((a, b), Candidate(T, "initial")))
+                pairs[a, b] = Candidate(T, "initial")
         self._register_all(pairs)
 
     # registration of pairs
@@ -352,39 +301,45 @@ class _PoseGraphBuilder:
         """Whether a pair, either way round, was registered or refused."""
         return bool({pair, pair[::-1]} & {*self.registered, *self.refused})
 
-    def _prepare(self, item: tuple[str, Scan | Cloud]) -> PreparedScan:
-        """Prepare a named scan for registration, using only its points away from edges."""
-        name, scan = item
+    def _prepare(self, name: str, scan: Scan | Cloud) -> PreparedScan:
+        """Prepare a named scan for registration, using only its points away from edges; InputError
+        where these are too few, so that it would fail later."""
         scan = scan if isinstance(scan, Scan) else Scan.from_cloud(scan)
-        trusted = slice(None) if scan.trusted is None else scan.trusted
-        _check_trusted(name, scan)
-        normals = None if scan.normals is None else scan.normals[trusted]
-        prepared = prepare_scan(name, scan.points[trusted], normals, scan.sigma_mm)
+        points, normals = scan.points, scan.normals
+        if scan.trusted is not None:
+            points = points[scan.trusted]
+            normals = None if normals is None else normals[scan.trusted]
+        if len(points) < LEAST_POINTS <= len(scan.points):
+            raise InputError(
+                f"{name} has {len(scan.points)} points, and all but {len(points)} lie beside holes"
+                " or depth steps: the cloud is too sparse or too noisy to be aligned; capture it"
+                " with more light and longer exposure, or with more phase steps"
+            )
+        prepared = prepare_scan(name, points, normals, scan.sigma_mm)
         self._report(self._share + 0.2 / len(self.names))
         return prepared
 
-    def _register_all(self, pairs: Sequence[tuple[Pair, Candidate | None]]) -> None:
+    def _register_all(self, starts: Mapping[Pair, Candidate | None]) -> None:
         """Register independent pairs from their initial poses in parallel, and store the results in
         their order."""
-        pending = [
-            (pair, start) for pair, start in pairs if not {pair, pair[::-1]} & set(self.registered)
-        ]
-        results = _map_parallel(lambda item: self._align(*item), pending)
-        for (pair, _), result in zip(pending, results, strict=True):
+        pending = [pair for pair in starts if not {pair, pair[::-1]} & set(self.registered)]
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            results = list(threads.map(lambda pair: self._align(pair, starts[pair]), pending))
+        for pair, result in zip(pending, results, strict=True):
             self._store(pair, result)
 
     def _register(
-        self, pair: Pair, start: Candidate | None = None, starts: list[Candidate] | None = None
+        self, pair: Pair, start: Candidate | list[Candidate] | None = None
     ) -> Registration | None:
         """Register a pair unless it is, and store the result; None where it is refused.
 
-        ``start``: its initial pose; ``starts``: candidate poses of an earlier search.
+        ``start``: its initial pose, or the candidate poses of an earlier search.
         """
         done = self.registered.get(pair) or self.registered.get(pair[::-1])
-        return done or self._store(pair, self._align(pair, start, starts))
+        return done or self._store(pair, self._align(pair, start))
 
     def _align(
-        self, pair: Pair, start: Candidate | None, starts: list[Candidate] | None = None
+        self, pair: Pair, start: Candidate | list[Candidate] | None
     ) -> Registration | Refused:
         """Register a pair and return the result or the refusal; may run in several threads."""
         tried = len(self.registered) + len(self.refused)
@@ -396,8 +351,7 @@ class _PoseGraphBuilder:
                 a,
                 b,
                 size=self.size,
-                initial=start,
-                starts=starts,
+                start=start,
                 markers=self._get_markers(pair),
                 progress=lambda share: self._report(before + step * share),
             )
@@ -429,7 +383,7 @@ class _PoseGraphBuilder:
         return [
             Edge(
                 self.names.index(scan), self.names.index(onto), result.T_reference_scan,
-                result.uncertainty.covariance, result.uncertainty.centre,
+                result.uncertainty.covariance, result.uncertainty.centre, result.gate_mm,
             )
             for (scan, onto), result in self.registered.items()
         ]  # fmt: skip
@@ -442,67 +396,63 @@ class _PoseGraphBuilder:
         """Drop contradicting pairs and optimise the poses of all scans."""
         self._report(0.92)
         pairs, edges = list(self.registered), self._edges()
-        gates = [self.registered[pair].gate_mm for pair in pairs]
-        consistent, gaps = select_consistent_edges(
-            len(self.names), edges, self.root, gates, self._is_good_fit
+        consistent, gaps = graph.select_consistent_edges(
+            len(self.names), edges, self.root, self._is_good_fit
         )
         dropped = {
             pairs[k]: (
-                f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {shift:.1f} mm "
-                f"and {turn:.1f} degrees, and is excluded"
+                f"{pairs[k][0]} -> {pairs[k][1]} contradicts the other pairs by {gap.shift_mm:.1f}"
+                f" mm and {gap.turn_deg:.1f} degrees, and is excluded"
             )
-            for k, (shift, turn) in gaps.items()
+            for k, gap in gaps.items()
         }
-        edges, pairs = [edges[k] for k in consistent], [pairs[k] for k in consistent]
+        edges = [edges[k] for k in consistent]
         start, tree = graph.spanning_poses(len(self.names), edges, self.root)
-        poses = (
-            graph.optimise_poses(start, edges, self.root)
-            if len(edges) >= len(self.names)
-            else start
-        )
-        loops = []
-        for k, edge in enumerate(edges):
-            if k not in tree:
-                expected = graph.expected_gap_mm(edge, edges, tree)
-                names = tuple(self.names[node] for node in graph.loop_nodes(edge, edges, tree))
-                loops.append(
-                    Loop(names, graph.loop_gap(edge, start, expected), graph.loop_gap(edge, poses))
-                )
+        poses = start
+        if len(edges) >= len(self.names):
+            poses = graph.optimise_poses(start, edges, self.root)
+        loops = [
+            LoopClosure(
+                [self.names[node] for node in graph.loop_nodes(edge, edges, tree)],
+                *graph.loop_gap(edge, start),
+                *graph.loop_gap(edge, poses),
+            )
+            for k, edge in enumerate(edges)
+            if k not in tree
+        ]
         self._report(1.0)
         return MultiwayAlignment(
             self.reference,
             dict(zip(self.names, poses, strict=True)),
             dict(zip(self.names, graph.pose_uncertainties(poses, edges, self.root), strict=True)),
-            {pair: self.registered[pair] for pair in pairs},
-            tuple(sorted(loops, key=lambda loop: -loop.before.shift_mm)),
+            {pairs[k]: self.registered[pairs[k]] for k in consistent},
+            sorted(loops, key=lambda loop: -loop.error_mm),
             dropped,
             {pair: str(error) for pair, error in self.refused.items()},
             self.markers,
         )
 
-    def _is_good_fit(self, edge: Edge, T: np.ndarray) -> bool:
-        """Whether ICP of an edge's scans from the pose ``T`` (4, 4) succeeds and stays within its
+    def _is_good_fit(self, edge: Edge, poses: np.ndarray) -> bool:
+        """Whether ICP of an edge's scans from ``poses`` (n, 4, 4) succeeds and stays within its
         gate."""
-        try:
-            result = register_prepared(
-                self.scans[edge.scan],
-                self.scans[edge.onto],
-                size=self.size,
-                initial=Candidate(T, "initial"),
-                markers=self._get_markers((self.names[edge.scan], self.names[edge.onto])),
-            )
-        except Refused:
+        T = np.linalg.inv(poses[edge.onto]) @ poses[edge.scan]
+        result = self._align(
+            (self.names[edge.scan], self.names[edge.onto]), Candidate(T, "initial")
+        )
+        if isinstance(result, Refused):
             return False
-        refined = replace(edge, T=result.T_reference_scan, scan=0, onto=1)
-        residual = graph.edge_residuals([refined], np.stack([T, np.eye(4)]))[0]
-        return bool(np.linalg.norm(residual[3:]) < result.gate_mm)
+        return (
+            graph.loop_gap(replace(edge, T=result.T_reference_scan), poses).shift_mm
+            < result.gate_mm
+        )
 
 
-def _map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """Map a function over items in threads on all cores; the results are in the order of the
-    items."""
-    with ThreadPoolExecutor(max(1, min(len(items), os.cpu_count() or 1))) as pool:
-        return list(pool.map(function, items))
+def _relative_pose(known: Mapping[str, Candidate], scan: str, onto: str) -> Candidate | None:
+    """Return the initial pose of a pair from poses in a common frame; None where one of them is not
+    known."""
+    if scan not in known or onto not in known:
+        return None
+    return Candidate(np.linalg.inv(known[onto].T) @ known[scan].T, known[scan].start)
 
 
 def _estimate_overlap(scan: PreparedScan, reference: PreparedScan, T: np.ndarray) -> float:

@@ -97,6 +97,22 @@ def _supply_libusb() -> None:
             return  # the import of Open3D says what is missing, in its own words
 
 
+def point_cloud(points: np.ndarray, normals: np.ndarray | None = None) -> Any:
+    """Return Open3D's cloud of points (n, 3), with normals (n, 3) if they are given."""
+    to_vectors = open3d().utility.Vector3dVector
+    cloud = open3d().geometry.PointCloud(to_vectors(points))
+    if normals is not None:
+        cloud.normals = to_vectors(normals)
+    return cloud
+
+
+def raycasting_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """Return Open3D's ray-casting scene of the triangles ``faces`` (m, 3) of vertices (n, 3)."""
+    scene, tensor = open3d().t.geometry.RaycastingScene(), open3d().core.Tensor
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
+    return scene
+
+
 def align_icp(
     scan: Any,
     reference: Any,

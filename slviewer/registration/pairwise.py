@@ -10,17 +10,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.errors import InputError
-from slviewer.geometry.rigid import move_points
+from slviewer.geometry.rigid import Uncertainty, move_points
 from slviewer.geometry.vectors import rms
-from slviewer.registration.freedom import WORDS, Freedom, estimate_freedom
 from slviewer.registration.markers import MOVED_MM, MarkerPose
 from slviewer.registration.open3d_loader import align_icp, open3d
-from slviewer.registration.prepared import PreparedScan, prepare_scan, scale_of
-from slviewer.registration.refine import refine_pose
+from slviewer.registration.refine import (
+    WORDS,
+    Freedom,
+    RefinedPose,
+    estimate_freedom,
+    refine_pose,
+)
 from slviewer.registration.refusal import Refused
-from slviewer.registration.start import SEARCHED, Candidate, Start, pose_distance, rank_starts
-from slviewer.registration.uncertainty import Uncertainty
+from slviewer.registration.scan import PreparedScan, scale_of
+from slviewer.registration.start import SEARCHED, Candidate, Start, pose_distance, search_starts
 
 Progress = Callable[[float], None]
 
@@ -69,97 +72,45 @@ class Registration:
     uncertainty: Uncertainty
 
 
-def register(
-    scan_points: np.ndarray,
-    reference_points: np.ndarray,
-    *,
-    scan_normals: np.ndarray | None = None,
-    reference_normals: np.ndarray | None = None,
-    initial: np.ndarray | Candidate | None = None,
-    progress: Progress | None = None,
+def register_prepared(
+    scan: PreparedScan,
+    reference: PreparedScan,
+    size: float,
+    start: Candidate | list[Candidate] | None = None,
+    markers: MarkerPose | None = None,
+    progress: Progress = lambda share: None,
 ) -> Registration:
-    """Align a scan with a reference that shows part of the same object.
+    """Align a scan with a reference that shows part of the same object, of ``size`` mm.
 
-    Points are ``(n, 3)`` mm without NaN, each in the frame of the camera that took it; normals
-    ``(n, 3)`` point to that camera, and are estimated where missing. ``initial`` replaces the
-    search for a start: the last pose (4, 4), or a ``Candidate`` such as ``picked.fit_picked_start``
-    gives. ``progress`` receives the share of the work done, 0 to 1, and may raise to cancel.
+    ``start``: the initial pose, or the result of an earlier ``search_starts``, which is run
+    otherwise. ``markers``: those that both scans show, from whose pose it starts, and which hold
+    what the shape leaves open; alone, where the surfaces do not overlap. ``progress`` receives the
+    share of the work done, 0 to 1, and may raise to cancel.
 
     Raises ``Refused`` where nothing aligns, where too little overlaps, where the shape does not
     hold the pose, or where a second pose fits alike.
     """
-    report = progress or (lambda share: None)
-    report(0.0)
-    scan = prepare_scan("scan", scan_points, scan_normals)
-    reference = prepare_scan("reference", reference_points, reference_normals)
-    report(0.3)
-    return register_prepared(
-        scan, reference, initial=initial, progress=lambda share: report(0.3 + 0.7 * share)
-    )
-
-
-def register_prepared(
-    scan: PreparedScan,
-    reference: PreparedScan,
-    *,
-    size: float | None = None,
-    initial: np.ndarray | Candidate | None = None,
-    starts: list[Candidate] | None = None,
-    markers: MarkerPose | None = None,
-    progress: Progress | None = None,
-) -> Registration:
-    """Register prepared scans; see ``register``.
-
-    ``size``: of the object in mm, by default that of the smaller scan. ``starts``: result of an
-    earlier ``search_starts``, which is run otherwise. ``markers``: those that both scans show, from
-    whose pose it starts, and which hold what the shape leaves open; alone, where the surfaces do
-    not overlap.
-    """
-    report = progress or (lambda share: None)
-    size = min(scan.size, reference.size) if size is None else size
     if markers is not None:
-        report(0.4)
+        progress(0.4)
         return _register_by_markers(scan, reference, markers, size)
-    if starts is None:
-        starts = search_starts(scan, reference, size, initial)
-    refusal: Refused | None = None
-    for attempt, start in enumerate(starts[:MOST_ATTEMPTS]):
-        report(0.4 + 0.15 * attempt)
+    starts = start if isinstance(start, list) else search_starts(scan, reference, size, start)
+    refusals: list[Refused] = []
+    for attempt, candidate in enumerate(starts[:MOST_ATTEMPTS]):
+        progress(0.4 + 0.15 * attempt)
         try:
-            result = _refine_start(scan, reference, start, size)
+            result = _refine_start(scan, reference, candidate, size)
         except Refused as error:
-            refusal = refusal or error  # the best start's refusal says most
+            refusals.append(error)
             # the surfaces agree, and every other start would slide or turn as well
             if error.reason in WORDS:
                 break
             continue
-        if start.start in SEARCHED:
-            _refuse_rivals(
-                scan, reference, result, start, starts[attempt + 1 : MOST_ATTEMPTS + 1], size
-            )
-        report(1.0)
+        if candidate.start in SEARCHED:
+            others = starts[attempt + 1 : MOST_ATTEMPTS + 1]
+            _refuse_rivals(scan, reference, result, candidate, others, size)
+        progress(1.0)
         return result
-    raise refusal or Refused(
-        "overlap", "The scan and the reference share nothing to start from: pick point pairs."
-    )
-
-
-def search_starts(
-    scan: PreparedScan,
-    reference: PreparedScan,
-    size: float,
-    initial: np.ndarray | Candidate | None = None,
-) -> list[Candidate]:
-    """Return candidate initial poses after a coarse ICP, the best first; only ``initial`` where it
-    is given."""
-    if initial is not None and not isinstance(initial, Candidate):
-        if np.shape(initial) != (4, 4):
-            raise InputError(
-                f"The initial pose has shape {np.shape(initial)}: give a (4, 4) matrix."
-            )
-        initial = Candidate(np.asarray(initial, dtype=np.float64), "initial")
-    coarse = max(size / 40.0, 2.0 * reference.spacing, 2.0 * scan.spacing)
-    return rank_starts(scan, reference, float(f"{coarse:.3g}"), initial)
+    raise refusals[0]  # the best start's refusal says most
 
 
 def _register_by_markers(
@@ -183,7 +134,8 @@ def _register_by_markers(
             f" {error:.2g} mm open: let both see three markers or more, well apart.",
         )
     gate = max(MOVED_MM, 2.0 * reference.spacing)
-    figures, _ = _compute_figures(scan, reference, markers.T, gate, uncertainty, "markers")
+    pose = RefinedPose(markers.T, gate, uncertainty)
+    figures, _ = _compute_figures(scan, reference, pose, "markers")
     return replace(
         figures, rms_mm=markers.rms_mm, inlier_rmse_mm=markers.rms_mm, agreement=1.0, slack_mm=error
     )
@@ -200,51 +152,29 @@ def _refine_start(
     not reliable."""
     scale = scale_of(size)
     T = start.T
+    # of the distance of two corresponding points
+    noise = float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
     for voxel, gate in LEVELS_MM:
-        widest = max(
-            gate * scale,
-            2.0 * max(scan.spacing, reference.spacing),
-            3.0 * _pair_noise(scan, reference),
-        )
+        widest = max(gate * scale, 2.0 * max(scan.spacing, reference.spacing), 3.0 * noise)
         # else it starts within a fraction of a millimetre, and a plane would slide
         if markers is None:
             loss = open3d().pipelines.registration.TukeyLoss(0.5 * widest)
-            T = align_icp(
-                scan.thinned(voxel * scale),
-                reference.thinned(voxel * scale),
-                T,
-                widest,
-                loss,
-                1e-6,
-                40,
-            )
-    narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * _pair_noise(scan, reference))
-    end = refine_pose(scan, reference, T, widest, narrowest, markers)
-    result, held = _compute_figures(
-        scan, reference, end.T, end.gate_mm, end.uncertainty, start.start
-    )
+            thinned = scan.thinned(voxel * scale), reference.thinned(voxel * scale)
+            T = align_icp(*thinned, T, widest, loss, 1e-6, 40)
+    narrowest = max(LAST_GATE_MM * min(1.0, scale), 3.0 * noise)
+    pose = refine_pose(scan, reference, T, widest, narrowest, markers)
+    result, held = _compute_figures(scan, reference, pose, start.start)
     _refuse_if_doubtful(result, None if markers is not None else held, size)
     return result
 
 
-def _pair_noise(scan: PreparedScan, reference: PreparedScan) -> float:
-    """Return the standard deviation in mm of the distance of two corresponding points; unknown
-    sigmas count as 0."""
-    return float(np.hypot(scan.sigma_mm or 0.0, reference.sigma_mm or 0.0))
-
-
 def _compute_figures(
-    scan: PreparedScan,
-    reference: PreparedScan,
-    T: np.ndarray,
-    gate: float,
-    uncertainty: Uncertainty | None,
-    start: Start,
+    scan: PreparedScan, reference: PreparedScan, pose: RefinedPose, start: Start
 ) -> tuple[Registration, Freedom]:
-    """Compute the figures of a pose ``T`` (4, 4) from up to 50,000 scan points, and the freedom of
-    the overlap."""
-    spacing = reference.spacing
-    gate = max(gate, 2.0 * spacing)
+    """Compute the figures of a pose from up to 50,000 scan points, and the freedom of the
+    overlap."""
+    T, spacing = pose.T, reference.spacing
+    gate = max(pose.gate_mm, 2.0 * spacing)
     points = move_points(T, scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)])
     distance, nearest = reference.tree.query(points, distance_upper_bound=4.0 * gate, workers=-1)
     near = np.isfinite(distance)
@@ -255,26 +185,20 @@ def _compute_figures(
     overlapping = distance < gate
     lateral = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     facing = lateral < spacing + 0.25 * height  # a point beyond the reference's rim faces nothing
-    error = _rms(height[overlapping])
+    error = rms(height[overlapping])
     held = estimate_freedom(scan, reference, T, counterpart[overlapping], error)
-    nowhere = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))
     figures = Registration(
         T_reference_scan=T,
         rms_mm=error,
-        inlier_rmse_mm=_rms(distance[overlapping]),
+        inlier_rmse_mm=rms(distance[overlapping]),
         overlap=float(overlapping.sum() / near.size),
         agreement=float((facing & (height < gate)).sum() / max(1, facing.sum())),
         slack_mm=held.loosest_mm,
         gate_mm=gate,
         start=start,
-        uncertainty=uncertainty or nowhere,
+        uncertainty=pose.uncertainty,
     )
     return figures, held
-
-
-def _rms(values: np.ndarray) -> float:
-    """Return the root mean square; NaN for an empty array."""
-    return rms(values) if values.size else float("nan")
 
 
 def _refuse_if_doubtful(result: Registration, held: Freedom | None, size: float) -> None:

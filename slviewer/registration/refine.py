@@ -1,24 +1,31 @@
-"""Final refinement of a registration by symmetric point-to-plane ICP, and the uncertainty of the
-pose.
+"""Final refinement of a registration by symmetric point-to-plane ICP, the uncertainty of the pose,
+and the degrees of freedom that the shared shape leaves undetermined.
 
 The residual of a pair is its distance along the mean of both normals (Rusinkiewicz, *A symmetric
 objective function for ICP*, 2019): exact where the surface is curved, so that the points' spacing
 does not show in the pose. The covariance is estimated from the residuals themselves, summed within
 patches before they are squared (a cluster-robust "sandwich"): neighbours that are wrong together do
 not pass for independent measurements.
+
+A plane slides, a sphere turns, a cylinder does both. The eigenvalues of the information matrix of
+point-to-plane residuals measure how well each of the six motions is determined. Noise in the
+normals would act like relief; so the matrix is the product of one scan's Jacobian with the other's,
+whose noise is independent and cancels.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from slviewer.geometry.cubes import occupied_cubes
-from slviewer.geometry.rigid import move_points, turn_about
+from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, rms_length
+from slviewer.geometry.vectors import diagonal, occupied_cubes, rms_length
 from slviewer.registration.markers import MarkerPose
-from slviewer.registration.prepared import PreparedScan
-from slviewer.registration.uncertainty import Uncertainty
+from slviewer.registration.scan import PreparedScan
+
+Shape = Literal["plane", "sphere", "cylinder", "slides", "turns"]
 
 _STEPS = 12
 _SETTLED_MM, _NEAR_MM = 2e-3, 5e-3
@@ -34,19 +41,21 @@ _INDEPENDENT = 100
 _UNSEEN = 1.25
 """Ratio of true to estimated sigma on simulated scans: residuals do not show that pairs change with
 the pose."""
+_FREEDOM_POINTS = 20_000
+_UNKNOWN = Uncertainty(np.full((6, 6), np.inf), np.full(3, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """A refined pose ``T`` (4, 4), T_reference_scan, with its uncertainty, None where it could not
-    be estimated.
+    """A refined pose ``T`` (4, 4), T_reference_scan, with its uncertainty, infinite where it could
+    not be estimated.
 
     ``gate_mm``: largest distance of a pair along its normal in the last iteration.
     """
 
     T: np.ndarray
     gate_mm: float
-    uncertainty: Uncertainty | None
+    uncertainty: Uncertainty
 
 
 def refine_pose(
@@ -61,7 +70,7 @@ def refine_pose(
     corners of markers.
 
     The gate decreases from ``widest`` mm to three times the residuals' noise, not below
-    ``narrowest`` mm. With too few pairs the current pose is returned with the uncertainty None.
+    ``narrowest`` mm. With too few pairs the current pose is returned with infinite uncertainty.
     """
     gate, lateral = widest, 2.0 * max(scan.fine_spacing, reference.fine_spacing)
     stride, least = (
@@ -70,28 +79,23 @@ def refine_pose(
     for _ in range(_STEPS):
         pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
-            return RefinedPose(T, gate, None)
-        points, normal, residual = pairs
-        centre, sigma, J, weight = _weigh_pairs(points, normal, residual)
-        H, gradient = (J * weight[:, None]).T @ J, J.T @ (weight * residual)
-        if markers is not None:
-            H_markers, gradient_markers = markers.normal_equations(
-                T, centre, sigma * np.sqrt(_count_alike(points))
-            )
-            H, gradient = H + H_markers, gradient + gradient_markers
-        step = -np.linalg.lstsq(H, gradient, rcond=1e-10)[0]
-        T = turn_about(step[:3], centre, step[3:]) @ T
-        next_gate = min(gate, max(3.0 * sigma, narrowest))
-        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(points)
+            return RefinedPose(T, gate, _UNKNOWN)
+        e = _linearise(*pairs, T, markers)
+        gradient = e.gradients.sum(axis=0) + e.gradient_markers
+        step = -np.linalg.lstsq(e.H + e.H_markers, gradient, rcond=1e-10)[0]
+        T = turn_about(step[:3], e.centre, step[3:]) @ T
+        next_gate = min(gate, max(3.0 * e.sigma, narrowest))
+        motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(pairs[0])
         if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
             if stride == least:
                 break
             stride = least  # the last iterations use many more points
         gate = next_gate
     pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
-    return RefinedPose(
-        T, gate, None if pairs is None else _estimate_uncertainty(*pairs, T, markers)
-    )
+    if pairs is None:
+        return RefinedPose(T, gate, _UNKNOWN)
+    equations = _linearise(*pairs, T, markers)
+    return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], equations))
 
 
 def _match_pairs(
@@ -115,10 +119,8 @@ def _match_pairs(
     )
     near = np.isfinite(distance)
     points, nearest = points[near], nearest[near]
-    reference_normals, scan_normals = (
-        reference.fine_normals[nearest],
-        scan.fine_normals[::stride][near] @ T[:3, :3].T,
-    )
+    reference_normals = reference.fine_normals[nearest]
+    scan_normals = scan.fine_normals[::stride][near] @ T[:3, :3].T
     is_pair = np.einsum("ij,ij->i", reference_normals, scan_normals) > _MIN_COSINE
     gap = points - reference.fine_points[nearest]
     normal = reference_normals + scan_normals
@@ -127,74 +129,69 @@ def _match_pairs(
     across = np.sqrt(np.maximum(np.einsum("ij,ij->i", gap, gap) - residual**2, 0.0))
     # beyond the rim the nearest point is far across
     is_pair &= (np.abs(residual) < gate) & (across < lateral)
-    return (
-        (points[is_pair], normal[is_pair], residual[is_pair])
-        if np.count_nonzero(is_pair) >= _MIN_PAIRS
-        else None
-    )
+    if np.count_nonzero(is_pair) < _MIN_PAIRS:
+        return None
+    return points[is_pair], normal[is_pair], residual[is_pair]
 
 
-def _count_alike(points: np.ndarray) -> float:
-    """Return how many of the pairs' points (n, 3) count as one measurement beside markers: what a
-    calibration leaves bent is alike over a good part of the surface, and a plane would slide until
-    it fits."""
-    return max(1.0, len(points) / _INDEPENDENT)
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of pairs and markers, of a small rotation (rad) about ``centre`` (3,) mm and
+    a translation (mm).
 
-
-def _weigh_pairs(
-    points: np.ndarray, normal: np.ndarray, residual: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """Return the middle (3,) of the pairs' points (n, 3), the residuals' noise in mm, and their
-    weights (n,).
-
-    Before the weights: the derivatives (n, 6) of the residuals by a small rotation (rad) about the
-    middle and a translation (mm).
+    ``sigma``: noise of the residuals, mm; ``gradients`` (n, 6) of each pair, ``H`` (6, 6) of all;
+    ``alike``: how many pairs count as one measurement beside markers, because what a calibration
+    leaves bent is alike over a good part of the surface, and a plane would slide until it fits.
     """
-    centre = points.mean(axis=0)
-    sigma = max(robust_sigma(residual, about=0.0), 1e-6)
-    return (
-        centre,
-        sigma,
-        np.hstack([np.cross(points - centre, normal), normal]),
-        tukey_weights(residual, sigma),
-    )
+
+    centre: np.ndarray
+    sigma: float
+    H: np.ndarray
+    gradients: np.ndarray
+    alike: float
+    H_markers: np.ndarray
+    gradient_markers: np.ndarray
 
 
-def _estimate_uncertainty(
+def _linearise(
     points: np.ndarray,
     normal: np.ndarray,
     residual: np.ndarray,
     T: np.ndarray,
     markers: MarkerPose | None,
-) -> Uncertainty | None:
-    """Estimate the uncertainty of a pose ``T`` (4, 4) from its pairs by a cluster-robust
-    covariance, and from the standard deviations of markers; None for too few patches."""
-    centre, sigma, J, weight = _weigh_pairs(points, normal, residual)
-    arm = points - centre
-    H = (J * weight[:, None]).T @ J
-    gradient = J * (weight * residual)[:, None]
-    alike = _count_alike(points)
-    H_markers = (
-        np.zeros((6, 6))
-        if markers is None
-        else markers.normal_equations(T, centre, sigma * np.sqrt(alike))[0]
-    )
+) -> _Equations:
+    """Return the normal equations of pairs, as of ``_match_pairs``, and of markers at a pose ``T``
+    (4, 4)."""
+    centre = points.mean(axis=0)
+    sigma = max(robust_sigma(residual, about=0.0), 1e-6)
+    J, weight = distance_jacobian(points - centre, normal), tukey_weights(residual, sigma)
+    alike = max(1.0, len(points) / _INDEPENDENT)
+    of_markers = np.zeros((6, 6)), np.zeros(6)
+    if markers is not None:
+        of_markers = markers.normal_equations(T, centre, sigma * np.sqrt(alike))
+    gradients = J * (weight * residual)[:, None]
+    return _Equations(centre, sigma, (J * weight[:, None]).T @ J, gradients, alike, *of_markers)
+
+
+def _estimate_uncertainty(points: np.ndarray, e: _Equations) -> Uncertainty:
+    """Estimate the uncertainty of a pose by a cluster-robust covariance of the pairs' points (n,
+    3), and from the standard deviations of markers."""
+    arm = points - e.centre
     diameter = 2.0 * rms_length(arm)
-    largest = None
+    inverse = np.linalg.pinv(e.H + e.H_markers, rcond=1e-12, hermitian=True)
+    covariances: list[np.ndarray] = []
     for share in _PATCHES:
-        patches = _sum_by_cube(gradient, arm, diameter / share)
-        if len(patches) < _LEAST_PATCHES and largest is not None:
+        patches = _sum_by_cube(e.gradients, arm, diameter / share)
+        if len(patches) < _LEAST_PATCHES and covariances:
             break
         meat = (
             patches.T @ patches * len(patches) / max(len(patches) - 6, 1)
-            + alike * sigma**2 * H_markers
+            + e.alike * e.sigma**2 * e.H_markers
         )
-        inverse = np.linalg.pinv(H + H_markers, rcond=1e-12, hermitian=True)
-        covariance = inverse @ meat @ inverse
-        # errors that are correlated over more than one patch show in larger patches only
-        if largest is None or np.trace(covariance[3:, 3:]) > np.trace(largest[3:, 3:]):
-            largest = covariance
-    return None if largest is None else Uncertainty(_UNSEEN**2 * (largest + largest.T) / 2, centre)
+        covariances.append(inverse @ meat @ inverse)
+    # errors that are correlated over more than one patch show in larger patches only
+    largest = max(covariances, key=lambda covariance: float(np.trace(covariance[3:, 3:])))
+    return Uncertainty(_UNSEEN**2 * (largest + largest.T) / 2, e.centre)
 
 
 def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
@@ -202,3 +199,69 @@ def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndar
     ``points`` (n, 3)."""
     _, which = occupied_cubes(points, side)
     return np.stack([np.bincount(which, column) for column in values.T], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """Principal motions of a scan on its reference, and how well the shape determines each.
+
+    ``slack_mm`` (6,), ascending: the motion at the overlap's rim that separates the surfaces by the
+    noise (RMS). ``motions`` (6, 6): a rotation and a translation per row, with lengths in units of
+    the overlap's radius.
+    """
+
+    slack_mm: np.ndarray
+    motions: np.ndarray
+
+    @property
+    def loosest_mm(self) -> float:
+        """Slack of the least determined motion."""
+        return float(self.slack_mm[-1])
+
+    def shape(self, limit_mm: float) -> Shape | None:
+        """Classify the shape by its motions with more slack than ``limit_mm``; None where all are
+        determined."""
+        if not self.loosest_mm > limit_mm:
+            return None
+        loose = self.motions[self.slack_mm > 0.5 * limit_mm]
+        turns = int(np.count_nonzero(np.linalg.svd(loose[:, :3], compute_uv=False) > 0.3))
+        if len(loose) >= 3:
+            return "sphere" if turns >= 3 else "plane"
+        if len(loose) == 2:
+            return "cylinder" if turns else "plane"
+        return "turns" if turns else "slides"
+
+
+WORDS: dict[Shape, str] = {
+    "plane": "is flat: it slides along itself and turns about its normal",
+    "sphere": "is round like a sphere: it turns about any axis through its centre",
+    "cylinder": "is round like a cylinder: it slides along its axis and turns about it",
+    "slides": "has the same profile all along one direction, and slides along it",
+    "turns": "is round about one axis, and turns about it",
+}
+
+
+def estimate_freedom(
+    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, points: np.ndarray, rms: float
+) -> Freedom:
+    """Estimate which motions of the scan the overlap leaves undetermined.
+
+    ``T`` (4, 4): T_reference_scan; ``points`` (n, 3) mm: the overlap, in the reference's frame;
+    ``rms``: noise in mm. The slack is inf for fewer than 6 points.
+    """
+    if len(points) < 6:
+        return Freedom(np.full(6, np.inf), np.eye(6))
+    points = points[:: -(-len(points) // _FREEDOM_POINTS)]
+    smooth_points, normals = reference.smooth
+    reference_normals = normals[cKDTree(smooth_points).query(points)[1]]
+    smooth_points, normals = scan.smooth
+    scan_normals = normals[cKDTree(move_points(T, smooth_points)).query(points)[1]] @ T[:3, :3].T
+    is_opposite = np.sum(scan_normals * reference_normals, axis=1, keepdims=True) < 0
+    scan_normals = np.where(is_opposite, -scan_normals, scan_normals)
+    arm = points - points.mean(axis=0)
+    arm /= rms_length(arm)
+    A, B = distance_jacobian(arm, reference_normals), distance_jacobian(arm, scan_normals)
+    information = A.T @ B / len(points)
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    slack = rms / np.sqrt(np.maximum(values, 1e-12))
+    return Freedom(slack[::-1], vectors.T[::-1])

@@ -1,15 +1,25 @@
-"""One scan as registration takes it: its points, and which of them can be trusted to lie on the
-surface."""
+"""One scan as registration takes it: its points, which of them can be trusted to lie on the
+surface, and what is computed of them once: downsampled clouds, normals, search trees, features."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 
-from slviewer.geometry.vectors import lengths
+from slviewer.errors import InputError
+from slviewer.geometry.vectors import lengths, median_spacing
 from slviewer.reconstruction.cloud import Cloud, choose_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
+from slviewer.registration.open3d_loader import open3d, point_cloud
 
+LEAST_POINTS = 500
+FINEST_MM = 0.5
+"""Thinned to one point in so many mm, of objects of 75 to 300 mm: the noise of several pixels is
+averaged."""
+_GRAZING = np.cos(np.radians(75.0))
 _RIM_PX = 2
 """So near to the edge of the measured surface, a pixel may have seen two surfaces at once."""
 _STEEPEST = 6.0
@@ -24,14 +34,13 @@ class Scan:
     """The valid points of one scan, in its camera's frame.
 
     ``points`` (n, 3) mm and ``normals`` (n, 3) towards the camera, float32 without NaN in the
-    points; a normal is NaN where the grid gives none. ``colours`` (n, 3) uint8 or None;
-    ``sigma_mm`` the median expected error of a point. ``trusted`` (n,) bool: the points away from
-    edges, which alone decide how the scan lies; None trusts all.
+    points; a normal is NaN where the grid gives none. ``sigma_mm``: the median expected error of a
+    point. ``trusted`` (n,) bool: the points away from edges, which alone decide how the scan lies;
+    None trusts all.
     """
 
     points: np.ndarray
     normals: np.ndarray | None = None
-    colours: np.ndarray | None = None
     sigma_mm: float | None = None
     trusted: np.ndarray | None = None
 
@@ -44,7 +53,6 @@ class Scan:
         return cls(
             points=choose_pixels(cloud.points, mask),
             normals=choose_pixels(grid_normals(cloud.points), mask),
-            colours=_rgb(cloud.colours()),
             sigma_mm=float(np.median(sigma)) if sigma.size else None,
             trusted=away_from_edges(cloud.points, cloud.sigma_z)[mask],
         )
@@ -58,11 +66,10 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
     exceed the noise ``sigma_z`` (h, w) mm of both pixels, where it is known.
     """
     inside = np.isfinite(points[..., 2])
-    noise = (
-        np.zeros(inside.shape) if sigma_z is None else _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
-    )
-    for axis in (0, 1):
-        before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+    noise = np.zeros(inside.shape)
+    if sigma_z is not None:
+        noise = _NOISE * np.nan_to_num(sigma_z, posinf=0.0)
+    for before, after in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         pitch = lengths((points[after] - points[before])[..., :2])
         known = pitch[np.isfinite(pitch)]
         if not known.size:
@@ -74,10 +81,153 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
     return binary_erosion(inside, np.ones((3, 3), bool), _RIM_PX)
 
 
-def _rgb(colours: np.ndarray | None) -> np.ndarray | None:
-    """Return colours (n, 3) from grey values (n,) or colours (n, 3)."""
-    return (
-        np.repeat(colours[:, None], 3, axis=1)
-        if colours is not None and colours.ndim == 1
-        else colours
-    )
+@dataclass(frozen=True, eq=False)
+class PreparedScan:
+    """``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of
+    them, thinned to ``voxel`` mm, with unit normals towards the camera, without what is seen at
+    grazing angles; ``spacing``: median distance in mm of a point to the next; ``size``: longest
+    side in mm; ``sigma_mm``: expected error of a point.
+    """
+
+    points: np.ndarray
+    fine: Any
+    voxel: float
+    spacing: float
+    size: float
+    sigma_mm: float | None
+    _thinned: dict[float, Any] = field(default_factory=dict)
+    _features: dict[float, Any] = field(default_factory=dict)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Search tree of all points."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    @cached_property
+    def fine_points(self) -> np.ndarray:
+        """(m, 3) float64 mm: points of the thinned cloud."""
+        return np.asarray(self.fine.points)
+
+    @cached_property
+    def fine_normals(self) -> np.ndarray:
+        """(m, 3) float64: normals of the thinned cloud."""
+        return np.asarray(self.fine.normals)
+
+    @cached_property
+    def fine_tree(self) -> cKDTree:
+        """Search tree of the thinned cloud's points."""
+        return cKDTree(self.fine_points)
+
+    @cached_property
+    def fine_spacing(self) -> float:
+        """Median distance in mm between neighbours of the thinned cloud."""
+        return median_spacing(self.fine_tree, 2000)
+
+    @cached_property
+    def smooth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (k, 3) mm, thinned to an eightieth of the size, and normals (k, 3) fitted to some
+        thirty of them, which show the shape and not the noise; towards either side."""
+        geometry = open3d().geometry
+        cloud = geometry.PointCloud(self.thinned(self.size / 80.0).points)
+        cloud.estimate_normals(geometry.KDTreeSearchParamKNN(30))
+        return np.asarray(cloud.points), np.asarray(cloud.normals)
+
+    def features(self, voxel: float) -> Any:
+        """Return Open3D's FPFH features of the cloud thinned to ``voxel`` mm; cached."""
+        if voxel not in self._features:
+            o3d = open3d()
+            search = o3d.geometry.KDTreeSearchParamHybrid(5.0 * voxel, 100)
+            self._features[voxel] = o3d.pipelines.registration.compute_fpfh_feature(
+                self.thinned(voxel), search
+            )
+        return self._features[voxel]
+
+    def thinned(self, voxel: float) -> Any:
+        """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals; cached."""
+        if voxel <= self.voxel:
+            return self.fine
+        key = float(f"{voxel:.3g}")
+        if key not in self._thinned:
+            cloud = self.fine.voxel_down_sample(key)
+            cloud.normalize_normals()
+            self._thinned[key] = cloud
+        return self._thinned[key]
+
+
+def prepare_scan(
+    name: str, points: np.ndarray, normals: np.ndarray | None = None, sigma_mm: float | None = None
+) -> PreparedScan:
+    """Prepare the points ``(n, 3)`` mm of one scan, in the frame of its camera, for registration.
+
+    ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for
+    errors. Raises ``InputError`` for points that cannot be used.
+    """
+    _check_arrays(name, points, normals)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    size = measure_size(points)
+    if not size > 0:
+        raise InputError(
+            f"Nearly all points of the {name} are one: give those that were measured, each once."
+        )
+    voxel = FINEST_MM * scale_of(size)
+    fine = _make_cloud(points, normals, voxel)
+    if len(fine.points) < LEAST_POINTS // 5:
+        raise InputError(
+            f"Nearly all of the {len(points)} points of the {name} are seen at grazing angles or"
+            f" have no normal ({len(fine.points)} places are left): turn the object towards the"
+            " camera."
+        )
+    spacing = median_spacing(cKDTree(np.asarray(fine.points)), 2000)
+    spacing /= np.sqrt(len(points) / len(fine.points))
+    return PreparedScan(points, fine, voxel, float(spacing), size, sigma_mm)
+
+
+def scale_of(size: float) -> float:
+    """Return the factor of voxels and gates for an object of ``size`` mm; 1 from 75 to 300 mm."""
+    return size / float(np.clip(size, 75.0, 300.0))
+
+
+def _check_arrays(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
+    """Raise InputError for arrays of wrong shapes, too few points, or points that are not
+    finite."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
+    if len(points) < LEAST_POINTS:
+        raise InputError(
+            f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it."
+        )
+    if not np.isfinite(points).all():
+        raise InputError(
+            f"The {name} holds points that are not finite: exclude its invalid pixels first."
+        )
+    if normals is not None and normals.shape != points.shape:
+        raise InputError(
+            f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one"
+            " each."
+        )
+
+
+def measure_size(points: np.ndarray) -> float:
+    """Return the longest side in mm of the points' bounding box between their 1st and 99th
+    percentiles."""
+    low, high = np.percentile(points[:: max(1, len(points) // 100_000)], (1.0, 99.0), axis=0)
+    return float((high - low).max())
+
+
+def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
+    """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
+    origin."""
+    if normals is not None:
+        # a NaN normal weighs nothing in a voxel's mean
+        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))
+        cloud = point_cloud(points, finite).voxel_down_sample(voxel)
+        known = lengths(np.asarray(cloud.normals)) > 0.1
+        cloud = cloud.select_by_index(np.flatnonzero(known))
+        cloud.normalize_normals()
+    else:
+        cloud = point_cloud(points).voxel_down_sample(voxel)
+        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
+        cloud.orient_normals_towards_camera_location(np.zeros(3))
+    seen = np.asarray(cloud.points)
+    facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)
+    return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

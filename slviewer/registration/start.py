@@ -1,20 +1,25 @@
 """Where to start ICP from: candidate poses from matched FPFH features, and from the centroids; or
-one that is known.
+one that is known, such as from points that an operator picked on both scans, or by the axis of a
+turntable, which is estimated from registered scans.
 
 RANSAC is our own, in NumPy, because Open3D's parallel one gives another answer at every call.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from slviewer.geometry.rigid import fit_rigid, move_points, rigid_transform
-from slviewer.geometry.vectors import diagonal, lengths
+from slviewer.errors import InputError
+from slviewer.geometry.rigid import fit_rigid, move_points, rigid_transform, turn_about
+from slviewer.geometry.vectors import diagonal, lengths, unit_vectors
 from slviewer.registration.open3d_loader import align_icp, open3d
-from slviewer.registration.prepared import PreparedScan
+from slviewer.registration.refusal import Refused
+from slviewer.registration.scan import PreparedScan
 
 Start = Literal["features", "centroids", "initial", "picked", "turntable", "markers"]
 """How a start was found: searched for (the first two); the last pose, picked points, the
@@ -28,6 +33,12 @@ _LEAST_VOTES = 0.15  # of those for the best pose
 _COARSE_POINTS = 2000
 """Of a scan in the coarse ICP, or up to twice as many: only scans much larger than the reference
 have more."""
+LEAST_PICKS = 3
+_THIN = 0.1
+"""Picks whose second extent is a smaller share of the first lie on a line: they leave the turn
+about it open."""
+_WORST = 0.15
+"""Of the picks' extent: what is worse was not the same points, and ICP would not find back."""
 
 
 @dataclass(frozen=True)
@@ -43,24 +54,23 @@ class Candidate:
     score: float = float("nan")
 
 
-def candidates(scan: PreparedScan, reference: PreparedScan, voxel: float) -> Iterator[Candidate]:
-    """Return the initial poses to try, features first, from the clouds thinned to ``voxel`` mm."""
-    for T in _feature_poses(scan, reference, voxel):
-        yield Candidate(T, "features")
-    shift = np.median(reference.fine_points, axis=0) - np.median(scan.fine_points, axis=0)
-    yield Candidate(rigid_transform(np.eye(3), shift), "centroids")
-
-
-def rank_starts(
-    scanned: PreparedScan, referred: PreparedScan, voxel: float, initial: Candidate | None = None
+def search_starts(
+    scanned: PreparedScan, referred: PreparedScan, size: float, initial: Candidate | None = None
 ) -> list[Candidate]:
-    """Refine the candidates by a coarse ICP, and sort them by the part of the scan on the
-    reference, largest first.
+    """Refine candidate poses by a coarse ICP, and sort them by the part of the scan on the
+    reference, largest first; one or more.
 
-    Equal poses are listed once. ICP uses the clouds thinned to ``voxel`` mm. With ``initial``, only
-    this candidate is refined.
+    Equal poses are listed once. ``size``: of the object in mm. With ``initial``, only this
+    candidate is refined.
     """
-    tried = candidates(scanned, referred, voxel) if initial is None else iter([initial])
+    coarse = max(size / 40.0, 2.0 * referred.spacing, 2.0 * scanned.spacing)
+    voxel = float(f"{coarse:.3g}")
+    if initial is not None:
+        tried = [initial]
+    else:
+        shift = np.median(referred.fine_points, axis=0) - np.median(scanned.fine_points, axis=0)
+        tried = [Candidate(T, "features") for T in _feature_poses(scanned, referred, voxel)]
+        tried.append(Candidate(rigid_transform(np.eye(3), shift), "centroids"))
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
     tree = cKDTree(np.asarray(reference.points))
     sparse_scan = scan.uniform_down_sample(max(1, len(scan.points) // _COARSE_POINTS))
@@ -106,10 +116,10 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     """Return up to six different poses, those on which most feature matches agree; none without
     matches."""
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
-    features = [one.features(voxel) for one in (scanned, referred)]
-    pipeline = open3d().pipelines.registration
     matches = np.asarray(
-        pipeline.correspondences_from_features(features[0], features[1], mutual_filter=True)
+        open3d().pipelines.registration.correspondences_from_features(
+            scanned.features(voxel), referred.features(voxel), mutual_filter=True
+        )
     )
     if len(matches) < 10:
         return []
@@ -147,3 +157,109 @@ def _match_triangles(p: np.ndarray, q: np.ndarray, shortest: float, slack: float
     within ``slack`` mm."""
     a, b = (lengths(x - np.roll(x, 1, axis=1)) for x in (p, q))
     return np.all((a > shortest) & (np.abs(a - b) < slack), axis=1)
+
+
+def fit_picked_start(
+    scan_points: np.ndarray, reference_points: np.ndarray
+) -> tuple[Candidate, np.ndarray]:
+    """The pose that brings three or more picked points (n, 3) mm of the scan onto those of the
+    reference, in order, and how far each pair (n,) stays apart in mm.
+
+    Raises ``InputError`` for picks that do not belong together, and ``Refused`` for ones that lie
+    on a line or that no rigid motion brings near each other.
+    """
+    p, q = np.asarray(scan_points, dtype=np.float64), np.asarray(reference_points, dtype=np.float64)
+    if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
+        raise InputError(
+            f"Picked points of shapes {p.shape} and {q.shape} are not pairs: pick as many on both"
+            " scans."
+        )
+    if len(p) < LEAST_PICKS:
+        raise InputError(
+            f"{len(p)} point pairs were picked: pick {LEAST_PICKS} or more, well apart."
+        )
+    if not (np.isfinite(p).all() and np.isfinite(q).all()):
+        raise InputError("A picked point lies where nothing was measured: pick on the surface.")
+    for name, points in (("scan", p), ("reference", q)):
+        extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if not extents[1] > _THIN * extents[0] or not extents[0] > 0:
+            raise Refused(
+                "picks",
+                f"The points picked on the {name} lie on one line, which leaves the turn about it"
+                " open: pick one more beside it.",
+            )
+    T = fit_rigid(p, q)
+    residual = lengths(move_points(T, p) - q)
+    extent = diagonal(q)
+    if residual.max() > _WORST * extent:
+        raise Refused(
+            "picks",
+            f"The picked pairs stay up to {residual.max():.1f} mm apart (pair"
+            f" {int(residual.argmax()) + 1} the most): pick the same points, in the same order, on"
+            " both scans.",
+        )
+    return Candidate(T, "picked"), np.asarray(residual)
+
+
+_MAX_ANGLE_ERROR_DEG = 3.0
+"""Largest difference between a measured and a given step of the turntable."""
+
+
+@dataclass(frozen=True, eq=False)
+class TurntableAxis:
+    """A turntable's axis in the camera's frame: a ``point`` (3,) mm on it and its ``direction``
+    (3,).
+
+    Positive angles are right-handed about the direction.
+    """
+
+    point: np.ndarray
+    direction: np.ndarray
+
+    def rotation(self, deg: float) -> np.ndarray:
+        """Return the motion (4, 4) of an object on the table when the table turns by an angle."""
+        return turn_about(np.radians(deg) * unit_vectors(self.direction), self.point)
+
+
+def shortest_turn(deg: float) -> float:
+    """Return the angle, -180 to 180 degrees, that turns to the same place."""
+    return (deg + 180.0) % 360.0 - 180.0
+
+
+def determines_axis(deg: float) -> bool:
+    """Whether a step of the table by -180 to 180 degrees is far enough from 0 and from 180 to give
+    its axis."""
+    return _MAX_ANGLE_ERROR_DEG < abs(deg) < 180.0 - _MAX_ANGLE_ERROR_DEG
+
+
+def fit_turntable_axis(steps: Sequence[np.ndarray], step_deg: ArrayLike) -> TurntableAxis:
+    """Fit the axis to registrations of scans, T_before_after (4, 4) mm each, ``step_deg`` apart:
+    one angle, or (n,).
+
+    The direction is such that the table turns by ``step_deg`` from a scan to the one after it.
+    Raises ``InputError`` where a measured step differs from its angle, and for angles near 0 or 180
+    degrees, which determine no direction.
+    """
+    given = np.broadcast_to(np.asarray(step_deg, np.float64), len(steps))
+    if unfit := [deg for deg in given if not determines_axis(deg)]:
+        raise InputError(
+            f"A turntable's step of {unfit[0]:g} degrees gives no axis: step by"
+            f" {_MAX_ANGLE_ERROR_DEG:g} to {180 - _MAX_ANGLE_ERROR_DEG:g} degrees, either way, or"
+            " start from features."
+        )
+    # registration turns the later scan back by the table's step
+    turns = np.array([-np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec()) for T in steps])
+    angles = lengths(turns)
+    for angle, deg in zip(angles, np.abs(given), strict=True):
+        if abs(angle - deg) > _MAX_ANGLE_ERROR_DEG:
+            raise InputError(
+                f"Two scans in a row lie {angle:.1f} degrees apart and the turntable is said to"
+                f" step by {deg:g}: check the angle and the order of the scans, or start from"
+                " features."
+            )
+    direction = (turns / angles[:, None] * np.sign(given)[:, None]).mean(axis=0)
+    A = np.vstack([np.eye(3) - T[:3, :3] for T in steps])
+    b = np.concatenate([T[:3, 3] for T in steps])
+    # the position along the axis is free: the minimum-norm solution is the point nearest to the
+    # camera
+    return TurntableAxis(np.linalg.lstsq(A, b, rcond=1e-3)[0], unit_vectors(direction))

@@ -16,12 +16,12 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import move_points
 from slviewer.geometry.vectors import lengths
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.registration.pairwise import Progress
-from slviewer.registration.prepared import LEAST_POINTS, measure_size, sort_spatially
 from slviewer.registration.refusal import Refused
+from slviewer.registration.scan import LEAST_POINTS, measure_size
 
 SIGMAS = 5.0
 """A point violates free space where its height exceeds this many standard deviations of the pair's
@@ -98,7 +98,7 @@ def register_object(
     clouds: Mapping[str, Cloud],
     reference: str,
     starts: Starts | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda share: None,
 ) -> ObjectAlignment:
     """Register the organised clouds of an object by ``register_all``, after removal of a static
     background.
@@ -110,35 +110,34 @@ def register_object(
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel.
     """
-    report = progress or (lambda share: None)
+    starts = starts or Starts()
     all_samples = _sample_clouds(clouds)
-    markers = starts.markers if starts is not None else None
-    alignment, static = _register_once(clouds, all_samples, reference, starts, report)
+    alignment, static = _register_once(clouds, all_samples, reference, starts, progress)
     first_start = {pair: registration.start for pair, registration in alignment.pairs.items()}
     moving, samples = clouds, all_samples
     for _ in range(ROUNDS):
-        if not _has_points(static):
+        if not static:
             break
         candidate = remove_points(clouds, static)
-        again = Starts(poses=alignment.T_reference_scan, markers=markers)
-        refined = _try_register(candidate, reference, again, lambda share: report(0.9))
+        again = Starts(poses=alignment.T_reference_scan, markers=starts.markers)
+        refined = _try_register(candidate, reference, again, lambda share: progress(0.9))
         # too few points remain of a scan: its background may be needed to determine its pose
         if refined is None:
-            moving, samples, static = clouds, all_samples, _no_points(clouds)
+            moving, samples, static = clouds, all_samples, {}
             break
         pairs = {
             pair: replace(r, start=first_start.get(pair, r.start))
             for pair, r in refined.pairs.items()
         }
-        alignment, moving, samples = (
-            replace(refined, pairs=pairs),
-            candidate,
-            _sample_clouds(candidate),
-        )
-        before, static = static, detect_static_points(clouds, all_samples, alignment)
-        if all(np.count_nonzero(static[n] ^ before[n]) < SETTLED * before[n].size for n in static):
-            static = before
+        alignment = replace(refined, pairs=pairs)
+        moving, samples = candidate, _sample_clouds(candidate)
+        now = detect_static_points(clouds, all_samples, alignment)
+        if all(
+            np.count_nonzero(now[n] ^ mask if now else mask) < SETTLED * mask.size
+            for n, mask in static.items()
+        ):
             break
+        static = now
     T = alignment.T_reference_scan
     contradictions = {
         (a, b): measure_contradiction(
@@ -146,7 +145,8 @@ def register_object(
         )
         for (a, b), registration in alignment.pairs.items()
     }
-    report(1.0)
+    progress(1.0)
+    static = static or {name: np.zeros_like(cloud.mask) for name, cloud in clouds.items()}
     return ObjectAlignment(alignment, moving, static, contradictions)
 
 
@@ -154,37 +154,26 @@ def _register_once(
     clouds: Mapping[str, Cloud],
     samples: Mapping[str, SurfaceSamples],
     reference: str,
-    starts: Starts | None,
+    starts: Starts,
     report: Progress,
 ) -> tuple[MultiwayAlignment, dict[str, np.ndarray]]:
     """Register the scans without what agrees without motion, or as they are where that does not
     separate two motions.
 
-    Returns the alignment and the static points, (h, w) bool by scan.
+    Returns the alignment and the static points, (h, w) bool by scan; {} without any.
     """
     # markers tell how the object moved, also where a plane in its own plane seems to stand still
-    is_marked = starts is not None and starts.markers
-    unmoved = _no_points(clouds) if is_marked else _detect_unmoved_points(clouds, samples)
-    if _has_points(unmoved):
+    unmoved = {} if starts.markers else _detect_unmoved_points(clouds, samples)
+    if unmoved:
         first = _try_register(
             remove_points(clouds, unmoved), reference, starts, lambda share: report(0.5 * share)
         )
         if first is not None:
             static = detect_static_points(clouds, samples, first)
-            if _has_points(static):
+            if static:
                 return first, static
     alignment = register_all(clouds, reference, starts, lambda share: report(0.5 + 0.2 * share))
     return alignment, detect_static_points(clouds, samples, alignment)
-
-
-def _has_points(static: Mapping[str, np.ndarray]) -> bool:
-    """Whether any pixel of a scan is static, by (h, w) bool of each."""
-    return any(mask.any() for mask in static.values())
-
-
-def _no_points(clouds: Mapping[str, Cloud]) -> dict[str, np.ndarray]:
-    """Return (h, w) bool by scan, all False."""
-    return {name: np.zeros_like(cloud.mask) for name, cloud in clouds.items()}
 
 
 def _sample_clouds(clouds: Mapping[str, Cloud]) -> dict[str, SurfaceSamples]:
@@ -206,15 +195,13 @@ def remove_points(
 ) -> dict[str, Cloud]:
     """Return the clouds with the points at ``static`` (h, w) bool replaced by NaN."""
     return {
-        name: replace(
-            cloud, points=np.where(static[name][..., None], np.float32(np.nan), cloud.points)
-        )
+        name: replace(cloud, points=keep_pixels(cloud.points, ~static[name]))
         for name, cloud in clouds.items()
     }
 
 
 def _try_register(
-    clouds: Mapping[str, Cloud], reference: str, starts: Starts | None, progress: Progress
+    clouds: Mapping[str, Cloud], reference: str, starts: Starts, progress: Progress
 ) -> MultiwayAlignment | None:
     """Return ``register_all`` of the clouds, or None where it refuses."""
     try:
@@ -229,33 +216,34 @@ def _detect_unmoved_points(
     """Detect the points, (h, w) bool by scan, that agree with the next scan's or the previous one's
     without any motion.
 
-    All False where they are less than LEAST_PART of a scan, or leave too few points to register.
+    {} where they are less than LEAST_PART of a scan, or leave too few points to register.
     """
     votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
-    sigma = {name: float(np.nanmedian(cloud.sigma_z[cloud.mask])) for name, cloud in clouds.items()}
+    sigma = {
+        name: float(np.nan_to_num(np.nanmedian(cloud.sigma_z[cloud.mask])))
+        for name, cloud in clouds.items()
+    }
     for first, second in pairwise(clouds):
-        gate = SIGMAS * float(np.hypot(np.nan_to_num(sigma[first]), np.nan_to_num(sigma[second])))
+        gate = SIGMAS * float(np.hypot(sigma[first], sigma[second]))
         for scan, onto in ((first, second), (second, first)):
             height = np.abs(heights_above(samples[scan], samples[onto], np.eye(4)))
-            with np.errstate(invalid="ignore"):
-                votes[scan] += (height <= gate).astype(float) - (height > gate)
-    static = {name: _classify_pixels(clouds[name], samples[name], votes[name]) for name in clouds}
-    for name, cloud in clouds.items():
-        measured, unmoved = int(cloud.mask.sum()), int(static[name].sum())
+            votes[scan] += (height <= gate).astype(float) - (height > gate)
+    static = _classify_pixels(clouds, samples, votes)
+    for name, mask in static.items():
+        measured, unmoved = int(clouds[name].mask.sum()), int(mask.sum())
         if unmoved < LEAST_PART * measured or measured - unmoved < 2 * LEAST_POINTS:
-            return _no_points(clouds)
+            return {}
     return static
 
 
 def sample_surface(points: np.ndarray) -> SurfaceSamples:
     """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are
     removed."""
-    o3d = open3d()
     points = np.asarray(points, np.float64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud = cloud.voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
-    cloud = sort_spatially(cloud)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
+    cloud = point_cloud(points).voxel_down_sample(measure_size(points) / _SAMPLES_PER_SIDE)
+    # neighbours beside each other in memory halve the time of searches
+    cloud = cloud.select_by_index(cKDTree(np.asarray(cloud.points)).indices)
+    cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(_NORMAL_POINTS))
     cloud.orient_normals_towards_camera_location(np.zeros(3))
     samples, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
     facing = -np.sum(samples * normals, axis=1) > _MIN_COSINE * lengths(samples)
@@ -275,13 +263,8 @@ def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> 
     medians over each sample's neighbourhood; NaN outside the other scan's view. Cached.
     """
     key = onto, T.tobytes()
-    if key not in scan.heights:
-        scan.heights[key] = _compute_heights(scan, onto, T)
-    return scan.heights[key]
-
-
-def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
-    """Compute ``heights_above``."""
+    if key in scan.heights:
+        return scan.heights[key]
     points = move_points(T, scan.points)
     in_front = points[:, 2] > 0
     rays = points[:, :2] / np.where(in_front, points[:, 2], 1.0)[:, None]
@@ -299,6 +282,7 @@ def _compute_heights(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) 
     count = np.count_nonzero(np.isfinite(neighbourhood), axis=1)
     row = np.arange(len(count))
     height[in_view] = 0.5 * (neighbourhood[row, (count - 1) // 2] + neighbourhood[row, count // 2])
+    scan.heights[key] = height
     return height
 
 
@@ -338,8 +322,8 @@ def detect_static_points(
 
     A sample votes for static where it disagrees with another scan under the ``alignment`` and
     agrees without motion, and against it in the opposite case; otherwise the nearest votes decide.
-    All False without a static part, and where the scans did not move, so that the two cases cannot
-    be distinguished.
+    {} without a static part, and where the scans did not move, so that the two cases cannot be
+    distinguished.
     """
     votes = {name: np.zeros(len(s.points)) for name, s in samples.items()}
     poses = alignment.T_reference_scan
@@ -352,14 +336,23 @@ def detect_static_points(
             moved = heights_above(samples[scan], samples[onto], T)
             unmoved = heights_above(samples[scan], samples[onto], np.eye(4))
             gate = estimate_gate(moved, registration.gate_mm)
-            with np.errstate(invalid="ignore"):
-                is_static = (np.abs(unmoved) <= gate) & (np.abs(moved) > gate)
-                is_moving = (np.abs(moved) <= gate) & (np.abs(unmoved) > gate)
+            is_static = (np.abs(unmoved) <= gate) & (np.abs(moved) > gate)
+            is_moving = (np.abs(moved) <= gate) & (np.abs(unmoved) > gate)
             votes[scan] += is_static.astype(float) - is_moving
-    return {name: _classify_pixels(clouds[name], samples[name], votes[name]) for name in clouds}
+    return _classify_pixels(clouds, samples, votes)
 
 
-def _classify_pixels(cloud: Cloud, samples: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
+def _classify_pixels(
+    clouds: Mapping[str, Cloud],
+    samples: Mapping[str, SurfaceSamples],
+    votes: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Return the static pixels (h, w) bool by scan; {} without any."""
+    static = {name: _classify_scan(clouds[name], samples[name], votes[name]) for name in clouds}
+    return static if any(mask.any() for mask in static.values()) else {}
+
+
+def _classify_scan(cloud: Cloud, samples: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
     """Return the static pixels (h, w) bool of a cloud, by the majority of the votes (n,) nearest to
     each sample.
 

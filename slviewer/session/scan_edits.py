@@ -14,9 +14,15 @@ from slviewer.errors import DamagedError, InputError
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.session.decisions import REGION_INPUT
 from slviewer.session.store import Session
-from slviewer.surface.point_edits import Edit, EditHistory, describe_edit, pack_mask, unpack_mask
 from slviewer.surface.region_of_interest import RegionOfInterest
-from slviewer.surface.selection import SupportPlane
+from slviewer.surface.selection import (
+    Edit,
+    EditHistory,
+    SupportPlane,
+    describe_edit,
+    pack_mask,
+    unpack_mask,
+)
 
 FOLDER = "edits"
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.geometry.vectors import unit_vectors
-from slviewer.registration.open3d_loader import open3d
+from slviewer.registration.open3d_loader import open3d, raycasting_scene
 from slviewer.simulation.assets import asset
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.scenes import Points, Rays, Surface, directions_of
@@ -88,13 +88,7 @@ class MeshScene:
     @cached_property
     def _caster(self) -> Any:
         """Open3D ray-casting scene of the placed mesh."""
-        core = open3d().core
-        scene = open3d().t.geometry.RaycastingScene()
-        scene.add_triangles(
-            core.Tensor(self.placed.astype(np.float32)),
-            core.Tensor(self.triangles.astype(np.uint32)),
-        )
-        return scene
+        return raycasting_scene(self.placed, self.triangles)
 
 
 def demo_object(pose: Pose) -> MeshScene:

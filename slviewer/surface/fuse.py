@@ -8,31 +8,53 @@ nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import permutations
 from typing import Any
 
 import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import move_points
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.surface.agreement import (
-    Agreements,
-    SurfaceAgreement,
-    Views,
-    colour_gains,
-    compare_views,
-)
-from slviewer.surface.clean import viewing_cosines
-from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes
+from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points
+from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.vectors import lengths, rms, unit_vectors
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes, measure_heights
 from slviewer.surface.shapes import PointSet
-from slviewer.surface.view import View, prepare_view
+from slviewer.surface.view import View, prepare_view, viewing_cosines
 
 Progress = Callable[[float], None]
 
 MIN_WITNESS_WEIGHT = 0.3
 """Least border weight of a pixel whose free space can contradict another scan's points."""
+_SAMPLES = 20_000
+_LEAST_PLACES = 30
+_WINDOW_SPACINGS = 6.0  # largest distance of points that may be of one surface, in point spacings
+_WINDOW_SIGMAS = 12.0  # and in standard deviations, whichever is larger
+_GATE_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class SurfaceAgreement:
+    """Comparison of two scans where they overlap.
+
+    ``places``: number of compared points; ``rms_mm`` and ``bias_mm`` (median): height of the second
+    scan's surface above the first's along the normal; ``gate_mm``: height within which both are one
+    surface; ``log_gain``: median logarithm of the second's brightness over the first's, None
+    without colours.
+    """
+
+    places: int
+    rms_mm: float
+    bias_mm: float
+    gate_mm: float
+    log_gain: float | None
+
+
+Views = Mapping[str, View]
+Agreements = Mapping[tuple[str, str], SurfaceAgreement]
+"""Of overlapping scans, by their names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +80,17 @@ class Fused:
         return float((self.seen_by > 1).mean())
 
 
-PoseCovariance = tuple[np.ndarray, np.ndarray]
-"""Covariance (6, 6) of a scan's pose in the reference's frame: of a small rotation (rad) about a
-centre (3,) mm, and of a translation (mm); and that centre."""
-
-
 def fuse(
     scans: Mapping[str, Cloud],
     T_reference_scan: Mapping[str, np.ndarray],
     progress: Progress | None = None,
-    poses: Mapping[str, PoseCovariance] | None = None,
+    poses: Mapping[str, Uncertainty] | None = None,
 ) -> Fused:
     """Fuse organised clouds, each in its camera's frame, with the pose (4, 4) of each by the same
     name.
 
-    ``poses``: how uncertain these poses are; it becomes part of the points' sigmas, as if a point
-    were from its best scan alone.
+    ``poses``: how uncertain these poses are, in the reference's frame; it becomes part of the
+    points' sigmas, as if a point were from its best scan alone.
 
     ``progress`` receives the completed share of the work, 0 to 1, and may raise to cancel. A single
     scan is only cleaned. Raises InputError for a scan without a pose, without a surface, or whose
@@ -84,8 +101,7 @@ def fuse(
     for name in scans:
         if name not in T_reference_scan:
             raise InputError(f"{name} has no pose: register it first, or exclude it.")
-    report = progress or (lambda share: None)
-    views = {}
+    report, views = progress or (lambda share: None), {}
     for i, (name, cloud) in enumerate(scans.items()):
         report(0.3 * i / len(scans))
         views[name] = prepare_view(name, cloud, T_reference_scan[name])
@@ -96,20 +112,26 @@ def fuse(
         views, pairs, lambda share: report(0.4 + 0.1 * share)
     ).items():
         excluded[name]["unconfirmed"] = int(violations.sum())
-        views[name] = views[name].without(violations)
+        kept = keep_pixels(views[name].points, ~violations)
+        views[name] = replace(views[name], points=kept)
     gains = colour_gains(views, pairs)
     parts = []
     for i, name in enumerate(names):
         report(0.5 + 0.5 * i / len(names))
         points, seen_by = _fuse_scan(name, views, pairs, gains)
         if poses is not None and name in poses:
-            points = _add_pose_error(points, *poses[name])
+            points = _add_pose_error(points, poses[name])
         parts.append((points, seen_by))
     report(1.0)
+    # either all scans have colours, or none
+    surface: dict[str, Any] = {
+        name: None if value is None else np.concatenate([vars(part)[name] for part, _ in parts])
+        for name, value in vars(parts[0][0]).items()
+    }
     return Fused(
-        surface=_concatenate([part[0] for part in parts]),
-        source=np.repeat(np.arange(len(names), dtype=np.uint8), [len(part[0]) for part in parts]),
-        seen_by=np.concatenate([part[1] for part in parts]),
+        surface=PointSet(**surface),
+        source=np.repeat(np.arange(len(names), dtype=np.uint8), [len(p) for p, _ in parts]),
+        seen_by=np.concatenate([seen_by for _, seen_by in parts]),
         names=names,
         excluded=excluded,
         pairs=pairs,
@@ -127,7 +149,7 @@ def _detect_violations(
         progress(i / len(views))
         mask = view.mask
         points = choose_pixels(view.points, mask)
-        confirming, contradicting = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
+        votes = np.zeros(len(points), np.int16)
         for other, there in views.items():
             if other != name:
                 T = np.linalg.inv(there.T) @ view.T
@@ -136,13 +158,10 @@ def _detect_violations(
                 gate = 2.0 * max(
                     _gate_mm(pairs, name, other, view, there), view.spacing, there.spacing
                 )
-                add_votes(
-                    move_points(T, points), gate, there.points, witnesses[other], there.to_pixel,
-                    confirming,
-                    contradicting,
-                )  # fmt: skip
+                moved = move_points(T, points)
+                add_votes(moved, gate, there.points, witnesses[other], there.to_pixel, votes)
         violations[name] = np.zeros(mask.shape, bool)
-        violations[name][mask] = contradicting > confirming
+        violations[name][mask] = votes < 0
     return violations
 
 
@@ -151,7 +170,7 @@ def _select_witnesses(view: View) -> np.ndarray:
     grazing angles."""
     inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     facing = viewing_cosines(view.points, view.normals) > 0.25
-    return np.asarray(inside & (view.inner > MIN_WITNESS_WEIGHT) & facing)
+    return inside & (view.inner > MIN_WITNESS_WEIGHT) & facing
 
 
 def _gate_mm(pairs: Agreements, a: str, b: str, first: View, second: View) -> float:
@@ -184,15 +203,13 @@ def _fuse_scan(
     own_colours = None
     if gains is not None and view.colours is not None:
         own_colours = view.colours[mask]
-        share = inner * -np.einsum("ij,ij->i", points, normals) / np.linalg.norm(points, axis=1)
+        share = inner * -np.einsum("ij,ij->i", points, normals) / lengths(points)
         sums[:, 8] = share
         sums[:, 9:] = share[:, None] * gains[name] * own_colours
-    scans = np.ones(len(points), np.uint8)
     inferior = np.zeros(len(points), bool)
     for other, there in views.items():
         if (name, other) not in pairs and (other, name) not in pairs:
             continue
-        overlap = np.zeros((len(points), FIELDS))
         add_surface(
             *view.move_into(there, points, normals),
             view.quality[mask],
@@ -203,16 +220,12 @@ def _fuse_scan(
             there.colours if own_colours is not None else np.zeros((0, 0, 3), np.uint8),
             1.0 if gains is None else gains[other],
             order.index(other) < order.index(name),
-            overlap,
+            sums,
             inferior,
         )
-        scans += (overlap[:, 7] > 0).astype(np.uint8)
-        sums += overlap
     best = ~inferior
-    return (
-        _average(view, points[best], normals[best], sums[best], own_colours is not None),
-        scans[best],
-    )
+    averages = _average(view, points[best], normals[best], sums[best], own_colours is not None)
+    return averages, (1 + sums[best, 7]).astype(np.uint8)
 
 
 def _average(
@@ -223,31 +236,100 @@ def _average(
     total = sums[:, 0]
     height = sums[:, 1] / total
     moved = move_points(view.T, points + height[:, None] * normals)
-    mean_normals = sums[:, 4:7] / np.linalg.norm(sums[:, 4:7], axis=1, keepdims=True)
     sigma = np.hypot(np.sqrt(sums[:, 2]) / total, sums[:, 3] / total)
     colours = None
     if coloured:
-        colours = np.clip(sums[:, 9:] / np.maximum(sums[:, 8:9], 1e-12) + 0.5, 0, 255).astype(
-            np.uint8
-        )
-    return PointSet(moved, mean_normals, colours, sigma)
+        colours = np.clip(sums[:, 9:] / np.maximum(sums[:, 8:9], 1e-12) + 0.5, 0, 255)
+    return PointSet(moved, unit_vectors(sums[:, 4:7]), colours, sigma)
 
 
-def _add_pose_error(points: PointSet, covariance: np.ndarray, centre: np.ndarray) -> PointSet:
+def _add_pose_error(points: PointSet, pose: Uncertainty) -> PointSet:
     """Return the points with the error that their scan's pose has along the normals added to their
     sigmas."""
     assert points.normals is not None and points.sigma_mm is not None
-    lever = np.hstack([np.cross(points.points - centre, points.normals), points.normals])
-    pose = np.einsum("ij,jk,ik->i", lever, covariance, lever)
-    return replace(points, sigma_mm=np.sqrt(points.sigma_mm**2 + np.maximum(pose, 0.0)))
+    lever = distance_jacobian(points.points - pose.centre, points.normals)
+    variance = np.einsum("ij,jk,ik->i", lever, pose.covariance, lever)
+    return replace(points, sigma_mm=np.sqrt(points.sigma_mm**2 + np.maximum(variance, 0.0)))
 
 
-def _concatenate(parts: list[PointSet]) -> PointSet:
-    """Concatenate point sets; attributes that one of them lacks are None."""
-    joined: dict[str, Any] = {}
-    for field in fields(PointSet):
-        values = [getattr(part, field.name) for part in parts]
-        joined[field.name] = (
-            None if any(value is None for value in values) else np.concatenate(values)
-        )
-    return PointSet(**joined)
+def compare_views(
+    views: Views, progress: Callable[[float], None]
+) -> dict[tuple[str, str], SurfaceAgreement]:
+    """Compare every ordered pair of scans; pairs that overlap in too few points are missing from
+    the result."""
+    agreements: dict[tuple[str, str], SurfaceAgreement] = {}
+    pairs = list(permutations(views, 2))
+    for i, (a, b) in enumerate(pairs):
+        progress(i / len(pairs))
+        agreement = _compare_pair(views[a], views[b])
+        if agreement is not None:
+            agreements[a, b] = agreement
+    return agreements
+
+
+def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
+    """Compare a subset of the first scan's points with the second scan's surface; None for too
+    small an overlap."""
+    mask = first.mask
+    subset = slice(None, None, max(1, int(mask.sum()) // _SAMPLES))
+    points, normals = first.move_into(
+        second, choose_pixels(first.points, mask)[subset], first.normals[mask][subset]
+    )
+    spacing = max(first.spacing, second.spacing)
+    noise = sum(
+        float(np.median(each)) for each in (first.noise[mask][subset], second.noise[second.mask])
+    )
+    window = max(_WINDOW_SPACINGS * spacing, _WINDOW_SIGMAS * noise)
+    heights = np.empty((len(points), 2))
+    measure_heights(points, normals, spacing, window, second.grid, heights)
+    height, overlaps = heights[:, 0], heights[:, 1] >= 0
+    if overlaps.sum() < _LEAST_PLACES:
+        return None
+    height = height[overlaps]
+    log_gain = None
+    if first.colours is not None and second.colours is not None:
+        there = second.colours.reshape(-1, 3)[heights[overlaps, 1].astype(int)]
+        log_gain = _estimate_log_gain(first.colours[mask][subset][overlaps], there)
+    gate = max(_GATE_SIGMAS * robust_sigma(height, about=0.0), 3.0 * noise, 0.25 * spacing)
+    gate = min(gate, window)
+    return SurfaceAgreement(
+        places=int(overlaps.sum()),
+        rms_mm=rms(height[np.abs(height) <= gate]),
+        bias_mm=float(np.median(height)),
+        gate_mm=gate,
+        log_gain=log_gain,
+    )
+
+
+def _estimate_log_gain(first: np.ndarray, second: np.ndarray) -> float | None:
+    """Return the median logarithm of the second colours' brightness over the first's, (n, 3) uint8
+    each.
+
+    None where too few are neither dark nor saturated.
+    """
+    first, second = first.mean(axis=1, dtype=float), second.mean(axis=1, dtype=float)
+    exposed = (first > 8) & (first < 250) & (second > 8) & (second < 250)
+    if exposed.sum() < _LEAST_PLACES:
+        return None
+    return float(np.median(np.log(second[exposed] / first[exposed])))
+
+
+def colour_gains(views: Views, pairs: Agreements) -> dict[str, float] | None:
+    """Estimate the factor of each scan's colours that makes overlapping scans agree, least squares
+    of the logarithms.
+
+    The mean logarithm is 0. None where a scan has no colours.
+    """
+    if any(view.colours is None for view in views.values()):
+        return None
+    names = list(views)
+    # weak equations for a mean of 0, and for 0 of a scan without overlap
+    rows = [np.full(len(names), 1e-3), *(1e-6 * np.eye(len(names)))]
+    values = [0.0] * len(rows)
+    for (a, b), pair in pairs.items():
+        if pair.log_gain is not None:
+            weight, of = np.sqrt(pair.places), np.eye(len(names))
+            rows.append(weight * (of[names.index(b)] - of[names.index(a)]))
+            values.append(-weight * pair.log_gain)
+    solution, *_ = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)
+    return dict(zip(names, np.exp(solution).tolist(), strict=True))

@@ -9,11 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, SlviewerError
-from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.mesh import triangulate_grid
-from slviewer.reconstruction.reconstruct import JUMP
+from slviewer.geometry.vectors import lengths, median_spacing
+from slviewer.reconstruction.cloud import Cloud, keep_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import clean, viewing_cosines
+from slviewer.reconstruction.reconstruct import triangulate_grid
 from slviewer.surface.edit import (
     DroppedParts,
     FilledHoles,
@@ -24,11 +23,14 @@ from slviewer.surface.edit import (
     smooth,
 )
 from slviewer.surface.fuse import fuse
-from slviewer.surface.poisson import TrimmedPatches, poisson_surface, trim_far_patches
-from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import select_faces
-from slviewer.surface.topology import Topology, analyse_topology
-from slviewer.surface.volume import volume_surface
+from slviewer.surface.implicit import (
+    TrimmedPatches,
+    poisson_surface,
+    trim_far_patches,
+    volume_surface,
+)
+from slviewer.surface.shapes import Mesh, PointSet, Topology, analyse_topology, select_faces
+from slviewer.surface.view import clean, viewing_cosines
 
 Method = Literal["grid", "poisson", "volume"]
 Progress = Callable[[float, str], None]
@@ -157,7 +159,9 @@ class BuiltMesh:
 
 
 def build_mesh(
-    shape: Cloud | PointSet, plan: MeshingPlan | None = None, progress: Progress | None = None
+    shape: Cloud | PointSet,
+    plan: MeshingPlan | None = None,
+    progress: Progress | None = None,
 ) -> BuiltMesh:
     """Mesh one scan's organised cloud, or the points of a merge (with normals), as planned.
 
@@ -181,6 +185,11 @@ def build_mesh(
     trimmed = filled = smoothed = thinned = None
     if method == "grid":
         mesh = grid_mesh(shape)
+    elif points.normals is None:
+        raise InputError(
+            "These points have no normals: a surface through them needs to know its outside; merge"
+            " the scans again."
+        )
     elif method == "volume":
         mesh = volume_surface(points, cell)
     else:
@@ -216,8 +225,7 @@ def measure_spacing(points: PointSet) -> float:
         raise InputError(f"{len(points)} points make no surface.")
     if not np.isfinite(points.points).all():
         raise InputError("Some points are NaN: select the valid ones first.")
-    distance, _ = cKDTree(points.points).query(points.points[:: max(1, len(points) // 20_000)], k=2)
-    median_mm = float(np.median(distance[:, 1]))
+    median_mm = median_spacing(cKDTree(points.points), 20_000)
     if not median_mm > 0:
         raise InputError("Most points are there twice: merge the scans instead of joining them.")
     return median_mm
@@ -252,23 +260,15 @@ def grid_mesh(cloud: Cloud | PointSet) -> Mesh:
         )
     normals = grid_normals(cloud.points)
     cleaned, _ = clean(cloud, normals)
-    points = np.where(cleaned[..., None], cloud.points, np.float32(np.nan))
-    depth = float(np.median(points[..., 2][cleaned])) if cleaned.any() else np.inf
-    faces = triangulate_grid(points, JUMP * depth)
+    points = keep_pixels(cloud.points, cleaned)
+    faces = triangulate_grid(points)
     if not len(faces):
         raise InputError(
             "No two neighbouring pixels of this scan lie on a surface: reconstruct it again."
         )
-    along = viewing_cosines(points, normals) * np.linalg.norm(points, axis=-1) / points[..., 2]
+    along = viewing_cosines(points, normals) * lengths(points) / points[..., 2]
     sigma = (cloud.sigma * along)[cleaned]
-    colours = None if cloud.texture is None else cloud.texture[cleaned]
-    if colours is not None and colours.ndim == 1:
-        colours = np.repeat(colours[:, None], 3, axis=1)
-    mesh = Mesh(
-        points[cleaned],
-        faces,
-        normals[cleaned],
-        colours,
-        sigma if np.isfinite(sigma).all() else None,
-    )
+    colours = None if (rgb := cloud.rgb) is None else rgb[cleaned]
+    known = sigma if np.isfinite(sigma).all() else None
+    mesh = Mesh(points[cleaned], faces, normals[cleaned], colours, known)
     return select_faces(mesh, np.ones(len(faces), bool))

@@ -11,7 +11,7 @@ MIN_NORMAL_COSINE = 0.5
 """Least cosine between the normals of one surface."""
 FIELDS = 12
 """Number of sums per point: weight, weight x height, (weight x noise)^2, weight x systematic,
-weight x normal (3), number of scans, weight of colour, weight x colour (3)."""
+weight x normal (3), number of other scans, weight of colour, weight x colour (3)."""
 
 
 class SurfaceGrid(NamedTuple):
@@ -27,18 +27,18 @@ class SurfaceGrid(NamedTuple):
 
 
 @kernel()
-def pixel_of(x, y, z, to_pixel):
-    """Return the (column, row) whose ray passes (x, y, z) mm in the camera's frame; NaN outside the
-    scan.
+def pixel_of(x, y, z, to_pixel, shape):
+    """Return the (row, column) whose ray passes (x, y, z) mm in the camera's frame; -1 outside the
+    scan of a ``shape`` (h, w).
 
     ``to_pixel``: see ``view._fit_pixel_map``.
     """
     if not z > 0.0:
-        return np.nan, np.nan
+        return -1, -1
     a = (x / z - to_pixel[0]) / to_pixel[2]
     b = (y / z - to_pixel[1]) / to_pixel[3]
     if abs(a) > 1.02 or abs(b) > 1.02:
-        return np.nan, np.nan
+        return -1, -1
     u = v = 0.0
     k = 4
     power = 1.0
@@ -50,7 +50,9 @@ def pixel_of(x, y, z, to_pixel):
             term *= b
             k += 1
         power *= a
-    return u, v
+    if not (u > -0.5 and v > -0.5 and u < shape[1] - 0.5 and v < shape[0] - 0.5):
+        return -1, -1
+    return int(np.rint(v)), int(np.rint(u))
 
 
 @kernel()
@@ -66,10 +68,9 @@ def interpolate_surface(p, n, reach, gate, grid, mean):
     """
     points, normals, noise = grid.points, grid.normals, grid.noise
     height, width = noise.shape
-    u, v = pixel_of(p[0], p[1], p[2], grid.to_pixel)
-    if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+    row, column = pixel_of(p[0], p[1], p[2], grid.to_pixel, noise.shape)
+    if row < 0:
         return False
-    row, column = int(np.rint(v)), int(np.rint(u))
     total = squares = t = tt = noises = s = w = m0 = m1 = m2 = 0.0
     for y in range(max(row - 2, 0), min(row + 3, height)):
         for x in range(max(column - 2, 0), min(column + 3, width)):
@@ -128,27 +129,22 @@ def measure_heights(p, n, reach, gate, grid, heights):
 
 
 @kernel(parallel=True)
-def add_votes(p, gate, points, witnesses, to_pixel, confirming, contradicting):
+def add_votes(p, gate, points, witnesses, to_pixel, votes):
     """Add a scan's votes on points ``p`` (k, 3) mm in its frame; only its pixels ``witnesses`` (h,
     w) bool vote.
 
-    Adds 1 to ``confirming`` (k,) where its surface is within ``gate`` mm in depth, or to
-    ``contradicting`` (k,) where the surface is more than 1.5 gates behind the point, which is thus
-    in the scan's free space.
+    Adds 1 to ``votes`` (k,) where its surface is within ``gate`` mm in depth, and -1 where the
+    surface is more than 1.5 gates behind the point, which is thus in the scan's free space.
     """
-    height, width = witnesses.shape
     for i in numba.prange(len(p)):
-        u, v = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel)
-        if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
-            continue
-        y, x = int(np.rint(v)), int(np.rint(u))
-        if not witnesses[y, x]:
+        y, x = pixel_of(p[i, 0], p[i, 1], p[i, 2], to_pixel, witnesses.shape)
+        if y < 0 or not witnesses[y, x]:
             continue
         behind = points[y, x, 2] - p[i, 2]
         if abs(behind) <= gate:
-            confirming[i] += 1
+            votes[i] += 1
         elif behind > 1.5 * gate:
-            contradicting[i] += 1
+            votes[i] -= 1
 
 
 @kernel(parallel=True)

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import rigid_transform
+from slviewer.geometry.vectors import finite_rows
 
 MARGIN = 0.05
 """Of the size of a cloud: how far its automatic box extends beyond it."""
@@ -51,7 +53,7 @@ class RegionOfInterest:
     def around(cls, points: np.ndarray) -> "RegionOfInterest":
         """Return the box, along the axes, around all points (..., 3) mm but outliers; InputError
         without points."""
-        flat = points[np.isfinite(points).all(axis=-1)].astype(np.float64)
+        flat = points[finite_rows(points)].astype(np.float64)
         if not len(flat):
             raise InputError("there are no points to put a region around: reconstruct a scan first")
         low, high = np.percentile(flat, [OUTLIERS_PERCENT, 100 - OUTLIERS_PERCENT], axis=0)
@@ -67,10 +69,8 @@ class RegionOfInterest:
     @property
     def T_camera_box(self) -> NDArray[np.float64]:
         """(4, 4): from the frame of the box, in its middle along its sides, to the camera's."""
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix()
-        T[:3, 3] = self.centre_mm
-        return T
+        turn = Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
+        return rigid_transform(turn.as_matrix(), np.array(self.centre_mm))
 
     def contains(self, points: np.ndarray) -> NDArray[np.bool_]:
         """Bool like points (..., 3) mm without their last axis: whether they lie in the box; False
@@ -86,13 +86,11 @@ class RegionOfInterest:
 
     def text(self) -> str:
         """Describe the box: its size, centre, and where it is turned its angles."""
-        turned = ""
-        if any(self.rotation_deg):
-            turned = (
-                f", turned by {', '.join(f'{deg:.1f}' for deg in self.rotation_deg)} degrees about"
-                " x, y, z"
-            )
-        centre = ", ".join(f"{mm:.1f}" for mm in self.centre_mm)
+        centre, turned = (
+            ", ".join(f"{value:.1f}" for value in values)
+            for values in (self.centre_mm, self.rotation_deg)
+        )
+        turned = f", turned by {turned} degrees about x, y, z" if any(self.rotation_deg) else ""
         return f"{_times(self.size_mm)} mm about ({centre}) mm{turned}"
 
 
@@ -100,7 +98,7 @@ def crop_mask(name: str, points: np.ndarray, region: RegionOfInterest) -> NDArra
     """Bool (...): the points (..., 3) mm of a scan in the region. InputError, with where they are,
     if none is."""
     inside = region.contains(points)
-    flat = points[np.isfinite(points).all(axis=-1)]
+    flat = points[finite_rows(points)]
     if len(flat) and not inside.any():
         spans = (f"{axis} {low:.0f} to {high:.0f}" for axis, low, high in zip(
             "xyz", flat.min(axis=0), flat.max(axis=0), strict=True))  # fmt: skip
@@ -114,7 +112,7 @@ def crop_mask(name: str, points: np.ndarray, region: RegionOfInterest) -> NDArra
 
 def _triple(values: np.ndarray) -> Triple:
     """Return an array (3,) as a tuple of floats."""
-    x, y, z = (float(value) for value in values)
+    x, y, z = values.tolist()
     return x, y, z
 
 
@@ -127,7 +125,6 @@ def box_edges(centre: np.ndarray, size: np.ndarray, axes: np.ndarray) -> np.ndar
     """(12, 2, 3) mm: the edges of a box of sides ``size`` (3,) along the rows of ``axes`` (3,
     3)."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3)))
-    pairs = [
-        (a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1
-    ]
-    return np.asarray((corners[np.array(pairs)] * size) @ axes + centre)
+    apart = np.abs(corners[:, None] - corners).sum(axis=-1)
+    pairs = np.argwhere(np.tril(apart == 1))
+    return (corners[pairs] * size) @ axes + centre

@@ -1,21 +1,28 @@
-"""Selecting points of an organised cloud: by an outline in a view, by connection, and by their
-supporting plane.
+"""Selecting points of an organised cloud by an outline in a view, by connection, and by their
+supporting plane; and edits that delete the selected points.
 
 Every function returns a mask (h, w) of the camera's pixels, so that a selection made in any view of
-the cloud applies to the same pixels after another calibration.
+the cloud applies to the same pixels after another calibration. Edits are stored as operations:
+nothing is removed from the scan itself. An operation names pixels of the camera, or a plane in its
+frame, not points: it applies in the same way to the cloud that another calibration makes of the
+same frames.
 """
 
+import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slviewer.errors import InputError
-from slviewer.geometry.ransac import ransac_plane
+from slviewer.geometry.robust import robust_sigma
+from slviewer.geometry.shapes import ransac_plane
+from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.reconstruction.reconstruct import JUMP
-from slviewer.surface.topology import label_connected
+from slviewer.surface.shapes import label_connected
 
 PLANE_SHARE = 0.1
 """Of the points that must lie on a plane for it to be taken as what supports the object."""
@@ -42,12 +49,9 @@ class ViewCamera:
         """Project points (..., 3) mm to (..., 2): 0 ... 1 from the left and from the top; NaN
         behind the view."""
         local = (points - self.position) @ self.R_scene_view
-        with np.errstate(invalid="ignore", divide="ignore"):
-            depth = np.where(local[..., 2] > 0, local[..., 2], np.nan)
+        depth = np.where(local[..., 2] > 0, local[..., 2], np.nan)
         reach = np.tan(self.fov_rad / 2)
-        return np.asarray(
-            0.5 + local[..., :2] / depth[..., None] / (2 * reach * np.array([self.aspect, 1.0]))
-        )
+        return 0.5 + local[..., :2] / depth[..., None] / (2 * reach * np.array([self.aspect, 1.0]))
 
     def is_near(self, other: "ViewCamera") -> bool:
         """Whether another view shows a scene at the same place of the picture, to about a pixel."""
@@ -72,11 +76,10 @@ def select_in_outline(
     size = np.maximum(high - low, 1e-9)
     raster = np.zeros((_RASTER, _RASTER), np.uint8)
     cv2.fillPoly(raster, [np.rint((corners - low) / size * (_RASTER - 1)).astype(np.int32)], 1)
-    with np.errstate(invalid="ignore"):
-        at = (view.project(points.astype(np.float64)) - low) / size
-        inside = ((at >= 0) & (at <= 1)).all(axis=-1)
+    at = (view.project(points.astype(np.float64)) - low) / size
+    inside = ((at >= 0) & (at <= 1)).all(axis=-1)
     pixel = np.rint(np.where(inside[..., None], at, 0) * (_RASTER - 1)).astype(int)
-    return np.asarray(inside & (raster[pixel[..., 1], pixel[..., 0]] == 1))
+    return inside & (raster[pixel[..., 1], pixel[..., 0]] == 1)
 
 
 def select_polygon(shape: tuple[int, ...], corners: np.ndarray) -> Mask:
@@ -101,7 +104,7 @@ def select_connected(
     of their depth. ``candidates`` (h, w): the points to consider, by default all. InputError for a
     seed that is none of them.
     """
-    valid = np.isfinite(points).all(axis=-1)
+    valid = finite_rows(points)
     if candidates is not None:
         valid &= candidates
     u, v = seed
@@ -111,15 +114,14 @@ def select_connected(
     index = np.arange(h * w).reshape(h, w)
     pairs = []
     for down, right in _STEPS:
-        a = (slice(0, h - down), slice(max(0, -right), w - max(0, right)))
-        b = (slice(down, h), slice(max(0, right), w + min(0, right)))
-        with np.errstate(invalid="ignore"):
-            depth = np.minimum(points[a][..., 2], points[b][..., 2])
-            near = np.linalg.norm(points[a] - points[b], axis=-1) < JUMP * depth
+        a = np.s_[: h - down, max(0, -right) : w - max(0, right)]
+        b = np.s_[down:, max(0, right) : w + min(0, right)]
+        depth = np.minimum(points[a][..., 2], points[b][..., 2])
+        near = lengths(points[a] - points[b]) < JUMP * depth
         joined = near & valid[a] & valid[b]
         pairs.append(np.stack([index[a][joined], index[b][joined]], axis=1))
     labels = label_connected(np.concatenate(pairs), h * w).reshape(h, w)
-    return np.asarray(valid & (labels == labels[v, u]))
+    return valid & (labels == labels[v, u])
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,7 @@ class SupportPlane:
 
     def select_below(self, points: np.ndarray) -> Mask:
         """Mask (h, w) of the points (h, w, 3) mm on the plane and below it."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(points @ np.array(self.normal) - self.offset_mm <= self.margin_mm)
+        return points @ np.array(self.normal) - self.offset_mm <= self.margin_mm
 
 
 def detect_support(
@@ -146,24 +147,22 @@ def detect_support(
     ``PLANE_TOLERANCE`` of their depth. InputError where less than ``PLANE_SHARE`` of the points lie
     on any plane.
     """
-    flat = points[np.isfinite(points).all(axis=-1)].astype(np.float64)
+    flat = points[finite_rows(points)].astype(np.float64)
     depth = float(np.median(flat[:, 2])) if len(flat) else 0.0
     tolerance = max(PLANE_TOLERANCE * depth, 3 * sigma_mm if np.isfinite(sigma_mm) else 0.0, 1e-6)
     plane, inliers = ransac_plane(flat, tolerance)
-    share = float(inliers.mean())
+    share = inliers.mean()
     if share < PLANE_SHARE:
         raise InputError(
             f"no supporting plane: at most {100 * share:.0f} % of the {len(flat)} points lie on one"
             f" plane to {tolerance:.2f} mm, {100 * PLANE_SHARE:.0f} % are needed: select the points"
             " with an outline"
         )
-    residuals = plane.distance(flat[inliers])
-    normal, offset = plane.normal, plane.offset
-    if offset > 0:  # the camera, in the origin, is on the positive side
-        normal, offset = -normal, -offset
-    scatter = 3 * 1.4826 * float(np.median(np.abs(residuals)))
-    margin = max(scatter, tolerance) if margin_mm is None else margin_mm
-    return SupportPlane((float(normal[0]), float(normal[1]), float(normal[2])), offset, margin)
+    if margin_mm is None:
+        margin_mm = max(3 * robust_sigma(plane.distance(flat[inliers]), about=0.0), tolerance)
+    side = -1 if plane.offset > 0 else 1  # the camera, in the origin, is on the positive side
+    x, y, z = (side * plane.normal).tolist()
+    return SupportPlane((x, y, z), side * plane.offset, margin_mm)
 
 
 def select_support(
@@ -173,3 +172,148 @@ def select_support(
     `detect_support` does; returns it with the mask (h, w) of the points on it and below."""
     plane = detect_support(points, float(np.nanmedian(sigma_z)), margin_mm)
     return plane, plane.select_below(points)
+
+
+_MAX_PIXELS = 1 << 32
+
+
+@dataclass(frozen=True, eq=False)
+class Edit:
+    """Points that are deleted: those at ``pixels`` (h, w) bool, or those on ``plane`` and below,
+    one of both.
+
+    ``what``: how they were selected, in words; ``points``: how many it deleted when it was made;
+    ``made``: when, as text that sorts by time, the same for edits of several scans that were made
+    together; empty where unknown.
+    """
+
+    what: str
+    points: int
+    pixels: Mask | None = None
+    plane: SupportPlane | None = None
+    made: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.pixels is None) == (self.plane is None):
+            raise InputError("an edit deletes pixels, or what is below a plane: give one of them")
+
+    @property
+    def kind(self) -> Literal["pixels", "plane"]:
+        """What the edit names its points by."""
+        return "plane" if self.pixels is None else "pixels"
+
+    def select(self, points: np.ndarray) -> Mask:
+        """Mask (h, w) of the points (h, w, 3) mm that the edit deletes. InputError for pixels of
+        another size."""
+        if self.plane is not None:
+            return self.plane.select_below(points)
+        assert self.pixels is not None
+        if self.pixels.shape != points.shape[:2]:
+            (h, w), (rows, columns) = self.pixels.shape, points.shape[:2]
+            raise InputError(
+                f"the edit {self.what!r} is of {w}x{h} pixels, the scan has {columns}x{rows}: undo"
+                " the edit"
+            )
+        return self.pixels
+
+    def text(self) -> str:
+        """Describe the edit in a line."""
+        return describe_edit(self.what, self.points)
+
+
+def describe_edit(what: str, points: int) -> str:
+    """Describe an edit in a line: how its points were selected, and how many it deleted."""
+    return f"{what}: {points:,} points deleted"
+
+
+@dataclass(frozen=True, eq=False)
+class EditHistory:
+    """The edits of a scan in the order in which they were made, of which the first ``applied`` are
+    in effect; those after them were undone. A new edit replaces those that were undone."""
+
+    edits: tuple[Edit, ...] = ()
+    applied: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.applied <= len(self.edits):
+            raise InputError(
+                f"{self.applied} of {len(self.edits)} edits are stated to be in effect"
+            )
+
+    @property
+    def active(self) -> tuple[Edit, ...]:
+        """The edits in effect."""
+        return self.edits[: self.applied]
+
+    @property
+    def undone(self) -> tuple[Edit, ...]:
+        """The edits that `redo` brings back, the next one first."""
+        return self.edits[self.applied :]
+
+    def add(self, edit: Edit) -> "EditHistory":
+        """Return the history with one more edit; what was undone is forgotten."""
+        return EditHistory((*self.active, edit), self.applied + 1)
+
+    def undo(self, count: int = 1) -> "EditHistory":
+        """Return the history without the effect of its last edits. InputError where there are
+        fewer."""
+        if not 1 <= count <= self.applied:
+            raise InputError(
+                f"{self.applied} edits are in effect: {count} of them cannot be undone"
+            )
+        return replace(self, applied=self.applied - count)
+
+    def redo(self, count: int = 1) -> "EditHistory":
+        """Return the history with undone edits in effect again. InputError where there are
+        fewer."""
+        if not 1 <= count <= len(self.undone):
+            raise InputError(
+                f"{len(self.undone)} edits are undone: {count} of them cannot be redone"
+            )
+        return replace(self, applied=self.applied + count)
+
+    def keep_mask(self, points: np.ndarray) -> Mask:
+        """Mask (h, w) of the measured points (h, w, 3) mm that no edit in effect deletes."""
+        kept = finite_rows(points)
+        for edit in self.active:
+            kept &= ~edit.select(points)
+        return kept
+
+
+def make_edit(
+    points: np.ndarray, selected: Mask, what: str, plane: SupportPlane | None = None, made: str = ""
+) -> Edit:
+    """Return the edit that deletes the ``selected`` (h, w) ones of points (h, w, 3) mm: with every
+    later calibration, also those at selected pixels that are NaN now.
+
+    ``plane``: what the selection is everything below of, where it is; the edit is then stored as
+    this plane. InputError where nothing is selected.
+    """
+    count = int(np.count_nonzero(selected & finite_rows(points)))
+    if not count:
+        raise InputError("no point is selected: select some first")
+    return Edit(what, count, selected if plane is None else None, plane, made)
+
+
+def pack_mask(mask: Mask) -> NDArray[np.uint8]:
+    """Compress a mask (h, w) to bytes (n,), which `unpack_mask` reads."""
+    return np.frombuffer(zlib.compress(np.packbits(mask).tobytes(), 6), np.uint8)
+
+
+def unpack_mask(packed: np.ndarray, size: Sequence[int]) -> Mask:
+    """Return the mask (h, w) of bytes (n,) from `pack_mask`; ``size`` is (w, h). InputError where
+    they do not fit."""
+    w, h = size
+    if not 0 < w * h <= _MAX_PIXELS:
+        raise InputError(f"a mask of {w}x{h} pixels is stated")
+    needed = (w * h + 7) // 8
+    reader = zlib.decompressobj()
+    try:
+        body = reader.decompress(np.asarray(packed, np.uint8).tobytes(), needed + 1)
+    except zlib.error as error:
+        raise InputError(f"the mask of an edit cannot be read ({error})") from error
+    if len(body) != needed:
+        raise InputError(
+            f"the mask of an edit holds {len(body)} bytes, {needed} are needed for {w}x{h} pixels"
+        )
+    return np.unpackbits(np.frombuffer(body, np.uint8), count=w * h).astype(bool).reshape(h, w)

@@ -18,11 +18,11 @@ from scipy.ndimage import distance_transform_edt
 from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
+from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.agreement import Views, colour_gains, compare_views
-from slviewer.surface.shapes import Mesh, pick_attributes
-from slviewer.surface.topology import face_areas, half_edges
+from slviewer.surface.fuse import Views, colour_gains, compare_views
+from slviewer.surface.shapes import Mesh, count_edges, face_areas, pick_attributes
 from slviewer.surface.view import View, prepare_view
 
 SIZES_PX = (512, 8192)
@@ -75,7 +75,7 @@ def texture_mesh(
     *,
     size: int = 2048,
     light: np.ndarray | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> TexturedMesh:
     """Unfold a mesh, and project the scans' textures onto it.
 
@@ -85,7 +85,6 @@ def texture_mesh(
     scan without a texture, a mesh that is too large, or sizes out of range; SlviewerError where the
     mesh cannot be unfolded.
     """
-    report = progress or (lambda share: None)
     if not SIZES_PX[0] <= size <= SIZES_PX[1]:
         raise InputError(
             f"a texture of {size} px cannot be made: give {SIZES_PX[0]} to {SIZES_PX[1]}"
@@ -101,16 +100,14 @@ def texture_mesh(
                 f"{name} has no texture: capture it with a white image among its patterns"
             )
     views = {name: prepare_view(name, cloud, T_mesh_scan[name]) for name, cloud in scans.items()}
-    gains = (
-        colour_gains(views, compare_views(views, lambda share: None)) if len(views) > 1 else None
-    )
-    report(0.2)
+    gains = colour_gains(views, compare_views(views, lambda share: None)) or {}
+    progress(0.2)
     unfolded, corners, charts = _unfold(mesh, size)
-    report(0.5)
+    progress(0.5)
     places, normals = _bake_places(unfolded, size)
     chart = np.isfinite(places[..., 0])
     colours, weight = _blend(
-        places[chart], normals[chart], views, gains, light, lambda s: report(0.5 + 0.4 * s)
+        places[chart], normals[chart], views, gains, light, lambda s: progress(0.5 + 0.4 * s)
     )
     image, seen = np.zeros((size, size, 3), np.float32), np.zeros((size, size), bool)
     image[chart], seen[chart] = colours, weight > 0
@@ -120,10 +117,10 @@ def texture_mesh(
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
     image = image[tuple(nearest)]
     image *= 250.0 / max(float(np.percentile(image[seen], 99.5)), 1e-6)
-    report(0.95)
+    progress(0.95)
     vertices, faces, uv, kept = _split_vertices(mesh, corners)
     split = Mesh(vertices, faces, **(pick_attributes(mesh, kept) | {"colours": None}))
-    report(1.0)
+    progress(1.0)
     return TexturedMesh(
         split,
         uv,
@@ -160,14 +157,14 @@ def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
         size, {"positions", "normals"}, margin=1, fill=float("nan"), update_material=False
     )
     normals = baked["normals"].numpy()
-    return baked["positions"].numpy(), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return baked["positions"].numpy(), unit_vectors(normals)
 
 
 def _blend(
     places: np.ndarray,
     normals: np.ndarray,
     views: Views,
-    gains: Mapping[str, float] | None,
+    gains: Mapping[str, float],
     light: np.ndarray | None,
     report: Callable[[float], None],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -175,12 +172,11 @@ def _blend(
     them."""
     total, weight = np.zeros((len(places), 3), np.float64), np.zeros(len(places), np.float64)
     for k, (name, view) in enumerate(views.items()):
-        gain = 1.0 if gains is None else gains[name]
         for first in range(0, len(places), _CHUNK):
             report((k + first / len(places)) / len(views))
             part = slice(first, first + _CHUNK)
             colours, own = _look(places[part], normals[part], view, light)
-            total[part] += gain * own[:, None] * colours
+            total[part] += gains[name] * own[:, None] * colours
             weight[part] += own
     return (total / np.maximum(weight, 1e-12)[:, None]).astype(np.float32), weight
 
@@ -192,7 +188,7 @@ def _look(
     of what it misses."""
     points = move_points(np.linalg.inv(view.T), places.astype(np.float64))
     facing = normals @ view.T[:3, :3]
-    cosine = -np.sum(facing * points, axis=1) / np.linalg.norm(points, axis=1)
+    cosine = -np.sum(facing * points, axis=1) / lengths(points)
     rays = (points[:, :2] / points[:, 2:] - view.to_pixel[:2]) / view.to_pixel[2:4]
     A = monomials(rays, _DEGREE)
     pixels = (A @ view.to_pixel[4:].reshape(2, -1).T).astype(np.float32)
@@ -206,8 +202,7 @@ def _look(
 
     away = np.sum((points - sample(view.points, cv2.INTER_NEAREST)) * facing, axis=1)
     inside = (np.abs(rays) <= 1.05).all(axis=1)
-    with np.errstate(invalid="ignore"):
-        sees = inside & (cosine > _MIN_COSINE) & (np.abs(away) < _GATE * view.spacing)
+    sees = inside & (cosine > _MIN_COSINE) & (np.abs(away) < _GATE * view.spacing)
     assert view.colours is not None
     colours = sample(view.colours.astype(np.float32)).astype(np.float64)
     weight = (
@@ -217,13 +212,12 @@ def _look(
     )
     if light is not None:
         to_light = light - points
-        distance = np.linalg.norm(to_light, axis=1)
+        distance = lengths(to_light)
         lit = np.sum(facing * to_light, axis=1) / distance
-        with np.errstate(invalid="ignore"):
-            sees &= lit > _MIN_COSINE
+        sees &= lit > _MIN_COSINE
         colours *= ((distance / _NOMINAL_MM) ** 2 / np.maximum(lit, _MIN_COSINE))[:, None]
         weight *= np.maximum(lit, 0.0) ** 2  # the noise grows as the shading is divided out
-    sees &= np.isfinite(weight) & np.isfinite(colours).all(axis=1)
+    sees &= np.isfinite(weight) & finite_rows(colours)
     return np.where(sees[:, None], colours, 0.0), np.where(sees, weight, 0.0)
 
 
@@ -248,10 +242,5 @@ def _split_vertices(
 def _seam_share(before: np.ndarray, after: np.ndarray) -> float:
     """Return the share of a mesh's edges along which its unfolded triangles ``after`` (m, 3) come
     apart."""
-
-    def edges(faces: np.ndarray) -> int:
-        """Return the number of different edges."""
-        return len(np.unique(np.sort(half_edges(faces), axis=1), axis=0))
-
-    whole = edges(before)
-    return (edges(after) - whole) / whole
+    whole, split = (len(count_edges(faces)[1]) for faces in (before, after))
+    return (split - whole) / whole

@@ -1,18 +1,21 @@
-"""Preparation of a scan for fusion: cleaning, standard deviations along the normals, weights, and a
-pixel map."""
+"""Preparation of a scan for fusion: cleaning of flying pixels at depth edges, grazing pixels, and
+small or distant groups; standard deviations along the normals, weights, and a pixel map."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.geometry.vectors import lengths, median_spacing, occupied_cubes, rms
+from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.surface.clean import ExcludedPixels, clean, close_pinholes, viewing_cosines
 from slviewer.surface.overlap_kernels import SurfaceGrid
+from slviewer.surface.shapes import label_connected
 
 LEAST_POINTS = 200
 FEATHER = 0.02
@@ -20,6 +23,33 @@ FEATHER = 0.02
 _DEGREE = 5  # of the polynomial from rays to pixels
 _MAX_RMS_PX = 0.75  # of that polynomial, for points of one camera
 _LEAST_WEIGHT = 1e-3
+STEEPEST = 6.0
+"""Largest depth step between neighbours of one surface, over their distance across the viewing
+direction (80°)."""
+MIN_VIEWING_COSINE = 0.12
+"""Least cosine between normal and viewing direction of a measured surface (83°)."""
+FAR_SPACINGS = 20.0
+FAR_SHARE = 0.005
+"""A cluster is excluded where it is more than 20 point spacings away from all others and has less
+than 0.5 % of the points."""
+LEAST_GROUP = 2e-4
+"""Least share of a scan's pixels in a connected group."""
+
+
+@dataclass(frozen=True)
+class ExcludedPixels:
+    """Numbers of excluded pixels: ``edges`` (border and depth jumps), ``grazing`` or without a
+    normal, in small ``groups``, and in ``far`` clusters."""
+
+    edges: int
+    grazing: int
+    groups: int
+    far: int
+
+    @property
+    def total(self) -> int:
+        """Number of all excluded pixels."""
+        return self.edges + self.grazing + self.groups + self.far
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +85,7 @@ class View:
     @property
     def grid(self) -> SurfaceGrid:
         """What the kernels need to interpolate the surface."""
-        return SurfaceGrid(
-            self.points,
-            self.normals,
-            self.noise,
-            self.systematic,
-            self.inner,
-            self.quality,
-            self.to_pixel,
-        )
+        return SurfaceGrid(*(getattr(self, name) for name in SurfaceGrid._fields))
 
     def move_into(
         self, other: "View", points: np.ndarray, normals: np.ndarray
@@ -74,10 +96,6 @@ class View:
         return np.ascontiguousarray(move_points(T, points)), np.ascontiguousarray(
             normals @ T[:3, :3].T
         )
-
-    def without(self, pixels: np.ndarray) -> "View":
-        """Return the view without the points at ``pixels`` (h, w) bool."""
-        return replace(self, points=np.where(pixels[..., None], np.float32(np.nan), self.points))
 
 
 def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
@@ -98,9 +116,10 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
             f"{name}: only {np.count_nonzero(surface)} of its pixels lie on a surface: "
             "reconstruct it again, or exclude it."
         )
-    crop = _bounding_box(surface)
+    x, y, width, height = cv2.boundingRect(surface.astype(np.uint8))
+    crop = np.s_[y : y + height, x : x + width]
     surface, normals = surface[crop], normals[crop]
-    points = np.where(surface[..., None], cloud.points[crop], np.float32(np.nan))
+    points = keep_pixels(cloud.points[crop], surface)
     cosine = viewing_cosines(points, normals)
     noise = _fill_noise(cloud.sigma_z[crop], points, cosine, surface)
     systematic = (
@@ -108,7 +127,7 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     )
     # an error dz of depth moves the point by dz (x/z, y/z, 1) along its ray; its component along
     # the normal
-    along = cosine * np.linalg.norm(points, axis=-1) / points[..., 2]
+    along = cosine * lengths(points) / points[..., 2]
     noise, systematic = noise * along, np.nan_to_num(systematic) * along
     inner = _border_weights(surface)
     area = _pixel_areas(points, cosine)
@@ -121,7 +140,7 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
         systematic=systematic.astype(np.float32),
         inner=inner,
         quality=_smooth(quality, surface),
-        colours=_crop_colours(cloud.texture, crop),
+        colours=None if (rgb := cloud.rgb) is None else np.ascontiguousarray(rgb[crop]),
         to_pixel=_fit_pixel_map(name, points, surface),
         spacing=float(np.sqrt(np.nanmedian(area))),
         cleaned=cleaned,
@@ -138,7 +157,7 @@ def _fill_noise(
     the surface.
     """
     known = surface & np.isfinite(sigma_z) & (sigma_z > 0)
-    if known.sum() == surface.sum():
+    if (known == surface).all():
         return sigma_z
     z = points[..., 2].astype(np.float64)
     shape = z**2 / np.maximum(cosine, 0.05)
@@ -152,13 +171,6 @@ def _fill_noise(
     # positive for a perfect plane too, as weights divide by it
     scale = max(scale, 1e-7 / float(np.nanmedian(z)))
     return np.where(known, sigma_z, scale * shape)
-
-
-def _bounding_box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Return the rows and columns of the smallest rectangle around a mask (h, w) that is not
-    empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def _border_weights(surface: np.ndarray) -> np.ndarray:
@@ -175,11 +187,10 @@ def _border_weights(surface: np.ndarray) -> np.ndarray:
 def _pixel_areas(points: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """(h, w) mm2: the area of surface that each pixel covers."""
     z = points[..., 2]
-    x, y = points[..., 0] / z, points[..., 1] / z
-    pitch = float(np.nanmedian(np.abs(np.diff(x, axis=1)))) * float(
-        np.nanmedian(np.abs(np.diff(y, axis=0)))
+    across, down = (
+        float(np.nanmedian(np.abs(np.diff(points[..., k] / z, axis=1 - k)))) for k in (0, 1)
     )
-    return np.asarray(pitch * z**2 / np.maximum(cosine, 0.05))
+    return across * down * z**2 / np.maximum(cosine, 0.05)
 
 
 def _smooth(quality: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -189,16 +200,6 @@ def _smooth(quality: np.ndarray, surface: np.ndarray) -> np.ndarray:
     total = cv2.blur(quality.astype(np.float64), size)
     share = cv2.blur(surface.astype(np.float64), size)
     return np.where(surface, total / np.maximum(share, 1e-9), 0).astype(np.float32)
-
-
-def _crop_colours(texture: np.ndarray | None, crop: tuple[slice, slice]) -> np.ndarray | None:
-    """Return the cropped texture as RGB (h, w, 3), from grey (H, W) or RGB; None without one."""
-    if texture is None:
-        return None
-    cropped = texture[crop]
-    return np.ascontiguousarray(
-        np.repeat(cropped[..., None], 3, axis=2) if cropped.ndim == 2 else cropped
-    )
 
 
 def _fit_pixel_map(name: str, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -219,11 +220,91 @@ def _fit_pixel_map(name: str, points: np.ndarray, surface: np.ndarray) -> np.nda
     A = monomials((rays - middle) / half, _DEGREE)
     pixels = np.stack([u, v], axis=1).astype(np.float64)
     coefficients, *_ = np.linalg.lstsq(A, pixels, rcond=1e-10)
-    rms = float(np.sqrt(np.mean((A @ coefficients - pixels) ** 2)))
-    if rms > _MAX_RMS_PX:
+    error_px = rms(A @ coefficients - pixels)
+    if error_px > _MAX_RMS_PX:
         raise InputError(
             f"{name}: its points do not lie on the lines of sight of one camera at the origin"
-            f" ({rms:.1f} px off): give the organised cloud in the frame of the camera that"
+            f" ({error_px:.1f} px off): give the organised cloud in the frame of the camera that"
             " took it."
         )
     return np.concatenate([middle, half, coefficients.T.ravel()])
+
+
+def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels]:
+    """Select the pixels of a cloud on a surface, (h, w) bool, and count the excluded ones.
+
+    ``normals``: (h, w, 3), towards the camera, NaN where unknown.
+    """
+    mask = cloud.mask
+    inside = mask & ~detect_jumps(cloud.points, cloud.sigma_z)
+    # the area of a pixel at the border is covered in part only, half in shadow, or mixed with the
+    # background
+    inside &= cv2.erode(close_pinholes(inside), np.ones((3, 3), np.uint8), borderValue=1) > 0
+    # False for NaN
+    facing = inside & (np.abs(viewing_cosines(cloud.points, normals)) > MIN_VIEWING_COSINE)
+    grouped = _select_large_groups(facing)
+    surface = grouped & ~detect_far_clusters(cloud.points, grouped)
+    counts = [np.count_nonzero(each) for each in (mask, inside, facing, grouped, surface)]
+    return surface, ExcludedPixels(*(int(a - b) for a, b in pairwise(counts)))
+
+
+def viewing_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(h, w): cosine between normals (h, w, 3) and directions from points (h, w, 3) to the camera
+    at the origin."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return -np.einsum("ijk,ijk->ij", points, normals) / lengths(points)
+
+
+def close_pinholes(mask: np.ndarray) -> np.ndarray:
+    """Close gaps of up to four pixels in a mask (h, w) bool; returns (h, w) uint8, 0 or 1."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    return cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2]
+
+
+def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
+    """Detect the pixels (h, w) bool of organised points (h, w, 3) mm on either side of a depth
+    jump.
+
+    A jump exceeds ``STEEPEST`` times the neighbours' distance across the viewing direction plus six
+    times their noise ``sigma_z`` (h, w) mm, where that is known.
+    """
+    noise = 6 * np.nan_to_num(sigma_z, posinf=0.0, neginf=0.0)
+    jumps = np.zeros(points.shape[:2], bool)
+    if not np.isfinite(points[..., 2]).any():
+        return jumps
+    for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        step = np.abs(points[there] - points[here])
+        across = np.hypot(step[..., 0], step[..., 1])
+        # on an oblique ray a depth jump moves the point across as well: limit that distance
+        across = across.clip(max=2 * np.nanmedian(across))
+        is_jump = step[..., 2] > STEEPEST * across + np.maximum(noise[here], noise[there])
+        jumps[here] |= is_jump
+        jumps[there] |= is_jump
+    return jumps
+
+
+def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(h, w) bool: of the points (h, w, 3) mm in a ``mask`` (h, w), those in small clusters far
+    from all others."""
+    far = np.zeros(mask.shape, bool)
+    chosen = choose_pixels(points, mask).astype(np.float64)
+    if len(chosen) < 2:
+        return far
+    spacing = median_spacing(cKDTree(chosen, balanced_tree=False, compact_nodes=False), 5000)
+    if not spacing > 0:
+        return far
+    cubes, which = occupied_cubes(chosen, FAR_SPACINGS * spacing)
+    pairs = cKDTree(cubes).query_pairs(1.8, output_type="ndarray")  # all 26 neighbours
+    cluster = label_connected(pairs, len(cubes))[which]
+    far[mask] = (np.bincount(cluster) < FAR_SHARE * len(chosen))[cluster]
+    return far
+
+
+def _select_large_groups(mask: np.ndarray) -> np.ndarray:
+    """Select the connected groups of a mask (h, w) bool with at least 20 pixels and a share of
+    LEAST_GROUP."""
+    least = max(20.0, LEAST_GROUP * np.count_nonzero(mask))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    return large[labels]

@@ -21,7 +21,9 @@ from slviewer.geometry.rigid import Floats, move_points, turn_about
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.onepass import LightLevels
 from slviewer.reconstruction.onepass_cuda import CudaPass
-from slviewer.registration.pairwise import register
+from slviewer.registration.pairwise import register_prepared
+from slviewer.registration.scan import prepare_scan
+from slviewer.registration.start import Candidate
 
 
 def row(
@@ -247,9 +249,10 @@ def registration_rows() -> list[Row]:
 
     def ours() -> np.ndarray:
         """Align by the program's registration, with its checks of the result."""
-        return register(
-            moved, points, scan_normals=moved_normals, reference_normals=normals, initial=np.eye(4)
-        ).T_reference_scan
+        scan = prepare_scan("scan", moved, moved_normals)
+        reference = prepare_scan("reference", points, normals)
+        size, initial = min(scan.size, reference.size), Candidate(np.eye(4), "initial")
+        return register_prepared(scan, reference, size, initial).T_reference_scan
 
     rows = [time_alignment(f"align {count}", ours, "with checks of the result", 0.6)]
     if missing("small-gicp"):

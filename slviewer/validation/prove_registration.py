@@ -213,7 +213,7 @@ def check_registration(
             )
             checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
             checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
-    adjusted = max((loop.after.shift_mm for loop in turn.alignment.loops), default=float("nan"))
+    adjusted = max((loop.left_mm for loop in turn.alignment.loops), default=float("nan"))
     checks += [
         BandCheck("three depths", "seconds to register", depths.seconds, 0.0, SECONDS),
         BandCheck("turn", "largest loop error in mm once adjusted", adjusted, 0.0, LOOP_MM),

@@ -3,7 +3,7 @@ others."""
 
 import numpy as np
 
-from slviewer.geometry.cubes import occupied_cubes
+from slviewer.geometry.vectors import occupied_cubes
 
 
 def test_cubes_are_the_occupied_ones_in_ascending_order() -> None:

@@ -69,7 +69,7 @@ def test_a_ball_is_cut_in_a_circle_that_its_cursors_read() -> None:
 def test_an_open_surface_is_cut_in_lines_from_left_to_right_the_longest_first() -> None:
     u, v = np.meshgrid(np.arange(40.0), np.arange(30.0))
     points = np.stack([u, v, 500 - 2 * np.sin(u / 5)], -1)
-    from slviewer.reconstruction.mesh import triangulate_grid
+    from slviewer.reconstruction.reconstruct import triangulate_grid
 
     points[:, 25] = np.nan  # a gap
     faces, vertices = triangulate_grid(points, 50.0), points[np.isfinite(points[..., 0])]

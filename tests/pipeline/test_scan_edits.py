@@ -23,7 +23,7 @@ from slviewer.session.ply import read_ply
 from slviewer.session.scan_edits import load_edits, load_region
 from slviewer.session.store import Session
 from slviewer.simulation.rig import letter
-from slviewer.surface.point_edits import EditHistory
+from slviewer.surface.selection import EditHistory
 from slviewer.validation.bench_live import true_calibration
 
 pytestmark = pytest.mark.computes

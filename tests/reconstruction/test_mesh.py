@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from facts import raises
 
-from slviewer.errors import InputError
-from slviewer.reconstruction.mesh import triangulate_grid
+from slviewer.reconstruction.reconstruct import triangulate_grid
 
 
 def grid(shape: tuple[int, int] = (20, 30)) -> np.ndarray:
@@ -56,10 +54,3 @@ def test_a_ridge_is_cut_along_itself() -> None:
     points = np.dstack([u, v, [[500, 501], [505, 500]]]).astype(np.float32)
     faces = triangulate_grid(points, 10.0)
     assert all({0, 3} <= set(face) for face in faces.tolist())
-
-
-def test_bad_input_is_refused() -> None:
-    with raises(InputError, "organised", "(10, 3)"):
-        triangulate_grid(np.zeros((10, 3)), 1.0)
-    with raises(InputError, "0.0 mm", "positive"):
-        triangulate_grid(grid(), 0.0)

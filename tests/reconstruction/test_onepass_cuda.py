@@ -301,12 +301,10 @@ def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
 
     from slviewer.fringe.kernels_spikes import spike_rules
     from slviewer.reconstruction import onepass_cuda_card as card
-    from slviewer.reconstruction import onepass_cuda_sweep as sweep
-    from slviewer.reconstruction.onepass_cuda_spikes import spike_kernels
 
-    there = sys.modules[type(sweep._verdict).__module__]
+    there = sys.modules[type(card._verdict).__module__]
     monkeypatch.setattr(there, "get_current_device", lambda: SimpleNamespace(compute_capability=cc))
-    job = CudaPass(SEQUENCES["short"], MODELS[model](), "x")._job()
+    job = CudaPass(SEQUENCES["short"], MODELS[model](), "x")
     measure, c, extra = card._depths(job)
     single, whole, words = types.float32[::1], types.uint16[::1], types.uint8[::1]
     maps, points = types.float32[:, ::1], types.float32[:, ::1]
@@ -318,7 +316,7 @@ def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
         ptx, _ = cuda.compile_ptx(kernel.py_func, arguments, cc=cc)
         return ".visible .entry" in ptx and "ld.local" not in ptx
 
-    kernel = sweep.sweep_kernel(job, len(job.frames), measure, True)
+    kernel = card.sweep_kernel(job, len(job.frames), measure, True)
     light = types.UniTuple(types.float32, 6)
     assert compiled(
         kernel,
@@ -333,7 +331,7 @@ def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
         whole,
         types.int32[::1],
     )
-    list_moves, move, list_masked, mask = spike_kernels(
+    list_moves, move, list_masked, mask = card.spike_kernels(
         spike_rules(job.layout), (HEIGHT, WIDTH), measure
     )
     assert compiled(list_moves, maps, words) and compiled(list_masked, maps, words)

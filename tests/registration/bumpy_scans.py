@@ -5,7 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slviewer.registration.pairwise import Registration
+from slviewer.registration.pairwise import Registration, register_prepared
+from slviewer.registration.scan import prepare_scan
+from slviewer.registration.start import Candidate
 
 CENTRE = np.array([0.0, 0.0, 600.0])
 NOISE = 0.03
@@ -54,6 +56,14 @@ def view(
     return (
         P if T_reference_scan is None else (P - T_reference_scan[:3, 3]) @ T_reference_scan[:3, :3]
     )
+
+
+def register(
+    scan_points: np.ndarray, reference_points: np.ndarray, start: Candidate | None = None
+) -> Registration:
+    """The registration of points (n, 3) mm onto others."""
+    scan, reference = prepare_scan("scan", scan_points), prepare_scan("reference", reference_points)
+    return register_prepared(scan, reference, min(scan.size, reference.size), start)
 
 
 def error(result: Registration, T: np.ndarray) -> tuple[float, float]:

@@ -5,13 +5,14 @@ import re
 
 import numpy as np
 import pytest
-from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, view
+from bumpy_scans import CENTRE, NOISE, Height, bumpy, error, motion, register, view
 from facts import raises
 
-from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.registration.pairwise import Registration, register
-from slviewer.registration.picked import fit_picked_start
+from slviewer.errors import InputError, SlviewerError
+from slviewer.registration.pairwise import Registration
 from slviewer.registration.refusal import Refused
+from slviewer.registration.scan import prepare_scan
+from slviewer.registration.start import Candidate, fit_picked_start
 
 pytestmark = pytest.mark.computes
 
@@ -148,7 +149,7 @@ def test_two_poses_that_fit_alike_are_refused_unless_one_is_chosen() -> None:
     picks = (corners - T[:3, 3]) @ T[:3, :3] + np.random.default_rng(0).normal(0, 2.0, (3, 3))
     start, apart = fit_picked_start(picks, corners)
     assert 0.1 < apart.max() < 6.0
-    found = register(scan, reference, initial=start)
+    found = register(scan, reference, start)
     assert found.start == "picked" and error(found, T)[0] < 0.03
 
 
@@ -174,7 +175,8 @@ def test_the_predicted_uncertainty_is_the_true_one() -> None:
     T, shifts, turns, told = motion(10, 30), [], [], []
     for seed in range(5):
         scan = view(bumpy(seed), (-45, 75), 2 * seed, T, points=5000)
-        found = register(scan, view(bumpy(seed), (-75, 45), 2 * seed + 1, points=5000), initial=T)
+        reference = view(bumpy(seed), (-75, 45), 2 * seed + 1, points=5000)
+        found = register(scan, reference, Candidate(T, "initial"))
         assert found.uncertainty.covariance.shape == (6, 6)
         D = found.T_reference_scan @ np.linalg.inv(T)
         centre = found.uncertainty.centre
@@ -192,17 +194,10 @@ def test_a_pose_handed_in_replaces_the_search() -> None:
     T = motion(60, 150)
     near = T.copy()
     near[:3, 3] += 1.0
-    result = register(view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2), initial=near)
+    scan, reference = view(bumpy(2), (-45, 75), 1, T), view(bumpy(2), (-75, 45), 2)
+    result = register(scan, reference, Candidate(near, "initial"))
     assert result.start == "initial"
     assert error(result, T)[0] < 0.03
-
-
-def test_progress_can_cancel() -> None:
-    def stop(share: float) -> None:
-        raise Cancelled("Stopped.")
-
-    with pytest.raises(Cancelled):
-        register(view(bumpy(2), (-45, 75), 1), view(bumpy(2), (-75, 45), 2), progress=stop)
 
 
 def test_points_that_cannot_be_used_are_refused() -> None:
@@ -216,4 +211,4 @@ def test_points_that_cannot_be_used_are_refused() -> None:
     with raises(InputError, "scan", "(n, 3)"):
         register(good.reshape(100, -1, 3), good)
     with raises(InputError, "scan", "normals"):
-        register(good, good, scan_normals=good[:-1])
+        prepare_scan("scan", good, good[:-1])

@@ -8,8 +8,9 @@ from ball_scans import ball, looking_from, off, rms
 from facts import raises
 
 from slviewer.errors import Cancelled, InputError
-from slviewer.surface.clean import detect_far_clusters
+from slviewer.geometry.rigid import Uncertainty
 from slviewer.surface.fuse import Fused, fuse
+from slviewer.surface.view import detect_far_clusters
 
 pytestmark = pytest.mark.computes
 
@@ -57,7 +58,7 @@ def test_a_place_is_kept_once_with_its_normal_outwards(fused: Fused) -> None:
 
 def test_the_error_of_a_pose_is_part_of_sigma_where_it_moves_the_surface(fused: Fused) -> None:
     covariance = np.diag([0, 0, 0, 0, 0, 0.1**2])  # 0.1 mm along z
-    uncertain = fuse(*depths(), poses={"near": (covariance, np.zeros(3))})
+    uncertain = fuse(*depths(), poses={"near": Uncertainty(covariance, np.zeros(3))})
     before, after = fused.surface.sigma_mm, uncertain.surface.sigma_mm
     assert before is not None and after is not None and uncertain.surface.normals is not None
     near = uncertain.source == uncertain.names.index("near")
@@ -67,7 +68,8 @@ def test_the_error_of_a_pose_is_part_of_sigma_where_it_moves_the_surface(fused: 
     )
     assert near.mean() > 0.5 and np.array_equal(after[~near], before[~near])
     # about the ball's middle
-    turned = fuse(*depths(), poses={"near": (np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))})
+    turning = Uncertainty(np.diag([1e-6, 0, 0, 0, 0, 0]), np.zeros(3))
+    turned = fuse(*depths(), poses={"near": turning})
     assert turned.surface.sigma_mm is not None
     assert np.abs(turned.surface.sigma_mm - before).max() < 0.05 * np.median(before)
 

@@ -10,12 +10,9 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.surface.edit import decimate, drop_small_parts, fill_holes, smooth
 from slviewer.surface.fuse import fuse
+from slviewer.surface.implicit import trim_far_patches, volume_surface
 from slviewer.surface.meshing import BuiltMesh, MeshingPlan, build_mesh, grid_mesh, measure_spacing
-from slviewer.surface.poisson import trim_far_patches
-from slviewer.surface.shapes import Mesh, PointSet
-from slviewer.surface.tools import select_faces
-from slviewer.surface.topology import analyse_topology
-from slviewer.surface.volume import volume_surface
+from slviewer.surface.shapes import Mesh, PointSet, analyse_topology, select_faces
 
 pytestmark = pytest.mark.computes
 

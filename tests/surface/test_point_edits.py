@@ -6,14 +6,18 @@ from ball_scans import ball
 from facts import raises
 
 from slviewer.errors import InputError
-from slviewer.surface.point_edits import Edit, EditHistory, make_edit, pack_mask, unpack_mask
 from slviewer.surface.region_of_interest import RegionOfInterest, crop_mask
 from slviewer.surface.selection import (
+    Edit,
+    EditHistory,
     ViewCamera,
     detect_support,
+    make_edit,
+    pack_mask,
     select_connected,
     select_in_outline,
     select_polygon,
+    unpack_mask,
 )
 
 CAMERA = ViewCamera(np.zeros(3), np.eye(3), np.radians(40.0), 4 / 3)
