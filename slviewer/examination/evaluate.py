@@ -68,7 +68,14 @@ class Evaluator:
     @cached_property
     def coarse(self) -> "Evaluator":
         """The same on a small part of the sample."""
-        by_axis = {axis: sample.coarse for axis, sample in self.sample.by_axis.items()}
+        return self.part()
+
+    def part(self, pixels: slice | None = None) -> "Evaluator":
+        """Return the same on some of the pixels; None: on the small sample of each axis."""
+        by_axis = {
+            axis: sample.part(pixels or slice(sample.few))
+            for axis, sample in self.sample.by_axis.items()
+        }
         return Evaluator(replace(self.sample, by_axis=by_axis), self._atoms)
 
     def atoms(self, hypothesis: Hypothesis, axis: Axis) -> Atoms:

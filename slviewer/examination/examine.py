@@ -24,11 +24,12 @@ from slviewer.examination.findings import (
     describe_unresolved,
 )
 from slviewer.examination.ghost import has_ghost
+from slviewer.examination.light import equalize_samples, estimate_light
 from slviewer.examination.motion import measure_motion
 from slviewer.examination.sample import sample_capture
 from slviewer.fringe.aliased_harmonics import MOST_STEPS, estimate_aliased_harmonics
 from slviewer.fringe.decoding_task import prepare_decoding
-from slviewer.fringe.frame_light import FrameLight, equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.layout import axis_layout, check_stack
 from slviewer.fringe.levels import layout_levels
 from slviewer.fringe.sequence import Axis, PatternSequence
@@ -48,16 +49,18 @@ def examine(
     check_stack(sequence, stack)
     if not sequence.axes:
         return Examination()
-    light = light or estimate_frame_light(sequence, stack)
     with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
-        findings = _judge(sequence, stack, light)
+        evaluator, base = Evaluator(sample_capture(sequence, stack)), described(sequence)
+        light = light or estimate_light(evaluator, base, stack)
+        findings = _judge(stack, _correct(evaluator, base, light), base, light)
     return Examination(tuple(findings), light.drift)
 
 
-def _judge(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> Sequence[Finding]:
+def _judge(
+    stack: np.ndarray, evaluator: Evaluator, base: Hypothesis, light: FrameLight
+) -> Sequence[Finding]:
     """Return the findings of a capture whose light has been estimated."""
-    evaluator, base = _prepare(sequence, stack, light), described(sequence)
-    sample = evaluator.sample
+    sequence, sample = base.sequence, evaluator.sample
     if not sample.is_usable and (sample.by_axis or sample.lit < limits.LEAST_LIT):
         return [describe_missing_pattern(sample)]
     ghost, motion = has_ghost(evaluator, base), measure_motion(evaluator, base)
@@ -75,20 +78,23 @@ def _judge(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> S
     return [*judged, *([describe_ghost(ghost)] if ghost else _judge_light(sequence, stack, light))]
 
 
-def _prepare(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> Evaluator:
-    """Return the evaluator of a capture; without the change of the room's light, which makes
-    surfaces vary that the patterns do not reach, if that leaves nothing to explain."""
-    evaluator = Evaluator(sample_capture(sequence, stack))
-    if light.is_significant and light.light.changes:
-        equal_sequence, equal, _ = equalize_frames(sequence, stack, light)
-        corrected, base = Evaluator(sample_capture(equal_sequence, equal)), described(sequence)
-        if corrected.sample.is_usable and not (
-            explain(corrected, base)
-            or measure_motion(corrected, base)
-            or has_ghost(corrected, base)
-        ):
-            return corrected
-    return evaluator
+def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evaluator:
+    """Return the evaluator of the same pixels under equal light, without those that only the light
+    of the room made vary, if that leaves nothing to explain, and less than other explanations."""
+    if not light.is_significant:
+        return evaluator
+    equal = equalize_samples(evaluator, base.sequence, light)
+    by_axis = {
+        axis: sample.part(np.ptp(sample.levels[:, 1], axis=0) > limits.STEEP * sample.swing)
+        for axis, sample in equal.sample.by_axis.items()
+    }
+    equal = Evaluator(replace(equal.sample, by_axis=by_axis))
+    if not equal.sample.is_usable or explain(equal, base) or measure_motion(equal, base):
+        return evaluator
+    if has_ghost(equal, base):
+        return evaluator
+    rivals = [evaluator.compare(base, _fill_in(h)).left for h in explain(evaluator, base)]
+    return evaluator if rivals and max(rivals) < equal.compare(base, base).loss else equal
 
 
 def _is_moving_still(
@@ -98,13 +104,17 @@ def _is_moving_still(
     only for a part of what motion does."""
     for hypothesis in found:
         own = {a: px for a, px in motion.items() if hypothesis.axis in (a, None)}
-        whole = described(hypothesis.sequence)
-        without = tuple(None if i in hypothesis.frames else i for i in whole.images)
-        images = hypothesis.images or without
-        left = measure_motion(evaluator, replace(hypothesis, images=images))
+        left = measure_motion(evaluator, _fill_in(hypothesis))
         if any(abs(left.get(axis, 0.0)) > 0.5 * abs(px) for axis, px in own.items()):
             return True
     return False
+
+
+def _fill_in(hypothesis: Hypothesis) -> Hypothesis:
+    """Return a hypothesis with the images of all frames but those that it names, if it has none."""
+    every = range(len(hypothesis.sequence.frames))
+    without = tuple(None if i in hypothesis.frames else i for i in every)
+    return replace(hypothesis, images=hypothesis.images or without)
 
 
 def _judge_readability(evaluator: Evaluator, base: Hypothesis) -> Iterator[Finding]:

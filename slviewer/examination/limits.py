@@ -114,3 +114,47 @@ MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
 LEAST_GHOST, GHOST_SIGMAS = 0.02, 5.0
 """Share of the image before, that blur and gamma do not imitate, and in its standard errors."""
+
+LIGHT_SHARE = 0.015
+"""Share of the residual that the light of the frames must explain in a small sample to be
+estimated: its values alone explain a third of that."""
+BETTER_LIGHT, EXPLAINED_WELL = (0.9, 0.75), 0.05
+"""Share of the residual that one term of the light, and a second one, may leave; and the share that
+a single term leaves where no second one is tried."""
+EXPLAINED_BY_LIGHT = 0.78
+"""Share of the misfit that light may leave where equal means do not confirm it."""
+AS_WELL = 1.02
+"""Factor by which light may raise the misfit of pixels predicted from their neighbours: small gains
+hardly change it, and those that imitate a strange frame do."""
+LEAST_GAIN, LEAST_GAIN_OF_THREE, LEAST_CODED_GAIN = 0.005, 0.01, 0.045
+"""Variation of the gains below which they are not corrected: rms over the steps of a period, where
+response and blur of a camera imitate as much; of three steps, which hardly determine it; and of
+frames without phase steps, where blurred stripes imitate it and thresholds tolerate more."""
+LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
+"""Rms of a wave along the rows, and change of the room's light over the mean grey level, that are
+corrected."""
+FEW_FRAMES_KNOWN = 3
+"""Frames on either side of a change of the room's light: one or two may just be of other gain."""
+REFUTED, REFUTED_LEAST = 1.5, 0.004
+"""Factor, and share of the brightness, by which a correction may worsen the equality of means."""
+CONFIRMED, CONFIRMED_LEAST = 0.65, 0.01
+"""Factor by which a correction improves it that is accepted although blur or the projector's
+response leave residuals; and variation that is not a matter of too few fringes in view."""
+MEAN_ROWS, MEAN_COLUMNS = 16, 4
+"""Every so many rows and columns are averaged: enough for a thousandth."""
+OUTLIER = 4.0
+"""Squared residual of a pixel over the median, from which it loses weight."""
+MOST_STEPS, CONVERGED = 10, 5e-4
+"""Gauss-Newton steps of the light, and change of the gains that ends them."""
+UNKNOWN_GAIN = 0.1
+"""Standard error of a gain from which that of the nearest frame is used: dark stripes hardly depend
+on it."""
+SCATTERED = 0.02
+"""Light that the scene scatters into dark stripes, of the contrast."""
+FUZZY = 0.4
+"""Share of the pixels at a stripe's edge, from which blur may have changed its contrast."""
+FUZZY_WEIGHT = 0.2
+"""Weight of their levels: blur changes them by up to a third of the contrast."""
+CONTRAST_PRIORS = 0.1, 0.5
+"""Uncertainty of the contrast of a frame's stripes: wide ones scatter light, and blur takes all of
+it from fine ones."""

@@ -27,13 +27,10 @@ class Sample:
     direction: int
     few: int
 
-    @property
-    def coarse(self) -> "Sample":
-        """The small sample."""
-        few = slice(self.few)
-        return replace(
-            self, levels=self.levels[:, :, few], place=self.place[few], swing=self.swing[few]
-        )
+    def part(self, pixels: slice | np.ndarray) -> "Sample":
+        """Return the sample of some pixels."""
+        levels, place, swing = self.levels[:, :, pixels], self.place[pixels], self.swing[pixels]
+        return replace(self, levels=levels, place=place, swing=swing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class CaptureSample:
 
     ``lit``: share of the image that varies with the patterns; ``saturated``: share that is
     saturated too often to be used; ``noise``: grey levels by which neighbours differ; ``swing``:
-    median range of a pixel's levels over the frames.
+    median range of a pixel's levels over the frames; ``white``: level at which the camera clips.
     """
 
     by_axis: dict[Axis, Sample]
@@ -50,6 +47,7 @@ class CaptureSample:
     saturated: float
     noise: float
     swing: float
+    white: float
 
     @property
     def is_usable(self) -> bool:
@@ -86,7 +84,9 @@ def sample_capture(sequence: PatternSequence, stack: np.ndarray) -> CaptureSampl
     # Gray code alone is read where it is saturated
     excluded = often & any(sequence.phase_shifts(axis) for axis in sequence.axes)
     usable, swing = lit.all(axis=0) & ~excluded, (high - low)[0]
-    place = np.stack(np.meshgrid(rows / height - 0.5, columns / width - 0.5, indexing="ij"), -1)
+    place = np.stack(
+        np.meshgrid(rows / (height - 1) - 0.5, columns / (width - 1) - 0.5, indexing="ij"), -1
+    )
     by_axis: dict[Axis, Sample] = {}
     for axis in sequence.axes:
         own = cross[[i for i in coded if sequence.frames[i].axis == axis]][:, :, usable]
@@ -101,7 +101,7 @@ def sample_capture(sequence: PatternSequence, stack: np.ndarray) -> CaptureSampl
             order[0] // 2 ^ 1, few,
         )  # fmt: skip
     shares = float(lit[0].mean()), float(often.mean())
-    return CaptureSample(by_axis, *shares, noise, float(np.median(swing)))
+    return CaptureSample(by_axis, *shares, noise, float(np.median(swing)), white)
 
 
 def _group_frames(sequence: PatternSequence) -> list[list[int]]:

@@ -46,12 +46,12 @@ def decode(
 ) -> PhaseMap:
     """Decode the phase map of one axis from the (n, h, w) uint8 or uint16 frames of a sequence.
 
-    A pixel is masked, with a reason, rather than given a doubtful phase. Where the light differed
-    between the frames (see `frame_light`), they are decoded as they would be under equal light; the
-    phase error that gamma causes with three or four steps (see `aliased_harmonics`) is corrected.
-    ``light``: from `estimate_frame_light`; estimated if None. ``mask_indirect``: mask pixels of
-    much indirect light, see `indirect_light`. Raises InputError when the frames are not those of
-    the sequence, or cannot give an absolute phase.
+    A pixel is masked, with a reason, rather than given a doubtful phase. The phase error that gamma
+    causes with three or four steps (see `aliased_harmonics`) is corrected. ``light``: of the
+    frames; where it differs between them, they are decoded as they would be under equal light; as
+    captured if None. ``mask_indirect``: mask pixels of much indirect light, see `indirect_light`.
+    Raises InputError when the frames are not those of the sequence, or cannot give an absolute
+    phase.
     """
     task = prepare_decoding(sequence, stack, axis, light)
     layout, stack = task.layout, task.stack

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import CLIPPED, FrameLight, equalize_frames
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.phase import Noise
@@ -32,18 +32,17 @@ class DecodingTask:
 def prepare_decoding(
     sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
 ) -> DecodingTask:
-    """Return the frames of one axis of a capture (n, h, w); as captured where the light needs no
-    correction.
+    """Return the frames of one axis of a capture (n, h, w), under equal light where ``light`` is
+    that of the frames and needs a correction, else as captured.
 
-    ``light``: estimated if None. Raises InputError when the frames are not those of the sequence,
+    Raises InputError when the frames are not those of the sequence,
     or cannot give an absolute phase.
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
     stack = np.ascontiguousarray(stack)
     white = white_level(sequence, stack, sequence.select(axis))
-    light = light or estimate_frame_light(sequence, stack)
-    if not light.is_significant:
+    if light is None or not light.is_significant:
         return DecodingTask(
             sequence, layout, stack, measure_noise(layout, stack, white), white, white
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.fringe.frame_light import equalize_frames, estimate_frame_light
+from slviewer.fringe.frame_light import FrameLight, equalize_frames
 from slviewer.fringe.layout import Layout, axis_layout, check_stack, white_level
 from slviewer.fringe.noise import measure_noise
 from slviewer.fringe.reference import bit_heights, dark_limit, dark_sigmas, phase_shift
@@ -41,8 +41,11 @@ class CodeOrigin:
     is_exact: bool = True
 
 
-def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> float:
-    """Estimate the projector coordinate, px, at which Gray code 0 begins.
+def estimate_gray_origin(
+    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
+) -> float:
+    """Estimate the projector coordinate, px, at which Gray code 0 begins; ``light`` of the frames,
+    equal if None.
 
     Between two neighbouring camera pixels whose codes are consecutive there is a code edge, and the
     wrapped phase there is that of the origin (half a period more at every other edge of a
@@ -57,8 +60,7 @@ def estimate_gray_origin(sequence: PatternSequence, stack: np.ndarray, axis: Axi
     """
     check_stack(sequence, stack)
     layout = axis_layout(sequence, axis)
-    light = estimate_frame_light(sequence, stack)
-    if light.is_significant:
+    if light is not None and light.is_significant:
         sequence, stack, _ = equalize_frames(sequence, stack, light)
     if not (layout.shifts and layout.gray):
         raise InputError(

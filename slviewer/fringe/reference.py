@@ -11,6 +11,7 @@ from slviewer.fringe.aliased_harmonics import (
 )
 from slviewer.fringe.cosines import FEWEST, select_rows
 from slviewer.fringe.decoding_task import DecodingTask, prepare_decoding
+from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.indirect_light import mask_indirect_light
 from slviewer.fringe.layout import Layout
 from slviewer.fringe.levels import (
@@ -38,10 +39,12 @@ AMPLITUDES = np.linspace(-0.4, 0.4, 33)
 _ARGUMENTS = np.linspace(-np.pi, np.pi, 1025)
 
 
-def decode_reference(sequence: PatternSequence, stack: np.ndarray, axis: Axis) -> PhaseMap:
+def decode_reference(
+    sequence: PatternSequence, stack: np.ndarray, axis: Axis, light: FrameLight | None = None
+) -> PhaseMap:
     """Decode one axis without kernels, like `decode.decode`: same wrapped phase to 1e-5 rad,
     absolute to 1e-4 rad."""
-    task = prepare_decoding(sequence, stack, axis)
+    task = prepare_decoding(sequence, stack, axis, light)
     layout, stack, noise, white = task.layout, task.stack, task.noise, task.white
     if not layout.shifts:
         phase, modulation, background, inconsistent, dark = _decode_gray_alone(layout, stack, noise)

@@ -9,8 +9,9 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.examination.findings import describe_disturbance
+from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode, texture
-from slviewer.fringe.frame_light import estimate_frame_light
+from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import axis_layout, to_eight_bits, white_level
 from slviewer.fringe.phase import PhaseMap, Reason
@@ -78,10 +79,15 @@ def decode_capture(
     return phases
 
 
-def decode_frames(name: str, sequence: PatternSequence, frames: np.ndarray) -> dict[Axis, PhaseMap]:
-    """Decode the phase of every axis, absolute or not; errors name the capture."""
+def decode_frames(
+    name: str, sequence: PatternSequence, frames: np.ndarray, light: FrameLight | None = None
+) -> dict[Axis, PhaseMap]:
+    """Decode the phase of every axis, absolute or not, under equal light; errors name the capture.
+
+    ``light`` of the frames is estimated if None.
+    """
     try:
-        light = estimate_frame_light(sequence, frames)
+        light = light or estimate_frame_light(sequence, frames)
         return {axis: decode(sequence, frames, axis, light) for axis in sequence.axes}
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
@@ -108,9 +114,10 @@ def decode_examined(
     examination rejects comes first, as it explains the others. ``files``: names of the frames'
     files.
     """
-    examination = examine_frames(sequence, frames, files)
+    light = estimate_frame_light(sequence, frames)
+    examination = examine_frames(sequence, frames, files, light)
     raise_rejected(name, examination)
-    phases = decode_frames(name, sequence, frames)
+    phases = decode_frames(name, sequence, frames, light)
     check_capture(name, sequence, frames, phases, examination)
     return phases
 

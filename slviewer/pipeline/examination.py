@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.examination.examine import examine
+from slviewer.fringe.frame_light import FrameLight
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Examination
@@ -37,11 +38,14 @@ def name_frames(text: str, sequence: PatternSequence, files: Sequence[str]) -> s
 
 
 def examine_frames(
-    sequence: PatternSequence, stack: np.ndarray, files: Sequence[str] = ()
+    sequence: PatternSequence,
+    stack: np.ndarray,
+    files: Sequence[str] = (),
+    light: FrameLight | None = None,
 ) -> Examination:
     """Examine the frames (n, h, w) of a capture; findings name their ``files``, see
-    `name_frames`."""
-    examination = examine(sequence, stack)
+    `name_frames`. ``light`` of the frames is estimated if None."""
+    examination = examine(sequence, stack, light)
     named = [
         replace(finding, sentence=name_frames(finding.sentence, sequence, files))
         for finding in examination.findings

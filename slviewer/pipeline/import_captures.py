@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.phase import Reason
@@ -398,7 +399,10 @@ def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
             if sequence.periods_px(axis) and sequence.find("gray", axis)
         ]
         try:
-            origins = {axis: estimate_gray_origin(sequence, capture.frames, axis) for axis in axes}
+            light = estimate_frame_light(sequence, capture.frames)
+            origins = {
+                axis: estimate_gray_origin(sequence, capture.frames, axis, light) for axis in axes
+            }
         except InputError:
             # Frames out of order and changed light leave no common origin; name the cause.
             unstated = ("gray-origin", "phase-offset")

@@ -1,0 +1,445 @@
+"""Light of each frame of a capture, estimated from its sample, or found to be equal.
+
+Per pixel, the patterns at its projector coordinate explain its levels but for background, contrast
+and a displacement; what these three cannot take up is solved for the light of the frames by
+Gauss-Newton steps (variable projection; Golub and Pereyra, Inverse Problems 19, 2003). Of several
+models the simplest that explains pixels which it was not fitted to about as well as the best is
+selected, and nothing is corrected that the frames' means, or the match of the patterns, refute.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from slviewer.examination import limits
+from slviewer.examination.evaluate import Evaluator, Hypothesis, described
+from slviewer.examination.sample import Sample, sample_capture
+from slviewer.fringe.frame_light import FrameLight, Term, estimate_albedo, list_shifts
+from slviewer.fringe.layout import check_stack
+from slviewer.fringe.sequence import Axis, PatternSequence
+
+MODELS: tuple[tuple[Term, ...], ...] = (
+    ("room",), ("gain",), ("wave",), ("gain", "wave"), ("gain", "room")
+)  # fmt: skip
+VALUES: dict[Term, tuple[str, ...]] = {
+    "gain": ("gain",), "wave": ("cosine", "sine"), "room": ("uniform", "albedo", "rows", "columns")
+}  # fmt: skip
+"""Values of each term: of every frame, of room light of all frames from its change on."""
+PRIORS = {
+    "gain": 0.3, "cosine": 0.1, "sine": 0.1, "uniform": 30.0, "albedo": 1.0, "rows": 1.0,
+    "columns": 1.0, "level": 0.3,
+}  # fmt: skip
+"""Standard deviation of each value: relative, in grey levels, and of the albedo."""
+CYCLES = np.arange(0.5, 8.25, 0.05)
+"""Waves along the image's height that are tried."""
+AROUND = np.linspace(-1, 1, 7)
+"""Places around a pixel, over the distance of its neighbours, between which a stripe must not end
+for blur to leave it as it is."""
+
+
+def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
+    """Estimate the light of the frames (n, h, w) uint8 or uint16 of a capture, from all of them
+    together.
+
+    Frames that cannot be judged have gain 1. Raises InputError when the frames are not those of the
+    sequence.
+    """
+    check_stack(sequence, stack)
+    with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
+        evaluator = Evaluator(sample_capture(sequence, stack))
+        return estimate_light(evaluator, described(sequence), stack)
+
+
+def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) -> FrameLight:
+    """Estimate the light of the frames (n, h, w) of a capture, described by ``base``, whose sample
+    an evaluator holds. A small part of it decides first whether there is anything to estimate."""
+    constant = FrameLight.constant(len(stack))
+    if not _is_varying(evaluator.coarse, base):
+        return constant
+    fitted, judged = evaluator.part(np.s_[::2]), evaluator.part(np.s_[1::2])
+    best = gains = constant
+    first, misfit = _measure_losses(judged, base, constant), judged.compare(base, base).loss
+    score = 1.0
+    for terms in MODELS:
+        if len(terms) > 1 and score < limits.EXPLAINED_WELL:
+            break
+        light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
+        gains = light if terms == ("gain",) else gains
+        losses = _measure_losses(judged, base, light)
+        gain = (first - losses)[both := np.isfinite(first - losses)]
+        least = limits.SIGMAS * gain.std() / np.sqrt(max(len(gain), 1))
+        if len(gain) < limits.FEWEST_PIXELS / 2 or gain.mean() < least:
+            continue
+        equal = equalize_samples(judged, base.sequence, light)
+        relative = equal.compare(base, base).loss / misfit
+        own = losses[both].mean() / first[both].mean() * relative
+        is_large = _is_large(base.sequence, light, terms[-1])
+        if (
+            is_large
+            and relative < limits.AS_WELL
+            and own < score * limits.BETTER_LIGHT[len(terms) - 1]
+        ):
+            best, score = light, own
+    before, after, claimed = _measure_unequal_means(base.sequence, stack, best)
+    is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
+    if is_refuted or claimed > 3 * before + limits.CONFIRMED_LEAST:
+        return constant
+    is_confirmed = before > limits.CONFIRMED_LEAST and after < limits.CONFIRMED * before
+    if is_confirmed or score < limits.EXPLAINED_BY_LIGHT:
+        return best
+    return replace(constant, unexplained=best.terms)
+
+
+def equalize_samples(
+    evaluator: Evaluator, sequence: PatternSequence, light: FrameLight
+) -> Evaluator:
+    """Return an evaluator of the same pixels under equal light."""
+    if not light.terms:
+        return evaluator
+    by_axis = {
+        axis: replace(sample, levels=_equalize(sample, sequence, light))
+        for axis, sample in evaluator.sample.by_axis.items()
+    }
+    return replace(evaluator.part(np.s_[:]), sample=replace(evaluator.sample, by_axis=by_axis))
+
+
+def _equalize(sample: Sample, sequence: PatternSequence, light: FrameLight) -> np.ndarray:
+    """Return the levels (n, 3, p) of a sample under equal light."""
+    row, column = sample.place.T
+    wave = light.wave @ np.stack(_waves(row, light))
+    gain = light.gain[:, None] * (1 + wave)
+    room = light.uniform[:, None, None]
+    if light.albedo.any():
+        lamp = light.albedo @ np.stack([np.ones_like(row), row, column])
+        seen = sample.levels.swapaxes(0, 1)
+        albedo = np.stack([estimate_albedo(sequence, each, light.changes) for each in seen])
+        room = room + lamp[:, None] * albedo
+    return ((sample.levels - room) / gain[:, None]).astype(np.float32)
+
+
+def _waves(row: np.ndarray, light: FrameLight) -> tuple[np.ndarray, np.ndarray]:
+    """Return cosine and sine of the light's wave at rows (p,), -0.5 to 0.5."""
+    angle = 2 * np.pi * light.cycles * (row + 0.5)
+    return np.cos(angle), np.sin(angle)
+
+
+@dataclass(frozen=True, eq=False)
+class _Residual:
+    """What the patterns of one axis leave of k frames at p pixels, relative to each pixel's
+    contrast.
+
+    ``frames``, ``groups`` (k,): as of `Atoms`; ``level``, ``fuzzy`` (k,): rms of the levels, and
+    share of the pixels beside an edge; ``pixels``: bool, of those of the sample; ``shapes``: (k, p)
+    change of the levels with each value of the light, by name; ``left`` (k, p): the residual
+    without the part that background, contrast and displacement of a pixel take up, which ``basis``
+    (3, k, p) spans; ``weight`` and ``row`` (p,); ``entries``: independent residuals.
+    """
+
+    axis: Axis
+    frames: np.ndarray
+    groups: np.ndarray
+    level: np.ndarray
+    fuzzy: np.ndarray
+    pixels: np.ndarray
+    shapes: dict[str, np.ndarray]
+    left: np.ndarray
+    basis: np.ndarray
+    weight: np.ndarray
+    row: np.ndarray
+    entries: int
+
+
+def _project(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Iterator[_Residual]:
+    """Yield the residual of each axis under a light."""
+    sequence, white = base.sequence, evaluator.sample.white
+    equal = equalize_samples(evaluator, sequence, light)
+    for axis, sample in equal.sample.by_axis.items():
+        m = equal.match(base, axis)
+        if m is None:
+            continue
+        good = m.misfit <= max(limits.GOOD, float(np.median(m.misfit)))
+        good &= m.contrast > limits.LEAST_CONTRAST * sample.swing
+        if np.count_nonzero(good) < limits.FEWEST_PIXELS / 2:
+            continue
+        atoms, frames, contrast = equal.atoms(base, axis), np.array(m.images), m.contrast[good]
+        seen = evaluator.sample.by_axis[axis].levels[:, 1, good]
+        predicted = m.predicted[:, good]
+        level = m.background[good] / contrast + predicted
+        # between stripes blur changes the levels, at the same phase of the fringes everywhere
+        beside = [atoms.at(m.coordinate[good] + d * m.rise[good])[m.places] for d in AROUND]
+        is_edge, groups = np.ptp(beside, axis=0) > 0.5, atoms.groups[m.places]
+        fuzzy = is_edge.mean(axis=1)
+        used = 1 - (is_edge & (groups < 0)[:, None]).astype(np.float32)
+        used[(groups < 0) & (fuzzy >= limits.FUZZY)] = limits.FUZZY_WEIGHT
+        used[seen[frames] >= white] = 0
+        row, column = sample.place[good].T
+        cosine, sine = _waves(row, light)
+        over = np.ones_like(level) / light.gain[frames, None]
+        albedo = over * estimate_albedo(sequence, seen, light.changes) / contrast
+        shapes = {
+            "gain": level, "cosine": level * cosine, "sine": level * sine,
+            "uniform": over / contrast, "albedo": albedo, "rows": albedo * row,
+            "columns": albedo * column, "level": np.ones_like(level),
+            "contrast": predicted - predicted.mean(axis=1, keepdims=True),
+        }  # fmt: skip
+        slope = atoms.slope_at(m.coordinate[good])[m.places] + 1e-6
+        spans = np.stack([np.ones_like(level), predicted, slope]) * used
+        basis = np.linalg.qr(spans.transpose(2, 1, 0))[0].transpose(2, 1, 0)
+        left = _take_out(basis, (sample.levels[frames, 1][:, good] / contrast - level) * used)
+        loss = np.einsum("kp,kp->p", left, left)
+        weight = np.minimum(1, limits.OUTLIER * np.median(loss) / np.maximum(loss, 1e-12))
+        yield _Residual(
+            axis, frames, groups, np.sqrt(np.mean(level**2, axis=1)), fuzzy, good,
+            {name: shape * used for name, shape in shapes.items()}, left, basis, weight, row,
+            np.count_nonzero(used) - 3 * used.shape[1],
+        )  # fmt: skip
+
+
+def _take_out(basis: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Return levels (k, p) without the part that a basis (3, k, p) spans at each pixel."""
+    taken = np.einsum("jkp,kp->jp", basis, levels)
+    return np.asarray(levels - np.einsum("jkp,jp->kp", basis, taken))
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Normal equations of ``values`` of each of n frames: ``matrix`` (v n, v n) and ``moment``
+    (v n,), in units of the mean squared residual; ``entries``: number of independent residuals.
+
+    ``level``, ``fuzzy`` (n,): see `_Residual`; the level of frames that the sample does not show is
+    0. ``groups`` (n,): a number for the steps of each period, negative for the other frames of an
+    axis.
+    """
+
+    values: tuple[str, ...]
+    matrix: np.ndarray
+    moment: np.ndarray
+    entries: int
+    groups: np.ndarray
+    level: np.ndarray
+    fuzzy: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """Indices of the frames that the sample shows."""
+        return np.flatnonzero(self.level)
+
+    def solve(self, terms: Sequence[Term], change: int = 0) -> tuple[dict[str, np.ndarray], float]:
+        """Return the change (n,) of each value, and the share of the residual that it removes.
+
+        Beside the values of the terms, contrast and level of each period's steps, and the contrast
+        of each other frame, are solved for. Gains are relative to the mean of their group, which
+        contrast and level imitate, and 0 where the sample does not determine them. ``change``:
+        frame before which the room's light changes.
+        """
+        n = len(self.groups)
+        each, other = np.eye(n), self.groups < 0
+        periods = [(self.groups == g).astype(float) for g in range(self.groups.max() + 1)]
+        shared = np.stack([*periods, *each[other]], axis=1)
+        blur = np.where(self.fuzzy[other] < limits.FUZZY, *limits.CONTRAST_PRIORS)
+        blocks: dict[str, np.ndarray] = {
+            "contrast": shared, "level": shared[:, : len(periods)],
+            **{name: each for term in terms for name in VALUES[term]},
+        }  # fmt: skip
+        if "gain" in terms:
+            same = (self.groups[:, None] == self.groups).astype(float)
+            blocks["gain"] = each - same / same.sum(axis=1, keepdims=True)
+        if "room" in terms:
+            blocks |= dict.fromkeys(VALUES["room"], each[:, change:].sum(axis=1, keepdims=True))
+        t, deviations = np.zeros((len(self.moment), 0)), np.zeros(0)
+        for place, name in enumerate(self.values):
+            if (block := blocks.get(name)) is not None:
+                rows = place * n, len(self.moment) - place * n - n
+                t = np.hstack([t, np.pad(block, (rows, (0, 0)))])
+                own = np.full(block.shape[1], PRIORS.get(name, PRIORS["level"]))
+                if name == "contrast":
+                    own[len(periods) :] = blur
+                deviations = np.concatenate([deviations, own])
+        moment = t.T @ self.moment
+        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
+        x = np.linalg.solve(normal, moment)
+        step = (t @ x).reshape(len(self.values), n)
+        if "gain" in terms:
+            relative = t[:n] - t[self.known].mean(axis=0)
+            error = np.sqrt(np.einsum("iq,qi->i", relative, np.linalg.solve(normal, relative.T)))
+            scattered = limits.SCATTERED / np.maximum(self.level, 1e-6)
+            sure = np.hypot(error, scattered) < limits.UNKNOWN_GAIN
+            same = same * sure / np.maximum((same * sure).sum(axis=1, keepdims=True), 1)
+            step[0] = np.where(sure, step[0] - same @ step[0], 0)
+        return dict(zip(self.values, step, strict=True)), float(x @ moment) / max(self.entries, 1)
+
+
+def _accumulate(parts: Sequence[_Residual], n: int, terms: Sequence[Term]) -> _Normal:
+    """Return the normal equations of the terms, and of contrast and level, of n frames."""
+    values = (*(name for term in terms for name in VALUES[term]), "contrast", "level")
+    matrix, moment = np.zeros((len(values), n, len(values), n)), np.zeros((len(values), n))
+    groups, (level, fuzzy) = np.full(n, -1), np.zeros((2, n))
+    squares, entries = 1e-12, 0
+    for part in parts:
+        f, root = part.frames, np.sqrt(part.weight)
+        shapes = root * np.stack([part.shapes[name] for name in values])
+        taken = np.einsum("akp,jkp->akjp", shapes, part.basis).reshape(len(values) * len(f), -1)
+        normal = -(taken @ taken.T).reshape(len(values), len(f), len(values), len(f))
+        every = np.arange(len(f))
+        normal[:, every, :, every] += np.einsum("akp,bkp->kab", shapes, shapes)
+        matrix[:, f[:, None], :, f] += normal.transpose(1, 3, 0, 2)
+        moment[:, f] += np.einsum("akp,kp->ak", shapes, root * part.left)
+        squares += float(np.sum((root * part.left) ** 2))
+        entries += part.entries
+        coded = np.where(level[f] > 0, groups[f], groups.min() - 1)
+        groups[f] = np.where(part.groups < 0, coded, part.groups + groups.max() + 1)
+        level[f], fuzzy[f] = part.level, part.fuzzy
+    noise, size = squares / max(entries, 1), len(values) * n
+    matrix, moment = matrix.reshape(size, size) / noise, moment.ravel() / noise
+    return _Normal(values, matrix, moment, entries, groups, level, fuzzy)
+
+
+def _is_varying(evaluator: Evaluator, base: Hypothesis) -> bool:
+    """Return whether one step of any model promises to explain more than noise."""
+    n = len(base.sequence.frames)
+    light = FrameLight.constant(n)
+    parts = [*_project(evaluator, base, light)]
+    if not parts:
+        return False
+    normal = _accumulate(parts, n, ("gain", "room"))
+    least = normal.solve(())[1] + limits.LIGHT_SHARE
+    if max(normal.solve(("gain",))[1], *_rate_changes(normal, ("room",)).values(), 0) > least:
+        return True
+    parts = [*_project(evaluator, base, replace(light, cycles=_find_wave(parts)))]
+    return _accumulate(parts, n, ("wave",)).solve(("wave",))[1] > least
+
+
+def _rate_changes(normal: _Normal, terms: Sequence[Term]) -> dict[int, float]:
+    """Return the share of the residual that a change of the room's light removes, by the frame
+    before which it happens: a few from either end, and not between all steps and all other frames,
+    where level and contrast of the fringes imitate it."""
+    few, known = limits.FEW_FRAMES_KNOWN, normal.known
+    ends = known[1:][np.diff(normal.groups[known] >= 0)]
+    inner = [int(k) for k in known[few : 1 - few] if len(ends) > 1 or k not in ends]
+    return {k: normal.solve(terms, k)[1] for k in inner}
+
+
+def _find_wave(parts: Sequence[_Residual]) -> float:
+    """Return the cycles per image height of the strongest wave that the residual has along the
+    rows."""
+    power = np.zeros(len(CYCLES))
+    for part in parts:
+        waves = np.exp(-2j * np.pi * (part.row[:, None] + 0.5) * CYCLES)
+        excess = part.left * part.shapes["gain"] * part.weight
+        excess = excess - excess.mean(axis=1, keepdims=True)
+        power += (np.abs(excess @ waves) ** 2).sum(axis=0)
+    return float(CYCLES[int(np.argmax(power))])
+
+
+def _fit(
+    evaluator: Evaluator, base: Hypothesis, terms: tuple[Term, ...], start: FrameLight
+) -> FrameLight:
+    """Fit the terms of a model by Gauss-Newton steps from a first light."""
+    light, n = replace(start, terms=terms), len(start.gain)
+    for step in range(limits.MOST_STEPS):
+        parts = [*_project(evaluator, base, light)]
+        if "wave" in terms and not step:
+            light = replace(light, cycles=_find_wave(parts))
+            parts = [*_project(evaluator, base, light)]
+        if not parts:
+            break
+        normal = _accumulate(parts, n, terms)
+        if "room" in terms and not step:
+            rated = _rate_changes(normal, terms)
+            if not rated:
+                break
+            light = replace(light, changes=(max(rated, key=rated.__getitem__),))
+        change, _ = normal.solve(terms, *light.changes)
+        light = _update(light, change, evaluator)
+        steps = [np.abs(change[name]).max() for term in terms for name in VALUES[term]]
+        if max(steps) < limits.CONVERGED:
+            break
+    return light
+
+
+def _update(light: FrameLight, change: dict[str, np.ndarray], evaluator: Evaluator) -> FrameLight:
+    """Return the light after a step."""
+    if "gain" in light.terms:
+        step = np.clip(change["gain"], -0.5, 0.5)
+        light = replace(light, gain=light.gain * np.exp(step))
+    if "wave" in light.terms:
+        step = np.stack([change["cosine"], change["sine"]], axis=1)
+        light = replace(light, wave=light.wave + step - step.mean(axis=0))
+    if "room" in light.terms:
+        samples = evaluator.sample.by_axis.values()
+        mean = np.mean([s.levels[:, 1].mean() for s in samples])
+        swing = np.mean([s.swing.mean() for s in samples])
+        uniform = light.uniform + change["uniform"]
+        albedo = light.albedo + np.stack([change[n] for n in VALUES["room"][1:]], axis=1)
+        room = (uniform + albedo[:, 0] * swing / 2) / mean
+        light = replace(light, uniform=uniform, albedo=albedo, room=room - room.min())
+    return light
+
+
+def _measure_losses(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> np.ndarray:
+    """Return the weighted squared residual (p,) of the pixels of all axes under a light, beside
+    contrasts and levels that fit them; NaN where it is not known."""
+    parts = {part.axis: part for part in _project(evaluator, base, light)}
+    change = _accumulate([*parts.values()], len(light.gain), ()).solve(())[0]
+    losses = [np.zeros(0)]
+    for axis, sample in evaluator.sample.by_axis.items():
+        losses.append(np.full(len(sample.swing), np.nan))
+        if part := parts.get(axis):
+            own = sum(part.shapes[name] * change[name][part.frames, None] for name in change)
+            left = part.left - _take_out(part.basis, own)
+            losses[-1][part.pixels] = np.einsum("kp,kp->p", left, left) * part.weight
+    return np.concatenate(losses)
+
+
+def _is_large(sequence: PatternSequence, light: FrameLight, term: Term) -> bool:
+    """Return whether a term of the light is large enough to be corrected."""
+    if term == "wave":
+        return float(np.sqrt(np.mean(light.wave**2))) > limits.LEAST_WAVE
+    if term == "room":
+        return float(np.ptp(light.room)) > limits.LEAST_ROOM
+    logs = np.log(light.gain)
+    for steps in list_shifts(sequence):
+        least = limits.LEAST_GAIN if len(steps) > 3 else limits.LEAST_GAIN_OF_THREE
+        if logs[[*steps]].std() > least:
+            return True
+    coded = [i for i, f in enumerate(sequence.frames) if f.kind not in ("phase", "texture")]
+    return bool(coded) and float(np.ptp(logs[coded])) / 2 > limits.LEAST_CODED_GAIN
+
+
+def _measure_unequal_means(
+    sequence: PatternSequence, stack: np.ndarray, light: FrameLight
+) -> tuple[float, float, float]:
+    """Measure the relative standard deviation of means of frames that are equal under equal light:
+    as captured, and without the light's gains and room light; and that of the gains, which room
+    light would have to balance where the means do not vary.
+
+    Equal are the steps of the finest period of an axis, and the sums of a bit and its inverse. A
+    surface that moves, and blur, imitate varying light, but not in these means.
+    """
+    means = stack[:, :: limits.MEAN_ROWS, :: limits.MEAN_COLUMNS].mean(axis=(1, 2))
+    # without the light of the room the mean is smaller, and the differences are the same
+    equalized = (means - light.room * means.mean()) / light.gain
+    spreads = []
+    for values, whole in ((means, means), (equalized, means), (light.gain, light.gain)):
+        spreads.append(
+            max(
+                (
+                    float(np.std(values[group].sum(axis=1)) / whole[group].sum(axis=1).mean())
+                    for group in _list_equal_sums(sequence)
+                ),
+                default=0.0,
+            )
+        )
+    return spreads[0], spreads[1], spreads[2]
+
+
+def _list_equal_sums(sequence: PatternSequence) -> Iterator[np.ndarray]:
+    """Yield groups (g, 1 or 2) of frames whose means, or sums of means, are equal."""
+    for axis in sequence.axes:
+        for _, steps in sequence.phase_shifts(axis)[-1:]:
+            yield np.array(steps)[:, None]
+        bits, inverse = sequence.bits("gray", axis), sequence.bits("inverse", axis)
+        if bits and len(bits) == len(inverse):
+            yield np.array([bits, inverse]).T
