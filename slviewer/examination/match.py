@@ -113,11 +113,11 @@ def _fit_groups(
         if np.count_nonzero(own) < 3 or not good.any():
             continue
         x, y = predicted[own][:, good].ravel(), np.clip(relative[own].ravel(), -1, 2)
-        middle, spread = float(x.mean()), max(float(x.var()), 1e-3)
+        middle, spread = x.mean(), np.float32(max(float(x.var()), 1e-3))
         slope = np.mean((x - middle) * (y - y.mean())) / spread
         slope = np.float32(np.clip(slope, *limits.CONTRASTS))
         bent = (x - middle) ** 2 - spread
-        curve = float(np.mean(bent * (y - slope * (x - middle)))) / max(float(bent.var()), 1e-3)
+        curve = np.mean(bent * (y - slope * (x - middle))) / max(float(bent.var()), 1e-3)
         curve = np.float32(np.clip(curve, -slope / 2, slope / 2))
         z = predicted[own] - middle
         out[own] = y.mean() + slope * z + curve * (z**2 - spread)
