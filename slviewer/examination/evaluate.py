@@ -105,7 +105,7 @@ class Evaluator:
                 if np.count_nonzero(good) >= limits.FEWEST_PIXELS:
                     yield axis, sample, m, good
 
-    def compare(self, base: Hypothesis, other: Hypothesis) -> "Comparison":
+    def compare(self, base: Hypothesis, other: Hypothesis) -> "MisfitChange":
         """Compare a hypothesis with the ``base``, on the images that both use."""
         gains, losses = [], []
         for axis, sample in self.sample.by_axis.items():
@@ -128,7 +128,7 @@ class Evaluator:
         gain = np.concatenate(gains)
         mean, error = float(gain.mean()), float(gain.std()) / np.sqrt(len(gain))
         every = np.concatenate(losses)
-        return Comparison(float(every.mean()) if every.size else 1.0, mean, mean / (error + 1e-9))
+        return MisfitChange(float(every.mean()) if every.size else 1.0, mean, mean / (error + 1e-9))
 
     def residuals(self, hypothesis: Hypothesis) -> np.ndarray:
         """Return the mean squared residual (n,) of each image in squares of the pattern's contrast,
@@ -174,7 +174,7 @@ class Evaluator:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MisfitChange:
     """By how much a hypothesis explains the images better than another.
 
     ``loss``: mean share of the images' variance that the other leaves; ``gain``: by how much less

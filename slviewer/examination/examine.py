@@ -12,9 +12,9 @@ from slviewer.examination.evaluate import Evaluator, Hypothesis, described
 from slviewer.examination.explain import Explanation, explain, list_unresolved
 from slviewer.examination.findings import (
     REMEDIES,
-    describe,
     describe_gamma,
     describe_ghost,
+    describe_hypothesis,
     describe_light,
     describe_mirroring,
     describe_missing_pattern,
@@ -70,7 +70,7 @@ def _judge(
     if found and motion and _is_moving_still(evaluator, found, motion):
         found = ()
     if found and not (ghost and is_first):
-        return [describe(hypothesis, sequence) for hypothesis in found]
+        return [describe_hypothesis(hypothesis, sequence) for hypothesis in found]
     if motion and not ghost:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *_judge_coordinates(evaluator, base)]

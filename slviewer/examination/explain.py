@@ -7,7 +7,7 @@ from itertools import combinations, product
 import numpy as np
 
 from slviewer.examination import limits
-from slviewer.examination.evaluate import Comparison, Evaluator, Hypothesis, described
+from slviewer.examination.evaluate import Evaluator, Hypothesis, MisfitChange, described
 from slviewer.examination.hypotheses import (
     exchange,
     list_descriptions,
@@ -146,7 +146,7 @@ class _Rated:
     ``turned`` is that of the coordinates' directions."""
 
     hypotheses: Explanation
-    comparison: Comparison
+    comparison: MisfitChange
     net: float
     turned: float
 
@@ -168,7 +168,7 @@ def _rate(evaluator: Evaluator, base: Hypothesis, hypotheses: Explanation) -> _R
     """Compare hypotheses of different axes with the description, on all pixels."""
     each = [evaluator.compare(base, h) for h in hypotheses]
     gain = sum(c.gain for c in each)
-    comparison = Comparison(each[0].loss, gain, min(c.sigmas for c in each))
+    comparison = MisfitChange(each[0].loss, gain, min(c.sigmas for c in each))
     turned = _turned(evaluator, hypotheses)
     net = gain - sum(h.cost for h in hypotheses) - turned
     return _Rated(hypotheses, comparison, net, turned)

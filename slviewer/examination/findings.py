@@ -49,7 +49,7 @@ REMEDIES: dict[Cause, str] = {
 """What to do, where it does not depend on values."""
 
 
-def describe(hypothesis: Hypothesis, base: PatternSequence) -> Finding:
+def describe_hypothesis(hypothesis: Hypothesis, base: PatternSequence) -> Finding:
     """Return the finding that a hypothesis stands for; ``base``: the sequence as described."""
     cause = hypothesis.cause
     assert cause is not None

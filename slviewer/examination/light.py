@@ -59,28 +59,15 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
     if not _is_varying(evaluator.coarse, base):
         return constant
     fitted, judged = evaluator.part(np.s_[::2]), evaluator.part(np.s_[1::2])
-    best = gains = constant
-    first, misfit = _measure_losses(judged, base, constant), judged.compare(base, base).loss
-    score = 1.0
+    best, gains, score = constant, constant, 1.0
     for terms in MODELS:
         if len(terms) > 1 and score < limits.EXPLAINED_WELL:
             break
         light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
         gains = light if terms == ("gain",) else gains
-        losses = _measure_losses(judged, base, light)
-        gain = (first - losses)[both := np.isfinite(first - losses)]
-        least = limits.SIGMAS * gain.std() / np.sqrt(max(len(gain), 1))
-        if len(gain) < limits.FEWEST_PIXELS / 2 or gain.mean() < least:
-            continue
-        equal = equalize_samples(judged, base.sequence, light)
-        relative = equal.compare(base, base).loss / misfit
-        own = losses[both].mean() / first[both].mean() * relative
+        own = _score(judged, base, light)
         is_large = _is_large(base.sequence, light, terms[-1])
-        if (
-            is_large
-            and relative < limits.AS_WELL
-            and own < score * limits.BETTER_LIGHT[len(terms) - 1]
-        ):
+        if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
     before, after, claimed = _measure_unequal_means(base.sequence, stack, best)
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
@@ -90,6 +77,22 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
     if is_confirmed or score < limits.EXPLAINED_BY_LIGHT:
         return best
     return replace(constant, unexplained=best.terms)
+
+
+def _score(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> float:
+    """Return the share of the residual, times that of the misfit, which a light leaves; infinite
+    where that is no significant improvement, or pixels match their neighbours less."""
+    first = _measure_losses(evaluator, base, FrameLight.constant(len(light.gain)))
+    losses = _measure_losses(evaluator, base, light)
+    gain = (first - losses)[both := np.isfinite(first - losses)]
+    if len(gain) < limits.FEWEST_PIXELS / 2:
+        return np.inf
+    equal = equalize_samples(evaluator, base.sequence, light)
+    misfit = equal.compare(base, base).loss / evaluator.compare(base, base).loss
+    is_significant = gain.mean() > limits.SIGMAS * gain.std() / np.sqrt(len(gain))
+    if misfit > limits.AS_WELL or not is_significant:
+        return np.inf
+    return float(losses[both].mean() / first[both].mean() * misfit)
 
 
 def equalize_samples(
@@ -313,11 +316,15 @@ def _is_varying(evaluator: Evaluator, base: Hypothesis) -> bool:
 
 def _rate_changes(normal: _Normal, terms: Sequence[Term]) -> dict[int, float]:
     """Return the share of the residual that a change of the room's light removes, by the frame
-    before which it happens: a few from either end, and not between all steps and all other frames,
-    where level and contrast of the fringes imitate it."""
+    before which it happens: a few from either end, and inside a group of frames; between groups
+    level and contrast of the fringes imitate it."""
     few, known = limits.FEW_FRAMES_KNOWN, normal.known
-    ends = known[1:][np.diff(normal.groups[known] >= 0)]
-    inner = [int(k) for k in known[few : 1 - few] if len(ends) > 1 or k not in ends]
+    groups = normal.groups[known].tolist()
+    inner = [
+        int(known[i])
+        for i in range(few, len(known) - few + 1)
+        if not {*groups[:i]}.isdisjoint(groups[i:])
+    ]
     return {k: normal.solve(terms, k)[1] for k in inner}
 
 

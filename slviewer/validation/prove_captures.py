@@ -218,7 +218,7 @@ def judge_errors(faulty: FaultyCapture, capture: SimulatedCapture) -> tuple[Outc
     floor = _list_errors(decode_coordinates(faulty.sound.described, sound.stack), sound.truth)
     errors = _list_errors(decode_coordinates(faulty.setup.described, capture.stack), capture.truth)
     texts = [_describe_errors(axis, errors.get(axis, np.empty(0)), floor[axis]) for axis in floor]
-    return compare_errors(errors, floor), "; ".join(texts)
+    return judge_coordinates(errors, floor), "; ".join(texts)
 
 
 def _describe_errors(axis: Axis, errors: np.ndarray, floor: np.ndarray) -> str:
@@ -232,7 +232,9 @@ def _describe_errors(axis: Axis, errors: np.ndarray, floor: np.ndarray) -> str:
     )
 
 
-def compare_errors(errors: Mapping[Axis, np.ndarray], floor: Mapping[Axis, np.ndarray]) -> Outcome:
+def judge_coordinates(
+    errors: Mapping[Axis, np.ndarray], floor: Mapping[Axis, np.ndarray]
+) -> Outcome:
     """The outcome by the absolute errors px of the decoded pixels of each axis; ``floor``: those
     without the fault."""
     for axis, least in floor.items():

@@ -22,7 +22,7 @@ from slviewer.validation.simulated_scene import (
     SCENES,
     TEXTURES,
     Geometry,
-    View,
+    SceneView,
     trace_view,
 )
 
@@ -73,7 +73,7 @@ class CaptureSetup:
 
     kind: CaptureKind
     seed: int
-    view: View
+    view: SceneView
     shown: PatternSequence
     described: PatternSequence
     gamma: float
@@ -128,7 +128,7 @@ class SimulatedCapture:
     truth: dict[Axis, np.ndarray]
 
 
-def build_sequence(kind: CaptureKind, view: View, blur_px: float) -> PatternSequence:
+def build_sequence(kind: CaptureKind, view: SceneView, blur_px: float) -> PatternSequence:
     """The patterns of one kind for the projector of a view, x before y; of Gray cells, two of which
     are a stripe, those that the camera resolves."""
     least = LEAST_STRIPE * max(1.0, blur_px) / (2 * view.pixels_per_column)
@@ -198,12 +198,12 @@ def draw_setup(kind: CaptureKind, seed: int) -> CaptureSetup:
     )  # fmt: skip
 
 
-def _draw_view(rng: np.random.Generator) -> View:
+def _draw_view(rng: np.random.Generator) -> SceneView:
     """Camera, projector and scene, drawn at random."""
     camera, projector = SIZES[rng.integers(len(SIZES))]
     length = float(rng.uniform(0.18, 0.3))
     left, right, above = (-length, 0.0), (length, 0.0), (0.0, -length)
-    return View(
+    return SceneView(
         camera,
         projector,
         float(rng.uniform(0.85, 1.15)),
@@ -215,7 +215,7 @@ def _draw_view(rng: np.random.Generator) -> View:
     )
 
 
-def _measure_contrast(sequence: PatternSequence, view: View, blur_px: float) -> float:
+def _measure_contrast(sequence: PatternSequence, view: SceneView, blur_px: float) -> float:
     """Contrast of the finest fringes after the camera's blur, 1 without any."""
     least = np.inf
     for axis, c, p in zip(AXES, view.camera, view.projector, strict=True):

@@ -27,7 +27,7 @@ _GRAZING = 0.05  # share of the light of a surface that faces the projector
 
 
 @dataclass(frozen=True)
-class View:
+class SceneView:
     """Camera, projector and scene. ``field``: width of the projector's field over the camera's.
 
     ``baseline``: position of the projector beside and above the camera; ``roll``: rad, of the
@@ -131,7 +131,7 @@ def _tilted(rng: np.random.Generator, most: float) -> np.ndarray:
     return normal / np.linalg.norm(normal)
 
 
-def _build_surfaces(view: View, moved: np.ndarray) -> list[_Surface]:
+def _build_surfaces(view: SceneView, moved: np.ndarray) -> list[_Surface]:
     """The surfaces of a scene, displaced by ``moved`` (3,)."""
     rng = np.random.default_rng(view.seed)
     if view.scene == "plane":
@@ -152,7 +152,7 @@ def _build_surfaces(view: View, moved: np.ndarray) -> list[_Surface]:
     return [_Plane(centre + moved, _tilted(rng, 0.35), radius=0.205)]
 
 
-def _paint(view: View, points: np.ndarray) -> np.ndarray:
+def _paint(view: SceneView, points: np.ndarray) -> np.ndarray:
     """Albedo (n,) of the surfaces at points (n, 3) that move with them."""
     rng = np.random.default_rng([view.seed, 1])
     if view.texture == "plain":
@@ -179,7 +179,9 @@ def _list_rays(camera: Size) -> np.ndarray:
     return rays.reshape(-1, 3)
 
 
-def _project(view: View, points: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _project(
+    view: SceneView, points: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Projector column and row (n,) px of points (n, 3); ``centre`` of the projector (3,)."""
     z = np.array([0, 0, 1.0]) - centre
     z /= np.linalg.norm(z)
@@ -194,7 +196,9 @@ def _project(view: View, points: np.ndarray, centre: np.ndarray) -> tuple[np.nda
 
 
 @lru_cache(maxsize=3)
-def trace_view(view: View, displacement: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Geometry:
+def trace_view(
+    view: SceneView, displacement: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Geometry:
     """Trace the rays of all subpixels; ``displacement`` of the scene, in its unit of length."""
     moved, rays = np.array(displacement, np.float32), _list_rays(view.camera)
     surfaces = _build_surfaces(view, moved)

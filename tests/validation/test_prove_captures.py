@@ -18,9 +18,9 @@ from slviewer.validation.prove_captures import (
     NO_FAULT,
     CaptureCase,
     Named,
-    compare_errors,
     decode_coordinates,
     examine_case,
+    judge_coordinates,
     judge_findings,
     plan_cases,
     prove_captures,
@@ -138,14 +138,14 @@ def test_errors_are_compared_with_those_without_the_fault(
 ) -> None:
     least = np.linspace(0, 0.1, 1001)
     errors = scale * least[: round(share * len(least))] / max(share, 0.1)
-    assert compare_errors({"x": least, "y": errors}, {"x": least, "y": least}) == outcome
+    assert judge_coordinates({"x": least, "y": errors}, {"x": least, "y": least}) == outcome
 
 
 def test_few_wrong_pixels_are_harmful() -> None:
     least = np.linspace(0, 0.1, 1001)
     errors = np.where(np.arange(1001) > 940, 30.0, least)
-    assert compare_errors({"x": errors}, {"x": least}) == "HARMFUL"
-    assert compare_errors({}, {"x": least}) == "LOST"
+    assert judge_coordinates({"x": errors}, {"x": least}) == "HARMFUL"
+    assert judge_coordinates({}, {"x": least}) == "LOST"
 
 
 @pytest.mark.computes
