@@ -86,14 +86,14 @@ class Evaluator:
         return self._atoms[key]
 
     def match(self, hypothesis: Hypothesis, axis: Axis) -> Match | None:
-        """Return the match of one axis; None where it has fewer than four images."""
-        atoms = self.atoms(hypothesis, axis)
+        """Return the match of one axis; None where it has fewer than four images, or no pixels."""
+        atoms, sample = self.atoms(hypothesis, axis), self.sample.by_axis.get(axis)
         images = tuple(hypothesis.images[i] for i in atoms.frames)
-        if axis not in self.sample.by_axis or len(images) - images.count(None) < 4:
+        if sample is None or not sample.swing.size or len(images) - images.count(None) < 4:
             return None
         key = _list_conventions(hypothesis.sequence, axis), images
         if key not in self._matches:
-            self._matches[key] = match(self.sample.by_axis[axis], atoms, list(images))
+            self._matches[key] = match(sample, atoms, list(images))
         return self._matches[key]
 
     def explained(self, hypothesis: Hypothesis) -> Iterator[tuple[Axis, Sample, Match, np.ndarray]]:
