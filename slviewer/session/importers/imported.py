@@ -298,11 +298,11 @@ def none_usable(skipped: Sequence[Skipped]) -> InputError:
 
 def list_folders(source: Path) -> list[Path]:
     """The folder, and those right inside it in counting order. InputError where it is none."""
-    source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
-    if not source.is_dir():
+    if not expand_user(source).is_dir():
         raise InputError(
             f"{source} is not a folder: give the folder of a capture, or a folder of such folders"
         )
+    source = Path(os.path.abspath(expand_user(source)))  # a link keeps its own name
     inner = [entry for entry in visible(source) if entry.is_dir()]
     return [source, *sorted(inner, key=lambda entry: natural_key(entry.name))]
 
