@@ -266,9 +266,9 @@ class _Normal:
         step = (t @ x).reshape(len(self.values), n)
         if "gain" in terms:
             relative = t[:n] - t[self.known].mean(axis=0)
-            error = np.sqrt(np.einsum("iq,qi->i", relative, np.linalg.solve(normal, relative.T)))
+            variance = np.einsum("iq,qi->i", relative, np.linalg.solve(normal, relative.T))
             scattered = limits.SCATTERED / np.maximum(self.level, 1e-6)
-            sure = np.hypot(error, scattered) < limits.UNKNOWN_GAIN
+            sure = variance + scattered**2 < limits.UNKNOWN_GAIN**2
             same = same * sure / np.maximum((same * sure).sum(axis=1, keepdims=True), 1)
             step[0] = np.where(sure, step[0] - same @ step[0], 0)
         return dict(zip(self.values, step, strict=True)), float(x @ moment) / max(self.entries, 1)

@@ -147,8 +147,8 @@ OUTLIER = 4.0
 MOST_STEPS, CONVERGED = 10, 5e-4
 """Gauss-Newton steps of the light, and change of the gains that ends them."""
 UNKNOWN_GAIN = 0.1
-"""Standard error of a gain from which that of the nearest frame is used: dark stripes hardly depend
-on it."""
+"""Standard error of a gain from which the mean of its group is used: dark stripes hardly depend on
+it."""
 SCATTERED = 0.02
 """Light that the scene scatters into dark stripes, of the contrast."""
 FUZZY = 0.4

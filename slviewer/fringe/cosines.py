@@ -10,8 +10,6 @@ FEWEST = 500
 """Number of valid pixels below which a frame is not judged."""
 HIGHEST = 6
 """The highest harmonic of the fringe that is attributed to gamma."""
-ONE_SIDED = 0.5
-"""Length of the mean unit phasor from which pixels do not cover all phases of the fringe."""
 
 
 def cosine_columns(steps: np.ndarray, n: int, own: int) -> np.ndarray:
