@@ -151,7 +151,8 @@ def _judge_coordinates(evaluator: Evaluator, base: Hypothesis) -> Iterator[Findi
             continue
         u, extent = m.coordinate[m.misfit < limits.GOOD], sequence.extent(axis)
         share = float(np.mean(u > extent + 0.5)) if u.size else 0.0
-        if share > limits.OUTSIDE:
+        is_coded = bool(sequence.find("gray", axis))
+        if share > (limits.OUTSIDE_OF_CODE if is_coded else limits.OUTSIDE):
             yield describe_reach(axis, extent, u, share)
 
 

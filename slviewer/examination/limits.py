@@ -106,8 +106,9 @@ MIRRORED_COST, TURNED_COST, FOLDED_COST = 0.02, 0.002, 0.02
 for a projector upside down, which is rare; and for an axis that runs backwards from neighbour to
 neighbour."""
 
-OUTSIDE = 0.08
-"""Share of the coordinates beyond the projector, that noise of fine periods does not reach."""
+OUTSIDE, OUTSIDE_OF_CODE = 0.08, 0.02
+"""Share of the coordinates beyond the projector, that noise of fine periods does not reach, and
+that wrong bits of a Gray code do not."""
 LEAST_MOTION = 0.015
 """Displacement from the first to the last step, in periods, that gamma and noise do not imitate."""
 MUCH_MOTION = 0.03
@@ -130,6 +131,8 @@ LEAST_GAIN, LEAST_GAIN_OF_THREE, LEAST_CODED_GAIN = 0.005, 0.01, 0.045
 """Variation of the gains below which they are not corrected: rms over the steps of a period, where
 response and blur of a camera imitate as much; of three steps, which hardly determine it; and of
 frames without phase steps, where blurred stripes imitate it and thresholds tolerate more."""
+FARTHEST_GAIN = 0.7
+"""Logarithm of a gain over the median of its kind beyond which a frame shows something else."""
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03
 """Rms of a wave along the rows, and change of the room's light over the mean grey level, that are
 corrected."""
