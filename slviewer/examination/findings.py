@@ -293,15 +293,15 @@ def describe_light(sequence: PatternSequence, light: FrameLight) -> Iterator[Fin
     wave = float(np.sqrt(np.mean(light.wave**2)))
     if "wave" in light.terms and wave > REPORTED / 3:
         text = (
-            f"the light varies along the image rows by {100 * np.sqrt(2) * wave:.0f} %, in"
+            f"the light varies from image row to image row by {100 * np.sqrt(2) * wave:.0f} %, in"
             f" {light.cycles:.1f} waves per image (mains flicker under a rolling shutter),"
             " which is corrected"
         )
         yield _of_light("flicker", text, used[0])
     if "gain" in light.terms and span > REPORTED:
         text = (
-            f"the brightness of the frames varies by {100 * span:.1f} % (automatic exposure, or an"
-            " unsteady lamp), which is corrected"
+            f"the brightness varies by {100 * span:.1f} % among frames of a kind (automatic"
+            " exposure, or an unsteady lamp), which is corrected"
         )
         frame = used[int(np.argmax(np.abs(np.log(gain))))]
         yield _of_light("exposure-drift", text, frame)
@@ -329,7 +329,7 @@ def describe_disturbance(terms: Sequence[Term]) -> Finding:
     """Return the finding of light that varies by more than can be corrected; ``terms``: how."""
     if "wave" in terms:
         cause: Cause = "flicker"
-        text = "the light varies along the image rows and between the frames"
+        text = "the light varies from image row to image row and between the frames"
     elif "room" in terms:
         cause, text = "room-light", "the light of the room changes between the frames"
     else:

@@ -26,7 +26,7 @@ MODELS: tuple[tuple[Term, ...], ...] = (
 VALUES: dict[Term, tuple[str, ...]] = {
     "gain": ("gain",), "wave": ("cosine", "sine"), "room": ("uniform", "albedo", "rows", "columns")
 }  # fmt: skip
-"""Values of each term: of every frame, of room light of all frames from its change on."""
+"""Unknowns of each term: one a frame; of room light one for all frames from its change on."""
 PRIORS = {
     "gain": 0.3, "cosine": 0.1, "sine": 0.1, "uniform": 30.0, "albedo": 1.0, "rows": 1.0,
     "columns": 1.0, "level": 0.3,
@@ -35,8 +35,8 @@ PRIORS = {
 CYCLES = np.arange(0.5, 8.25, 0.05)
 """Waves along the image's height that are tried."""
 AROUND = np.linspace(-1, 1, 7)
-"""Places around a pixel, over the distance of its neighbours, between which a stripe must not end
-for blur to leave it as it is."""
+"""Offsets from a pixel, over the distance of its neighbours: a stripe that ends between them is
+changed by blur."""
 
 
 def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameLight:
@@ -82,7 +82,7 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
 
 def _score(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> float:
     """Return the share of the residual, times that of the misfit, which a light leaves; infinite
-    where that is no significant improvement, or pixels match their neighbours less."""
+    where pixels are few or match their neighbours less, or the improvement is not significant."""
     first = _measure_losses(evaluator, base, FrameLight.constant(len(light.gain)))
     losses = _measure_losses(evaluator, base, light)
     gain = (first - losses)[both := np.isfinite(first - losses)]
@@ -301,7 +301,8 @@ def _accumulate(parts: Sequence[_Residual], n: int, terms: Sequence[Term]) -> _N
 
 
 def _is_varying(evaluator: Evaluator, base: Hypothesis) -> bool:
-    """Return whether one step of any model promises to explain more than noise."""
+    """Return whether one step of any single term promises to explain more than noise, contrast and
+    level do."""
     n = len(base.sequence.frames)
     light = FrameLight.constant(n)
     parts = [*_project(evaluator, base, light)]
@@ -419,7 +420,7 @@ def _is_large(sequence: PatternSequence, light: FrameLight, term: Term) -> bool:
 def _measure_unequal_means(
     sequence: PatternSequence, stack: np.ndarray, light: FrameLight
 ) -> tuple[float, float, float]:
-    """Measure the relative standard deviation of means of frames that are equal under equal light:
+    """Measure the largest relative standard deviation of means of frames equal under equal light:
     as captured, and without the light's gains and room light; and that of the gains, which room
     light would have to balance where the means do not vary.
 

@@ -148,7 +148,7 @@ MEAN_ROWS, MEAN_COLUMNS = 16, 4
 OUTLIER = 4.0
 """Squared residual of a pixel over the median, from which it loses weight."""
 MOST_STEPS, CONVERGED = 10, 5e-4
-"""Gauss-Newton steps of the light, and change of the gains that ends them."""
+"""Gauss-Newton steps of the light, and change of all its values that ends them."""
 UNKNOWN_GAIN = 0.1
 """Standard error of a gain from which the mean of its group is used: dark stripes hardly depend on
 it."""

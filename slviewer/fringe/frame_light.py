@@ -1,8 +1,8 @@
 """Light of each frame of a capture, and frames as they would be under equal light.
 
 Frame i shows ``g_i(v) S_i(p) + o_i(p)``: S_i is what the scene shows of its pattern; the gain g_i
-varies with automatic exposure and unsteady lamps, under a rolling shutter also along the image rows
-v; o_i is the room light in excess of that of the other frames, uniform or in proportion to the
+varies with automatic exposure and unsteady lamps, under a rolling shutter also from image row to
+row, v; o_i is the room light in excess of that of the other frames, uniform or in proportion to the
 scene's albedo. `slviewer.examination.light` estimates it.
 """
 
@@ -31,17 +31,18 @@ CLIPPED = 65535.0
 
 @dataclass(frozen=True, eq=False)
 class FrameLight:
-    """Light of each of n frames, relative to their mean.
+    """Light of each of n frames; gains relative to the mean of the frames of their kind, the steps
+    of a period or the other frames of an axis.
 
     ``terms``: terms of the light that are to be corrected, empty where no correction is necessary
     or possible; ``unexplained``: terms by which the frames differ, although these explain too
     little to be corrected.
 
-    ``gain`` (n,); ``wave`` (n, 2): relative cosine and sine of ``cycles`` per image height along
-    the rows. The room light, ``uniform`` (n,) grey levels and ``albedo`` (n, 3) times the scene's
-    albedo (in grey levels: constant, along rows, along columns, both -0.5 ... 0.5), changes before
-    the frames ``changes`` only: if it varied freely, a part in step with the fringes could not be
-    separated from them. ``room`` (n,): its share of the mean grey level.
+    ``gain`` (n,); ``wave`` (n, 2): relative cosine and sine of ``cycles`` per image height. The
+    room light, ``uniform`` (n,) grey levels and ``albedo`` (n, 3) times the scene's albedo (in grey
+    levels: constant, along rows, along columns, both -0.5 ... 0.5), changes before the frames
+    ``changes`` only: if it varied freely, a part in step with the fringes could not be separated
+    from them. ``room`` (n,): its excess over the darkest frame, as a share of the mean grey level.
     """
 
     gain: np.ndarray
@@ -71,9 +72,9 @@ class FrameLight:
         return float(np.std(np.log(self.gain)))
 
     def count_open_steps(self, sequence: PatternSequence, k: int) -> int:
-        """Return the number of phase steps of the period during which the room's light changes
-        before frame ``k``; 0 where there are none, or enough to tell uniform light from light in
-        proportion to the albedo."""
+        """Return the number of steps of the period in which a change of the room's light before
+        frame ``k`` falls, if they are too few to tell uniform light from light in proportion to the
+        albedo; else 0."""
         shifts = [s for s in list_shifts(sequence) if min(s) < k <= max(s)]
         return next((len(steps) for steps in shifts if len(steps) <= FEW_STEPS), 0)
 

@@ -121,7 +121,7 @@ LIGHT_CAUSES: tuple[Cause, ...] = ("room-light", "flicker", "exposure-drift", "g
 class Examination(msgspec.Struct, frozen=True):
     """What was found about the frames of a capture, root causes first; nothing for a sound one.
 
-    ``light_rms``: relative variation of the light from frame to frame, 0 below what is corrected.
+    ``light_rms``: rms of the logarithms of the frames' gains, 0 below what is corrected.
     """
 
     findings: tuple[Finding, ...] = ()

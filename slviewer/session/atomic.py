@@ -72,7 +72,7 @@ def write_bytes(path: Path, *parts: Any) -> None:
 
 
 def write_synced_json(path: Path, data: Any) -> None:
-    """Write a new JSON file and sync it. Takes what `records.to_plain` takes."""
+    """Write a new JSON file and sync it. Takes what `records.plain.to_plain` takes."""
     write_bytes(path, to_json(data))
 
 

@@ -12,7 +12,7 @@ from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import AlteredScene, Points, Rays, Scene, Spheres, Surface
 
 Pattern = tuple[Axis | None, np.ndarray]
-"""What `fringe.profile` gives: the axis and the grey levels along it."""
+"""What `fringe.patterns.profile` gives: the axis and the grey levels along it."""
 CleanScene = BoardScene | Spheres
 """Scenes that faults act on."""
 

@@ -118,7 +118,7 @@ class Renderer:
         gain: float = 1.0,
     ) -> None:
         """Fill `out` (h, w) uint8 with one frame of `pattern`, the axis and grey levels that
-        `fringe.profile` gives.
+        `fringe.patterns.profile` gives.
 
         `keys` (2,) uint32 decide the noise, `lamp` is the relative light of this frame, `exposure`
         replaces the renderer's own, and `gain` multiplies the signal and its noise before they

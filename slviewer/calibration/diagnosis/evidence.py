@@ -86,7 +86,7 @@ class PoseEvidence:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "PoseEvidence":
-        """Return the evidence that `records.to_plain` saved; None is read as NaN."""
+        """Return the evidence that `records.plain.to_plain` saved; None is read as NaN."""
         axes = {
             name: {k: np.nan if v is None else v for k, v in axis.items()}
             for name, axis in data["axes"].items()
