@@ -71,8 +71,9 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
             best, score = light, own
     before, after, claimed = _measure_unequal_means(base.sequence, stack, best)
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
+    is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
     is_strange = np.abs(np.log(best.gain)).max() > limits.FARTHEST_GAIN
-    if is_refuted or is_strange or claimed > 3 * before + limits.CONFIRMED_LEAST:
+    if is_strange or (is_refuted and score > limits.EXPLAINED_CLEARLY):
         return constant
     is_confirmed = before > limits.CONFIRMED_LEAST and after < limits.CONFIRMED * before
     if is_confirmed or score < limits.EXPLAINED_BY_LIGHT:

@@ -122,8 +122,9 @@ estimated: its values alone explain a third of that."""
 BETTER_LIGHT, EXPLAINED_WELL = (0.9, 0.75), 0.05
 """Share of the residual that one term of the light, and a second one, may leave; and the share that
 a single term leaves where no second one is tried."""
-EXPLAINED_BY_LIGHT = 0.78
-"""Share of the misfit that light may leave where equal means do not confirm it."""
+EXPLAINED_BY_LIGHT, EXPLAINED_CLEARLY = 0.78, 0.55
+"""Share of the residual that light may leave where equal means do not confirm it, and where they
+refute it, as those of few fringes in view do."""
 AS_WELL = 1.02
 """Factor by which light may raise the misfit of pixels predicted from their neighbours: small gains
 hardly change it, and those that imitate a strange frame do."""
