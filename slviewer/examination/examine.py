@@ -22,6 +22,7 @@ from slviewer.examination.findings import (
     describe_reach,
     describe_unreadable,
     describe_unresolved,
+    wrap,
 )
 from slviewer.examination.ghost import has_ghost
 from slviewer.examination.light import equalize_samples, estimate_light
@@ -69,6 +70,8 @@ def _judge(
     is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
     if found and motion and _is_moving_still(evaluator, found, motion):
         found = ()
+    if found and (displaced := _read_displacement(found, base)):
+        return [describe_motion(sequence, *displaced)]
     if found and not (ghost and is_first):
         return [describe_hypothesis(hypothesis, sequence) for hypothesis in found]
     if motion and not ghost:
@@ -105,9 +108,25 @@ def _is_moving_still(
     for hypothesis in found:
         own = {a: px for a, px in motion.items() if hypothesis.axis in (a, None)}
         left = measure_motion(evaluator, _fill_in(hypothesis))
-        if any(abs(left.get(axis, 0.0)) > 0.5 * abs(px) for axis, px in own.items()):
+        if any(
+            abs(left.get(axis, 0.0)) > limits.STILL_MOVING * abs(px) for axis, px in own.items()
+        ):
             return True
     return False
+
+
+def _read_displacement(found: Explanation, base: Hypothesis) -> tuple[Axis, float] | None:
+    """Return axis and px of an offset of the phase that is no convention, on one axis whose periods
+    are captured one after the other: what moves between them shifts their phases so."""
+    first, sequence = found[0], base.sequence
+    axis = first.axis
+    is_offset = len(found) == 1 and first.cause == "phase-offset" and len(sequence.axes) == 2
+    if axis is None or not is_offset or sequence.find("gray", axis):
+        return None
+    *_, (period, steps) = sequence.phase_shifts(axis)
+    turns = wrap((first.sequence.offset_rad(axis) - sequence.offset_rad(axis)) / (2 * np.pi))
+    is_usual = any(abs(wrap(turns * n)) < limits.USUAL_OFFSET * n for n in (4, len(steps)))
+    return None if is_usual else (axis, turns * period)
 
 
 def _fill_in(hypothesis: Hypothesis) -> Hypothesis:

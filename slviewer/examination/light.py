@@ -73,6 +73,7 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
     is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
     is_strange = np.abs(np.log(best.gain)).max() > limits.FARTHEST_GAIN
+    is_refuted |= "wave" in best.terms and not _shows_wave(base.sequence, stack, best)
     if is_strange or (is_refuted and score > limits.EXPLAINED_CLEARLY):
         return constant
     is_confirmed = before > limits.CONFIRMED_LEAST and after < limits.CONFIRMED * before
@@ -415,7 +416,8 @@ def _is_large(sequence: PatternSequence, light: FrameLight, term: Term) -> bool:
         if logs[[*steps]].std() > least:
             return True
     coded = [i for i, f in enumerate(sequence.frames) if f.kind not in ("phase", "texture")]
-    return bool(coded) and float(np.ptp(logs[coded])) / 2 > limits.LEAST_CODED_GAIN
+    least_coded = limits.LEAST_CODED_GAIN[bool(list_shifts(sequence))]
+    return bool(coded) and float(np.ptp(logs[coded])) / 2 > least_coded
 
 
 def _measure_unequal_means(
@@ -443,6 +445,27 @@ def _measure_unequal_means(
             )
         )
     return spreads[0], spreads[1], spreads[2]
+
+
+def _shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight) -> bool:
+    """Return whether the means of image rows vary among frames that are equal under equal light as
+    the light's wave does: gamma imitates a wave at the pixels, but not in the mean over fringes."""
+    rows = stack[:, :, :: limits.MEAN_COLUMNS].mean(axis=2)
+    waves = np.stack(_waves(np.linspace(-0.5, 0.5, rows.shape[1]), light))
+    products = np.zeros(3)
+    for group in _list_equal_sums(sequence):
+        if (
+            sequence.frames[group[0, 0]].kind == "phase"
+            and sequence.frames[group[0, 0]].axis == "y"
+        ):
+            continue  # the fringes are along the rows
+        sums = rows[group].sum(axis=1)
+        excess = sums / np.maximum(sums.mean(axis=0), 1e-6) - 1
+        seen = (excess - excess.mean(axis=1, keepdims=True)) @ waves.T * (2 / rows.shape[1])
+        own = light.wave[group].mean(axis=1)
+        own = own - own.mean(axis=0)
+        products += np.sum(seen * own), np.sum(seen**2), np.sum(own**2)
+    return bool(products[0] > 0.5 * np.sqrt(products[1] * products[2]))
 
 
 def _list_equal_sums(sequence: PatternSequence) -> Iterator[np.ndarray]:

@@ -113,6 +113,10 @@ LEAST_MOTION = 0.015
 """Displacement from the first to the last step, in periods, that gamma and noise do not imitate."""
 MUCH_MOTION = 0.03
 """The same, from which a capture must not be measured: a fringe is read to a hundredth."""
+USUAL_OFFSET = 0.02
+"""Periods by which an offset of the phase may differ from a quarter or a step."""
+STILL_MOVING = 0.6
+"""Share of the displacement left by an explanation, from which motion explains more."""
 LEAST_GHOST, GHOST_SIGMAS = 0.02, 5.0
 """Share of the image before, that blur and gamma do not imitate, and in its standard errors."""
 
@@ -128,10 +132,11 @@ refute it, as those of few fringes in view do."""
 AS_WELL = 1.02
 """Factor by which light may raise the misfit of pixels predicted from their neighbours: small gains
 hardly change it, and those that imitate a strange frame do."""
-LEAST_GAIN, LEAST_GAIN_OF_THREE, LEAST_CODED_GAIN = 0.005, 0.01, 0.045
+LEAST_GAIN, LEAST_GAIN_OF_THREE, LEAST_CODED_GAIN = 0.0075, 0.01, (0.045, 0.25)
 """Variation of the gains below which they are not corrected: rms over the steps of a period, where
 response and blur of a camera imitate as much; of three steps, which hardly determine it; and of
-frames without phase steps, where blurred stripes imitate it and thresholds tolerate more."""
+stripes, which blur imitates and thresholds tolerate: alone, and beside fringes, which would show
+it."""
 FARTHEST_GAIN = 0.7
 """Logarithm of a gain over the median of its kind beyond which a frame shows something else."""
 LEAST_WAVE, LEAST_ROOM = 0.01, 0.03

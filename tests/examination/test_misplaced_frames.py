@@ -198,7 +198,7 @@ def test_bits_and_inverses_must_add_up():
     assert told(sequence, swapped(stack, 2)) == {2: "frame-order"}
     assert told(sequence, swapped(stack, 1)) == {1: "frame-order"}
     assert told(sequence, dropped(stack, 2)) == {2: "missing-frame"}
-    assert told(sequence, brighter(stack, 0)) == {0: "exposure-drift"}
+    assert told(sequence, brighter(stack, 0)) == {}  # 5 % of one frame move no threshold
 
 
 @pytest.mark.slow
