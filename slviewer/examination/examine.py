@@ -70,10 +70,8 @@ def _judge(
     is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
     if found and motion and _is_moving_still(evaluator, found, motion):
         found = ()
-    if found and (displaced := _read_displacement(found, base)):
-        return [describe_motion(sequence, *displaced)]
     if found and not (ghost and is_first):
-        return [describe_hypothesis(hypothesis, sequence) for hypothesis in found]
+        return _describe_explanation(found, sequence)
     if motion and not ghost:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
     judged = [*_judge_readability(evaluator, base), *_judge_coordinates(evaluator, base)]
@@ -115,18 +113,20 @@ def _is_moving_still(
     return False
 
 
-def _read_displacement(found: Explanation, base: Hypothesis) -> tuple[Axis, float] | None:
-    """Return axis and px of an offset of the phase that is no convention, on one axis whose periods
-    are captured one after the other: what moves between them shifts their phases so."""
-    first, sequence = found[0], base.sequence
-    axis = first.axis
+def _describe_explanation(found: Explanation, sequence: PatternSequence) -> list[Finding]:
+    """Return the findings of an explanation.
+
+    An offset of the phase that is no convention, on one axis of several periods captured one after
+    the other, is motion between them.
+    """
+    first, axis = found[0], found[0].axis
     is_offset = len(found) == 1 and first.cause == "phase-offset" and len(sequence.axes) == 2
-    if axis is None or not is_offset or sequence.find("gray", axis):
-        return None
-    *_, (period, steps) = sequence.phase_shifts(axis)
-    turns = wrap((first.sequence.offset_rad(axis) - sequence.offset_rad(axis)) / (2 * np.pi))
-    is_usual = any(abs(wrap(turns * n)) < limits.USUAL_OFFSET * n for n in (4, len(steps)))
-    return None if is_usual else (axis, turns * period)
+    if axis is not None and is_offset and not sequence.find("gray", axis):
+        *_, (period, steps) = sequence.phase_shifts(axis)
+        turns = wrap((first.sequence.offset_rad(axis) - sequence.offset_rad(axis)) / (2 * np.pi))
+        if all(abs(wrap(turns * n)) > limits.USUAL_OFFSET * n for n in (4, len(steps))):
+            return [describe_motion(sequence, axis, turns * period)]
+    return [describe_hypothesis(hypothesis, sequence) for hypothesis in found]
 
 
 def _fill_in(hypothesis: Hypothesis) -> Hypothesis:

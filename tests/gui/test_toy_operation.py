@@ -56,6 +56,9 @@ def brightness(job: Job, settings: BrightnessSettings) -> Iterator[Found[Brightn
     )
 
 
+del OPERATIONS["brightness"]  # every worker imports this file, whichever tests it runs
+
+
 @pytest.fixture(autouse=True)
 def registered() -> Iterator[None]:
     """Other tests do not see the kind and the operation of this file."""
