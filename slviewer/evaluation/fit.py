@@ -4,7 +4,7 @@ residuals, and those that noise alone would cause.
 RANSAC says where the shape is; the largest patch of connected pixels within a tolerance says how
 far it reaches. The tolerance is many times wider than any form error worth measuring, so that
 finding the shape never flatters it: what is wrong by less stays in, and what is wrong by more,
-inside the patch, stays in too, to be counted as set aside. Where a cloud is noisier than that (Gray
+inside the patch, stays in too, to be counted as excluded. Where a cloud is noisier than that (Gray
 code alone), the tolerances follow its expected noise.
 """
 

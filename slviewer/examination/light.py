@@ -47,6 +47,8 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
     sequence.
     """
     check_stack(sequence, stack)
+    if not sequence.axes:
+        return FrameLight.constant(len(stack))
     with threadpool_limits(1, "blas"):  # the products of a sample are too small for more
         evaluator = Evaluator(sample_capture(sequence, stack))
         return estimate_light(evaluator, described(sequence), stack)
@@ -60,37 +62,49 @@ def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) ->
         return constant
     fitted, judged = evaluator.part(np.s_[::2]), evaluator.part(np.s_[1::2])
     best, gains, score = constant, constant, 1.0
+    first = _measure_losses(judged, judged, base, constant)
     for terms in MODELS:
         if len(terms) > 1 and score < limits.EXPLAINED_WELL:
             break
         light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
         gains = light if terms == ("gain",) else gains
-        own = _score(judged, base, light)
+        own = _score(judged, base, light, first)
         is_large = _is_large(base.sequence, light, terms[-1])
         if is_large and own < score * limits.BETTER_LIGHT[len(terms) - 1]:
             best, score = light, own
-    before, after, claimed = _measure_unequal_means(base.sequence, stack, best)
+    return _accept(base.sequence, stack, best, score) if best.terms else constant
+
+
+def _accept(
+    sequence: PatternSequence, stack: np.ndarray, light: FrameLight, score: float
+) -> FrameLight:
+    """Return the light of best ``score`` if it is to be corrected; else equal light, with the terms
+    of one that is neither refuted nor explains enough."""
+    constant = FrameLight.constant(len(stack))
+    before, after, claimed = _measure_unequal_means(sequence, stack, light)
     is_refuted = after > limits.REFUTED * before + limits.REFUTED_LEAST
     is_refuted |= claimed > 3 * before + limits.CONFIRMED_LEAST
-    is_strange = np.abs(np.log(best.gain)).max() > limits.FARTHEST_GAIN
-    is_refuted |= "wave" in best.terms and not _shows_wave(base.sequence, stack, best)
+    is_refuted |= "wave" in light.terms and not _shows_wave(sequence, stack, light)
+    is_strange = np.abs(np.log(light.gain)).max() > limits.FARTHEST_GAIN
     if is_strange or (is_refuted and score > limits.EXPLAINED_CLEARLY):
         return constant
     is_confirmed = before > limits.CONFIRMED_LEAST and after < limits.CONFIRMED * before
     if is_confirmed or score < limits.EXPLAINED_BY_LIGHT:
-        return best
-    return replace(constant, unexplained=best.terms)
+        return light
+    return replace(constant, unexplained=light.terms)
 
 
-def _score(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> float:
+def _score(evaluator: Evaluator, base: Hypothesis, light: FrameLight, first: np.ndarray) -> float:
     """Return the share of the residual, times that of the misfit, which a light leaves; infinite
-    where pixels are few or match their neighbours less, or the improvement is not significant."""
-    first = _measure_losses(evaluator, base, FrameLight.constant(len(light.gain)))
-    losses = _measure_losses(evaluator, base, light)
+    where pixels are few or match their neighbours less, or the improvement is not significant.
+
+    ``first`` (p,): losses under equal light.
+    """
+    equal = equalize_samples(evaluator, base.sequence, light)
+    losses = _measure_losses(evaluator, equal, base, light)
     gain = (first - losses)[both := np.isfinite(first - losses)]
     if len(gain) < limits.FEWEST_PIXELS / 2:
         return np.inf
-    equal = equalize_samples(evaluator, base.sequence, light)
     misfit = equal.compare(base, base).loss / evaluator.compare(base, base).loss
     is_significant = gain.mean() > limits.SIGMAS * gain.std() / np.sqrt(len(gain))
     if misfit > limits.AS_WELL or not is_significant:
@@ -157,10 +171,12 @@ class _Residual:
     entries: int
 
 
-def _project(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Iterator[_Residual]:
-    """Yield the residual of each axis under a light."""
+def _project(
+    evaluator: Evaluator, equal: Evaluator, base: Hypothesis, light: FrameLight
+) -> Iterator[_Residual]:
+    """Yield the residual of each axis under a light; ``equal``: the same pixels under equal
+    light."""
     sequence, white = base.sequence, evaluator.sample.white
-    equal = equalize_samples(evaluator, sequence, light)
     for axis, sample in equal.sample.by_axis.items():
         m = equal.match(base, axis)
         if m is None:
@@ -307,14 +323,15 @@ def _is_varying(evaluator: Evaluator, base: Hypothesis) -> bool:
     level do."""
     n = len(base.sequence.frames)
     light = FrameLight.constant(n)
-    parts = [*_project(evaluator, base, light)]
+    parts = [*_project(evaluator, evaluator, base, light)]
     if not parts:
         return False
     normal = _accumulate(parts, n, ("gain", "room"))
     least = normal.solve(())[1] + limits.LIGHT_SHARE
     if max(normal.solve(("gain",))[1], *_rate_changes(normal, ("room",)).values(), 0) > least:
         return True
-    parts = [*_project(evaluator, base, replace(light, cycles=_find_wave(parts)))]
+    waving = replace(light, cycles=_find_wave(parts))
+    parts = [*_project(evaluator, evaluator, base, waving)]
     return _accumulate(parts, n, ("wave",)).solve(("wave",))[1] > least
 
 
@@ -350,10 +367,11 @@ def _fit(
     """Fit the terms of a model by Gauss-Newton steps from a first light."""
     light, n = replace(start, terms=terms), len(start.gain)
     for step in range(limits.MOST_STEPS):
-        parts = [*_project(evaluator, base, light)]
-        if "wave" in terms and not step:
+        equal = equalize_samples(evaluator, base.sequence, light)
+        parts = [*_project(evaluator, equal, base, light)]
+        if "wave" in terms and not step:  # of no amplitude yet
             light = replace(light, cycles=_find_wave(parts))
-            parts = [*_project(evaluator, base, light)]
+            parts = [*_project(evaluator, equal, base, light)]
         if not parts:
             break
         normal = _accumulate(parts, n, terms)
@@ -389,10 +407,12 @@ def _update(light: FrameLight, change: dict[str, np.ndarray], evaluator: Evaluat
     return light
 
 
-def _measure_losses(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> np.ndarray:
+def _measure_losses(
+    evaluator: Evaluator, equal: Evaluator, base: Hypothesis, light: FrameLight
+) -> np.ndarray:
     """Return the weighted squared residual (p,) of the pixels of all axes under a light, beside
-    contrasts and levels that fit them; NaN where it is not known."""
-    parts = {part.axis: part for part in _project(evaluator, base, light)}
+    contrasts and levels that fit them; NaN where it is not known. ``equal``: see `_project`."""
+    parts = {part.axis: part for part in _project(evaluator, equal, base, light)}
     change = _accumulate([*parts.values()], len(light.gain), ()).solve(())[0]
     losses = [np.zeros(0)]
     for axis, sample in evaluator.sample.by_axis.items():
@@ -454,10 +474,8 @@ def _shows_wave(sequence: PatternSequence, stack: np.ndarray, light: FrameLight)
     waves = np.stack(_waves(np.linspace(-0.5, 0.5, rows.shape[1]), light))
     products = np.zeros(3)
     for group in _list_equal_sums(sequence):
-        if (
-            sequence.frames[group[0, 0]].kind == "phase"
-            and sequence.frames[group[0, 0]].axis == "y"
-        ):
+        first = sequence.frames[group[0, 0]]
+        if first.kind == "phase" and first.axis == "y":
             continue  # the fringes are along the rows
         sums = rows[group].sum(axis=1)
         excess = sums / np.maximum(sums.mean(axis=0), 1e-6) - 1

@@ -241,8 +241,8 @@ def _choose_poses(
         chosen = match_names(names, settings.poses, "target pose")
         others = [name for name in names if name not in chosen]
         excluded |= dict.fromkeys(others, "not among the poses that were named")
-    left_out = match_names(names, settings.exclude, "target pose")
-    excluded |= dict.fromkeys(left_out, "excluded for this calibration")
+    skipped = match_names(names, settings.exclude, "target pose")
+    excluded |= dict.fromkeys(skipped, "excluded for this calibration")
     names = [name for name in names if name not in excluded]
     if not names:
         raise InputError("every target pose is excluded: include some again")

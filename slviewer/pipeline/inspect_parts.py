@@ -486,14 +486,14 @@ def make_plan(
         T = fit_to_nominal(load_surface(job, source.source, source.model), ideal).T_nominal_scan
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
     listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
-    left_out = [
+    skipped = [
         each.label
         for each in measured
         if each.record.what not in (*FORM_OF, "relation") or each.stale
     ]
-    if left_out:
+    if skipped:
         job.warn(
-            f"a plan holds fits and their relations that are not stale: {', '.join(left_out)} are"
+            f"a plan holds fits and their relations that are not stale: {', '.join(skipped)} are"
             " not in it"
         )
     return Plan(

@@ -72,7 +72,7 @@ class Reel:
         """Whether that capture holds a dark frame."""
         return any(frame.kind == "black" for frame in self.sequence.frames)
 
-    def wind_on(self) -> None:
+    def advance(self) -> None:
         """Play the next capture; the first after the last. Raises InputError where it is not of the
         same rig."""
         self._at = (self._at + 1) % len(self.names)

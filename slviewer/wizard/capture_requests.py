@@ -138,7 +138,7 @@ class CaptureRequests(RigRequests, ResultRequests):
                 # the next recording may lack these
                 if self._acquisition.view().light in ("dark", "pattern"):
                     self._acquisition.set_light("white")
-                reel.wind_on()
+                reel.advance()
 
         self._acquisition.capture(CaptureRequest(name, sequence, save, saved, exposures))
 

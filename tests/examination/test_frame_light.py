@@ -10,7 +10,7 @@ from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe import decode as decoding
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import complementary, gray, p18
-from slviewer.fringe.sequence import PatternSequence
+from slviewer.fringe.sequence import Frame, PatternSequence
 
 pytestmark = pytest.mark.computes
 
@@ -125,6 +125,13 @@ def test_clipped_pixels_stay_saturated_and_levels_are_the_captures():
     ratio = np.median((phase.modulation / before.modulation)[:, 90:])
     variance, steady = (p.noise[0] + 100 * p.noise[1] for p in (phase, before))
     assert 0.94 < ratio < 1.0 and 0.6 < variance / steady < 1.4
+
+
+def test_frames_without_a_pattern_have_equal_light():
+    sequence = PatternSequence(PROJECTOR, (Frame("white"), Frame("black")))
+    stack = np.full((2, 60, 80), 9, np.uint8)
+    light = estimate_frame_light(sequence, stack)
+    assert not light.is_significant and (light.gain == 1).all()
 
 
 def test_the_definition_agrees():

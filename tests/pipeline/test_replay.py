@@ -47,12 +47,12 @@ def test_a_session_is_played_in_order_and_again(recorded: Path):
         for name in ("scan_1", "scan_2", "scan_1"):
             rig.projector.load(played.sequence)
             np.testing.assert_array_equal(seen(rig, 3), frames_of(recorded, name)[3])
-            played.wind_on()
+            played.advance()
 
 
 def test_one_capture_is_played_again_and_again(recorded: Path):
     played = reel(recorded, capture="scan_2")
-    played.wind_on()
+    played.advance()
     with played.rig.opened() as rig:
         rig.projector.load(played.sequence)
         np.testing.assert_array_equal(seen(rig, 0), frames_of(recorded, "scan_2")[0])
