@@ -204,7 +204,7 @@ def run_guarded(
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            "verify.fit_clouds",
+            "reconstruct.fit_clouds",
             run_guarded(verify, VerifySettings(["plane_01"], "plane")),
             marks=pytest.mark.slow,
         ),

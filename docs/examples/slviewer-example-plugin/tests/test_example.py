@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from slviewer_example.aprilgrid import SPACING
 from slviewer_example.hotfolder import HotfolderCamera, HotfolderProjector
 from slviewer_example.pts import EXPORTER
 from slviewer_example.turntable import TcpTurntable
 
-from slviewer.evaluation.acceptance import SPACING
 from slviewer.plugins import (
     Board,
     CameraSettings,
