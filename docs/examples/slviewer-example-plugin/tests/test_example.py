@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from slviewer_example.aprilgrid import SPACING
+from slviewer_example.axisfolders import LAYOUT
 from slviewer_example.hotfolder import HotfolderCamera, HotfolderProjector
 from slviewer_example.pts import EXPORTER
 from slviewer_example.turntable import TcpTurntable
@@ -29,7 +30,6 @@ from slviewer.plugins import (
     phase_steps,
     render,
 )
-from slviewer.session.importers.frames import LAYOUT
 from slviewer.target.detect import detect
 
 
