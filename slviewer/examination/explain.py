@@ -262,14 +262,15 @@ def _identify_pattern(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> i
 
 def _measure_strangeness(evaluator: Evaluator, hypothesis: Hypothesis, k: int) -> float:
     """Return the mean squared residual of image k, which the hypothesis leaves out, in squares of
-    the contrast; 0 where it shows its pattern, or what blur leaves of stripes."""
+    the contrast; 0 where it shows its pattern, or what blur leaves of stripes, and no other one."""
     if (read := _read_image(evaluator, hypothesis, k)) is None:
         return 0.0
     frames, shown, patterns = read
     own = patterns[frames.index(k)]
     is_flat = np.median(np.abs(shown - 0.5)) < limits.FLAT
     alike = np.corrcoef(shown, own)[0, 1] if own.std() > 0.05 else 0.0
-    if hypothesis.sequence.frames[k].kind != "phase" and (is_flat or alike > limits.ALIKE):
+    is_excused = hypothesis.sequence.frames[k].kind != "phase" and (is_flat or alike > limits.ALIKE)
+    if is_excused and _identify_pattern(evaluator, hypothesis, k) is None:
         return 0.0
     residual = float(np.minimum((shown - own) ** 2, 1).mean())
     usual = limits.STRANGE * np.nanmedian(evaluator.residuals(hypothesis))
