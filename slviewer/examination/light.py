@@ -56,16 +56,19 @@ def estimate_frame_light(sequence: PatternSequence, stack: np.ndarray) -> FrameL
 
 def estimate_light(evaluator: Evaluator, base: Hypothesis, stack: np.ndarray) -> FrameLight:
     """Estimate the light of the frames (n, h, w) of a capture, described by ``base``, whose sample
-    an evaluator holds. A small part of it decides first whether there is anything to estimate."""
+    an evaluator holds. One step of each term decides first whether there is any to estimate."""
     constant = FrameLight.constant(len(stack))
-    if not _is_varying(evaluator.coarse, base):
+    fitted = evaluator.part(np.s_[::2])
+    if not (varying := _list_varying(fitted, base)):
         return constant
-    fitted, judged = evaluator.part(np.s_[::2]), evaluator.part(np.s_[1::2])
+    judged = evaluator.part(np.s_[1::2])
     best, gains, score = constant, constant, 1.0
     first = _measure_losses(judged, judged, base, constant)
     for terms in MODELS:
         if len(terms) > 1 and score < limits.EXPLAINED_WELL:
             break
+        if not varying.issuperset(terms):
+            continue
         light = _fit(fitted, base, terms, gains if "gain" in terms else constant)
         gains = light if terms == ("gain",) else gains
         own = _score(judged, base, light, first)
@@ -152,9 +155,9 @@ class _Residual:
 
     ``frames``, ``groups`` (k,): as of `Atoms`; ``level``, ``fuzzy`` (k,): rms of the levels, and
     share of the pixels beside an edge; ``pixels``: bool, of those of the sample; ``shapes``: (k, p)
-    change of the levels with each value of the light, by name; ``left`` (k, p): the residual
-    without the part that background, contrast and displacement of a pixel take up, which ``basis``
-    (3, k, p) spans; ``weight`` and ``row`` (p,); ``entries``: independent residuals.
+    change of the levels with each value of the light but its wave's, by name; ``left`` (k, p): the
+    residual without the part that background, contrast and displacement of a pixel take up, which
+    ``basis`` (3, k, p) spans; ``weight`` and ``row`` (p,); ``entries``: independent residuals.
     """
 
     axis: Axis
@@ -197,12 +200,10 @@ def _project(
         used[(groups < 0) & (fuzzy >= limits.FUZZY)] = limits.FUZZY_WEIGHT
         used[seen[frames] >= white] = 0
         row, column = sample.place[good].T
-        cosine, sine = _waves(row, light)
         over = np.ones_like(level) / light.gain[frames, None]
         albedo = over * estimate_albedo(sequence, seen, light.changes) / contrast
         shapes = {
-            "gain": level, "cosine": level * cosine, "sine": level * sine,
-            "uniform": over / contrast, "albedo": albedo, "rows": albedo * row,
+            "gain": level, "uniform": over / contrast, "albedo": albedo, "rows": albedo * row,
             "columns": albedo * column, "level": np.ones_like(level),
             "contrast": predicted - predicted.mean(axis=1, keepdims=True),
         }  # fmt: skip
@@ -256,11 +257,52 @@ class _Normal:
         contrast and level imitate, and 0 where the sample does not determine them. ``change``:
         frame before which the room's light changes.
         """
+        t, deviations, _ = self._design(terms, (change,))
+        moment = t.T @ self.moment
+        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
+        x = np.linalg.solve(normal, moment)
+        n = len(self.groups)
+        step = (t @ x).reshape(len(self.values), n)
+        if "gain" in terms:
+            relative = t[:n] - t[self.known].mean(axis=0)
+            variance = np.einsum("iq,qi->i", relative, np.linalg.solve(normal, relative.T))
+            scattered = limits.SCATTERED / np.maximum(self.level, 1e-6)
+            sure = variance + scattered**2 < limits.UNKNOWN_GAIN**2
+            same = (self.groups[:, None] == self.groups) * sure
+            same = same / np.maximum(same.sum(axis=1, keepdims=True), 1)
+            step[0] = np.where(sure, step[0] - same @ step[0], 0)
+        return dict(zip(self.values, step, strict=True)), float(x @ moment) / max(self.entries, 1)
+
+    def rate_changes(self, terms: Sequence[Term]) -> dict[int, float]:
+        """Return the share of the residual that a change of the room's light removes, by the frame
+        before which it happens: a few from either end, and inside a group of frames; between groups
+        level and contrast of the fringes imitate it."""
+        few, known = limits.FEW_FRAMES_KNOWN, self.known
+        groups = self.groups[known].tolist()
+        inner = [
+            int(known[i])
+            for i in range(few, len(known) - few + 1)
+            if not {*groups[:i]}.isdisjoint(groups[i:])
+        ]
+        t, deviations, changes = self._design(terms, inner)
+        moment = t.T @ self.moment
+        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
+        out = dict[int, float]()
+        for k in inner:
+            own = np.flatnonzero((changes == k) | (changes < 0))
+            x = np.linalg.solve(normal[np.ix_(own, own)], moment[own])
+            out[k] = float(x @ moment[own]) / max(self.entries, 1)
+        return out
+
+    def _design(
+        self, terms: Sequence[Term], changes: Sequence[int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what q unknowns do to the values (v n, q), the standard deviation (q,) of each
+        before, and the frame before which the room's light changes (q,), -1 of other unknowns."""
         n = len(self.groups)
         each, other = np.eye(n), self.groups < 0
         periods = [(self.groups == g).astype(float) for g in range(self.groups.max() + 1)]
         shared = np.stack([*periods, *each[other]], axis=1)
-        blur = np.where(self.fuzzy[other] < limits.FUZZY, *limits.CONTRAST_PRIORS)
         blocks: dict[str, np.ndarray] = {
             "contrast": shared, "level": shared[:, : len(periods)],
             **{name: each for term in terms for name in VALUES[term]},
@@ -269,39 +311,37 @@ class _Normal:
             same = (self.groups[:, None] == self.groups).astype(float)
             blocks["gain"] = each - same / same.sum(axis=1, keepdims=True)
         if "room" in terms:
-            blocks |= dict.fromkeys(VALUES["room"], each[:, change:].sum(axis=1, keepdims=True))
-        t, deviations = np.zeros((len(self.moment), 0)), np.zeros(0)
-        for place, name in enumerate(self.values):
-            if (block := blocks.get(name)) is not None:
-                rows = place * n, len(self.moment) - place * n - n
-                t = np.hstack([t, np.pad(block, (rows, (0, 0)))])
-                own = np.full(block.shape[1], PRIORS.get(name, PRIORS["level"]))
-                if name == "contrast":
-                    own[len(periods) :] = blur
-                deviations = np.concatenate([deviations, own])
-        moment = t.T @ self.moment
-        normal = t.T @ self.matrix @ t + np.diag(deviations**-2)
-        x = np.linalg.solve(normal, moment)
-        step = (t @ x).reshape(len(self.values), n)
-        if "gain" in terms:
-            relative = t[:n] - t[self.known].mean(axis=0)
-            variance = np.einsum("iq,qi->i", relative, np.linalg.solve(normal, relative.T))
-            scattered = limits.SCATTERED / np.maximum(self.level, 1e-6)
-            sure = variance + scattered**2 < limits.UNKNOWN_GAIN**2
-            same = same * sure / np.maximum((same * sure).sum(axis=1, keepdims=True), 1)
-            step[0] = np.where(sure, step[0] - same @ step[0], 0)
-        return dict(zip(self.values, step, strict=True)), float(x @ moment) / max(self.entries, 1)
+            blocks |= dict.fromkeys(VALUES["room"], np.tri(n)[:, [*changes]])
+        used = [(place, name) for place, name in enumerate(self.values) if name in blocks]
+        count = sum(blocks[name].shape[1] for _, name in used)
+        t, deviations, of_room = np.zeros((len(self.moment), count)), np.empty(count), []
+        for place, name in used:
+            own = np.s_[len(of_room) : len(of_room) + blocks[name].shape[1]]
+            t[place * n : place * n + n, own] = blocks[name]
+            deviations[own] = PRIORS.get(name, PRIORS["level"])
+            if name == "contrast":
+                blur = np.where(self.fuzzy[other] < limits.FUZZY, *limits.CONTRAST_PRIORS)
+                deviations[own][len(periods) :] = blur
+            of_room += changes if name in VALUES["room"] else [-1] * blocks[name].shape[1]
+        return t, deviations, np.array(of_room)
 
 
-def _accumulate(parts: Sequence[_Residual], n: int, terms: Sequence[Term]) -> _Normal:
-    """Return the normal equations of the terms, and of contrast and level, of n frames."""
+def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[Term]) -> _Normal:
+    """Return the normal equations of the terms, and of contrast and level, about a light."""
+    n = len(light.gain)
     values = (*(name for term in terms for name in VALUES[term]), "contrast", "level")
     matrix, moment = np.zeros((len(values), n, len(values), n)), np.zeros((len(values), n))
     groups, (level, fuzzy) = np.full(n, -1), np.zeros((2, n))
     squares, entries = 1e-12, 0
     for part in parts:
         f, root = part.frames, np.sqrt(part.weight)
-        shapes = root * np.stack([part.shapes[name] for name in values])
+        waves = dict(zip(VALUES["wave"], _waves(part.row, light), strict=True))
+        shapes = root * np.stack(
+            [
+                part.shapes["gain"] * waves[name] if name in waves else part.shapes[name]
+                for name in values
+            ]
+        )
         taken = np.einsum("akp,jkp->akjp", shapes, part.basis).reshape(len(values) * len(f), -1)
         normal = -(taken @ taken.T).reshape(len(values), len(f), len(values), len(f))
         every = np.arange(len(f))
@@ -318,35 +358,22 @@ def _accumulate(parts: Sequence[_Residual], n: int, terms: Sequence[Term]) -> _N
     return _Normal(values, matrix, moment, entries, groups, level, fuzzy)
 
 
-def _is_varying(evaluator: Evaluator, base: Hypothesis) -> bool:
-    """Return whether one step of any single term promises to explain more than noise, contrast and
-    level do."""
-    n = len(base.sequence.frames)
-    light = FrameLight.constant(n)
+def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:
+    """Return the terms of which one step promises to explain more of the residual than as many
+    values of noise do, beside contrast and level."""
+    light = FrameLight.constant(len(base.sequence.frames))
     parts = [*_project(evaluator, evaluator, base, light)]
     if not parts:
-        return False
-    normal = _accumulate(parts, n, ("gain", "room"))
-    least = normal.solve(())[1] + limits.LIGHT_SHARE
-    if max(normal.solve(("gain",))[1], *_rate_changes(normal, ("room",)).values(), 0) > least:
-        return True
-    waving = replace(light, cycles=_find_wave(parts))
-    parts = [*_project(evaluator, evaluator, base, waving)]
-    return _accumulate(parts, n, ("wave",)).solve(("wave",))[1] > least
-
-
-def _rate_changes(normal: _Normal, terms: Sequence[Term]) -> dict[int, float]:
-    """Return the share of the residual that a change of the room's light removes, by the frame
-    before which it happens: a few from either end, and inside a group of frames; between groups
-    level and contrast of the fringes imitate it."""
-    few, known = limits.FEW_FRAMES_KNOWN, normal.known
-    groups = normal.groups[known].tolist()
-    inner = [
-        int(known[i])
-        for i in range(few, len(known) - few + 1)
-        if not {*groups[:i]}.isdisjoint(groups[i:])
-    ]
-    return {k: normal.solve(terms, k)[1] for k in inner}
+        return set()
+    light = replace(light, cycles=_find_wave(parts))
+    normal = _accumulate(parts, light, tuple(VALUES))
+    before, count = normal.solve(())[1], len(normal.known)
+    shares: dict[Term, float] = {
+        "gain": normal.solve(("gain",))[1] - count / normal.entries,
+        "wave": normal.solve(("wave",))[1] - 2 * count / normal.entries,
+        "room": max(normal.rate_changes(("room",)).values(), default=0.0),
+    }
+    return {term for term, share in shares.items() if share > before + limits.LIGHT_SHARE}
 
 
 def _find_wave(parts: Sequence[_Residual]) -> float:
@@ -365,18 +392,17 @@ def _fit(
     evaluator: Evaluator, base: Hypothesis, terms: tuple[Term, ...], start: FrameLight
 ) -> FrameLight:
     """Fit the terms of a model by Gauss-Newton steps from a first light."""
-    light, n = replace(start, terms=terms), len(start.gain)
+    light = replace(start, terms=terms)
     for step in range(limits.MOST_STEPS):
         equal = equalize_samples(evaluator, base.sequence, light)
         parts = [*_project(evaluator, equal, base, light)]
         if "wave" in terms and not step:  # of no amplitude yet
             light = replace(light, cycles=_find_wave(parts))
-            parts = [*_project(evaluator, equal, base, light)]
         if not parts:
             break
-        normal = _accumulate(parts, n, terms)
+        normal = _accumulate(parts, light, terms)
         if "room" in terms and not step:
-            rated = _rate_changes(normal, terms)
+            rated = normal.rate_changes(terms)
             if not rated:
                 break
             light = replace(light, changes=(max(rated, key=rated.__getitem__),))
@@ -413,7 +439,7 @@ def _measure_losses(
     """Return the weighted squared residual (p,) of the pixels of all axes under a light, beside
     contrasts and levels that fit them; NaN where it is not known. ``equal``: see `_project`."""
     parts = {part.axis: part for part in _project(evaluator, equal, base, light)}
-    change = _accumulate([*parts.values()], len(light.gain), ()).solve(())[0]
+    change = _accumulate([*parts.values()], light, ()).solve(())[0]
     losses = [np.zeros(0)]
     for axis, sample in evaluator.sample.by_axis.items():
         losses.append(np.full(len(sample.swing), np.nan))

@@ -120,9 +120,9 @@ STILL_MOVING = 0.6
 LEAST_GHOST, GHOST_SIGMAS = 0.02, 5.0
 """Share of the image before, that blur and gamma do not imitate, and in its standard errors."""
 
-LIGHT_SHARE = 0.015
-"""Share of the residual that the light of the frames must explain in a small sample to be
-estimated: its values alone explain a third of that."""
+LIGHT_SHARE = 0.008
+"""Share of the residual, beyond that of as many values of noise, that one step of a term of the
+light must explain for it to be estimated: measured, light that is corrected explains 0.014."""
 BETTER_LIGHT, EXPLAINED_WELL = (0.9, 0.75), 0.05
 """Share of the residual that one term of the light, and a second one, may leave; and the share that
 a single term leaves where no second one is tried."""

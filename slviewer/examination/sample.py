@@ -123,10 +123,14 @@ def _list_extremes(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     if len(levels) < limits.FEW_FRAMES:
         return levels.max(axis=0), levels.min(axis=0)
-    rest = levels.copy()
-    for find in (np.argmax, np.argmin):
-        np.put_along_axis(rest, find(levels, axis=0)[None], levels[:1] * 0 + np.nan, axis=0)
-    return np.nanmax(rest, axis=0), np.nanmin(rest, axis=0)
+    high, low = levels[:2].max(axis=0), levels[:2].min(axis=0)
+    second_high, second_low = low.copy(), high.copy()
+    for frame in levels[2:]:
+        np.maximum(second_high, np.minimum(high, frame), out=second_high)
+        np.maximum(high, frame, out=high)
+        np.minimum(second_low, np.maximum(low, frame), out=second_low)
+        np.minimum(low, frame, out=low)
+    return second_high, second_low
 
 
 def _choose_pixels(levels: np.ndarray, swing: np.ndarray) -> tuple[np.ndarray, int]:
