@@ -72,11 +72,14 @@ def _judge(
         found = ()
     if found and not (ghost and is_first):
         return _describe_explanation(found, sequence)
-    if motion and not ghost:
+    coordinates = [*_judge_coordinates(evaluator, base)]
+    # codes that cannot be are displaced as well
+    if motion and not ghost and not coordinates:
         return [describe_motion(sequence, axis, px) for axis, px in motion.items()]
-    judged = [*_judge_readability(evaluator, base), *_judge_coordinates(evaluator, base)]
-    # the image before imitates other light
-    return [*judged, *([describe_ghost(ghost)] if ghost else _judge_light(sequence, stack, light))]
+    judged = [*_judge_readability(evaluator, base), *coordinates]
+    if ghost:  # it imitates other light
+        return [*judged, describe_ghost(ghost)]
+    return [*judged, *(_judge_light(sequence, stack, light) if not coordinates else ())]
 
 
 def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evaluator:
@@ -101,9 +104,11 @@ def _correct(evaluator: Evaluator, base: Hypothesis, light: FrameLight) -> Evalu
 def _is_moving_still(
     evaluator: Evaluator, found: Explanation, motion: Mapping[Axis, float]
 ) -> bool:
-    """Return whether the steps are displaced also where an explanation is true: then it accounts
-    only for a part of what motion does."""
+    """Return whether the steps are displaced also where an explanation is true, which accounts only
+    for a part of what motion does then, or where it is a frame that shows no pattern."""
     for hypothesis in found:
+        if hypothesis.cause == "duplicate-frame" and hypothesis.value is None:
+            return True
         own = {a: px for a, px in motion.items() if hypothesis.axis in (a, None)}
         left = measure_motion(evaluator, _fill_in(hypothesis))
         if any(

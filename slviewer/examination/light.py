@@ -229,7 +229,7 @@ def _take_out(basis: np.ndarray, levels: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class _Normal:
     """Normal equations of ``values`` of each of n frames: ``matrix`` (v n, v n) and ``moment``
-    (v n,), in units of the mean squared residual; ``entries``: number of independent residuals.
+    (v n,), in units of ``loss``, the mean square of ``entries`` independent residuals.
 
     ``level``, ``fuzzy`` (n,): see `_Residual`; the level of frames that the sample does not show is
     0. ``groups`` (n,): a number for the steps of each period, negative for the other frames of an
@@ -239,6 +239,7 @@ class _Normal:
     values: tuple[str, ...]
     matrix: np.ndarray
     moment: np.ndarray
+    loss: float
     entries: int
     groups: np.ndarray
     level: np.ndarray
@@ -314,7 +315,8 @@ class _Normal:
             blocks |= dict.fromkeys(VALUES["room"], np.tri(n)[:, [*changes]])
         used = [(place, name) for place, name in enumerate(self.values) if name in blocks]
         count = sum(blocks[name].shape[1] for _, name in used)
-        t, deviations, of_room = np.zeros((len(self.moment), count)), np.empty(count), []
+        t, deviations = np.zeros((len(self.moment), count)), np.empty(count)
+        of_room = list[int]()
         for place, name in used:
             own = np.s_[len(of_room) : len(of_room) + blocks[name].shape[1]]
             t[place * n : place * n + n, own] = blocks[name]
@@ -353,9 +355,9 @@ def _accumulate(parts: Sequence[_Residual], light: FrameLight, terms: Sequence[T
         coded = np.where(level[f] > 0, groups[f], groups.min() - 1)
         groups[f] = np.where(part.groups < 0, coded, part.groups + groups.max() + 1)
         level[f], fuzzy[f] = part.level, part.fuzzy
-    noise, size = squares / max(entries, 1), len(values) * n
-    matrix, moment = matrix.reshape(size, size) / noise, moment.ravel() / noise
-    return _Normal(values, matrix, moment, entries, groups, level, fuzzy)
+    loss, size = squares / max(entries, 1), len(values) * n
+    matrix, moment = matrix.reshape(size, size) / loss, moment.ravel() / loss
+    return _Normal(values, matrix, moment, loss, entries, groups, level, fuzzy)
 
 
 def _list_varying(evaluator: Evaluator, base: Hypothesis) -> set[Term]:
@@ -391,8 +393,10 @@ def _find_wave(parts: Sequence[_Residual]) -> float:
 def _fit(
     evaluator: Evaluator, base: Hypothesis, terms: tuple[Term, ...], start: FrameLight
 ) -> FrameLight:
-    """Fit the terms of a model by Gauss-Newton steps from a first light."""
-    light = replace(start, terms=terms)
+    """Fit the terms of a model by Gauss-Newton steps from a first light, and return the light of
+    the step that leaves the least residual: of few fringes in view the steps may diverge."""
+    light = best = replace(start, terms=terms)
+    least = np.inf
     for step in range(limits.MOST_STEPS):
         equal = equalize_samples(evaluator, base.sequence, light)
         parts = [*_project(evaluator, equal, base, light)]
@@ -401,6 +405,9 @@ def _fit(
         if not parts:
             break
         normal = _accumulate(parts, light, terms)
+        left = normal.loss * (1 - normal.solve(())[1])
+        if left < least:
+            least, best = left, light
         if "room" in terms and not step:
             rated = normal.rate_changes(terms)
             if not rated:
@@ -411,7 +418,7 @@ def _fit(
         steps = [np.abs(change[name]).max() for term in terms for name in VALUES[term]]
         if max(steps) < limits.CONVERGED:
             break
-    return light
+    return best
 
 
 def _update(light: FrameLight, change: dict[str, np.ndarray], evaluator: Evaluator) -> FrameLight:
