@@ -68,7 +68,7 @@ def _judge(
     found = explain(evaluator, base)
     # the first image has none before it, and stands out from those that have a ghost
     is_first = len(found) == 1 and found[0].cause == "duplicate-frame"
-    if found and motion and _is_moving_still(evaluator, found, motion):
+    if motion and _is_moving_still(evaluator, found, motion):
         found = ()
     if found and not (ghost and is_first):
         return _describe_explanation(found, sequence)
