@@ -53,7 +53,7 @@ def intersect(rays, origin, axes, rotation, bounds, shape):
 @kernel()
 def _albedo(x, y, bounds, sheet):
     """Albedo at one point of the board, ``white`` or ``dark``; 0 outside the plate."""
-    kind, pitch, cells, circles, radius, mark, white, dark = sheet
+    kind, pitch, cells, circles, radius, white, dark = sheet
     px, py = x - bounds[0], y - bounds[1]
     if not (0 <= px <= bounds[2] and 0 <= py <= bounds[3]):
         return 0.0
@@ -62,9 +62,7 @@ def _albedo(x, y, bounds, sheet):
         column = min(int(4 * px / pitch), cells.shape[1] - 1)
         nearest = cells[row, column]
         dx, dy = x - circles[nearest, 0], y - circles[nearest, 1]
-        mx, my = x - mark[0], y - mark[1]
-        inside = dx * dx + dy * dy < radius * radius or mx * mx + my * my < mark[2] * mark[2]
-        return dark if inside else white
+        return dark if dx * dx + dy * dy < radius * radius else white
     if kind == 2:
         column, row = math.floor(x / pitch), math.floor(y / pitch)
         inside = -1 <= column < cells[0, 0] and -1 <= row < cells[0, 1]
@@ -77,9 +75,8 @@ def average_albedo(xy, bounds, sheet):
     """Mean albedo (h, w) float32 of each pixel; `xy` (h, w, 2) are the board coordinates of the
     pixels' centres.
 
-    sheet: kind, pitch, cells, circles, radius, mark, white, dark. kind: 0 blank, 1 circles (`cells`
-    names the nearest circle for each quarter pitch; `mark` (3,) is one more, x, y and radius, 0 for
-    none), 2 chessboard (`cells` holds its inner corners). A pixel whose centre and corners agree is
+    sheet: kind, pitch, cells, circles, radius, white, dark. kind: 0 blank, 1 circles (`cells`
+    names the nearest circle for each quarter pitch), 2 chessboard (`cells` holds its inner corners). A pixel whose centre and corners agree is
     taken as uniform; others are sampled 8x8 times.
     """
     h, w = xy.shape[:2]

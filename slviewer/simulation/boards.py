@@ -10,7 +10,6 @@ from slviewer.errors import InputError
 from slviewer.simulation.board_kernels import average_albedo, intersect
 from slviewer.simulation.scenes import Points, Rays, Surface
 from slviewer.target.board import Board
-from slviewer.target.mark import Mark
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ class BoardScene:
 
     The plate reaches from `corner` to `corner + size` (x, y) in the board's frame, where the first
     feature is the origin; `misplacement` (n, 2) mm is what has been added to the printed circles.
-    Circles are `diameter_mm` wide; `mark` is the dot that tells the first one.
+    Circles are `diameter_mm` wide.
     """
 
     pose: Pose
@@ -72,7 +71,6 @@ class BoardScene:
     diameter_mm: float = 0.0
     white: float = 0.85
     dark: float = 0.09
-    mark: Mark | None = None
 
     @cached_property
     def features(self) -> np.ndarray:
@@ -99,13 +97,13 @@ class BoardScene:
         )
         board = self.board
         kind, pitch, cells = 0, 1.0, np.zeros((1, 1), np.int32)
-        if board is not None:
-            kind, pitch, cells = 1, board.pitch_mm, self._cells
-            if board.kind == "chessboard":
-                kind, cells = 2, np.array([[board.columns, board.rows]], np.int32)
-        mark = np.array([self.mark.x, self.mark.y, self.mark.radius]) if self.mark else np.zeros(3)
+        if board is not None and board.kind == "chessboard":
+            kind, pitch = 2, board.pitch_mm
+            cells = np.array([[board.columns, board.rows]], np.int32)
+        elif board is not None:
+            kind, pitch, cells = 1, board.pitch_mm, self._cells(board)
         circles = self.features[:, :2].copy()
-        sheet = kind, pitch, cells, circles, self.diameter_mm / 2, mark, self.white, self.dark
+        sheet = kind, pitch, cells, circles, self.diameter_mm / 2, self.white, self.dark
         albedo = average_albedo(xy, bounds, sheet)
         outside = albedo == 0
         points[outside], normals[outside] = np.nan, np.nan
@@ -115,12 +113,10 @@ class BoardScene:
         """Return all False: a nearly flat plate shades no part of itself."""
         return np.zeros(len(points), bool)
 
-    @cached_property
-    def _cells(self) -> np.ndarray:
+    def _cells(self, board: Board) -> np.ndarray:
         """(rows, columns) int32: in cells of a quarter pitch, the nearest circle: the only one that
         can be there."""
-        assert self.board is not None
-        step = self.board.pitch_mm / 4
+        step = board.pitch_mm / 4
         shape = [int(np.ceil(length / step)) for length in reversed(self.plate)]
         middle = np.array(self.corner) + (np.moveaxis(np.indices(shape)[::-1], 0, -1) + 0.5) * step
         return cKDTree(self.features[:, :2]).query(middle)[1].astype(np.int32)
@@ -132,10 +128,9 @@ def printed_board(board: Board, pose: Pose, shape: BoardShape = FLAT, seed: int 
     `seed` draws the circles' misplacement, the same for every pose of one board. Circles are half a
     pitch wide. Raises `InputError` for ChArUco boards, which the simulation does not print.
     """
-    if board.kind not in ("circles", "acircles", "chessboard"):
-        kind = "ChArUco" if board.kind == "charuco" else board.kind
+    if board.kind == "charuco":
         raise InputError(
-            f"the simulation does not print {kind} boards: use circles, acircles or a chessboard"
+            "the simulation does not print ChArUco boards: use circles, acircles or a chessboard"
         )
     margin = 1.5 * board.pitch_mm
     low, high = board.points[:, :2].min(0) - margin, board.points[:, :2].max(0) + margin

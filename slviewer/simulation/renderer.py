@@ -1,6 +1,5 @@
 """From a rig and a scene to the frames that its camera would take, and the truth behind them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -82,13 +81,9 @@ class Renderer:
         self,
         sequence: PatternSequence,
         seed: int = 0,
-        progress: Callable[[int, int], None] | None = None,
     ) -> np.ndarray:
         """(n, h, w) uint8: every frame of `sequence`; the same seed (and rig) gives the same
-        frames.
-
-        `progress(done, n)` is called after each frame, and may raise to stop.
-        """
+        frames."""
         rig = self.rig
         if tuple(sequence.projector) != rig.projector.size:
             raise InputError(
@@ -103,8 +98,6 @@ class Renderer:
         stack = np.empty((len(sequence.frames), height, width), np.uint8)
         for k, frame in enumerate(stack):
             self.frame(profile(sequence, k), keys[k], frame, lamp=lamp[k])
-            if progress is not None:
-                progress(k + 1, len(stack))
         return stack
 
     def frame(

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from slviewer.evaluation.render import Row
-from slviewer.geometry.vectors import box_middle
+from slviewer.geometry.vectors import box_middle, rms
 from slviewer.pipeline.feedback import Progress
 from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud
 from slviewer.simulation.boards import BoardScene, Pose, printed_board
@@ -16,7 +16,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.proof import BandCheck, Proof, prove_checks, root_mean_square, track
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 from slviewer.validation.rendered_calibration import render_phase
 
 PRINT = "chessboard:7x5:32"
@@ -88,9 +88,7 @@ def measure_object_edges(rig: SimulatedRig, seed: int = 0) -> tuple[float, float
     renderer = Renderer(rig, scene)
     before, after = _measure_depth_errors(renderer, "object", seed)
     near = _find_creases(renderer.truth().points) & np.isfinite(before) & np.isfinite(after)
-    rms_before, rms_after = (
-        root_mean_square(np.clip(each[near], -1.0, 1.0)) for each in (before, after)
-    )
+    rms_before, rms_after = (rms(np.clip(each[near], -1.0, 1.0)) for each in (before, after))
     return rms_before, rms_after
 
 

@@ -15,7 +15,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.rigid import move_points, transform_from_rvec
 from slviewer.geometry.shapes import fit_plane
-from slviewer.geometry.vectors import box_middle
+from slviewer.geometry.vectors import box_middle, rms
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.boards import Pose, printed_board
@@ -24,7 +24,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.proof import Proof, root_mean_square, track
+from slviewer.validation.proof import Proof, track
 from slviewer.validation.rendered_calibration import (
     calibrate_observed,
     observe_rendered,
@@ -249,4 +249,4 @@ def _measure_plane(model: SplinedModel, target: _TargetPlane) -> tuple[float, fl
 def _compute_plane_rms(points: np.ndarray) -> float:
     """Plane RMS in mm over all points (n, 3), outliers included."""
     points = points.astype(float)
-    return root_mean_square(fit_plane(points).distance(points))
+    return rms(fit_plane(points).distance(points))

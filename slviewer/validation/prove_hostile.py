@@ -26,6 +26,7 @@ from slviewer.examination.examine import examine
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.import_captures import import_captures
@@ -59,7 +60,7 @@ from slviewer.simulation.plans import planes, spheres, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.target.board import Board
-from slviewer.validation.proof import Proof, root_mean_square
+from slviewer.validation.proof import Proof
 
 BOARD = Board.parse("circles:21x16:9")
 SCANS = ("plane_04", "sphere_3")
@@ -521,9 +522,7 @@ def score(measured: Sequence[MeasuredScan], gauge: np.ndarray) -> Figures:
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
     most = max(1, int(_TRIMMED * target.sum()))
-    rms, predicted = (
-        root_mean_square(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma)
-    )
+    rms, predicted = (rms(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma))
     return Figures(
         rms,
         predicted,

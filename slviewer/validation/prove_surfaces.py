@@ -14,6 +14,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import one_axis
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.feedback import Progress
 from slviewer.simulation.boards import Pose
 from slviewer.simulation.concave import Indirect, bowl, groove, wax
@@ -22,7 +23,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
 from slviewer.simulation.scenes import Scene
 from slviewer.simulation.truth import PerfectModel
-from slviewer.validation.proof import BandCheck, Proof, prove_checks, root_mean_square, track
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 
 LEAST_GAIN = 5.0
 """Of p18's error over micro's, RMS without any mask, in the groove that is judged."""
@@ -156,8 +157,8 @@ def measure_errors(
         for points in (wrong, gross, valid & ~wrong)
     )
     return SequenceErrors(
-        root_mean_square(error[valid]),
-        root_mean_square(error[valid & ~masked]),
+        rms(error[valid]),
+        rms(error[valid & ~masked]),
         float(np.mean(wrong[valid])),
         caught,
         gross_caught,
