@@ -76,8 +76,9 @@ def average_albedo(xy, bounds, sheet):
     pixels' centres.
 
     sheet: kind, pitch, cells, circles, radius, white, dark. kind: 0 blank, 1 circles (`cells`
-    names the nearest circle for each quarter pitch), 2 chessboard (`cells` holds its inner corners). A pixel whose centre and corners agree is
-    taken as uniform; others are sampled 8x8 times.
+    names the nearest circle for each quarter pitch), 2 chessboard (`cells` holds its inner
+    corners). A pixel whose centre and corners agree is taken as uniform; others are sampled 8x8
+    times.
     """
     h, w = xy.shape[:2]
     out = np.empty((h, w), np.float32)

@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
-from slviewer.simulation.plans import rotation
+from slviewer.simulation.plans import pose_at, rotation
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import AlteredScene, Points, Rays, Scene, Spheres, Surface
 
@@ -237,14 +237,13 @@ def add_second_board(scene: CleanScene, size_mm: float, number: int) -> Scene:
     """The scene with another white plate of this width 70 mm behind the object, to the left of
     it."""
     if isinstance(scene, BoardScene):
-        middle = scene.pose.to_camera(
-            np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0])
-        )
+        (x, y), (width, height) = scene.corner, scene.plate
+        middle = scene.pose.to_camera(np.array([x + width / 2, y + height / 2, 0.0]))
     else:
         middle = scene.centres[0]
     place = middle + np.array([-0.18 * middle[2], -0.09 * middle[2], 70.0])
-    turn = rotation(np.radians([5.0, -12.0, 8.0]))
-    return SceneGroup((scene, blank_board(Pose(turn, place), (size_mm, 0.8 * size_mm))))
+    pose = pose_at((5.0, -12.0, 8.0), place)
+    return SceneGroup((scene, blank_board(pose, (size_mm, 0.8 * size_mm))))
 
 
 def reverse_pattern(pattern: Pattern, level: float) -> Pattern:

@@ -13,7 +13,7 @@ from slviewer.fringe.presets import AXES
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.simulation.concave import ConcaveScene
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
-from slviewer.simulation.light import blur_levels, blurred_profile, window
+from slviewer.simulation.light import OFFSET, blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
@@ -146,8 +146,7 @@ class Renderer:
         out = np.empty((height, width), np.float32)
         image_light(
             maps.coordinates[varies or "x"], maps.level, illuminated,
-            np.float32(lamp) * light.table, light.offset,
-            self._taps, stray, out,
+            np.float32(lamp) * light, OFFSET, self._taps, stray, out,
         )  # fmt: skip
         if self._concave:
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)

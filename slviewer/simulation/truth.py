@@ -1,7 +1,7 @@
 """The truth of a simulated capture as plain values, for a file that only scoring reads."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -78,12 +78,8 @@ class PerfectModel:
 
     rig: SimulatedRig
 
-    name = "floor"
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """The fringe axes that the model can use: both."""
-        return ("x", "y")
+    name: ClassVar = "floor"
+    axes: ClassVar[tuple[Axis, ...]] = ("x", "y")
 
     def points(self, phase: PhaseMap) -> np.ndarray:
         """(h, w, 3) float32 mm: where the rig's own lenses put each phase; NaN where it is
