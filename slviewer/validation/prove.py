@@ -9,12 +9,11 @@ from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy, prove_uncertainty
 from slviewer.validation.prove_captures import prove_captures
 from slviewer.validation.prove_causes import prove_causes
-from slviewer.validation.prove_edges import prove_edges
 from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_plan import prove_plan
 from slviewer.validation.prove_registration import prove_registration
-from slviewer.validation.prove_surfaces import prove_surfaces
+from slviewer.validation.prove_surfaces import prove_edges, prove_surfaces
 
 Claim = Literal[
     "accuracy",
