@@ -119,7 +119,7 @@ def _list_directions(n: int) -> np.ndarray:
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
     others = [(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1)]
     cycle = [place for other in others for place in (*corners, other)]
-    return np.array([cycle[i % len(cycle)] for i in range(n)], float)
+    return np.resize(np.array(cycle, float), (n, 2))
 
 
 def _place_board(

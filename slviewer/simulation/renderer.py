@@ -139,7 +139,7 @@ class Renderer:
         exposure = self.exposure if exposure is None else exposure
         illuminated, stray = self._light(exposure)
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
-        sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
+        sigmas = maps.sigmas * (rig.rows_per_column if varies == "y" else 1.0)
         light_levels = (grey_levels / 255.0) ** rig.light.gamma
         light = blurred_profile(light_levels, sigmas)
         width, height = rig.camera.size
@@ -225,11 +225,6 @@ class Renderer:
         margin, (width, height) = len(self._taps) // 2, self.rig.camera.size
         return slice(margin, margin + height), slice(margin, margin + width)
 
-    @property
-    def _rows_per_column(self) -> float:
-        """Ratio of the projector's focal lengths in px, vertical over horizontal."""
-        return self.rig.projector.focal_px[1] / self.rig.projector.focal_px[0]
-
     @cached_property
     def _maps(self) -> _Maps:
         """The traced scene: projector coordinates and light at unit exposure of every pixel."""
@@ -253,7 +248,7 @@ class Renderer:
         u, v = projector[..., 0], projector[..., 1]
         lens_falloff = (1 + (rays**2).sum(-1)) ** -2  # cos^4 of the angle to the camera's axis
         reflected = surface.albedo * lens_falloff
-        illuminated = window(u, columns, blur) * window(v, rows, blur * self._rows_per_column)
+        illuminated = window(u, columns, blur) * window(v, rows, blur * rig.rows_per_column)
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)

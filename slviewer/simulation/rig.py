@@ -57,6 +57,11 @@ class SimulatedRig:
     seed: int = 0
 
     @property
+    def rows_per_column(self) -> float:
+        """Ratio of the projector's focal lengths in px, vertical over horizontal."""
+        return self.projector.focal_px[1] / self.projector.focal_px[0]
+
+    @property
     def projector_centre(self) -> np.ndarray:
         """(3,) mm, in the camera frame."""
         return -self.R.T @ self.t
@@ -145,9 +150,14 @@ def _compute_arrangement(
     roll, pan, nod = np.radians(arrangement["spread_deg"]) * rng.uniform(-1, 1, 3)
     axis = np.array([0, 0, arrangement["crossing_mm"]]) - centre
     axis += np.linalg.norm(axis) * np.array([pan, nod, 0])
+    R = look_along(axis, roll + np.radians(arrangement["roll_deg"]))
+    return R, -R @ centre
+
+
+def look_along(axis: np.ndarray, roll: float) -> np.ndarray:
+    """(3, 3): R_device_camera of a device that looks along ``axis`` (3,), rolled by rad about
+    it."""
     z = axis / np.linalg.norm(axis)
-    roll += np.radians(arrangement["roll_deg"])
     x = np.cross([-np.sin(roll), np.cos(roll), 0], z)
     x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return R, -R @ centre
+    return np.stack([x, np.cross(z, x), z])

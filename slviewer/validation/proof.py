@@ -57,10 +57,8 @@ class Proof:
         text = json.dumps(
             {"scale": self.scale, "holds": self.holds, **self.record}, default=to_plain
         )
-        plain: dict[str, Any] = json.loads(
-            text, parse_constant={"NaN": None, "Infinity": float("inf")}.get
-        )
-        return plain
+        constants = {"NaN": None, "Infinity": float("inf")}
+        return dict(json.loads(text, parse_constant=constants.get))
 
 
 def prove_checks(

@@ -69,20 +69,14 @@ class Proofs:
     @property
     def failure(self) -> str:
         """Which claims do not hold; empty where all do."""
-        failed = [claim for claim, proof in self.proofs.items() if not proof.holds]
-        return (
-            f"not proven: {', '.join(failed)}: the tables show which figures miss their bounds"
-            if failed
-            else ""
-        )
+        failed = ", ".join(claim for claim, proof in self.proofs.items() if not proof.holds)
+        return failed and f"not proven: {failed}: the tables show which figures miss their bounds"
 
     def text(self) -> str:
         """Each table under its title, then whether each claim holds."""
-        blocks = [f"{CLAIMS[claim][0]}\n\n{proof.text()}\n" for claim, proof in self.proofs.items()]
-        lines = [
-            f"{'pass' if proof.holds else 'FAIL'}  {CLAIMS[claim][0]}"
-            for claim, proof in self.proofs.items()
-        ]
+        titled = [(CLAIMS[claim][0], proof) for claim, proof in self.proofs.items()]
+        blocks = [f"{title}\n\n{proof.text()}\n" for title, proof in titled]
+        lines = [f"{'pass' if proof.holds else 'FAIL'}  {title}" for title, proof in titled]
         return "\n".join([*blocks, *lines])
 
     def to_json(self) -> dict[str, Any]:
