@@ -9,8 +9,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.simulation.assets import asset
-from slviewer.simulation.lens import SimulatedLens
-from slviewer.simulation.waves import random_waves
+from slviewer.simulation.lens import SimulatedLens, random_waves
 
 
 @dataclass(frozen=True)
@@ -127,17 +126,11 @@ def _sample_lens(
     focal = np.array(device["focal_px"]) * (1 + device["focal_spread"] * rng.uniform(-1, 1))
     middle = np.array([(width - 1) / 2, (height - 1) / 2]) + device["centre_offset_px"]
     centre = middle + device["centre_spread_px"] * rng.uniform(-1, 1, 2)
-    brown = np.array(device["distortion"]) + np.array(device["distortion_spread"]) * rng.uniform(
-        -1, 1, 5
-    )
-    waves = random_waves(
-        rng, (width, height), focal[1] / focal[0], local["waves"], wavelengths, rms
-    )
-    k1, k2, p1, p2, k3 = brown.tolist()
-    return SimulatedLens(
-        (width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])),
-        (k1, k2, p1, p2, k3), waves,
-    )  # fmt: skip
+    spread = np.array(device["distortion_spread"]) * rng.uniform(-1, 1, 5)
+    k1, k2, p1, p2, k3 = (np.array(device["distortion"]) + spread).tolist()
+    (fx, fy), (cx, cy), size = focal.tolist(), centre.tolist(), (width, height)
+    waves = random_waves(rng, size, fy / fx, local["waves"], wavelengths, rms)
+    return SimulatedLens(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3), waves)
 
 
 def _compute_arrangement(

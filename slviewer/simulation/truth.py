@@ -96,12 +96,9 @@ class PerfectModel:
             going = np.abs(off) > _SETTLED_PX
             if not going.any():
                 break
-            step = np.where(
-                going & (off != before),
-                off * (inverse - nearer) / np.where(off == before, 1, off - before),
-                0,
-            )
-            nearer, before, inverse = inverse, off, inverse - step
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = off * (inverse - nearer) / (off - before)
+            nearer, before, inverse = inverse, off, inverse - np.where(going, step, 0)
         out = np.full((*phase.phase.shape, 3), np.nan, np.float32)
         solved = (np.abs(off) <= _SETTLED_PX) & (inverse > 0)
         out[valid] = np.where(solved, 1 / np.where(solved, inverse, 1), np.nan)[:, None] * rays

@@ -79,6 +79,7 @@ EXPLAINED_LOSS = 0.7
 """Share of it below which the loss has to be explained."""
 _TRIMMED = 0.99  # of the points count in an RMS; those beyond are counted one by one, by `GROSS`
 
+Case = tuple[str, Severity, Direction]
 Outcome = Literal[
     "measured", "degraded, warned", "noisier as predicted", "refused",
     "TURNED AWAY", "UNEXPLAINED LOSS", "WRONG REASON", "SILENTLY WRONG", "CRASH",
@@ -201,15 +202,10 @@ class HostileBench:
     def sequence(self) -> PatternSequence:
         """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at
         the end."""
-        frames = [
-            frame
-            for axis in AXES
-            for frame in (
-                *phase_steps(axis, STEPS, PERIOD_PX),
-                *gray_bits(axis, BITS),
-                Frame("complementary", axis),
-            )
-        ]
+        frames: list[Frame] = []
+        for axis in AXES:
+            frames += *phase_steps(axis, STEPS, PERIOD_PX), *gray_bits(axis, BITS)
+            frames.append(Frame("complementary", axis))
         return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
 
     @cached_property
@@ -372,9 +368,9 @@ def prove_hostile(
         sound = bench.measure_anew(CaseRun(bench.folder / "sound"))
         gauge = fit_gauge(sound)
         floor = score(sound, gauge)
-        for i, (name, severity, direction) in enumerate(chosen):
-            progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
-            done.append(run_case(bench, (name, severity, direction), gauge, floor))
+        for i, wanted in enumerate(chosen):
+            progress((i + 1) / (len(chosen) + 1), "{}, {}, in the {}".format(*wanted))
+            done.append(run_case(bench, wanted, gauge, floor))
     failed = [case for case in done if not case.passed]
     lines = [f"{len(done) - len(failed)} of {len(done)} hold, at scale {scale:g}"]
     for case in failed:
@@ -383,17 +379,17 @@ def prove_hostile(
     return Proof(not failed, scale, [case.row() for case in done], {"cases": done}, below=lines)
 
 
-def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direction]]:
+def choose_cases(wanted: Sequence[str] = ()) -> list[Case]:
     """All cases, or those that begin with one of the ``wanted``, colons between fault, severity and
     direction."""
-    every = [
+    every: list[Case] = [
         (name, severity, direction)
         for direction in get_args(Direction)
         for name, fault in FAULTS.items()
         for severity in SEVERITIES
         if direction in fault.directions
     ]
-    chosen: list[tuple[str, Severity, Direction]] = []
+    chosen: dict[Case, None] = {}
     for pattern in wanted or ("",):
         parts = pattern.split(":")
         matching = [
@@ -406,20 +402,15 @@ def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direct
                 f"no hostile case is called {pattern!r}: use {', '.join(FAULTS)}; :mild, :medium or"
                 " :severe"
             )
-        chosen += [case for case in matching if case not in chosen]
-    return chosen
+        chosen |= dict.fromkeys(matching)
+    return list(chosen)
 
 
-def run_case(
-    bench: HostileBench,
-    case: tuple[str, Severity, Direction],
-    gauge: np.ndarray,
-    floor: Figures,
-) -> HostileCase:
+def run_case(bench: HostileBench, case: Case, gauge: np.ndarray, floor: Figures) -> HostileCase:
     """Run one case against the undisturbed session; an error, a crash too, is its result."""
     start, (name, severity, direction), figures = perf_counter(), case, None
-    session = bench.folder / ("sound" if direction == "scan" else "hostile")
-    run = CaseRun(session, FAULTS[name], severity)
+    folder = "sound" if direction == "scan" else "hostile"
+    run = CaseRun(bench.folder / folder, FAULTS[name], severity)
     try:
         if direction == "scan":
             measured = bench.measure_scans(run, run.fault)
@@ -430,19 +421,11 @@ def run_case(
     except Exception as error:  # the other cases still have to run
         run.error = error
     outcome, named = judge_case(run, figures, floor)
+    passed, seconds = outcome in PASSED, perf_counter() - start
     messages = list(run.warnings)
     if run.error:
         messages.append(f"{type(run.error).__name__}: {run.error}")
-    return HostileCase(
-        *case,
-        outcome,
-        outcome in PASSED,
-        figures,
-        floor,
-        named,
-        tuple(messages),
-        perf_counter() - start,
-    )
+    return HostileCase(*case, outcome, passed, figures, floor, named, tuple(messages), seconds)
 
 
 def judge_case(

@@ -45,7 +45,7 @@ from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase, scan_sequence
+from slviewer.validation.rendered_calibration import calibrate_rendered, scan_sequence
 
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
@@ -179,7 +179,10 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
 
 def _scan(model: Model, renderer: Renderer, name: str, number: int) -> Cloud:
     """The cloud of a rendered scan, whose noise ``number`` seeds."""
-    return reconstruct_cloud(model, {"x": render_phase(renderer, name, number)})
+    sequence = scan_sequence(renderer.rig)
+    frames = renderer.capture(sequence, number)
+    phases = decode_frames(name, sequence, frames)
+    return reconstruct_cloud(model, phases, texture=texture(sequence, frames))
 
 
 def check_registration(
@@ -304,12 +307,10 @@ def _measure_marked(
 ) -> float:
     """The largest error, mm, over the surface of the second scan, registered by markers onto the
     first."""
-    clouds = {}
-    for k, (name, scene) in enumerate(zip("ab", pair, strict=True)):
-        sequence = scan_sequence(rig)
-        frames = Renderer(rig, scene).capture(sequence, number + k)
-        phases = decode_frames(name, sequence, frames)
-        clouds[name] = reconstruct_cloud(model, phases, texture=texture(sequence, frames))
+    clouds = {
+        name: _scan(model, Renderer(rig, scene), name, number + k)
+        for k, (name, scene) in enumerate(zip("ab", pair, strict=True))
+    }
     markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     T = register_all(clouds, "a", Starts(markers=markers)).T_reference_scan["b"]
     true = [T_calibrated_camera @ scene.pose.matrix for scene in pair]
