@@ -64,9 +64,8 @@ class SimulatedLens:
         """(h + 2 margin, w + 2 margin, 2) float64: (x/z, y/z) of every pixel, and of so many beyond
         each edge."""
         if margin not in self._ray_grids:
-            width, height = self.size
             u, v = np.meshgrid(
-                *(np.arange(-margin, n + margin, dtype=float) for n in (width, height))
+                *(np.arange(-margin, extent + margin, dtype=float) for extent in self.size)
             )
             self._ray_grids[margin] = self.undistort(np.stack([u, v], -1))
         return self._ray_grids[margin]
@@ -78,9 +77,9 @@ class SimulatedLens:
 
     def _map_points(self, function: Any, values: np.ndarray) -> np.ndarray:
         """Values (..., 2) mapped by a compiled kernel with this lens's parameters."""
-        numbers = np.array([*self.focal_px, *self.centre_px, *self.brown, self.scale])
+        pinhole = np.array([*self.focal_px, *self.centre_px, self.scale])
         flat = np.ascontiguousarray(values.reshape(-1, 2))
-        return function(flat, numbers, self.waves).reshape(values.shape)
+        return function(flat, pinhole, np.array(self.brown), self.waves).reshape(values.shape)
 
 
 def _check_shape(values: np.ndarray, last: int) -> np.ndarray:
@@ -107,10 +106,10 @@ _displace_point = kernel()(displace)
 
 
 @kernel()
-def _distort(x, y, numbers):
+def _distort(x, y, brown):
     """Brown's distortion of one normalised point, and its derivatives: of x by x, of x by y, which
     is that of y by x, and of y by y."""
-    _, _, _, _, k1, k2, p1, p2, k3, _ = numbers
+    k1, k2, p1, p2, k3 = brown
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     # d radial / d r2, twice: times x or y it is d radial / dx or dy
@@ -125,12 +124,12 @@ def _distort(x, y, numbers):
 
 
 @kernel(parallel=True)
-def _project_kernel(normalised, numbers, waves):
+def _project_kernel(normalised, pinhole, brown, waves):
     """Pixels (n, 2) at the lens's scale of normalised points (n, 2)."""
     out = np.empty_like(normalised)
-    fx, fy, cx, cy, _, _, _, _, _, scale = numbers
+    fx, fy, cx, cy, scale = pinhole
     for i in numba.prange(normalised.shape[0]):
-        x, y, _, _, _ = _distort(normalised[i, 0], normalised[i, 1], numbers)
+        x, y, _, _, _ = _distort(normalised[i, 0], normalised[i, 1], brown)
         u, v = cx + fx * x, cy + fy * y
         du, dv = _displace_point(u, v, waves)
         out[i, 0], out[i, 1] = (u + du + 0.5) * scale - 0.5, (v + dv + 0.5) * scale - 0.5
@@ -138,11 +137,11 @@ def _project_kernel(normalised, numbers, waves):
 
 
 @kernel(parallel=True)
-def _undistort_kernel(pixels, numbers, waves):
+def _undistort_kernel(pixels, pinhole, brown, waves):
     """Normalised points (n, 2) of pixels (n, 2): without the waves, which are gentle, by a fixed
     point, then by Newton's method; NaN where it does not converge."""
     out = np.empty_like(pixels)
-    fx, fy, cx, cy, _, _, _, _, _, scale = numbers
+    fx, fy, cx, cy, scale = pinhole
     for i in numba.prange(pixels.shape[0]):
         from_u, from_v = (pixels[i, 0] + 0.5) / scale - 0.5, (pixels[i, 1] + 0.5) / scale - 0.5
         u, v = from_u, from_v
@@ -156,7 +155,7 @@ def _undistort_kernel(pixels, numbers, waves):
         x, y = from_x, from_y
         error = np.inf
         for _ in range(20):
-            X, Y, xx, xy, yy = _distort(x, y, numbers)
+            X, Y, xx, xy, yy = _distort(x, y, brown)
             dx, dy = from_x - X, from_y - Y
             determinant = xx * yy - xy * xy
             x += (yy * dx - xy * dy) / determinant

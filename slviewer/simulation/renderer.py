@@ -189,11 +189,9 @@ class Renderer:
         if exposure not in self._lights:
             maps, black = self._maps, self.rig.light.black
             stray = self._blur(exposure * (black * maps.gain + self.rig.light.ambient * maps.even))
-            self._lights.clear()  # an exposure is kept for many frames
-            self._lights[exposure] = (
-                (exposure * (1 - black) * maps.gain).astype(np.float32),
-                stray.astype(np.float32),
-            )
+            light = exposure * (1 - black) * maps.gain
+            # an exposure is kept for many frames
+            self._lights = {exposure: (light.astype(np.float32), stray.astype(np.float32))}
         return self._lights[exposure]
 
     @cached_property

@@ -505,10 +505,12 @@ def score(measured: Sequence[MeasuredScan], gauge: np.ndarray) -> Figures:
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
     most = max(1, int(_TRIMMED * target.sum()))
-    rms, predicted = (rms(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma))
+    rms_mm, predicted_mm = (
+        rms(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma)
+    )
     return Figures(
-        rms,
-        predicted,
+        rms_mm,
+        predicted_mm,
         float(wrong.mean()) if len(wrong) else 0.0,
         float(target.sum() / max(expected, 1)),
     )
