@@ -143,17 +143,20 @@ def _measure(
     )
     if first_uses and last_uses and not np.isnan(first_uses).any():
         growth = (np.median(last_uses, axis=0) - np.median(first_uses, axis=0)).tolist()
-    shown = [live for _, live, _ in samples]
-    behind = [live.latency_ms for live in shown if live.latency_ms is not None]
+    lives = [live for _, live, _ in samples]
+    made, shown = np.median(
+        [(live.clouds_per_s, live.shown_per_s) for live in lives], axis=0
+    ).tolist()
+    behind = [live.latency_ms for live in lives if live.latency_ms is not None]
     return LiveFigures(
         camera,
         seconds,
         (then - first) / halfway,
         (captures - then) / (time.monotonic() - begun - halfway),
-        statistics.median(live.clouds_per_s for live in shown),
-        statistics.median(live.shown_per_s for live in shown),
+        made,
+        shown,
         statistics.median(behind or [float("nan")]),
-        shown[-1].points,
+        lives[-1].points,
         *growth,
     )
 
