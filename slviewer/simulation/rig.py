@@ -9,7 +9,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.simulation.assets import asset
-from slviewer.simulation.lens import SimulatedLens, random_waves
+from slviewer.simulation.lens import SimulatedLens
+from slviewer.simulation.waves import random_waves
 
 
 @dataclass(frozen=True)
