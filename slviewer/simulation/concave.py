@@ -8,7 +8,7 @@ between diffuse surfaces", SIGGRAPH 1984; form factors from a point to a polygon
 glossy lobes: Phong's, normalised.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -135,17 +135,11 @@ class ConcaveScene(MeshScene):
     def _form_factors(self) -> np.ndarray:
         """(n, m) float32 in 0 ... 1: irradiance of each vertex by each patch of radiosity 1, by
         Lambert's formula."""
-        return self.form_factors(np.arange(len(self.vertices)))
-
-    def form_factors(self, chosen: np.ndarray) -> np.ndarray:
-        """Return (k, m) float32 in 0 ... 1: irradiance of the vertices ``chosen`` (k,) by each
-        patch of radiosity 1."""
         corners, facing = self._corners, self._normals_and_areas[0]
-        out = np.zeros((len(chosen), len(corners)), np.float32)
-        for first in range(0, len(chosen), _CHUNK):
-            some = chosen[first : first + _CHUNK]
-            normals = self.vertex_normals[some]
-            at = self.placed[some, None, None]
+        out = np.zeros((len(self.vertices), len(corners)), np.float32)
+        for first in range(0, len(out), _CHUNK):
+            some = slice(first, first + _CHUNK)
+            normals, at = self.vertex_normals[some], self.placed[some, None, None]
             to = corners[None] - at
             size = np.linalg.norm(to, axis=-1, keepdims=True)
             beside = (size < 1e-6).any(axis=(2, 3))  # of its own patches a vertex receives nothing
@@ -159,7 +153,7 @@ class ConcaveScene(MeshScene):
             visible = (middle * normals[:, None]).sum(-1) > 0
             visible &= (middle * facing[None]).sum(-1) < 0
             factor = np.abs(total)[..., 0] / (2 * np.pi)
-            out[first : first + _CHUNK] = np.where(visible & ~beside, factor, 0)
+            out[some] = np.where(visible & ~beside, factor, 0)
         return out
 
     def _lobe(self, rig: SimulatedRig) -> np.ndarray:
@@ -188,25 +182,21 @@ class ConcaveScene(MeshScene):
 
 
 def groove(
-    pose: Pose,
-    angle_deg: float = 90.0,
-    albedo: float = 0.8,
-    indirect: Indirect = Indirect(),
-    length_mm: float = 90.0,
+    pose: Pose, angle_deg: float = 90.0, albedo: float = 0.8, indirect: Indirect = Indirect()
 ) -> ConcaveScene:
     """Return a V-groove: two walls 60 mm wide that meet at ``angle_deg`` in a fold along y, open
     towards -z."""
-
     half = np.radians(angle_deg / 2)
-    away = _graded_steps(60.0)
-    along = np.linspace(-length_mm / 2, length_mm / 2, int(np.ceil(length_mm / _COARSEST_MM)) + 1)
+    steps = [0.0]  # from the fold: fine ones first, which grow
+    while steps[-1] < 60.0:
+        steps.append(steps[-1] + np.clip(0.15 * steps[-1], _FINEST_MM, _COARSEST_MM))
+    away = np.array(steps) * (60.0 / steps[-1])
+    along = np.linspace(-45.0, 45.0, int(np.ceil(90.0 / _COARSEST_MM)) + 1)
     walls = []
     for side in (-1, 1):
         x, z = np.stack([side * away * np.sin(half), -away * np.cos(half)])[:, ::side]
         walls.append(np.stack(np.broadcast_arrays(x[:, None], along[None], z[:, None]), axis=-1))
-    patches = _grid_patches(walls[0].shape[:2])
-    both = np.concatenate([patches, patches + walls[0].size // 3])
-    return _make_scene(np.concatenate(walls), both, pose, albedo, indirect)
+    return _make_scene(walls, pose, albedo, indirect)
 
 
 def bowl(
@@ -214,7 +204,6 @@ def bowl(
 ) -> ConcaveScene:
     """Return the inside of a sphere, up to ``opening_deg`` from its deepest point, which is the
     origin; open to -z."""
-
     edge = radius_mm * np.sin(np.radians(opening_deg))
     side = np.linspace(-1, 1, 2 * int(np.ceil(edge / 2.0)) + 1)
     a, b = np.meshgrid(side, side, indexing="ij")
@@ -223,15 +212,15 @@ def bowl(
     polar = np.radians(opening_deg) * np.hypot(x, y)
     share = np.where(polar > 0, np.sin(polar) / np.maximum(np.hypot(x, y), 1e-12), 0) * radius_mm
     grid = np.stack([x * share, y * share, radius_mm * (np.cos(polar) - 1)], axis=-1)
-    return _make_scene(grid, _grid_patches(a.shape), pose, albedo, Indirect())
+    return _make_scene([grid], pose, albedo, Indirect())
 
 
 def wax(pose: Pose) -> ConcaveScene:
     """Return a wavy plate of wax of 90 mm, in which 60 % of the light scatters, facing -z."""
-    indirect = Indirect(0, scattered=0.6, reach_mm=3.0)
     x, y = np.meshgrid(*[np.linspace(-45.0, 45.0, 61)] * 2, indexing="ij")
     z = 4.0 * np.sin(2 * np.pi * x / 45) * np.cos(2 * np.pi * y / 60)
-    return _make_scene(np.stack([x, y, z], axis=-1), _grid_patches(x.shape), pose, 0.8, indirect)
+    grid = np.stack([x, y, z], axis=-1)
+    return _make_scene([grid], pose, 0.8, Indirect(0, scattered=0.6, reach_mm=3.0))
 
 
 CONCAVE: dict[str, Callable[[Pose], ConcaveScene]] = {"groove": groove, "bowl": bowl, "wax": wax}
@@ -239,24 +228,17 @@ CONCAVE: dict[str, Callable[[Pose], ConcaveScene]] = {"groove": groove, "bowl": 
 
 
 def _make_scene(
-    vertices: np.ndarray, patches: np.ndarray, pose: Pose, albedo: float, indirect: Indirect
-) -> ConcaveScene:  # fmt: skip
-    """Return the scene of patches of the vertices (..., 3), each of two triangles."""
-    triangles = np.concatenate([patches[:, [0, 1, 2]], patches[:, [0, 2, 3]]])
-    return ConcaveScene(vertices.reshape(-1, 3), triangles, pose, albedo, patches, indirect)
-
-
-def _graded_steps(width: float) -> np.ndarray:
-    """Return distances (n,) mm from a fold, 0 to ``width``: in fine steps first, which grow."""
-    steps = [0.0]
-    while steps[-1] < width:
-        steps.append(steps[-1] + np.clip(0.15 * steps[-1], _FINEST_MM, _COARSEST_MM))
-    return np.array(steps) * (width / steps[-1])
-
-
-def _grid_patches(shape: tuple[int, ...]) -> np.ndarray:
-    """Return (m, 4) vertex indices of the cells of a grid whose x and y grow, in order, facing
-    -z."""
-    index = np.arange(shape[0] * shape[1]).reshape(shape)
-    corners = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    return np.stack([each.ravel() for each in corners], axis=1)
+    grids: Sequence[np.ndarray], pose: Pose, albedo: float, indirect: Indirect
+) -> ConcaveScene:
+    """Return the scene of grids of vertices (k, l, 3), whose x and y grow in order: each cell is a
+    patch of two triangles that face -z."""
+    patches, count = [], 0
+    for grid in grids:
+        index = count + np.arange(grid.size // 3).reshape(grid.shape[:2])
+        corners = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+        patches.append(np.stack([each.ravel() for each in corners], axis=1))
+        count += index.size
+    quads = np.concatenate(patches)
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    vertices = np.concatenate(grids).reshape(-1, 3)
+    return ConcaveScene(vertices, triangles, pose, albedo, quads, indirect)

@@ -1,7 +1,7 @@
 """Coded markers stuck onto the scenes of the simulated rig."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -71,7 +71,7 @@ class MarkedScene(AlteredScene):
                 there = decal.albedo(local[near][:, :2] + a * along + b * down)
                 total += np.where(np.isnan(there), own, there).astype(np.float32)
             albedo[near] = total / _SAMPLES**2
-        return Surface(surface.points, surface.normals, albedo)
+        return replace(surface, albedo=albedo)
 
 
 def marked_plate(pose: Pose) -> MarkedScene:

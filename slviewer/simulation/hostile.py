@@ -92,11 +92,9 @@ def render_light(
     patterns = [change(profile(sequence, k)) for k in range(len(sequence.frames))]
     light = np.stack([renderer.light(pattern) for pattern in patterns])
     if isinstance(scene, MirrorTable):
-        second = Renderer(scene.second_projector(rig), scene.scene)
-        for k, pattern in enumerate(patterns):
-            light[k] += np.float32(scene.reflectivity) * second.light(
-                pattern, exposure=renderer.exposure
-            )
+        second, exposure = Renderer(scene.second_projector(rig), scene.scene), renderer.exposure
+        mirrored = np.stack([second.light(pattern, exposure=exposure) for pattern in patterns])
+        light += np.float32(scene.reflectivity) * mirrored
     return light, renderer
 
 

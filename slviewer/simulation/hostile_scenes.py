@@ -7,7 +7,7 @@ import numpy as np
 
 from slviewer.fringe.sequence import Axis
 from slviewer.simulation.boards import BoardScene, BoardShape, Pose, blank_board
-from slviewer.simulation.plans import rotation
+from slviewer.simulation.plans import pose_at, rotation
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import AlteredScene, Points, Rays, Scene, Spheres, Surface
 
@@ -19,6 +19,8 @@ CleanScene = BoardScene | Spheres
 _FINGERS_MM = (-24.0, -8.0, 8.0, 24.0)
 _FINGER_RADIUS_MM = 11.0
 _SPECK_CELL_MM = 2.0
+_DIRT = 0.35
+"""Share of its light that a dirty cell reflects."""
 _THICKNESS_MM = 2.0  # more than any board's bow
 
 
@@ -41,27 +43,21 @@ class SceneGroup:
 
     def occluded(self, points: Points, source: Points) -> np.ndarray:
         """Whether any of the scenes blocks the way from a point to the source."""
-        blocked = [scene.occluded(points, source) for scene in self.scenes]
-        blocked += [
-            _is_behind_plate(scene, points, source)
-            for scene in self.scenes
-            if isinstance(scene, BoardScene)
-        ]
-        return np.logical_or.reduce(blocked)
+        blocked = np.zeros(len(points), bool)
+        for scene in self.scenes:
+            blocked |= scene.occluded(points, source)
+            if isinstance(scene, BoardScene):
+                blocked |= _is_behind_plate(scene, points, source)
+        return blocked
 
 
 @dataclass(frozen=True, eq=False)
 class DirtyBoard(AlteredScene):
-    """A board with specks of dust and scratches: of the cells of its surface, `share` reflect only
-    `left` of the light.
-
-    The dirt is fixed to the board; `seed` draws it.
-    """
+    """A board with specks of dust and scratches, fixed to it: of the cells of its surface, `share`
+    reflect only a third of the light."""
 
     scene: BoardScene
     share: float
-    left: float = 0.35
-    seed: int = 0
 
     def trace(self, rays: Rays) -> Surface:
         """The board's surface, with reduced albedo at dirt."""
@@ -71,37 +67,34 @@ class DirtyBoard(AlteredScene):
         xy = ((surface.points[hit] - pose.t) @ pose.R)[:, :2]
         cells = np.floor((xy - np.array(self.scene.corner)) / _SPECK_CELL_MM).astype(int)
         shape = np.ceil(np.array(self.scene.plate) / _SPECK_CELL_MM).astype(int) + 1
-        rng = np.random.default_rng([self.seed, 0xD1])
+        rng = np.random.default_rng([0, 0xD1])
         dirty = rng.random(shape) < self.share
         for _ in range(round(40 * self.share * 10)):  # scratches: lines of cells
             start, way = rng.uniform(0, 1, 2) * shape, rng.normal(size=2)
             line = start + np.arange(rng.integers(10, 40))[:, None] * way / np.linalg.norm(way)
             dirty[tuple(np.clip(line.astype(int), 0, shape - 1).T)] = True
         albedo = surface.albedo.copy()
-        albedo[hit] *= np.where(dirty[tuple(np.clip(cells, 0, shape - 1).T)], self.left, 1.0)
-        return Surface(surface.points, surface.normals, albedo)
+        albedo[hit] *= np.where(dirty[tuple(np.clip(cells, 0, shape - 1).T)], _DIRT, 1.0)
+        return replace(surface, albedo=albedo)
 
 
 @dataclass(frozen=True, eq=False)
 class MirrorTable(AlteredScene):
-    """A polished table below an object: rays that miss the object and meet the table see the object
-    mirrored.
+    """A polished table at y = `offset_mm` below an object: rays that miss the object and meet the
+    table see the object mirrored.
 
-    `normal` (3,) and `offset_mm`: the table is n . X = offset. `reflectivity` 0 ... 1. Points and
-    normals of mirrored pixels are those of the real surface, which the projector lights;
-    `is_direct` says which pixels see it directly.
+    `reflectivity` 0 ... 1. Points and normals of mirrored pixels are those of the real surface,
+    which the projector lights; `is_direct` says which pixels see it directly.
     """
 
     scene: CleanScene
-    normal: np.ndarray
     offset_mm: float
     reflectivity: float
 
     @property
     def reflection(self) -> tuple[np.ndarray, np.ndarray]:
         """M (3, 3) and shift (3,): X' = M X + shift is X mirrored in the table."""
-        n = self.normal
-        return np.eye(3) - 2 * np.outer(n, n), 2 * self.offset_mm * n
+        return np.diag([1.0, -1.0, 1.0]), np.array([0.0, 2 * self.offset_mm, 0.0])
 
     def trace(self, rays: Rays) -> Surface:
         """Trace rays to the object, and below it to its mirror image."""
@@ -114,7 +107,7 @@ class MirrorTable(AlteredScene):
         # The table lies between camera and mirror image, so that the image's points are behind the
         # mirror.
         with np.errstate(invalid="ignore"):
-            behind = image.points @ self.normal > self.offset_mm
+            behind = image.points[..., 1] > self.offset_mm
         visible = ~np.isfinite(surface.points[..., 2]) & behind
         albedo = np.float32(self.reflectivity) * image.albedo
         return surface.overlay(
@@ -237,21 +230,20 @@ def put_on_table(scene: CleanScene, reflectivity: float, number: int) -> Scene:
         lowest = scene.pose.to_camera(np.array(corners))[:, 1].max()
     else:
         lowest = scene.centres[:, 1].max() + scene.radius_mm
-    return MirrorTable(scene, np.array([0.0, 1.0, 0.0]), float(lowest) + 3.0, reflectivity)
+    return MirrorTable(scene, float(lowest) + 3.0, reflectivity)
 
 
 def add_second_board(scene: CleanScene, size_mm: float, number: int) -> Scene:
     """The scene with another white plate of this width 70 mm behind the object, to the left of
     it."""
     if isinstance(scene, BoardScene):
-        middle = scene.pose.to_camera(
-            np.array([*(np.array(scene.corner) + np.array(scene.plate) / 2), 0.0])
-        )
+        (x, y), (width, height) = scene.corner, scene.plate
+        middle = scene.pose.to_camera(np.array([x + width / 2, y + height / 2, 0.0]))
     else:
         middle = scene.centres[0]
     place = middle + np.array([-0.18 * middle[2], -0.09 * middle[2], 70.0])
-    turn = rotation(np.radians([5.0, -12.0, 8.0]))
-    return SceneGroup((scene, blank_board(Pose(turn, place), (size_mm, 0.8 * size_mm))))
+    pose = pose_at((5.0, -12.0, 8.0), place)
+    return SceneGroup((scene, blank_board(pose, (size_mm, 0.8 * size_mm))))
 
 
 def reverse_pattern(pattern: Pattern, level: float) -> Pattern:

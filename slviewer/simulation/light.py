@@ -1,7 +1,6 @@
 """What the projector throws on a surface: profiles blurred by its optics, tabulated for the frame
 kernel."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,15 +15,8 @@ LEVELS = 9
 """Blurs that are tabulated, from sharpest to widest; linear between them."""
 
 _MARGIN = 2  # px that a table holds beyond either end of the projector
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Relative light 0 ... 1 along one axis: table (LEVELS, n) float32, entry i at (i - offset) /
-    OVERSAMPLING px."""
-
-    table: np.ndarray
-    offset: float
+OFFSET = _MARGIN * OVERSAMPLING
+"""Entry i of a table is at (i - OFFSET) / OVERSAMPLING px."""
 
 
 def blur_levels(blur_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,9 +33,9 @@ def blur_levels(blur_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return sigmas, np.clip(level, 0, LEVELS - 1).astype(np.float32)
 
 
-def blurred_profile(values: np.ndarray, sigmas: np.ndarray) -> Profile:
-    """`values` (n,) in 0 ... 1, one per projector px, as light after the pixel's box and a Gaussian
-    of each sigma (px).
+def blurred_profile(values: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
+    """Table (LEVELS, n OVERSAMPLING + 2 OFFSET) float32 of `values` (n,) in 0 ... 1, one per
+    projector px, as light after the pixel's box and a Gaussian of each sigma (px).
 
     Beyond its ends the profile continues with its end values: `window` darkens what lies outside
     the projector.
@@ -53,7 +45,7 @@ def blurred_profile(values: np.ndarray, sigmas: np.ndarray) -> Profile:
         np.pad(values.astype(np.float32), reach + _MARGIN, mode="edge"), 2 * reach + 1
     )
     table = np.tensordot(windows, weights, 1)  # (px, within, sigma)
-    return Profile(np.ascontiguousarray(table.reshape(-1, len(sigmas)).T), _MARGIN * OVERSAMPLING)
+    return np.ascontiguousarray(table.reshape(-1, len(sigmas)).T)
 
 
 @lru_cache(8)

@@ -2,9 +2,11 @@
 every time."""
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
@@ -38,10 +40,11 @@ def letter_plan(
     in place. The rig's seed draws the target poses and the misplacement.
     """
     board = board or Board.parse("circles:21x16:9")
-    scenes: dict[str, Scene] = {}
-    for i, pose in enumerate(target_poses(rig, board, poses), 1):
-        scenes[f"pose_{i:02d}"] = printed_board(board, pose, shape, rig.seed)
-    return scenes | planes() | spheres() | objects()
+    targets = {
+        f"pose_{i:02d}": printed_board(board, pose, shape, rig.seed)
+        for i, pose in enumerate(target_poses(rig, board, poses), 1)
+    }
+    return {**targets, **planes(), **spheres(), **objects()}
 
 
 def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
@@ -78,9 +81,7 @@ def target_poses(rig: SimulatedRig, board: Board, n: int = 25) -> list[Pose]:
 def planes() -> dict[str, BoardScene]:
     """The blank plate at ten poses whose shares in R1/R2/R3 resemble the Letter's Table 1."""
     return {
-        f"plane_{i:02d}": blank_board(
-            Pose(rotation(np.radians([tilt_x, tilt_y, 0])), np.array([x, y, z]))
-        )
+        f"plane_{i:02d}": blank_board(pose_at((tilt_x, tilt_y, 0), (x, y, z)))
         for i, (z, x, y, tilt_x, tilt_y) in enumerate(_PLANS["planes"], 1)
     }
 
@@ -97,7 +98,7 @@ def objects(moved: bool = False) -> dict[str, MeshScene]:
     ``moved``: turned by up to 15 degrees from one to the next, and placed beside the axis.
     """
     return {
-        name: demo_object(Pose(rotation(np.radians(turns)), np.array(middle)))
+        name: demo_object(pose_at(turns, middle))
         for name, (middle, turns) in _PLANS["moved_objects" if moved else "objects"].items()
     }
 
@@ -107,13 +108,18 @@ def rotation(vector: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
+def pose_at(turns_deg: Sequence[float], place_mm: ArrayLike) -> Pose:
+    """Return the pose turned by a rotation vector, at a place in the camera's frame."""
+    return Pose(rotation(np.radians(turns_deg)), np.array(place_mm))
+
+
 def _list_directions(n: int) -> np.ndarray:
     """(n, 2) in -1 ... 1: position of each board in the field of view; corners most, then edges,
     then the middle."""
     corners = [(-1, -1), (1, 1), (1, -1), (-1, 1)]
     others = [(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1)]
     cycle = [place for other in others for place in (*corners, other)]
-    return np.array([cycle[i % len(cycle)] for i in range(n)], float)
+    return np.resize(np.array(cycle, float), (n, 2))
 
 
 def _place_board(

@@ -1,6 +1,5 @@
 """From a rig and a scene to the frames that its camera would take, and the truth behind them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +13,7 @@ from slviewer.fringe.presets import AXES
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.simulation.concave import ConcaveScene
 from slviewer.simulation.film import NORMAL_QUANTILES, digitise, image_light, psf_taps
-from slviewer.simulation.light import blur_levels, blurred_profile, window
+from slviewer.simulation.light import OFFSET, blur_levels, blurred_profile, window
 from slviewer.simulation.rig import SimulatedRig
 from slviewer.simulation.scenes import Scene
 
@@ -82,13 +81,9 @@ class Renderer:
         self,
         sequence: PatternSequence,
         seed: int = 0,
-        progress: Callable[[int, int], None] | None = None,
     ) -> np.ndarray:
         """(n, h, w) uint8: every frame of `sequence`; the same seed (and rig) gives the same
-        frames.
-
-        `progress(done, n)` is called after each frame, and may raise to stop.
-        """
+        frames."""
         rig = self.rig
         if tuple(sequence.projector) != rig.projector.size:
             raise InputError(
@@ -103,8 +98,6 @@ class Renderer:
         stack = np.empty((len(sequence.frames), height, width), np.uint8)
         for k, frame in enumerate(stack):
             self.frame(profile(sequence, k), keys[k], frame, lamp=lamp[k])
-            if progress is not None:
-                progress(k + 1, len(stack))
         return stack
 
     def frame(
@@ -146,15 +139,14 @@ class Renderer:
         exposure = self.exposure if exposure is None else exposure
         illuminated, stray = self._light(exposure)
         # Rows and columns are blurred alike in space, hence by different numbers of pixels.
-        sigmas = maps.sigmas * (self._rows_per_column if varies == "y" else 1.0)
+        sigmas = maps.sigmas * (rig.rows_per_column if varies == "y" else 1.0)
         light_levels = (grey_levels / 255.0) ** rig.light.gamma
         light = blurred_profile(light_levels, sigmas)
         width, height = rig.camera.size
         out = np.empty((height, width), np.float32)
         image_light(
             maps.coordinates[varies or "x"], maps.level, illuminated,
-            np.float32(lamp) * light.table, light.offset,
-            self._taps, stray, out,
+            np.float32(lamp) * light, OFFSET, self._taps, stray, out,
         )  # fmt: skip
         if self._concave:
             indirect = self._indirect_light(varies or "x", (1 - rig.light.black) * light_levels)
@@ -197,11 +189,9 @@ class Renderer:
         if exposure not in self._lights:
             maps, black = self._maps, self.rig.light.black
             stray = self._blur(exposure * (black * maps.gain + self.rig.light.ambient * maps.even))
-            self._lights.clear()  # an exposure is kept for many frames
-            self._lights[exposure] = (
-                (exposure * (1 - black) * maps.gain).astype(np.float32),
-                stray.astype(np.float32),
-            )
+            light = exposure * (1 - black) * maps.gain
+            # an exposure is kept for many frames
+            self._lights = {exposure: (light.astype(np.float32), stray.astype(np.float32))}
         return self._lights[exposure]
 
     @cached_property
@@ -233,11 +223,6 @@ class Renderer:
         margin, (width, height) = len(self._taps) // 2, self.rig.camera.size
         return slice(margin, margin + height), slice(margin, margin + width)
 
-    @property
-    def _rows_per_column(self) -> float:
-        """Ratio of the projector's focal lengths in px, vertical over horizontal."""
-        return self.rig.projector.focal_px[1] / self.rig.projector.focal_px[0]
-
     @cached_property
     def _maps(self) -> _Maps:
         """The traced scene: projector coordinates and light at unit exposure of every pixel."""
@@ -261,7 +246,7 @@ class Renderer:
         u, v = projector[..., 0], projector[..., 1]
         lens_falloff = (1 + (rays**2).sum(-1)) ** -2  # cos^4 of the angle to the camera's axis
         reflected = surface.albedo * lens_falloff
-        illuminated = window(u, columns, blur) * window(v, rows, blur * self._rows_per_column)
+        illuminated = window(u, columns, blur) * window(v, rows, blur * rig.rows_per_column)
         with np.errstate(invalid="ignore"):
             inside = (u > -0.5) & (u < columns - 0.5) & (v > -0.5) & (v < rows - 0.5)
         sigmas, level = blur_levels(blur)

@@ -57,6 +57,11 @@ class SimulatedRig:
     seed: int = 0
 
     @property
+    def rows_per_column(self) -> float:
+        """Ratio of the projector's focal lengths in px, vertical over horizontal."""
+        return self.projector.focal_px[1] / self.projector.focal_px[0]
+
+    @property
     def projector_centre(self) -> np.ndarray:
         """(3,) mm, in the camera frame."""
         return -self.R.T @ self.t
@@ -122,17 +127,11 @@ def _sample_lens(
     focal = np.array(device["focal_px"]) * (1 + device["focal_spread"] * rng.uniform(-1, 1))
     middle = np.array([(width - 1) / 2, (height - 1) / 2]) + device["centre_offset_px"]
     centre = middle + device["centre_spread_px"] * rng.uniform(-1, 1, 2)
-    brown = np.array(device["distortion"]) + np.array(device["distortion_spread"]) * rng.uniform(
-        -1, 1, 5
-    )
-    waves = random_waves(
-        rng, (width, height), focal[1] / focal[0], local["waves"], wavelengths, rms
-    )
-    k1, k2, p1, p2, k3 = brown.tolist()
-    return SimulatedLens(
-        (width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])),
-        (k1, k2, p1, p2, k3), waves,
-    )  # fmt: skip
+    spread = np.array(device["distortion_spread"]) * rng.uniform(-1, 1, 5)
+    k1, k2, p1, p2, k3 = (np.array(device["distortion"]) + spread).tolist()
+    (fx, fy), (cx, cy), size = focal.tolist(), centre.tolist(), (width, height)
+    waves = random_waves(rng, size, fy / fx, local["waves"], wavelengths, rms)
+    return SimulatedLens(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3), waves)
 
 
 def _compute_arrangement(
@@ -145,9 +144,14 @@ def _compute_arrangement(
     roll, pan, nod = np.radians(arrangement["spread_deg"]) * rng.uniform(-1, 1, 3)
     axis = np.array([0, 0, arrangement["crossing_mm"]]) - centre
     axis += np.linalg.norm(axis) * np.array([pan, nod, 0])
+    R = look_along(axis, roll + np.radians(arrangement["roll_deg"]))
+    return R, -R @ centre
+
+
+def look_along(axis: np.ndarray, roll: float) -> np.ndarray:
+    """(3, 3): R_device_camera of a device that looks along ``axis`` (3,), rolled by rad about
+    it."""
     z = axis / np.linalg.norm(axis)
-    roll += np.radians(arrangement["roll_deg"])
     x = np.cross([-np.sin(roll), np.cos(roll), 0], z)
     x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return R, -R @ centre
+    return np.stack([x, np.cross(z, x), z])

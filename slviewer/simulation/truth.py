@@ -1,7 +1,7 @@
 """The truth of a simulated capture as plain values, for a file that only scoring reads."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -78,12 +78,8 @@ class PerfectModel:
 
     rig: SimulatedRig
 
-    name = "floor"
-
-    @property
-    def axes(self) -> tuple[Axis, ...]:
-        """The fringe axes that the model can use: both."""
-        return ("x", "y")
+    name: ClassVar = "floor"
+    axes: ClassVar[tuple[Axis, ...]] = ("x", "y")
 
     def points(self, phase: PhaseMap) -> np.ndarray:
         """(h, w, 3) float32 mm: where the rig's own lenses put each phase; NaN where it is
@@ -100,12 +96,9 @@ class PerfectModel:
             going = np.abs(off) > _SETTLED_PX
             if not going.any():
                 break
-            step = np.where(
-                going & (off != before),
-                off * (inverse - nearer) / np.where(off == before, 1, off - before),
-                0,
-            )
-            nearer, before, inverse = inverse, off, inverse - step
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = off * (inverse - nearer) / (off - before)
+            nearer, before, inverse = inverse, off, inverse - np.where(going, step, 0)
         out = np.full((*phase.phase.shape, 3), np.nan, np.float32)
         solved = (np.abs(off) <= _SETTLED_PX) & (inverse > 0)
         out[valid] = np.where(solved, 1 / np.where(solved, inverse, 1), np.nan)[:, None] * rays

@@ -15,10 +15,8 @@ STEP_DEG = 360.0 / STEPS
 AXIS_POINT = np.array([3.0, 6.0, 600.0])
 """On the table's axis, mm in the camera's frame."""
 LOOKING_DOWN_DEG = 30.0
-AXIS = np.array(
-    [0.02, -np.cos(np.radians(LOOKING_DOWN_DEG)), -np.sin(np.radians(LOOKING_DOWN_DEG))]
-)
-AXIS /= np.linalg.norm(AXIS)
+_DOWN = np.radians(LOOKING_DOWN_DEG)
+AXIS = unit_vectors(np.array([0.02, -np.cos(_DOWN), -np.sin(_DOWN)]))
 """Up from the table, in the camera's frame; the table turns the right-handed way about it."""
 _AXIS_OFFSET_MM = np.array([6.0, -4.0, 0.0])  # the object does not stand in the table's middle
 
@@ -32,8 +30,7 @@ def turning(steps: int = STEPS) -> dict[str, MeshScene]:
     """The worn stone in equal steps of the table, turn_01, turn_02 ...: the camera sees all of it
     but its flat foot."""
     vertices, triangles = stone()
-    side = np.cross(AXIS, [0.0, 0.0, 1.0])
-    side /= np.linalg.norm(side)
+    side = unit_vectors(np.cross(AXIS, [0.0, 0.0, 1.0]))
     upright = np.stack([side, np.cross(AXIS, side), AXIS], axis=1)
     first = Pose(upright, AXIS_POINT + upright @ _AXIS_OFFSET_MM)
     return {

@@ -361,12 +361,15 @@ def _time_files(cloud: Cloud, sequence: PatternSequence, frames: np.ndarray) -> 
             """Write the cloud."""
             write_ply(path, cloud.measured, colours=cloud.colours(), scalars=cloud.sigmas(mask))
 
-        def save() -> None:
-            """Save the capture."""
-            session.save_capture(
-                "scan_01", "scan", sequence, frames, source="simulated", force=True
-            )
-
+        save = partial(
+            session.save_capture,
+            "scan_01",
+            "scan",
+            sequence,
+            frames,
+            source="simulated",
+            force=True,
+        )
         rows = []
         for stage, work, read in (
             (f"write {np.count_nonzero(mask) / 1e6:.2f} M points as PLY", export, path.read_bytes),

@@ -28,6 +28,7 @@ from slviewer.server.secure import SafeServer, Serving
 from slviewer.session.store import Session
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.wizard.operator import Operator
+from slviewer.wizard.snapshot import LiveView, Snapshot
 
 _VIEWPOINT = {
     "wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -103,15 +104,11 @@ def live_rate(scale: float, seconds: float, progress: Progress = ignore_progress
             contextlib.closing(App(operator, Serving(port=0))) as app,
         ):
             app.shell.go("scan")
-            _wait_until(lambda: operator.snapshot().rig.state == "open", operator)
+            _wait_for(operator, lambda now: now.rig.state == "open")
             operator.place("object")
             with _viewing(app.server, draws=True):
-                _wait_until(lambda: len(app.server.viser.get_clients()) == 1, operator)
                 operator.start_live()
-                _wait_until(
-                    lambda: (live := operator.snapshot().live) is not None and live.shown_per_s > 0,
-                    operator,
-                )
+                _wait_for(operator, lambda now: now.live is not None and now.live.shown_per_s > 0)
                 time.sleep(_WARM_S)
                 return _measure(operator, app.server, seconds, progress)
 
@@ -122,8 +119,7 @@ def _measure(
     """Figures of the running live scan over so many seconds, with a second viewer that stops
     reading."""
     begun, first = time.monotonic(), operator.live_captures
-    used: list[tuple[float, tuple[float, ...]]] = []
-    made, shown, behind, points = [], [], [], 0
+    samples: list[tuple[float, LiveView, tuple[float, ...]]] = []
     alone = min(seconds / 3, _STALLED_AFTER_S)
     with contextlib.ExitStack() as stack:
         halfway, then = 0.0, 0
@@ -135,31 +131,32 @@ def _measure(
             live = operator.snapshot().live
             if live is None:
                 raise SlviewerError(f"the live scan ended: {_get_last_notice(operator)}")
-            made.append(live.clouds_per_s)
-            shown.append(live.shown_per_s)
-            behind += [] if live.latency_ms is None else [live.latency_ms]
-            points = live.points
-            used.append((passed, _measure_use()))
+            samples.append((passed, live, _measure_use()))
             progress(min(passed / seconds, 0.999), f"live: {live.shown_per_s:.1f} clouds/s")
     captures = operator.live_captures
     camera = operator.snapshot().rig.camera
     assert camera is not None
     growth: list[float | None] = [None] * 3
     first_uses, last_uses = (
-        [use for at, use in used if low < at <= low + seconds / 10]
+        [use for at, _, use in samples if low < at <= low + seconds / 10]
         for low in (1.5 * alone, 0.9 * seconds)
     )
-    if first_uses and last_uses and not np.isnan(used[0][1]).any():
+    if first_uses and last_uses and not np.isnan(first_uses).any():
         growth = (np.median(last_uses, axis=0) - np.median(first_uses, axis=0)).tolist()
+    lives = [live for _, live, _ in samples]
+    made, shown = np.median(
+        [(live.clouds_per_s, live.shown_per_s) for live in lives], axis=0
+    ).tolist()
+    behind = [live.latency_ms for live in lives if live.latency_ms is not None]
     return LiveFigures(
         camera,
         seconds,
         (then - first) / halfway,
         (captures - then) / (time.monotonic() - begun - halfway),
-        statistics.median(made),
-        statistics.median(shown),
-        statistics.median(behind) if behind else float("nan"),
-        points,
+        made,
+        shown,
+        statistics.median(behind or [float("nan")]),
+        lives[-1].points,
         *growth,
     )
 
@@ -233,16 +230,12 @@ def true_calibration(folder: Path, rig: SimulatedRig) -> None:
         save_true_stereo(store, rig)
 
 
-def _wait_until(condition: Callable[[], bool], operator: Operator) -> None:
+def _wait_for(operator: Operator, condition: Callable[[Snapshot], bool]) -> None:
     """Wait until the condition holds; raises SlviewerError when it takes too long."""
-    end = time.monotonic() + _PATIENCE_S
-    while not condition():
-        if time.monotonic() > end:
-            raise SlviewerError(
-                f"the live scan did not begin within {_PATIENCE_S:.0f} s:"
-                f" {_get_last_notice(operator)}"
-            )
-        time.sleep(0.02)
+    if operator.wait_for(condition, _PATIENCE_S) is None:
+        raise SlviewerError(
+            f"the live scan did not begin within {_PATIENCE_S:.0f} s: {_get_last_notice(operator)}"
+        )
 
 
 def _get_last_notice(operator: Operator) -> str:

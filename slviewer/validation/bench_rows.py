@@ -5,6 +5,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from timeit import repeat, timeit
 
@@ -147,23 +148,14 @@ def gpu_rows(
     if cuda_device.find_device() is None:  # it failed, with a warning
         return []
     alone, least, moved = _time_kernel(one, here, scan.light)
-    whole = median(lambda: one.run(here, scan.light, scan), TIMES)
-    ordinary = median(lambda: one.run(frames, scan.light, scan), TIMES)
     stage, fast = f"one pass over {len(frames)} frames, {model.name}, {name}", moved / least / 1e9
     note = f"{least / alone:.0%} of the {fast:.0f} GB/s of a copy on the device"
-    return [
-        row(f"{stage}: kernel", alone, moved / 1e6, least, note=note),
-        row(
-            f"{stage}: with copies",
-            whole,
-            note=f"{1 / whole:.0f} clouds/s, frames in page-locked memory",
-        ),
-        row(
-            f"{stage}: with copies",
-            ordinary,
-            note=f"{1 / ordinary:.0f} clouds/s, frames in ordinary memory",
-        ),
-    ]
+    rows = [row(f"{stage}: kernel", alone, moved / 1e6, least, note=note)]
+    for memory, stack in (("page-locked", here), ("ordinary", frames)):
+        whole = median(partial(one.run, stack, scan.light, scan), TIMES)
+        note = f"{1 / whole:.0f} clouds/s, frames in {memory} memory"
+        rows.append(row(f"{stage}: with copies", whole, note=note))
+    return rows
 
 
 def _time_kernel(one: CudaPass, frames: np.ndarray, light: LightLevels) -> tuple[float, float, int]:
@@ -292,7 +284,5 @@ def _make_relief(seed: int, shift_mm: float) -> tuple[np.ndarray, np.ndarray]:
     slope_y, slope_x = np.gradient(z, u, u)
     normals = np.stack([slope_x, slope_y, -np.ones_like(z)], -1)
     noise = 0.03 * np.random.default_rng(seed).standard_normal(z.shape)
-    points = np.stack([x, y, 600.0 + z + noise], -1)
-    return points.reshape(-1, 3).astype(np.float32), unit_vectors(normals).reshape(-1, 3).astype(
-        np.float32
-    )
+    points, normals = np.stack([x, y, 600.0 + z + noise], -1), unit_vectors(normals)
+    return points.reshape(-1, 3).astype(np.float32), normals.reshape(-1, 3).astype(np.float32)

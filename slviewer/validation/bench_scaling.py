@@ -30,6 +30,7 @@ from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.turning import STEPS, turning
 from slviewer.validation.bench_live import true_calibration
 from slviewer.validation.bench_rows import Row, median, row, run_python
+from slviewer.validation.proof import track
 from slviewer.validation.rendered_calibration import observe_rendered, scan_sequence
 from slviewer.wizard.planner import Planner
 from slviewer.wizard.session_reader import SessionReader
@@ -60,18 +61,15 @@ def time_scaling(progress: Progress) -> list[Row]:
     rig = letter(SCALE)
     plan = letter_plan(rig, poses=max(POSES))
     scene = plan["pose_01"]
-    progress(0.0, "pixels")
-    rows = _time_pixels(rig, scene)
-    progress(0.2, "captures of a session")
-    rows += _time_captures(rig, scene)
-    progress(0.3, "scans")
-    rows += _time_scans(rig)
-    progress(0.5, "reading poses")
-    rows += _time_poses(rig, plan)
-    progress(0.8, "whole captures")
-    rows += _time_whole_captures(scene)
-    progress(0.95, "batches")
-    rows += _time_batches(scene)
+    kinds: dict[str, Callable[[], list[Row]]] = {
+        "pixels": partial(_time_pixels, rig, scene),
+        "captures of a session": partial(_time_captures, rig, scene),
+        "scans": partial(_time_scans, rig),
+        "reading poses": partial(_time_poses, rig, plan),
+        "whole captures": partial(_time_whole_captures, scene),
+        "batches": partial(_time_batches, scene),
+    }
+    rows = [row for _, measure, _ in track(progress, kinds) for row in measure()]
     progress(1.0, "measured")
     return rows
 
@@ -199,14 +197,11 @@ def _time_whole_captures(scene: Any) -> list[Row]:
         lasted, peak = map(float, output.split()[-2:])
         seconds.append(lasted)
         memory = peak / (1e6 if sys.platform == "darwin" else 1e3)
-        rows.append(row(f"reconstruct a capture, MP: {megapixels:g}", lasted, memory))
-        rows[-1] |= {
-            "target": f"{MOST_MB / 1e3:g} GB",
-            "holds": "yes" if memory <= MOST_MB else "no",
-        }
-    rows[-1]["note"] = (
-        f"{_describe_growth(WHOLE_MEGAPIXELS, seconds)}; MB: peak of the whole process"
-    )
+        holds = {"target": f"{MOST_MB / 1e3:g} GB", "holds": "yes" if memory <= MOST_MB else "no"}
+        stage = f"reconstruct a capture, MP: {megapixels:g}"
+        rows.append(row(stage, lasted, memory) | holds)
+    growth = _describe_growth(WHOLE_MEGAPIXELS, seconds)
+    rows[-1]["note"] = f"{growth}; MB: peak of the whole process"
     return rows
 
 

@@ -8,6 +8,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -165,13 +166,9 @@ def time_wizard(scale: float, progress: Progress) -> list[Row]:
         for name in ("warm", "session"):  # the first run compiles what is not compiled yet
             acts.clear()
             watch, session = _Stopwatch(), Path(folder, name)
-            with Operator(
-                session, {**RIG, "scale": scale if name == "session" else min(scale, 0.25)}
-            ) as operator:
-                stop = operator.subscribe(watch.note)
-                Autopilot(operator, poses=POSES, before=begin).run()
-                begin("")
-                stop()
+            _run_autopilot(
+                session, scale if name == "session" else min(scale, 0.25), watch.note, begin
+            )
         lasted = [(act, after - at) for (act, at), (_, after) in pairwise(acts)]
         watch.seconds["Autopilot"].append(acts[-1][1] - acts[0][1])
         watch.seconds[f"calibrate {POSES} poses"] += [
@@ -196,11 +193,8 @@ def time_wizard(scale: float, progress: Progress) -> list[Row]:
     rows = []
     for stage, limit in LIMITS.items():
         measured = watch.seconds[stage] or [float("nan")]
-        note = (
-            f"median of {len(measured)}, the longest {1e3 * max(measured):.0f} ms"
-            if len(measured) > 1
-            else ""
-        )
+        note = f"median of {len(measured)}, the longest {1e3 * max(measured):.0f} ms"
+        note *= len(measured) > 1
         rows.append(row(stage, statistics.median(measured), target=limit, note=note))
         if max(measured) > limit:  # of every time, not of their median
             rows[-1]["holds"] = "no"
@@ -217,6 +211,18 @@ def time_wizard(scale: float, progress: Progress) -> list[Row]:
     ]
 
 
+def _run_autopilot(
+    session: Path, scale: float, note: Callable[[Snapshot], None], begin: Callable[[str], None]
+) -> None:
+    """Run the Autopilot; ``note`` gets the snapshots, ``begin`` the name of each act and, at the
+    end, an empty one."""
+    with Operator(session, {**RIG, "scale": scale}) as operator:
+        stop = operator.subscribe(note)
+        Autopilot(operator, poses=POSES, before=begin).run()
+        begin("")
+        stop()
+
+
 def run_autopilot(session: str, scale: float) -> None:
     """Run the Autopilot, and print the seconds since the process was started: at the first pose,
     and at the end."""
@@ -229,10 +235,7 @@ def run_autopilot(session: str, scale: float) -> None:
             first.append(time.perf_counter() - begun)
 
     begun = time.perf_counter()
-    with Operator(Path(session), {**RIG, "scale": scale}) as operator:
-        stop = operator.subscribe(note)
-        Autopilot(operator, poses=POSES).run()
-        stop()
+    _run_autopilot(Path(session), scale, note, lambda act: None)
     print(started + first[0], started + time.perf_counter() - begun)
 
 

@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-import numpy as np
-
 from slviewer.evaluation.render import Row, render
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.records.plain import to_plain
@@ -59,10 +57,8 @@ class Proof:
         text = json.dumps(
             {"scale": self.scale, "holds": self.holds, **self.record}, default=to_plain
         )
-        plain: dict[str, Any] = json.loads(
-            text, parse_constant={"NaN": None, "Infinity": float("inf")}.get
-        )
-        return plain
+        constants = {"NaN": None, "Infinity": float("inf")}
+        return dict(json.loads(text, parse_constant=constants.get))
 
 
 def prove_checks(
@@ -91,8 +87,3 @@ def track(
         begin, after = (start + (end - start) * k / len(named) for k in (i, i + 1))
         progress(begin, name)
         yield name, item, part(progress, begin, after, name)
-
-
-def root_mean_square(values: np.ndarray) -> float:
-    """Return the root of the mean square; NaN without values."""
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

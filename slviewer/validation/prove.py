@@ -9,12 +9,11 @@ from slviewer.validation.proof import Proof
 from slviewer.validation.prove_accuracy import prove_accuracy, prove_uncertainty
 from slviewer.validation.prove_captures import prove_captures
 from slviewer.validation.prove_causes import prove_causes
-from slviewer.validation.prove_edges import prove_edges
 from slviewer.validation.prove_guidance import prove_guidance
 from slviewer.validation.prove_hostile import prove_hostile
 from slviewer.validation.prove_plan import prove_plan
 from slviewer.validation.prove_registration import prove_registration
-from slviewer.validation.prove_surfaces import prove_surfaces
+from slviewer.validation.prove_surfaces import prove_edges, prove_surfaces
 
 Claim = Literal[
     "accuracy",
@@ -70,20 +69,14 @@ class Proofs:
     @property
     def failure(self) -> str:
         """Which claims do not hold; empty where all do."""
-        failed = [claim for claim, proof in self.proofs.items() if not proof.holds]
-        return (
-            f"not proven: {', '.join(failed)}: the tables show which figures miss their bounds"
-            if failed
-            else ""
-        )
+        failed = ", ".join(claim for claim, proof in self.proofs.items() if not proof.holds)
+        return failed and f"not proven: {failed}: the tables show which figures miss their bounds"
 
     def text(self) -> str:
         """Each table under its title, then whether each claim holds."""
-        blocks = [f"{CLAIMS[claim][0]}\n\n{proof.text()}\n" for claim, proof in self.proofs.items()]
-        lines = [
-            f"{'pass' if proof.holds else 'FAIL'}  {CLAIMS[claim][0]}"
-            for claim, proof in self.proofs.items()
-        ]
+        titled = [(CLAIMS[claim][0], proof) for claim, proof in self.proofs.items()]
+        blocks = [f"{title}\n\n{proof.text()}\n" for title, proof in titled]
+        lines = [f"{'pass' if proof.holds else 'FAIL'}  {title}" for title, proof in titled]
         return "\n".join([*blocks, *lines])
 
     def to_json(self) -> dict[str, Any]:

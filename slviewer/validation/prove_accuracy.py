@@ -6,12 +6,13 @@ it happens in memory, one capture after another: a full-size session of so many 
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from statistics import fmean
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.feedback import Progress, part
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model
@@ -45,7 +47,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Spheres
 from slviewer.simulation.truth import PerfectModel
-from slviewer.validation.proof import BandCheck, Proof, prove_checks, root_mean_square, track
+from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
 from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase
 
 POSES = 25
@@ -74,37 +76,22 @@ GRID = (13, 10, 5)
 """Places where these are compared: columns, rows, depths."""
 
 
-@dataclass(frozen=True)
-class RigCase:
-    """A simulated rig of the Letter's kind, and the shape of the board that it is calibrated
-    with."""
-
-    name: str
-    seed: int = 0
-    texture: Literal["coarse", "fine"] = "coarse"
-    local_distortion_px: float | None = None
-    shape: BoardShape = FLAT
-
-    def rig(self, scale: float) -> SimulatedRig:
-        """The rig, its camera at ``scale`` times the Letter's resolution."""
-        return letter(
-            scale, self.seed, local_distortion_px=self.local_distortion_px, texture=self.texture
-        )
-
-
 BENT = BoardShape(bow_x_mm=0.1, bow_y_mm=0.1, twist_mm=0.05, misplaced_mm=0.02)
 
 
-def rig_cases(seed: int) -> tuple[RigCase, ...]:
-    """The default rig and five others; another seed makes six others of the same kinds."""
-    return (
-        RigCase("coarse", seed),
-        RigCase("fine", seed + 1, "fine"),
-        RigCase("coarse, bent board", seed + 2, shape=BENT),
-        RigCase("fine and strong, bent board", seed + 3, "fine", 0.2, BENT),
-        RigCase("coarse again", seed + 4),
-        RigCase("none", seed + 5, local_distortion_px=0.0),
-    )
+def rig_cases(seed: int, scale: float) -> dict[str, tuple[SimulatedRig, BoardShape]]:
+    """The default rig and five others of the Letter's kind, and the shape of the board that each is
+    calibrated with; another seed makes six others of the same kinds. ``scale``: resolution of the
+    camera, as a share of the Letter's."""
+    strong = letter(scale, seed + 3, local_distortion_px=0.2, texture="fine")
+    return {
+        "coarse": (letter(scale, seed), FLAT),
+        "fine": (letter(scale, seed + 1, texture="fine"), FLAT),
+        "coarse, bent board": (letter(scale, seed + 2), BENT),
+        "fine and strong, bent board": (strong, BENT),
+        "coarse again": (letter(scale, seed + 4), FLAT),
+        "none": (letter(scale, seed + 5, local_distortion_px=0.0), FLAT),
+    }
 
 
 @dataclass(frozen=True)
@@ -133,110 +120,83 @@ class RigFigures:
     spacing_error_mm: Mapping[str, Mapping[str, float]]
     seconds: float
 
-    def mean_mm(self, model: str, region: str | None = None) -> float:
-        """Mean plane RMS of a model, of one region or of all; NaN where no plane lies there."""
-        chosen = [p.rms_mm[model] for p in self.planes.values() if region in (None, p.region)]
-        return fmean(chosen) if chosen else math.nan
-
-    def over_floor(self, region: str) -> float:
-        """Splined's mean plane RMS over the floor in a region; NaN where no plane lies there."""
-        return self.mean_mm("splined", region) / self.mean_mm(FLOOR, region)
-
-    @property
-    def predicted_over_floor(self) -> float:
-        """Ratio of predicted noise to the floor of the plane where it is farthest from 1; NaN where
-        one is unknown."""
-        ratios = [plane.predicted_mm / plane.rms_mm[FLOOR] for plane in self.planes.values()]
-        return max(
-            ratios, key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio))
-        )
-
-    @property
-    def measured(self) -> float:
-        """Mean share of the planes' pixels that the splined model measures."""
-        return float(np.mean([plane.measured for plane in self.planes.values()]))
-
-    @property
-    def largest_errors_mm(self) -> tuple[float, float]:
-        """Splined's largest errors of a radius and of a spacing; NaN where one is not known."""
-        errors = self.radius_error_mm["splined"], self.spacing_error_mm["splined"]
-        radius, spacing = (np.max(np.abs(list(each.values()))) for each in errors)
-        return radius, spacing
-
 
 def prove_accuracy(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate and measure the six of ``rig_cases``, one rig after another."""
-    cases = {case.name: case for case in rig_cases(seed)}
-    figures = [measure_rig(case, scale, report) for _, case, report in track(progress, cases)]
-    return judge_accuracy(figures, scale)
+    cases = track(progress, rig_cases(seed, scale))
+    return judge_accuracy([measure_rig(name, *case, report) for name, case, report in cases], scale)
 
 
 def judge_accuracy(rigs: Sequence[RigFigures], scale: float) -> Proof:
     """The proof from the figures of all rigs."""
     title = f"mean plane RMS in mm over pixels seen in {COVERED} poses or more, at scale {scale:g}"
-    checks = [check for rig in rigs for check in check_figures(rig)]
-    return prove_checks(checks, scale, [_make_row(rig) for rig in rigs], {"rigs": rigs}, [title])
+    rows, checks = zip(*map(judge_rig, rigs), strict=True)
+    return prove_checks([*chain(*checks)], scale, rows, {"rigs": rigs}, [title])
 
 
-def check_figures(rig: RigFigures) -> tuple[BandCheck, ...]:
-    """The checks of one rig's figures against their bounds."""
-    floor, splined = rig.mean_mm(FLOOR), rig.mean_mm("splined")
-    regions = {plane.region for plane in rig.planes.values()}
-    radius, spacing = rig.largest_errors_mm
-    bounds: list[tuple[str, float, float, float]] = [
-        (
-            "stereo over splined, of stereo over the floor,",
-            floor / splined,
-            OF_STEREO,
-            1 / BELOW_FLOOR,
-        ),
-        *(
-            (f"splined over the floor in {region}", rig.over_floor(region), BELOW_FLOOR, most)
+def judge_rig(rig: RigFigures) -> tuple[Row, list[BandCheck]]:
+    """The printed table row of one rig: mean RMS by model, ratios to the floor and the largest
+    errors; and the checks of these figures against their bounds."""
+    planes = rig.planes.values()
+
+    def mean_mm(model: str, region: str = "") -> float:
+        """Mean plane RMS of a model, of one region or of all; NaN where no plane lies there."""
+        chosen = [plane.rms_mm[model] for plane in planes if region in ("", plane.region)]
+        return fmean(chosen) if chosen else math.nan
+
+    means = {model: mean_mm(model) for model in ("stereo", "pixelwise", "splined", FLOOR)}
+    over_floor = {r: mean_mm("splined", r) / mean_mm(FLOOR, r) for r in OVER_FLOOR}
+    # of the plane where it is farthest from 1, or unknown
+    predicted = max(
+        (plane.predicted_mm / plane.rms_mm[FLOOR] for plane in planes),
+        key=lambda ratio: math.inf if math.isnan(ratio) else abs(math.log(ratio)),
+    )
+    measured = float(np.mean([plane.measured for plane in planes]))
+    radius, spacing = (
+        np.max(np.abs(list(errors["splined"].values())))
+        for errors in (rig.radius_error_mm, rig.spacing_error_mm)
+    )
+    stereo_gain = means[FLOOR] / means["splined"], OF_STEREO, 1 / BELOW_FLOOR
+    bounds: dict[str, tuple[float, float, float]] = {
+        "stereo over splined, of stereo over the floor,": stereo_gain,
+        **{
+            f"splined over the floor in {region}": (over_floor[region], BELOW_FLOOR, most)
             for region, most in OVER_FLOOR.items()
-            if region in regions
-        ),
-        (
-            "predicted floor over the floor, of the worst plane,",
-            rig.predicted_over_floor,
+            if any(plane.region == region for plane in planes)
+        },
+        "predicted floor over the floor, of the worst plane,": (
+            predicted,
             1 - PREDICTED,
             1 + PREDICTED,
         ),
-        ("share of the pixels that splined measures", rig.measured, MIN_MEASURED, 1.0),
-        ("largest error of a sphere's radius in mm", radius, 0.0, RADIUS_MM),
-        ("largest error of a spacing in mm", spacing, 0.0, SPACING_MM),
-    ]
+        "share of the pixels that splined measures": (measured, MIN_MEASURED, 1.0),
+        "largest error of a sphere's radius in mm": (radius, 0.0, RADIUS_MM),
+        "largest error of a spacing in mm": (spacing, 0.0, SPACING_MM),
+    }
     if not rig.has_local_distortion:
-        bounds.append(
-            ("splined over stereo", splined / rig.mean_mm("stereo"), BELOW_FLOOR, OVER_STEREO)
-        )
-    return tuple(BandCheck(rig.rig, *bound) for bound in bounds)
-
-
-def _make_row(rig: RigFigures) -> Row:
-    """The printed table row of one rig: mean RMS by model, ratios to the floor and the largest
-    errors."""
-    radius, spacing = rig.largest_errors_mm
-    return {
+        ratio = means["splined"] / means["stereo"]
+        bounds["splined over stereo"] = ratio, BELOW_FLOOR, OVER_STEREO
+    checks = [BandCheck(rig.rig, what, *bound) for what, bound in bounds.items()]
+    row = {
         "rig": rig.rig,
         "seed": rig.seed,
-        **{model: rig.mean_mm(model) for model in ("stereo", "pixelwise", "splined", FLOOR)},
-        **{f"ratio {region}": rig.over_floor(region) for region in OVER_FLOOR},
-        "predicted ratio": rig.predicted_over_floor,
+        **means,
+        **{f"ratio {region}": ratio for region, ratio in over_floor.items()},
+        "predicted ratio": predicted,
         "worst radius": radius,
         "worst spacing": spacing,
-        "measured %": 100 * rig.measured,
-        "holds": "yes" if all(check.holds for check in check_figures(rig)) else "NO",
+        "measured %": 100 * measured,
+        "holds": "yes" if all(check.holds for check in checks) else "NO",
         "s": f"{rig.seconds:.0f}",
     }
+    return row, checks
 
 
-def measure_rig(case: RigCase, scale: float, progress: Progress) -> RigFigures:
-    """Calibrate a rig from ``POSES`` rendered captures of its board, and measure the Letter's ten
+def measure_rig(name: str, rig: SimulatedRig, shape: BoardShape, progress: Progress) -> RigFigures:
+    """Calibrate a rig from ``POSES`` rendered captures of a board, and measure the Letter's ten
     planes and six spheres with it."""
     start = perf_counter()
-    rig = case.rig(scale)
-    plan = letter_plan(rig, poses=POSES, shape=case.shape)
-    shapes = {name: scene for name, scene in plan.items() if name.startswith(("plane_", "sphere_"))}
+    plan = letter_plan(rig, poses=POSES, shape=shape)
     stereo, splined, observations = calibrate_rendered(rig, plan, part(progress, 0.0, 0.6))
     models: dict[str, Model] = {
         "stereo": stereo,
@@ -246,43 +206,39 @@ def measure_rig(case: RigCase, scale: float, progress: Progress) -> RigFigures:
     }
     covered = covered_pixels(observations)
     planes: dict[str, PlaneFigures] = {}
-    spheres: dict[str, Spheres] = {}
-    fits: dict[str, dict[str, ShapeResult]] = {}
-    for name, scene, _ in track(progress, shapes, 0.6, 1.0):
-        phase = render_phase(Renderer(rig, scene), name, list(plan).index(name))
+    spheres: dict[str, tuple[Spheres, Mapping[str, ShapeResult]]] = {}
+    shapes = {key: scene for key, scene in plan.items() if key.startswith(("plane_", "sphere_"))}
+    for key, scene, _ in track(progress, shapes, 0.6, 1.0):
+        phase = render_phase(Renderer(rig, scene), key, list(plan).index(key))
         if isinstance(scene, Spheres):
-            spheres[name] = scene
-            for model, result in compare_fits(models, phase, covered, "sphere")[0].results.items():
-                fits.setdefault(model, {})[name] = result
-        else:
-            comparison, measured = compare_fits(models, phase, covered, "plane")
-            shares, own = comparison.incidence or {}, comparison.results["splined"]
-            planes[name] = PlaneFigures(
-                max(shares, key=lambda region: shares[region]),
-                {model: result.rms_mm for model, result in comparison.results.items()},
-                own.noise_floor_mm,
-                own.points,
-                measured,
-            )
+            comparison, _ = compare_fits(models, phase, covered, "sphere")
+            spheres[key] = scene, comparison.results
+            continue
+        comparison, measured = compare_fits(models, phase, covered, "plane")
+        shares, own = comparison.incidence or {}, comparison.results["splined"]
+        planes[key] = PlaneFigures(
+            max(shares, key=lambda region: shares[region]),
+            {model: result.rms_mm for model, result in comparison.results.items()},
+            own.noise_floor_mm,
+            own.points,
+            measured,
+        )
+    radius_error_mm, spacing_error_mm = (defaultdict[str, dict[str, float]](dict) for _ in range(2))
+    for key, (scene, fits) in spheres.items():
+        for model, fit in fits.items():
+            radius_error_mm[model][key] = fit.radius_mm - scene.radius_mm
+    for (a, (first, fits)), (b, (second, others)) in combinations(spheres.items(), 2):
+        true = math.dist(first.centres[0], second.centres[0])
+        for model in [model for model in fits if model in others]:
+            distance = math.dist(fits[model].sphere.centre, others[model].sphere.centre)
+            spacing_error_mm[model][f"{a} - {b}"] = distance - true
     return RigFigures(
-        case.name,
-        case.seed,
-        case.local_distortion_px != 0,
+        name,
+        rig.seed,
+        len(rig.camera.waves) > 0,
         planes,
-        {
-            m: {n: fit.radius_mm - spheres[n].radius_mm for n, fit in each.items()}
-            for m, each in fits.items()
-        },
-        {
-            model: {
-                f"{a} - {b}": (
-                    math.dist(each[a].sphere.centre, each[b].sphere.centre)
-                    - math.dist(spheres[a].centres[0], spheres[b].centres[0])
-                )
-                for a, b in combinations(each, 2)
-            }
-            for model, each in fits.items()
-        },
+        radius_error_mm,
+        spacing_error_mm,
         perf_counter() - start,
     )
 
@@ -341,7 +297,7 @@ class PredictedErrors:
         """The figures in mm; NaN where target poses support everything."""
         inside, elsewhere = self.supported, ~self.supported
         predicted, true, predicted_elsewhere, true_elsewhere = (
-            root_mean_square(errors[places])
+            rms(errors[places])
             for places in (inside, elsewhere)
             for errors in (self.predicted, self.true)
         )
@@ -364,9 +320,8 @@ def prove_uncertainty(scale: float, seed: int, progress: Progress) -> Proof:
     Raises CalibrationRejected where one cannot be calibrated.
     """
     rigs = {}
-    for name, case, report in track(progress, {case.name: case for case in rig_cases(seed)}):
-        rig = case.rig(scale)
-        plan = letter_plan(rig, poses=POSES, shape=case.shape)
+    for name, (rig, shape), report in track(progress, rig_cases(seed, scale)):
+        plan = letter_plan(rig, poses=POSES, shape=shape)
         rigs[name] = compare_with_truth(calibrate_rendered(rig, plan, report)[1], rig)
     return judge_uncertainty(rigs, scale)
 
@@ -410,9 +365,7 @@ def compare_with_truth(model: SplinedModel, true: SimulatedRig) -> PredictedErro
     axis = select_depth_axis(rig, volume)
     errors = true_errors(true, rig, volume, axis)
     known = np.isfinite(errors).all(axis=1)
-    volume = Volume(
-        *(each[known] for each in (volume.pixels, volume.z, volume.points, volume.projector))
-    )
+    volume = volume.select(known)
     supported = volume.supported(rig, bundle.camera_poses > 0, bundle.projector_poses > 0)
     predicted = volume_sigmas(bundle, axis, volume)
     return PredictedErrors(

@@ -1,22 +1,24 @@
 """Whether suggested poses, followed with a hand-held board, lead to the noise floor, on simulated
 rigs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from statistics import fmean
 from time import perf_counter
+from typing import Any
 
 import cv2
 import numpy as np
 
+from slviewer.calibration.board_pose import solve_pose
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError
+from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap
-from slviewer.geometry.rigid import move_points, transform_from_rvec
+from slviewer.geometry.rigid import move_points
 from slviewer.geometry.shapes import fit_plane
-from slviewer.geometry.vectors import box_middle
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.geometry.vectors import box_middle, rms
+from slviewer.pipeline.feedback import Progress
 from slviewer.pipeline.simulate import TARGET
 from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import planes, rotation, target_poses
@@ -24,7 +26,7 @@ from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.truth import PerfectModel
 from slviewer.target.board import Board
-from slviewer.validation.proof import Proof, root_mean_square, track
+from slviewer.validation.proof import Proof, track
 from slviewer.validation.rendered_calibration import (
     calibrate_observed,
     observe_rendered,
@@ -41,30 +43,13 @@ _TRIES = 50
 _WAYS = ("guided", "random")
 
 
-@dataclass(frozen=True)
-class WayFigures:
-    """One rig calibrated from ``poses`` chosen in one ``way``, by plane: RMS of the model and of
-    the true rig over the same illuminated pixels, mm, and the share of these that poses support;
-    ``unmeasured`` pixels of all planes.
-    """
-
-    way: str
-    seed: int
-    poses: int
-    rms_mm: tuple[float, ...]
-    floor_mm: tuple[float, ...]
-    supported: tuple[float, ...]
-    unmeasured: int
-    predicted_sigma_mm: float | None
-    over_floor: float
-    seconds: float
-
-
 def prove_guidance(scale: float, seed: int, progress: Progress) -> Proof:
     """Calibrate each of ``RIGS`` simulated rigs from ``POSES`` guided poses, and from as many drawn
-    at random as the Letter's were; measure the Letter's ten planes with both.
+    at random as the Letter's were; measure the Letter's ten planes with both. It holds where guided
+    poses reach the floor and support the planes, in the mean over the rigs.
     """
-    figures: list[WayFigures] = []
+    rows: list[Row] = []
+    outcomes: list[dict[str, Any]] = []
     ways = {f"rig {k + 1} of {RIGS}, {way}": (seed + k, way) for k in range(RIGS) for way in _WAYS}
     for _, (rig_seed, way), report in track(progress, ways):
         if way == _WAYS[0]:
@@ -75,40 +60,29 @@ def prove_guidance(scale: float, seed: int, progress: Progress) -> Proof:
         observations, predicted = observe(rig, report)
         report(0.9, "calibrating")
         model = calibrate_observed(rig, observations)[1]
-        rms, floor, supported, unmeasured = zip(
-            *(_measure_plane(model, t) for t in targets), strict=True
-        )
-        over_floor = fmean(rms) / fmean(floor)
+        measured = [_measure_plane(model, *target) for target in targets]
+        rms_mm, floor_mm, supported, unmeasured = zip(*measured, strict=True)
+        over_floor = fmean(rms_mm) / fmean(floor_mm)
         seconds = perf_counter() - start
-        figures.append(
-            WayFigures(way, rig_seed, len(observations), rms, floor, supported, sum(unmeasured),
-            predicted,
-                       over_floor, seconds)
-        )  # fmt: skip
-    return judge_guidance(figures, scale)
-
-
-def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
-    """The proof: whether guided poses reach the floor and support the planes, in the mean over the
-    rigs."""
-    rows = [
-        {
-            "poses": f"{each.poses} {each.way}",
-            "seed": each.seed,
-            "RMS mm": fmean(each.rms_mm),
-            "floor mm": fmean(each.floor_mm),
-            "over floor": each.over_floor,
-            "worst plane": float(np.max(np.divide(each.rms_mm, each.floor_mm))),
-            "supported %": 100 * fmean(each.supported),
-            "not measured": each.unmeasured,
-            "s": round(each.seconds, 1),
-        }
-        for each in figures
-    ]
+        outcomes.append({
+            "way": way, "seed": rig_seed, "poses": len(observations), "rms_mm": rms_mm,
+            "floor_mm": floor_mm, "supported": supported, "unmeasured": sum(unmeasured),
+            "predicted_sigma_mm": predicted, "over_floor": over_floor, "seconds": seconds,
+        })  # fmt: skip
+        rows.append({
+            "poses": f"{len(observations)} {way}",
+            "seed": rig_seed,
+            "RMS mm": fmean(rms_mm),
+            "floor mm": fmean(floor_mm),
+            "over floor": over_floor,
+            "worst plane": float(np.max(np.divide(rms_mm, floor_mm))),
+            "supported %": 100 * fmean(supported),
+            "not measured": sum(unmeasured),
+            "s": round(seconds, 1),
+        })  # fmt: skip
     means = {
         way: np.mean(
-            [(each.over_floor, fmean(each.supported)) for each in figures if each.way == way],
-            axis=0,
+            [(o["over_floor"], fmean(o["supported"])) for o in outcomes if o["way"] == way], axis=0
         )
         for way in _WAYS
     }
@@ -118,21 +92,21 @@ def judge_guidance(figures: Sequence[WayFigures], scale: float) -> Proof:
     ]
     over, share = means["guided"]
     holds = bool(over <= MOST_OVER_FLOOR and share >= LEAST_SUPPORTED)
-    wanted = (
+    lines.append(
         f"wanted of guided poses: at most {MOST_OVER_FLOOR:g} times, at least"
-        f" {100 * LEAST_SUPPORTED:g} %"
+        f" {100 * LEAST_SUPPORTED:g} %: {'reached' if holds else 'NOT reached'}"
     )
-    lines.append(f"{wanted}: {'reached' if holds else 'NOT reached'}")
-    return Proof(holds, scale, rows, {"outcomes": figures}, below=lines)
+    return Proof(holds, scale, rows, {"outcomes": outcomes}, below=lines)
 
 
 def _observe_random(rig: SimulatedRig, report: Progress) -> tuple[list[Observation], None]:
     """The observations of poses drawn at random like the Letter's; undetected ones are skipped."""
-    observations = [
-        _observe_pose(rig, pose, i, part(report, 0.9 * i / POSES, 0.9))
-        for i, pose in enumerate(target_poses(rig, BOARD, POSES))
-    ]
-    return [each for each in observations if each is not None], None
+    observations = []
+    for i, pose in enumerate(target_poses(rig, BOARD, POSES)):
+        report(0.9 * i / POSES, f"pose {i + 1}")
+        with suppress(InputError):
+            observations.append(_observe_pose(rig, pose, i))
+    return observations, None
 
 
 def _observe_guided(rig: SimulatedRig, report: Progress) -> tuple[list[Observation], float | None]:
@@ -154,33 +128,23 @@ def _observe_guided(rig: SimulatedRig, report: Progress) -> tuple[list[Observati
                 f"{refused} of {i} suggested poses could not be read, at {rig.camera.size} px"
             )
         pose = _vary_pose(rig, _solve_suggested_pose(rig, planned.suggestion.outline_px), rng)
-        observation = _observe_pose(
-            rig, pose, i, part(report, 0.9 * len(observations) / POSES, 0.9)
-        )
-        if observation is None:
+        report(0.9 * len(observations) / POSES, f"pose {i + 1}")
+        try:
+            observations.append(_observe_pose(rig, pose, i))
+        except InputError:
             refused += 1
-        else:
-            observations.append(observation)
 
 
-def _observe_pose(
-    rig: SimulatedRig, pose: Pose, number: int, report: Progress
-) -> Observation | None:
-    """Render the board at a pose and observe it; None if it was not detected."""
-    report(0.0, f"pose {number + 1}")
-    try:
-        return observe_rendered(
-            rig, printed_board(BOARD, pose, seed=rig.seed), f"pose_{number + 1:02d}", number
-        )
-    except InputError:
-        return None
+def _observe_pose(rig: SimulatedRig, pose: Pose, number: int) -> Observation:
+    """Render the board at a pose and observe it; raises InputError if it was not detected."""
+    scene = printed_board(BOARD, pose, seed=rig.seed)
+    return observe_rendered(rig, scene, f"pose_{number + 1:02d}", number)
 
 
 def _extract_features(observation: Observation) -> PoseFeatures:
     """Features of one observation, and its median phase noise; NaN where that is unknown."""
-    noise = (
-        np.nan if observation.samples is None else float(np.nanmedian(observation.samples.sigma))
-    )
+    samples = observation.samples
+    noise = np.nan if samples is None else float(np.nanmedian(samples.sigma))
     return PoseFeatures(observation.points, observation.camera, observation.projector, noise)
 
 
@@ -188,10 +152,9 @@ def _solve_suggested_pose(rig: SimulatedRig, outline_px: np.ndarray) -> np.ndarr
     """T_camera_board (4, 4) at which the board fills an outline (4, 2) px that is drawn into the
     picture: what a hand follows, whatever the program believes of the lens."""
     rays = rig.camera.undistort(outline_px)
-    _, turn, t = cv2.solvePnP(
-        BOARD.outline(), rays, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE
-    )
-    return transform_from_rvec(turn, t)
+    T = solve_pose(BOARD.outline(), rays, np.eye(3), np.zeros(5), cv2.SOLVEPNP_IPPE)
+    assert T is not None
+    return T
 
 
 def _vary_pose(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Generator) -> Pose:
@@ -212,41 +175,31 @@ def _vary_pose(rig: SimulatedRig, T_camera_board: np.ndarray, rng: np.random.Gen
     return pose
 
 
-@dataclass(frozen=True, eq=False)
-class _TargetPlane:
-    """A plane's phase, illuminated pixels (h, w), and the points (h, w, 3) mm that the true rig
-    measures there."""
-
-    phase: PhaseMap
-    illuminated: np.ndarray
-    exact: np.ndarray
-
-
-def _render_plane(rig: SimulatedRig, name: str, number: int) -> _TargetPlane:
-    """A rendered scan of the plane ``name``, whose noise ``number`` seeds, and its true points."""
+def _render_plane(
+    rig: SimulatedRig, name: str, number: int
+) -> tuple[PhaseMap, np.ndarray, np.ndarray]:
+    """The phase of a rendered scan of the plane ``name``, whose noise ``number`` seeds, illuminated
+    pixels (h, w), and the points (h, w, 3) mm that the true rig measures there."""
     renderer = Renderer(rig, planes()[name])
     phase = render_phase(renderer, name, number)
     exact = PerfectModel(rig).points(phase)
-    return _TargetPlane(
-        phase, renderer.truth().mask & phase.mask & np.isfinite(exact[..., 2]), exact
-    )
+    return phase, renderer.truth().mask & phase.mask & np.isfinite(exact[..., 2]), exact
 
 
-def _measure_plane(model: SplinedModel, target: _TargetPlane) -> tuple[float, float, float, int]:
-    """Plane RMS in mm by the model and by the true rig over the same illuminated pixels, the share
-    that poses support, and the number of pixels that the model does not measure at all."""
-    points = model.points(target.phase, supported=False)
-    known = target.illuminated & np.isfinite(points[..., 2])
-    supported = model.support(target.phase) & target.illuminated
+def _measure_plane(
+    model: SplinedModel, phase: PhaseMap, illuminated: np.ndarray, exact: np.ndarray
+) -> tuple[float, float, float, int]:
+    """Plane RMS in mm by the model and by the true rig over the same illuminated pixels, outliers
+    included, the share that poses support, and the number of pixels that the model does not measure
+    at all."""
+    points = model.points(phase, supported=False)
+    known = illuminated & np.isfinite(points[..., 2])
+    measured = (each[known].astype(float) for each in (points, exact))
+    own, floor = (rms(fit_plane(each).distance(each)) for each in measured)
+    supported = model.support(phase) & illuminated
     return (
-        _compute_plane_rms(points[known]),
-        _compute_plane_rms(target.exact[known]),
-        float(supported.sum() / target.illuminated.sum()),
-        int((target.illuminated & ~known).sum()),
+        own,
+        floor,
+        float(supported.sum() / illuminated.sum()),
+        int((illuminated & ~known).sum()),
     )
-
-
-def _compute_plane_rms(points: np.ndarray) -> float:
-    """Plane RMS in mm over all points (n, 3), outliers included."""
-    points = points.astype(float)
-    return root_mean_square(fit_plane(points).distance(points))

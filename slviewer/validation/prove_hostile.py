@@ -26,6 +26,7 @@ from slviewer.examination.examine import examine
 from slviewer.fringe.presets import AXES, gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
 from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate, load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.import_captures import import_captures
@@ -59,7 +60,7 @@ from slviewer.simulation.plans import planes, spheres, target_poses
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.target.board import Board
-from slviewer.validation.proof import Proof, root_mean_square
+from slviewer.validation.proof import Proof
 
 BOARD = Board.parse("circles:21x16:9")
 SCANS = ("plane_04", "sphere_3")
@@ -78,6 +79,7 @@ EXPLAINED_LOSS = 0.7
 """Share of it below which the loss has to be explained."""
 _TRIMMED = 0.99  # of the points count in an RMS; those beyond are counted one by one, by `GROSS`
 
+Case = tuple[str, Severity, Direction]
 Outcome = Literal[
     "measured", "degraded, warned", "noisier as predicted", "refused",
     "TURNED AWAY", "UNEXPLAINED LOSS", "WRONG REASON", "SILENTLY WRONG", "CRASH",
@@ -200,15 +202,10 @@ class HostileBench:
     def sequence(self) -> PatternSequence:
         """Phase steps, Gray code and complementary bit: as many frames along x as along y; white at
         the end."""
-        frames = [
-            frame
-            for axis in AXES
-            for frame in (
-                *phase_steps(axis, STEPS, PERIOD_PX),
-                *gray_bits(axis, BITS),
-                Frame("complementary", axis),
-            )
-        ]
+        frames: list[Frame] = []
+        for axis in AXES:
+            frames += *phase_steps(axis, STEPS, PERIOD_PX), *gray_bits(axis, BITS)
+            frames.append(Frame("complementary", axis))
         return PatternSequence(self.rig.projector.size, (*frames, Frame("texture")))
 
     @cached_property
@@ -371,9 +368,9 @@ def prove_hostile(
         sound = bench.measure_anew(CaseRun(bench.folder / "sound"))
         gauge = fit_gauge(sound)
         floor = score(sound, gauge)
-        for i, (name, severity, direction) in enumerate(chosen):
-            progress((i + 1) / (len(chosen) + 1), f"{name}, {severity}, in the {direction}")
-            done.append(run_case(bench, (name, severity, direction), gauge, floor))
+        for i, wanted in enumerate(chosen):
+            progress((i + 1) / (len(chosen) + 1), "{}, {}, in the {}".format(*wanted))
+            done.append(run_case(bench, wanted, gauge, floor))
     failed = [case for case in done if not case.passed]
     lines = [f"{len(done) - len(failed)} of {len(done)} hold, at scale {scale:g}"]
     for case in failed:
@@ -382,17 +379,17 @@ def prove_hostile(
     return Proof(not failed, scale, [case.row() for case in done], {"cases": done}, below=lines)
 
 
-def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direction]]:
+def choose_cases(wanted: Sequence[str] = ()) -> list[Case]:
     """All cases, or those that begin with one of the ``wanted``, colons between fault, severity and
     direction."""
-    every = [
+    every: list[Case] = [
         (name, severity, direction)
         for direction in get_args(Direction)
         for name, fault in FAULTS.items()
         for severity in SEVERITIES
         if direction in fault.directions
     ]
-    chosen: list[tuple[str, Severity, Direction]] = []
+    chosen: dict[Case, None] = {}
     for pattern in wanted or ("",):
         parts = pattern.split(":")
         matching = [
@@ -405,20 +402,15 @@ def choose_cases(wanted: Sequence[str] = ()) -> list[tuple[str, Severity, Direct
                 f"no hostile case is called {pattern!r}: use {', '.join(FAULTS)}; :mild, :medium or"
                 " :severe"
             )
-        chosen += [case for case in matching if case not in chosen]
-    return chosen
+        chosen |= dict.fromkeys(matching)
+    return list(chosen)
 
 
-def run_case(
-    bench: HostileBench,
-    case: tuple[str, Severity, Direction],
-    gauge: np.ndarray,
-    floor: Figures,
-) -> HostileCase:
+def run_case(bench: HostileBench, case: Case, gauge: np.ndarray, floor: Figures) -> HostileCase:
     """Run one case against the undisturbed session; an error, a crash too, is its result."""
     start, (name, severity, direction), figures = perf_counter(), case, None
-    session = bench.folder / ("sound" if direction == "scan" else "hostile")
-    run = CaseRun(session, FAULTS[name], severity)
+    folder = "sound" if direction == "scan" else "hostile"
+    run = CaseRun(bench.folder / folder, FAULTS[name], severity)
     try:
         if direction == "scan":
             measured = bench.measure_scans(run, run.fault)
@@ -429,19 +421,11 @@ def run_case(
     except Exception as error:  # the other cases still have to run
         run.error = error
     outcome, named = judge_case(run, figures, floor)
+    passed, seconds = outcome in PASSED, perf_counter() - start
     messages = list(run.warnings)
     if run.error:
         messages.append(f"{type(run.error).__name__}: {run.error}")
-    return HostileCase(
-        *case,
-        outcome,
-        outcome in PASSED,
-        figures,
-        floor,
-        named,
-        tuple(messages),
-        perf_counter() - start,
-    )
+    return HostileCase(*case, outcome, passed, figures, floor, named, tuple(messages), seconds)
 
 
 def judge_case(
@@ -521,12 +505,12 @@ def score(measured: Sequence[MeasuredScan], gauge: np.ndarray) -> Figures:
     expected = sum(m.expected for m in measured)
     wrong = ~(np.abs(errors) <= SIGMAS * sigma)  # also where nothing is to be seen
     most = max(1, int(_TRIMMED * target.sum()))
-    rms, predicted = (
-        root_mean_square(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma)
+    rms_mm, predicted_mm = (
+        rms(np.sort(np.abs(values[target]))[:most]) for values in (errors, sigma)
     )
     return Figures(
-        rms,
-        predicted,
+        rms_mm,
+        predicted_mm,
         float(wrong.mean()) if len(wrong) else 0.0,
         float(target.sum() / max(expected, 1)),
     )

@@ -6,13 +6,20 @@ machining leaves it.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from slviewer.inspection.features import Feature
 from slviewer.inspection.fitting import fit_feature
-from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
+from slviewer.inspection.form import (
+    OrientationKind,
+    form_error,
+    orientation_error,
+    position_error,
+    profile_error,
+)
 from slviewer.pipeline.feedback import Progress
 from slviewer.records.measurement import Quantity
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
@@ -130,17 +137,15 @@ def _cylindricity(side: int, rng: Rng) -> Case:
     return float(truth), form_error("cylindricity", fit_feature("cylinder", points), points)
 
 
-def _orientation(side: int, rng: Rng, upright: bool) -> Case:
+def _orientation(side: int, rng: Rng, kind: OrientationKind) -> Case:
     """The parallelism of a tilted plate, or the perpendicularity of a leaning wall, to a plate
     without form."""
     points, heights = make_plate(side, rng, TILT)
     datum = np.column_stack([20 * make_grid(side), -20 + NOISE_MM * rng.normal(size=len(points))])
-    if upright:
+    if kind == "perpendicularity":
         points = points[:, [2, 1, 0]]
-    kind = "perpendicularity" if upright else "parallelism"
     fit, flat = fit_feature("plane", points), fit_feature("plane", datum)
-    measured = orientation_error(kind, fit, points, flat)  # type: ignore[arg-type]
-    return float(np.ptp(heights)), measured
+    return float(np.ptp(heights)), orientation_error(kind, fit, points, flat)
 
 
 def _position(side: int, rng: Rng) -> Case:
@@ -169,8 +174,8 @@ CASES: dict[str, Callable[[int, Rng], Case]] = {
     "flatness": _flatness,
     "roundness": _roundness,
     "cylindricity": _cylindricity,
-    "parallelism": lambda side, rng: _orientation(side, rng, False),
-    "perpendicularity": lambda side, rng: _orientation(side, rng, True),
+    "parallelism": partial(_orientation, kind="parallelism"),
+    "perpendicularity": partial(_orientation, kind="perpendicularity"),
     "position": _position,
     "profile": _profile,
 }

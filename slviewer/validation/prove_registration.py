@@ -5,7 +5,7 @@ Three depths and a full turn of an object are measured with the splined calibrat
 target poses, registered and fused; pairs that do not determine a pose must be refused.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from time import perf_counter
@@ -19,7 +19,7 @@ from slviewer.fringe.decode import texture
 from slviewer.geometry.rigid import fit_rigid, move_points, rotation_angle
 from slviewer.inspection.deviation import deviation
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.feedback import Progress, part
+from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.simulate import TARGET, turn_plan
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.reconstruct import Model, reconstruct_cloud
@@ -35,17 +35,17 @@ from slviewer.simulation.decals import (
     marked_sphere,
 )
 from slviewer.simulation.mesh import MeshScene, demo_object
-from slviewer.simulation.plans import rotation
+from slviewer.simulation.plans import pose_at
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import SimulatedRig, letter
 from slviewer.simulation.scenes import Scene, sphere
-from slviewer.simulation.turning import STEP_DEG, stone
+from slviewer.simulation.turning import STEP_DEG, STEPS, stone
 from slviewer.surface.fuse import fuse
 from slviewer.surface.meshing import MeshingPlan, build_mesh
 from slviewer.surface.shapes import Mesh, PointSet
 from slviewer.target.board import Board
 from slviewer.validation.proof import BandCheck, Proof, prove_checks, track
-from slviewer.validation.rendered_calibration import calibrate_rendered, render_phase, scan_sequence
+from slviewer.validation.rendered_calibration import calibrate_rendered, scan_sequence
 
 POSES = 25
 SHIFT_MM, TURN_DEG = 0.020, 0.01
@@ -73,17 +73,16 @@ class RegisteredScans:
     poses: Mapping[str, np.ndarray]
     seconds: float
 
-    def loop_error(self) -> tuple[float, float]:
+    def loop_error(self) -> float:
         """Loop error of the pairs that follow one another, from the first scan to the last and back
-        to the first, mm at the object's middle and degrees; NaN where one of them did not
-        register."""
+        to the first, mm at the object's middle; NaN where one of them did not register."""
         names, pairs = list(self.clouds), self.alignment.pairs
         steps = [(after, before) for before, after in pairwise(names)]
         if not {*steps, (names[-1], names[0])} <= set(pairs):
-            return float("nan"), float("nan")
+            return float("nan")
         T = np.linalg.multi_dot([np.eye(4), *(pairs[step].T_reference_scan for step in steps)])
         D = T @ np.linalg.inv(pairs[names[-1], names[0]].T_reference_scan)
-        return _measure_motion(D, self.poses[names[0]][:3, 3])
+        return _measure_motion(D, self.poses[names[0]][:3, 3])[0]
 
     def error(
         self, scan: str, onto: str, T_onto_scan: np.ndarray, centre: np.ndarray
@@ -93,13 +92,13 @@ class RegisteredScans:
             T_onto_scan @ self.poses[scan] @ np.linalg.inv(self.poses[onto]), centre
         )
 
-    def rows(self) -> list[Row]:
-        """A table row for each registered pair, true and predicted errors beside each other."""
-        rows: list[Row] = []
+    def rows(self) -> Iterator[Row]:
+        """Yield a table row for each registered pair, true and predicted errors beside each
+        other."""
         for (scan, onto), pair in self.alignment.pairs.items():
             predicted = pair.uncertainty
             shift, turn = self.error(scan, onto, pair.T_reference_scan, predicted.centre)
-            rows.append({
+            yield {
                 "scan": scan,
                 "onto": onto,
                 "error um": 1000 * shift,
@@ -110,8 +109,7 @@ class RegisteredScans:
                 "point to point mm": pair.inlier_rmse_mm,
                 "overlap %": 100 * pair.overlap,
                 "start": pair.start,
-            })  # fmt: skip
-        return rows
+            }
 
 
 def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
@@ -133,23 +131,20 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     # distance the same.
     T_calibrated_camera = fit_rigid(np.concatenate(true), np.concatenate(measured))
     truth = {name: T_calibrated_camera @ scene.pose.matrix for name, scene in scans.items()}
-
-    def register(
-        kind: str, reference: str, starts: Starts | None, done: Progress
-    ) -> RegisteredScans:
-        """Register all scans of one kind onto the reference, and time it."""
+    angles = {f"turn_{k + 1:02d}": STEP_DEG * k for k in range(STEPS)}
+    groups: dict[str, RegisteredScans] = {}
+    for kind, reference, starts, begin, end in (
+        ("object_", "object_r3", None, 0.75, 0.8),
+        ("turn_", "turn_01", Starts(table_deg=angles), 0.8, 0.88),
+    ):
         chosen = {name: cloud for name, cloud in clouds.items() if name.startswith(kind)}
         start = perf_counter()
         alignment = register_all(
-            chosen, reference, starts, lambda share: done(share, "registering")
+            chosen, reference, starts, stage(progress, begin, end, "registering")
         )
-        return RegisteredScans(chosen, alignment, truth, perf_counter() - start)
-
-    depths = register("object_", "object_r3", None, part(progress, 0.75, 0.8))
-    turns = [name for name in scans if name.startswith("turn_")]
-    angles = {name: STEP_DEG * k for k, name in enumerate(turns)}
-    turn = register("turn_", "turn_01", Starts(table_deg=angles), part(progress, 0.8, 0.88))
-    rows = depths.rows() + turn.rows()
+        groups[kind] = RegisteredScans(chosen, alignment, truth, perf_counter() - start)
+    depths, turn = groups.values()
+    rows = [*depths.rows(), *turn.rows()]
     checks = check_registration(depths, turn, rows)
     progress(0.88, "fusing and meshing")
     surfaces, lines, surface_record = _check_surfaces(depths, turn, scans)
@@ -158,45 +153,36 @@ def prove_registration(scale: float, seed: int, progress: Progress) -> Proof:
     for what, (wanted, *pair), _ in track(progress, _make_ambiguous_pairs(), 0.95, 0.98):
         number = 900 + len(refusals)
         reason = _describe_refusal(
-            {
-                name: _scan(model, Renderer(rig, scene), name, number)
+            *(
+                _scan(model, Renderer(rig, scene), name, number)
                 for name, scene in zip("ab", pair, strict=True)
-            }
+            )
         )
         refusals[what] = {"wanted": wanted, "got": reason}
         is_right = float(reason in wanted.split("/"))
-        checks.append(
-            BandCheck(what, f"refused as {wanted} (it was: {reason})", is_right, 1.0, 1.0)
-        )
+        claim = f"refused as {wanted} (it was: {reason})"
+        checks.append(BandCheck(what, claim, is_right, 1.0, 1.0))
     for k, (what, marked) in enumerate(_make_marked_pairs().items()):
         progress(0.98, f"{what} by markers")
         error = _measure_marked(rig, model, marked, T_calibrated_camera, 950 + 2 * k)
-        checks.append(
-            BandCheck(
-                f"two scans of a {what}, by markers",
-                "largest error in mm",
-                error,
-                1e-4,
-                MARKERS_MM / scale,
-            )
-        )
+        title = f"two scans of a {what}, by markers"
+        checks.append(BandCheck(title, "largest error in mm", error, 1e-4, MARKERS_MM / scale))
     r1, r2 = the_letter.EXPERIMENT_3_ICP_RMS_MM.values()
-    return prove_checks(
-        checks,
-        scale,
-        rows,
-        {"surface": surface_record, "refusals": refusals, "pairs": rows},
-        [
-            f"errors of pairs at scale {scale:g}; the Letter's point-to-point RMS: {r1:.2f} and"
-            f" {r2:.2f} mm"
-        ],
-        [*lines, *(check.text() for check in checks if check.holds)],
+    above = (
+        f"errors of pairs at scale {scale:g}; the Letter's point-to-point RMS: {r1:.2f} and"
+        f" {r2:.2f} mm"
     )
+    record = {"surface": surface_record, "refusals": refusals, "pairs": rows}
+    held = [check.text() for check in checks if check.holds]
+    return prove_checks(checks, scale, rows, record, [above], [*lines, *held])
 
 
 def _scan(model: Model, renderer: Renderer, name: str, number: int) -> Cloud:
     """The cloud of a rendered scan, whose noise ``number`` seeds."""
-    return reconstruct_cloud(model, {"x": render_phase(renderer, name, number)})
+    sequence = scan_sequence(renderer.rig)
+    frames = renderer.capture(sequence, number)
+    phases = decode_frames(name, sequence, frames)
+    return reconstruct_cloud(model, phases, texture=texture(sequence, frames))
 
 
 def check_registration(
@@ -206,18 +192,17 @@ def check_registration(
     of the pairs' ``rows``."""
     checks = []
     onto = depths.alignment.reference
-    for name in depths.clouds:
-        if name != onto:
-            shift, angle = depths.error(
-                name, onto, depths.alignment.T_reference_scan[name], depths.poses[onto][:3, 3]
-            )
-            checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
-            checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
+    for name in [name for name in depths.clouds if name != onto]:
+        shift, angle = depths.error(
+            name, onto, depths.alignment.T_reference_scan[name], depths.poses[onto][:3, 3]
+        )
+        checks.append(BandCheck(name, "error of its place in mm", shift, 0.0, SHIFT_MM))
+        checks.append(BandCheck(name, "error of its turn in degrees", angle, 0.0, TURN_DEG))
     adjusted = max((loop.left_mm for loop in turn.alignment.loops), default=float("nan"))
     checks += [
         BandCheck("three depths", "seconds to register", depths.seconds, 0.0, SECONDS),
         BandCheck("turn", "largest loop error in mm once adjusted", adjusted, 0.0, LOOP_MM),
-        BandCheck("turn", "loop error in mm round all scans", turn.loop_error()[0], 0.0, LOOP_MM),
+        BandCheck("turn", "loop error in mm round all scans", turn.loop_error(), 0.0, LOOP_MM),
         BandCheck("good pairs", "number accepted", float(len(rows)), GOOD_PAIRS, float("inf")),
     ]
     for what, unit in (("shift", "um"), ("turn", "mdeg")):
@@ -247,20 +232,18 @@ def _check_surfaces(
         name: rms(fuse({name: cloud}, {name: np.eye(4)}).surface, name)
         for name, cloud in depths.clouds.items()
     }
-    fused = rms(
-        fuse(depths.clouds, depths.alignment.T_reference_scan).surface, depths.alignment.reference
+    once, around = (
+        fuse(each.clouds, each.alignment.T_reference_scan).surface for each in (depths, turn)
     )
-    meshed = build_mesh(
-        fuse(turn.clouds, turn.alignment.T_reference_scan).surface, MeshingPlan(watertight=True)
-    )
+    fused = rms(once, depths.alignment.reference)
+    meshed = build_mesh(around, MeshingPlan(watertight=True))
     turned = rms(PointSet(meshed.mesh.vertices), turn.alignment.reference)
-    ratio = fused / min(single.values())
+    ratio, closed = fused / min(single.values()), float(meshed.topology.watertight)
+    what = "RMS deviation over the best single scan's"
     checks = [
-        BandCheck(
-            "three depths, fused", "RMS deviation over the best single scan's", ratio, *OVER_SINGLE
-        ),
+        BandCheck("three depths, fused", what, ratio, *OVER_SINGLE),
         BandCheck("turn, mesh", "RMS deviation from the true mesh in mm", turned, *MESH_MM),
-        BandCheck("turn, mesh", "watertight", float(meshed.topology.watertight), 1.0, 1.0),
+        BandCheck("turn, mesh", "watertight", closed, 1.0, 1.0),
     ]
     scans = ", ".join(f"{name} {each:.4f}" for name, each in single.items())
     line = (
@@ -271,10 +254,10 @@ def _check_surfaces(
     return checks, [line, meshed.text()], record
 
 
-def _describe_refusal(pair: Mapping[str, Cloud]) -> str:
-    """Why two clouds "a" and "b" are not registered, or "accepted"."""
+def _describe_refusal(scan: Cloud, onto: Cloud) -> str:
+    """Why a cloud is not registered onto another one, or "accepted"."""
     try:
-        register_all(pair, "b")
+        register_all({"a": scan, "b": onto}, "b")
     except Refused as refusal:
         return refusal.reason
     except InputError as error:
@@ -284,8 +267,8 @@ def _describe_refusal(pair: Mapping[str, Cloud]) -> str:
 
 def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
     """Two scans each that must not be registered, and the reason."""
-    first = _make_pose((4.0, -6.0, 2.0), (0.0, 0.0, 560.0))
-    second = _make_pose((-5.0, 3.0, 6.0), (6.0, -4.0, 620.0))
+    first = pose_at((4.0, -6.0, 2.0), (0.0, 0.0, 560.0))
+    second = pose_at((-5.0, 3.0, 6.0), (6.0, -4.0, 620.0))
     cylinder = cylinder_mesh(40.0, 150.0)
     return {
         "two scans of a plane": ("plane", blank_board(first), blank_board(second)),
@@ -305,19 +288,14 @@ def _make_ambiguous_pairs() -> dict[str, tuple[str, Scene, Scene]]:
 
 def _make_marked_pairs() -> dict[str, tuple[MarkedScene, MarkedScene]]:
     """Two scans each of shapes that do not hold a pose, with coded markers on them."""
-    first = _make_pose((4.0, -6.0, 2.0), (0.0, 0.0, 620.0))
-    second = _make_pose((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0))
+    first = pose_at((4.0, -6.0, 2.0), (0.0, 0.0, 620.0))
+    second = pose_at((-5.0, 8.0, 16.0), (6.0, -4.0, 640.0))
     behind = [Pose(pose.R, pose.t + np.array([0.0, 0.0, 60.0])) for pose in (first, second)]
     return {
         "plane": (marked_plate(first), marked_plate(second)),
         "sphere": (marked_sphere(behind[0]), marked_sphere(behind[1])),
         "cylinder": (marked_cylinder(first), marked_cylinder(second)),
     }
-
-
-def _make_pose(turns_deg: tuple[float, float, float], place_mm: tuple[float, float, float]) -> Pose:
-    """The pose turned by a rotation vector, at a place in the camera's frame."""
-    return Pose(rotation(np.radians(turns_deg)), np.array(place_mm))
 
 
 def _measure_marked(
@@ -329,12 +307,10 @@ def _measure_marked(
 ) -> float:
     """The largest error, mm, over the surface of the second scan, registered by markers onto the
     first."""
-    clouds = {}
-    for k, (name, scene) in enumerate(zip("ab", pair, strict=True)):
-        sequence = scan_sequence(rig)
-        frames = Renderer(rig, scene).capture(sequence, number + k)
-        phases = decode_frames(name, sequence, frames)
-        clouds[name] = reconstruct_cloud(model, phases, texture=texture(sequence, frames))
+    clouds = {
+        name: _scan(model, Renderer(rig, scene), name, number + k)
+        for k, (name, scene) in enumerate(zip("ab", pair, strict=True))
+    }
     markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
     T = register_all(clouds, "a", Starts(markers=markers)).T_reference_scan["b"]
     true = [T_calibrated_camera @ scene.pose.matrix for scene in pair]

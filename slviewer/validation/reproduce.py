@@ -2,30 +2,31 @@
 JSON and report."""
 
 import json
+import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
-from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
-from slviewer.evaluation.render import Row, render
+from slviewer.evaluation.render import render
+from slviewer.geometry.vectors import rms
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
+from slviewer.pipeline.merge import MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
+from slviewer.records.merge import Merge
 from slviewer.records.plain import to_plain
 from slviewer.records.verification import Shape, centre_distances_mm
 from slviewer.report.data import (
@@ -54,86 +55,68 @@ PIXEL = (500, 500)
 OBJECTS = ("object_r1", "object_r2", "object_r3")
 SHAPES: tuple[tuple[Shape, float, float], ...] = (("plane", 0.65, 0.75), ("sphere", 0.75, 0.82))
 """Shapes whose captures are compared, and the progress from and to which that takes."""
-SHOWN_PLANES = (1, 3, 8)
+SHOWN_PLANES = ("plane_01", "plane_03", "plane_08")
 """Those whose error maps the Letter shows."""
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The results of all experiments."""
+    """The results of all experiments: the report's ``data``, and what its text and JSON show
+    besides."""
 
-    quick: bool
-    stereo: StereoModel
-    pixelwise: PixelwiseModel
+    data: ReproductionData
     planes: Mapping[str, Comparison]
     spheres: Mapping[str, Comparison]
-    spacings_mm: Mapping[str, tuple[float, Mapping[str, float]]]
-    merged: MergedScans
+    merge: Merge
     report: Path
 
     @property
     def in_range_ratio(self) -> float:
         """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their
         points in R2."""
-        return inside_ratio(self.plane_rows())[0]
+        return inside_ratio(self.data.planes)[0]
 
     @property
     def spacing_rms_mm(self) -> dict[str, float]:
         """RMS error of the distances between all pairs of sphere centres, by model."""
-        errors = {
-            m: [(measured[m] - known) ** 2 for known, measured in self.spacings_mm.values()]
+        return {
+            m: rms([each.measured_mm[m] - each.known_mm for each in self.data.spacings])
             for m in MODELS
         }
-        return {m: float(np.sqrt(np.mean(squares))) for m, squares in errors.items()}
-
-    def plane_rows(self) -> list[PlaneRow]:
-        """The report's rows of the planes, beside the Letter's values."""
-        return [
-            PlaneRow(
-                name,
-                comparison.incidence or {},
-                _get_rms(comparison),
-                _get_noise_floor(comparison),
-                dict(zip(("R1", "R2", "R3"), theirs.incidence, strict=True)),
-                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-            )
-            for (name, comparison), theirs in zip(self.planes.items(), letter.TABLE_1, strict=True)
-        ]
 
     def to_json(self) -> dict[str, Any]:
         """All figures that ``text`` shows, and the values that they are computed from."""
         return {
-            "quick": self.quick,
-            "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
-            "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.depth_axis),
+            "quick": self.data.quick,
+            "reprojection_rms_px": dict(self.data.reprojection_rms_px),
+            "fit_rms_mm": self.data.fit_rms_mm,
             "planes": {name: to_plain(c.record()) for name, c in self.planes.items()},
             "spheres": {name: to_plain(c.record()) for name, c in self.spheres.items()},
             "in_range_ratio": self.in_range_ratio,
             "spacing_rms_mm": self.spacing_rms_mm,
-            "merge": to_plain(self.merged.record),
+            "merge": to_plain(self.merge),
             "report": str(self.report),
         }
 
     def text(self) -> str:
         """Both tables with the Letter's figures beside ours, and further results."""
-        rms, theirs = self.stereo.reprojection_rms_px, letter.REPROJECTION_RMS_PX
-        icp = letter.EXPERIMENT_3_ICP_RMS_MM
-        spacing = self.spacing_rms_mm
+        reprojection, theirs = self.data.reprojection_rms_px, letter.REPROJECTION_RMS_PX
+        icp, spacing = letter.EXPERIMENT_3_ICP_RMS_MM, self.spacing_rms_mm
         pairs = [
             f"  {name}: RMS {pair.point_to_point_rms_mm:.3f} mm point to point "
             f"(the Letter: {icp[name[-2:].upper()]:.2f}), "
             f"{pair.rms_mm:.3f} mm point to plane, overlap {100 * pair.overlap:.0f} %"
-            for name, pair in self.merged.record.pairs.items()
+            for name, pair in self.merge.pairs.items()
         ]
-        size = "x".join(map(str, self.stereo.rig.camera.size))
+        size = "x".join(map(str, self.data.camera))
         session = self.report.parent / "session"
         used_gb = sum(f.stat().st_size for f in session.rglob("*") if f.is_file()) / 1e9
         return "\n".join(
             [
-                f"Simulated rig, camera {size}, {len(self.stereo.poses)} target poses. RMS in mm.",
+                f"Simulated rig, camera {size}, {self.data.poses} target poses. RMS in mm.",
                 (
-                    f"Reprojection RMS: camera {rms['camera']:.3f} px, projector"
-                    f" {rms['projector']:.3f} px (the Letter: {theirs['camera']:.3f},"
+                    f"Reprojection RMS: camera {reprojection['camera']:.3f} px, projector"
+                    f" {reprojection['projector']:.3f} px (the Letter: {theirs['camera']:.3f},"
                     f" {theirs['projector']:.3f})."
                 ),
                 "",
@@ -147,7 +130,7 @@ class Reproduction:
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
                 "",
-                f"Object at three depths (experiment 3), reference {self.merged.record.reference}",
+                f"Object at three depths (experiment 3), reference {self.merge.reference}",
                 *pairs,
                 "",
                 f"Report: {self.report}",
@@ -205,20 +188,46 @@ def reproduce(
         planes, spheres = comparisons
         settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
         with merge_scans(Job(store, part(progress, 0.82, 0.9)), settings) as merged:
-            spacings = _compare_spacings(session, spheres)
-    result = Reproduction(
-        quick=quick,
-        stereo=stereo,
-        pixelwise=pixelwise,
-        planes=planes,
-        spheres=spheres,
-        spacings_mm=spacings,
-        merged=merged,
-        report=out / "report.html",
-    )
+            record, whole = merged.record, merged.fused
     progress(0.92, "drawing the report")
     pixel = (round((PIXEL[0] + 0.5) * scale - 0.5), round((PIXEL[1] + 0.5) * scale - 0.5))
-    data = _make_report_data(result, observations, pixel, seed)
+    axis, rays = pixelwise.depth_axis, stereo.rig.camera.rays()
+    data = ReproductionData(
+        camera=stereo.rig.camera.size,
+        projector=stereo.rig.projector.size,
+        quick=quick,
+        seed=seed,
+        poses=len(stereo.poses),
+        depth_range_mm=letter.DEPTH_RANGE_MM,
+        reprojection_rms_px=stereo.reprojection_rms_px,
+        letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
+        fit_rms_mm=pixelwise.median_rms_mm(axis),
+        planes=_list_planes(planes),
+        spheres=_list_spheres(spheres),
+        spacings=_list_spacings(session, spheres),
+        pairs=[
+            MergePair(
+                name,
+                record.reference,
+                pair.point_to_point_rms_mm or float("nan"),
+                pair.overlap,
+                letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
+            )
+            for name, pair in record.pairs.items()
+        ],
+        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, axis),
+        rms_maps_mm=pixelwise.fits[axis].rms_mm,
+        plane_maps=_make_error_maps({name: planes[name] for name in SHOWN_PLANES}),
+        sphere_maps=_make_error_maps(spheres),
+        plane_outlines={name: _outline_plane(c, rays) for name, c in planes.items()},
+        clouds=[CloudView(name, cloud.points) for name, cloud in merged.clouds.items()],
+        merged=CloudView(
+            "merged", whole.surface.points, whole.surface.normals, whole.source, whole.names
+        ),
+        poses_left_out=stereo.excluded,
+        letter_points=letter.EXPERIMENT_3_POINTS,
+    )
+    result = Reproduction(data, planes, spheres, record, out / "report.html")
     headlines, sections = reproduction_headlines(data), reproduction_sections(data)
     write_page(result.report, *reproduction_title(data), headlines, sections)
     progress(1.0, "reproduced")
@@ -249,95 +258,56 @@ def _load_truth(session: Path) -> dict[str, Any]:
     return truth
 
 
-def _compare_spacings(
-    session: Path, spheres: Mapping[str, Comparison]
-) -> dict[str, tuple[float, Mapping[str, float]]]:
-    """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the
-    simulation's truth."""
-    centres = {
-        name: np.array(record["centres"][0])
-        for name, record in _load_truth(session)["spheres"].items()
-    }
-    return {
-        f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
-        for (a, b), measured in centre_distances_mm(
-            {name: found.record() for name, found in spheres.items()}
-        ).items()
-    }
+def _list_planes(planes: Mapping[str, Comparison]) -> list[PlaneRow]:
+    """The report's rows of the planes, beside the Letter's values."""
+    return [
+        PlaneRow(
+            name,
+            comparison.incidence or {},
+            _get_rms(comparison),
+            _get_noise_floor(comparison),
+            dict(zip(("R1", "R2", "R3"), theirs.incidence, strict=True)),
+            {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
+        )
+        for (name, comparison), theirs in zip(planes.items(), letter.TABLE_1, strict=True)
+    ]
+
+
+def _list_spheres(spheres: Mapping[str, Comparison]) -> list[SphereRow]:
+    """The report's rows of the spheres, beside the Letter's values."""
+    return [
+        SphereRow(
+            name,
+            theirs.region,
+            letter.SPHERE_RADIUS_MM,
+            _get_rms(comparison),
+            _get_noise_floor(comparison),
+            {m: r.radius_mm for m, r in comparison.results.items()},
+            {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
+            {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
+        )
+        for (name, comparison), theirs in zip(spheres.items(), letter.TABLE_2, strict=True)
+    ]
+
+
+def _list_spacings(session: Path, spheres: Mapping[str, Comparison]) -> list[SpacingRow]:
+    """The report's rows of the distances between sphere centres: true in the simulation, and by
+    model."""
+    true = {name: record["centres"][0] for name, record in _load_truth(session)["spheres"].items()}
+    records = {name: found.record() for name, found in spheres.items()}
+    return [
+        SpacingRow(f"{a} - {b}", math.dist(true[a], true[b]), measured)
+        for (a, b), measured in centre_distances_mm(records).items()
+    ]
 
 
 def _render_table(comparisons: Mapping[str, Comparison]) -> str:
     """The table with the columns that fit a terminal, without coverage and excluded points, which
     the report has."""
-    rows: list[Row] = [
+    return render([
         {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
         for row in letter.letter_rows(comparisons)
-    ]
-    return render(rows)
-
-
-def _make_report_data(
-    result: Reproduction, observations: Sequence[Observation], pixel: tuple[int, int], seed: int
-) -> ReproductionData:
-    """The report's input from the results, with the curves of one camera pixel (u, v)."""
-    stereo, pixelwise, merged = result.stereo, result.pixelwise, result.merged
-    fit = pixelwise.fits[pixelwise.depth_axis]
-    clouds = [CloudView(name, cloud.points) for name, cloud in merged.clouds.items()]
-    whole = merged.fused
-    return ReproductionData(
-        camera=stereo.rig.camera.size,
-        projector=stereo.rig.projector.size,
-        quick=result.quick,
-        seed=seed,
-        poses=len(stereo.poses),
-        depth_range_mm=letter.DEPTH_RANGE_MM,
-        reprojection_rms_px=stereo.reprojection_rms_px,
-        letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
-        fit_rms_mm=pixelwise.median_rms_mm(pixelwise.depth_axis),
-        planes=result.plane_rows(),
-        spheres=[
-            SphereRow(
-                name,
-                theirs.region,
-                letter.SPHERE_RADIUS_MM,
-                _get_rms(c),
-                _get_noise_floor(c),
-                {m: r.radius_mm for m, r in c.results.items()},
-                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-                {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
-            )
-            for (name, c), theirs in zip(result.spheres.items(), letter.TABLE_2, strict=True)
-        ],
-        spacings=[
-            SpacingRow(name, known, measured)
-            for name, (known, measured) in result.spacings_mm.items()
-        ],
-        pairs=[
-            MergePair(
-                name,
-                merged.record.reference,
-                pair.point_to_point_rms_mm or float("nan"),
-                pair.overlap,
-                letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
-            )
-            for name, pair in merged.record.pairs.items()
-        ],
-        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
-        rms_maps_mm=fit.rms_mm,
-        plane_maps=_make_error_maps(
-            {name: result.planes[name] for name in (f"plane_{i:02d}" for i in SHOWN_PLANES)}
-        ),
-        sphere_maps=_make_error_maps(result.spheres),
-        plane_outlines={
-            name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()
-        },
-        clouds=clouds,
-        merged=CloudView(
-            "merged", whole.surface.points, whole.surface.normals, whole.source, whole.names
-        ),
-        poses_left_out=stereo.excluded,
-        letter_points=letter.EXPERIMENT_3_POINTS,
-    )
+    ])  # fmt: skip
 
 
 def _make_error_maps(comparisons: Mapping[str, Comparison]) -> list[ErrorMaps]:

@@ -6,10 +6,10 @@ import numpy as np
 from slviewer.calibration.observe import Observation, Samples
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.polynomial import fit_polynomial
-from slviewer.simulation.board_kernels import intersect
 from slviewer.simulation.boards import FLAT, BoardScene, BoardShape, Pose, printed_board
 from slviewer.simulation.plans import target_poses
 from slviewer.simulation.rig import SimulatedRig, letter
+from slviewer.simulation.scenes import directions_of
 from slviewer.target.board import Board
 
 BOARD = Board.parse("circles:15x12:12")
@@ -85,12 +85,7 @@ def observation(
 
 def on_board(scene: BoardScene, rays: np.ndarray) -> np.ndarray:
     """(n, 3) mm: where rays (n, 2) meet the board's bent surface."""
-    bounds = np.array([*scene.corner, *scene.plate])
-    bend = np.array([scene.shape.bow_x_mm, scene.shape.bow_y_mm, scene.shape.twist_mm])
-    R, t = scene.pose.R, scene.pose.t
-    return np.asarray(
-        intersect(rays[None].copy(), -R.T @ t, np.ascontiguousarray(R.T), R, bounds, bend)[1][0]
-    )
+    return directions_of(rays[None])[0] * scene.intersect(rays[None])[2].T
 
 
 def phase_map(

@@ -1,6 +1,7 @@
 """Light that surfaces throw on themselves: form factors of known shapes, linearity, and what it
 does to decoding."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -39,9 +40,10 @@ def coordinate_errors(sequence_of, angle_deg=90.0, bounces=2):
 def test_a_wall_of_a_groove_receives_what_the_formula_of_two_strips_says():
     """In the middle of a long wall: (1 + (cos a - s) / sqrt(1 + s^2 - 2 s cos a)) / 2 at s widths
     from the fold."""
-    scene = groove(Pose(np.eye(3), np.array([0, 0, 640.0])), 70, length_mm=900)
+    short = groove(Pose(np.eye(3), np.array([0, 0, 640.0])), 70)
+    scene = replace(short, vertices=short.vertices * [1, 10, 1])
     middle = np.flatnonzero(np.abs(scene.vertices[:, 1]) < 1e-6)
-    factors = scene.form_factors(middle).sum(axis=1)
+    factors = scene._form_factors[middle].sum(axis=1)
     x, _, z = scene.vertices[middle].T
     s, c = np.hypot(x, z) / 60, np.cos(np.radians(70))
     # Seen from the point, the direction of the other wall's far edge.

@@ -10,11 +10,22 @@ from slviewer.simulation.boards import Pose, printed_board
 from slviewer.simulation.plans import rotation
 from slviewer.simulation.renderer import Renderer
 from slviewer.simulation.rig import letter
+from slviewer.simulation.scenes import AlteredScene, Rays, Surface
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
 from slviewer.target.mark import mark_geometry
 
 BOARD = Board.parse("circles:11x8:14")
+
+
+class MarkedBoard(AlteredScene):
+    """The board with its mark."""
+
+    def trace(self, rays: Rays) -> Surface:
+        surface, mark = self.scene.trace(rays), mark_geometry(BOARD)
+        x, y, _ = np.moveaxis((surface.points - self.scene.pose.t) @ self.scene.pose.R, -1, 0)
+        inside = np.hypot(x - mark.x, y - mark.y) < mark.radius
+        return replace(surface, albedo=np.where(inside, np.float32(0.09), surface.albedo))
 
 
 @pytest.mark.parametrize("turned", [0.0, 180.0])
@@ -25,12 +36,12 @@ def test_the_first_circle_is_the_marked_one(turned: float) -> None:
     image = np.empty(rig.camera.size[::-1], np.uint8)
     found = {}
     for marked in (True, False):
-        mark = mark_geometry(BOARD) if marked else None
-        scene = replace(printed_board(BOARD, pose), mark=mark)
+        board = printed_board(BOARD, pose)
+        scene = MarkedBoard(board) if marked else board
         Renderer(rig, scene).frame(("x", np.full(912, 255.0)), np.arange(2, dtype=np.uint32), image)
         found[marked] = detect(BOARD, image)
         assert found[marked].marked == marked
-    true = rig.camera.project(pose.to_camera(scene.features))
+    true = rig.camera.project(pose.to_camera(board.features))
     assert np.abs(found[True].pixels - true).max() < 0.15
     plain = found[False].pixels if turned == 0 else found[False].pixels[::-1]
     assert np.abs(plain - true).max() < 0.15

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from slviewer.simulation.rig import letter
-from slviewer.validation.prove_edges import measure_object_edges, measure_ridges
+from slviewer.validation.prove_surfaces import measure_object_edges, measure_ridges
 
 pytestmark = [pytest.mark.computes, pytest.mark.slow]
 
