@@ -1,7 +1,7 @@
 """Tables of figures with units: what the terminal, pages, panels and CSV files draw."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -138,6 +138,10 @@ class Table:
         names = {str(row[0]) for row in self.rows}
         return self.select(self.columns[1:]) if len(names) == 1 < len(self.rows) else self
 
+    def without_details(self) -> "Table":
+        """Return the table without the columns that are details."""
+        return self.select([column for column in self.columns if not column.detail])
+
     def without_empty(self) -> "Table":
         """Return the table without columns that hold nothing."""
         rows = list(map(self.values, self.rows))
@@ -171,6 +175,13 @@ def compare_errors(error: float | None, rival: float | None) -> Cell:
         return Cell(None)
     error, rival, mark = abs(error), abs(rival), better_worse(error, rival)
     return Cell(f"{max(rival / error, error / rival):.2f} × {mark}" if mark else "equal", mark)
+
+
+def compare_with_first(errors: Mapping[str, float | None], model: str) -> Cell:
+    """Return the cell that compares a model's error with that of the first one; empty for the
+    first."""
+    first = next(iter(errors), model)
+    return Cell("") if model == first else compare_errors(errors.get(model), errors[first])
 
 
 def render_text(table: Table) -> str:

@@ -16,58 +16,6 @@ from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.report.page import Figure
 
-ByModel = Mapping[str, float]
-"""One value a model, such as ``{"stereo": 0.198, "pixelwise": 0.076}``."""
-
-Region = Literal["R1", "R2", "R3"]
-
-
-@dataclass(frozen=True)
-class PlaneRow:
-    """A flat board at one pose. ``incidence``: its share in R1, R2 and R3, percent; ``letter_*``:
-    the Letter's own."""
-
-    name: str
-    incidence: Mapping[str, float]
-    rms_mm: ByModel
-    noise_floor_mm: ByModel
-    letter_incidence: Mapping[str, float] = field(default_factory=dict)
-    letter_rms_mm: ByModel = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class SphereRow:
-    """A sphere of known ``true_radius_mm`` at one place, in depth range ``region``."""
-
-    name: str
-    region: str
-    true_radius_mm: float
-    rms_mm: ByModel
-    noise_floor_mm: ByModel
-    radius_mm: ByModel
-    letter_rms_mm: ByModel = field(default_factory=dict)
-    letter_radius_mm: ByModel = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class SpacingRow:
-    """The distance between the centres of two spheres, known and as each model measures it."""
-
-    name: str
-    known_mm: float
-    measured_mm: ByModel
-
-
-@dataclass(frozen=True)
-class MergePair:
-    """The alignment of one scan to the reference after ICP; ``overlap`` is a share, 0 to 1."""
-
-    name: str
-    reference: str
-    rms_mm: float
-    overlap: float
-    letter_rms_mm: float = float("nan")
-
 
 @dataclass(frozen=True, eq=False)
 class PixelCurve:
@@ -84,63 +32,6 @@ class PixelCurve:
     y: np.ndarray
     coefficients: np.ndarray
     rms_mm: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorMaps:
-    """Signed errors (h, w) mm, NaN at excluded pixels, of each model on one capture, with RMS and
-    noise floor."""
-
-    title: str
-    maps: Mapping[str, np.ndarray]
-    rms_mm: ByModel
-    noise_floor_mm: float = float("nan")
-
-
-@dataclass(frozen=True, eq=False)
-class CloudView:
-    """A scan to look at, ``points`` (h, w, 3) mm, NaN where invalid; or a merged cloud, ``points``
-    (n, 3) with ``normals``, ``source`` (n,), the number of the scan that each comes from, and the
-    ``names`` of these."""
-
-    name: str
-    points: np.ndarray
-    normals: np.ndarray | None = None
-    source: np.ndarray | None = None
-    names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class ReproductionData:
-    """The Letter's experiments on a simulated rig.
-
-    ``depth_range_mm`` bounds R2. ``rms_maps_mm`` (3, h, w) are the pixel-wise fits' RMS in z, x, y.
-    ``plane_outlines`` holds, by plane, four or more points (n, 3) of it. ``reprojection_rms_px``
-    and the Letter's have the keys camera, projector (and stereo, ours).
-    """
-
-    camera: tuple[int, int]
-    projector: tuple[int, int]
-    quick: bool
-    seed: int
-    poses: int
-    depth_range_mm: tuple[float, float]
-    reprojection_rms_px: Mapping[str, float]
-    letter_reprojection_rms_px: Mapping[str, float]
-    fit_rms_mm: Mapping[str, float]
-    planes: Sequence[PlaneRow]
-    spheres: Sequence[SphereRow]
-    spacings: Sequence[SpacingRow]
-    pairs: Sequence[MergePair]
-    pixel_curve: PixelCurve | None
-    rms_maps_mm: np.ndarray
-    plane_maps: Sequence[ErrorMaps]
-    sphere_maps: Sequence[ErrorMaps]
-    plane_outlines: Mapping[str, np.ndarray]
-    clouds: Sequence[CloudView]
-    merged: CloudView | None
-    poses_left_out: Mapping[str, str] = field(default_factory=dict)
-    letter_points: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

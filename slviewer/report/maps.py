@@ -136,17 +136,20 @@ SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
 
 
 def verification_maps(
-    title: str, found: Verification, arrays: Mapping[str, np.ndarray], width: int = FULL
+    title: str,
+    found: Verification,
+    arrays: Mapping[str, np.ndarray],
+    width: int = FULL,
+    limit_mm: float | None = None,
 ) -> Figure:
     """Error maps of a verification, with its arrays."""
-    fits = {model: fit for model, fit in found.models.items() if f"error_{model}" in arrays}
-    rms = {model: np.nan if fit.rms_mm is None else fit.rms_mm for model, fit in fits.items()}
-    floor = next(
-        (fit.noise_floor_mm for fit in reversed(fits.values()) if fit.noise_floor_mm is not None),
-        np.nan,
+    names = {model: f"error_{model}" for model in found.models}
+    maps = {model: arrays[name] for model, name in names.items() if name in arrays}
+    floors = [found.models[model].noise_floor_mm for model in maps]
+    floor = next((mm for mm in reversed(floors) if mm is not None), np.nan)
+    return draw_error_maps(
+        title, maps, found.rms_mm, floor, limit_mm=limit_mm, width=width, sign=SIGN[found.shape]
     )
-    maps = {model: arrays[f"error_{model}"] for model in fits}
-    return draw_error_maps(title, maps, rms, floor, width=width, sign=SIGN[found.shape])
 
 
 def error_limit(maps: list[np.ndarray]) -> float:

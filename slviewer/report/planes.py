@@ -1,7 +1,7 @@
 """Pictures of verified planes: RMS of each by model, with the noise floor and the Letter's value,
 and their positions in front of the camera."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os.path import commonprefix
 from typing import Any
@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.evaluation.letter import find_pose
+from slviewer.records.verification import DEPTHS, Verification
 from slviewer.report.canvas import (
     BAND,
     FULL,
@@ -24,19 +26,18 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.data import PlaneRow
 from slviewer.report.page import Figure
 
 
-def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
+def rms_bars(found: Mapping[str, Verification]) -> Figure:
     """Bars of every plane's RMS by model with the noise floor as a tick and the Letter's figure as
     a ring, and below them the share of each plane in R1, R2 and R3."""
-    if not rows:
+    if not found:
         raise InputError("no plane was given: their RMS cannot be drawn")
     drawing = new_figure(FULL, 390)
     upper, lower = drawing.subplots(2, 1, height_ratios=(4.4, 1), sharex=True)
-    _draw_rms(upper, rows)
-    _draw_shares(lower, rows)
+    _draw_rms(upper, found)
+    _draw_shares(lower, found)
     return finish_figure(
         drawing,
         "RMS distance of the flat board from its own plane, by model. Black ticks: what the"
@@ -47,23 +48,23 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     )
 
 
-def _draw_rms(upper: Any, rows: Sequence[PlaneRow]) -> None:
+def _draw_rms(upper: Any, found: Mapping[str, Verification]) -> None:
     """Draw the bars of the RMS with noise floors, the Letter's figures and values."""
-    models = list(rows[0].rms_mm)
+    models = list(next(iter(found.values())).models)
     width = 0.8 / len(models)
     style_axes(upper, "", "", "plane RMS, mm")
     upper.grid(False, axis="x")
     for i, model in enumerate(models):
-        x = np.arange(len(rows)) + (i - (len(models) - 1) / 2) * width
-        rms, floor, letter = np.array(
-            [
-                [
-                    values.get(model, np.nan)
-                    for values in (row.rms_mm, row.noise_floor_mm, row.letter_rms_mm)
-                ]
-                for row in rows
-            ]
-        ).T
+        x = np.arange(len(found)) + (i - (len(models) - 1) / 2) * width
+        figures = [
+            (
+                each.rms_mm[model],
+                each.models[model].noise_floor_mm,
+                find_pose(name, "plane").rms_mm.get(model),
+            )
+            for name, each in found.items()
+        ]
+        rms, floor, letter = np.array(figures, float).T
         upper.bar(x, rms, 0.92 * width, color=model_colour(model), label=model)
         upper.hlines(
             floor,
@@ -82,7 +83,6 @@ def _draw_rms(upper: Any, rows: Sequence[PlaneRow]) -> None:
                 markerfacecolor="white",
                 markeredgecolor=INK,
                 markeredgewidth=1.1,
-                linestyle="none",
                 label="the Letter's rig" if not i else None,
             )
         for place, value in zip(x, rms, strict=True):
@@ -110,22 +110,20 @@ def _draw_rms(upper: Any, rows: Sequence[PlaneRow]) -> None:
     upper.tick_params(labelbottom=False)
 
 
-def _draw_shares(lower: Any, rows: Sequence[PlaneRow]) -> None:
+def _draw_shares(lower: Any, found: Mapping[str, Verification]) -> None:
     """Draw the shares of each plane in R1, R2 and R3 as stacked bars, with the planes' names."""
-    at = np.arange(len(rows))
+    at = np.arange(len(found))
     style_axes(lower, "", "", "share", grid=False)
-    bottom = np.zeros(len(rows))
-    for region in ("R1", "R2", "R3"):
-        share = np.array([row.incidence.get(region, 0.0) for row in rows]) / 100
+    bottom = np.zeros(len(found))
+    for region in DEPTHS:
+        share = np.array([(each.incidence or {}).get(region, 0.0) for each in found.values()]) / 100
         colour = {"R1": REGIONS["R1"], "R2": "#c3ced8", "R3": REGIONS["R3"]}[region]
         lower.bar(at, share, 0.8, bottom=bottom, color=colour, label=region)
         bottom += share
     lower.set_ylim(0, 1)
     lower.set_yticks([])
-    lower.set_xlim(-0.6, len(rows) - 0.4)
-    lower.set_xticks(
-        at, [row.name for row in rows], fontsize=SMALL_PT, rotation=45 if len(rows) > 14 else 0
-    )
+    lower.set_xlim(-0.6, len(found) - 0.4)
+    lower.set_xticks(at, list(found), fontsize=SMALL_PT, rotation=45 if len(found) > 14 else 0)
     add_legend(lower, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, handlelength=1.0)
 
 

@@ -16,7 +16,6 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
-from slviewer.evaluation.render import Row, render
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
@@ -27,22 +26,17 @@ from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
 from slviewer.records.plain import to_plain
-from slviewer.records.verification import Shape, centre_distances_mm
-from slviewer.report.data import (
-    CloudView,
-    ErrorMaps,
-    MergePair,
-    PlaneRow,
-    ReproductionData,
-    SpacingRow,
-    SphereRow,
-)
+from slviewer.records.table import render_text
+from slviewer.records.verification import Shape, Verification, centre_distances_mm
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import (
+    ReproductionData,
     inside_ratio,
+    radius_table,
     reproduction_headlines,
     reproduction_sections,
     reproduction_title,
+    shape_table,
 )
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
@@ -75,7 +69,7 @@ class Reproduction:
     def in_range_ratio(self) -> float:
         """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their
         points in R2."""
-        return inside_ratio(self.plane_rows())[0]
+        return inside_ratio(_list_records(self.planes))[0]
 
     @property
     def spacing_rms_mm(self) -> dict[str, float]:
@@ -86,28 +80,14 @@ class Reproduction:
         }
         return {m: float(np.sqrt(np.mean(squares))) for m, squares in errors.items()}
 
-    def plane_rows(self) -> list[PlaneRow]:
-        """The report's rows of the planes, beside the Letter's values."""
-        return [
-            PlaneRow(
-                name,
-                comparison.incidence or {},
-                _get_rms(comparison),
-                _get_noise_floor(comparison),
-                dict(zip(("R1", "R2", "R3"), theirs.incidence, strict=True)),
-                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-            )
-            for (name, comparison), theirs in zip(self.planes.items(), letter.TABLE_1, strict=True)
-        ]
-
     def to_json(self) -> dict[str, Any]:
         """All figures that ``text`` shows, and the values that they are computed from."""
         return {
             "quick": self.quick,
             "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
             "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.depth_axis),
-            "planes": {name: to_plain(c.record()) for name, c in self.planes.items()},
-            "spheres": {name: to_plain(c.record()) for name, c in self.spheres.items()},
+            "planes": to_plain(_list_records(self.planes)),
+            "spheres": to_plain(_list_records(self.spheres)),
             "in_range_ratio": self.in_range_ratio,
             "spacing_rms_mm": self.spacing_rms_mm,
             "merge": to_plain(self.merged.record),
@@ -119,6 +99,7 @@ class Reproduction:
         rms, theirs = self.stereo.reprojection_rms_px, letter.REPROJECTION_RMS_PX
         icp = letter.EXPERIMENT_3_ICP_RMS_MM
         spacing = self.spacing_rms_mm
+        planes, spheres = _list_records(self.planes), _list_records(self.spheres)
         pairs = [
             f"  {name}: RMS {pair.point_to_point_rms_mm:.3f} mm point to point "
             f"(the Letter: {icp[name[-2:].upper()]:.2f}), "
@@ -138,11 +119,12 @@ class Reproduction:
                 ),
                 "",
                 "Flat board (Table 1)",
-                _render_table(self.planes),
+                render_text(shape_table(planes, "")),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                _render_table(self.spheres),
+                render_text(shape_table(spheres, "")),
+                render_text(radius_table(spheres, "")),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
@@ -260,20 +242,8 @@ def _compare_spacings(
     }
     return {
         f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
-        for (a, b), measured in centre_distances_mm(
-            {name: found.record() for name, found in spheres.items()}
-        ).items()
+        for (a, b), measured in centre_distances_mm(_list_records(spheres)).items()
     }
-
-
-def _render_table(comparisons: Mapping[str, Comparison]) -> str:
-    """The table with the columns that fit a terminal, without coverage and excluded points, which
-    the report has."""
-    rows: list[Row] = [
-        {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
-        for row in letter.letter_rows(comparisons)
-    ]
-    return render(rows)
 
 
 def _make_report_data(
@@ -281,76 +251,36 @@ def _make_report_data(
 ) -> ReproductionData:
     """The report's input from the results, with the curves of one camera pixel (u, v)."""
     stereo, pixelwise, merged = result.stereo, result.pixelwise, result.merged
-    fit = pixelwise.fits[pixelwise.depth_axis]
-    clouds = [CloudView(name, cloud.points) for name, cloud in merged.clouds.items()]
-    whole = merged.fused
+    axis = pixelwise.depth_axis
+    shown = {name: result.planes[name] for name in (f"plane_{i:02d}" for i in SHOWN_PLANES)}
     return ReproductionData(
-        camera=stereo.rig.camera.size,
-        projector=stereo.rig.projector.size,
         quick=result.quick,
         seed=seed,
-        poses=len(stereo.poses),
-        depth_range_mm=letter.DEPTH_RANGE_MM,
-        reprojection_rms_px=stereo.reprojection_rms_px,
-        letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
-        fit_rms_mm=pixelwise.median_rms_mm(pixelwise.depth_axis),
-        planes=result.plane_rows(),
-        spheres=[
-            SphereRow(
-                name,
-                theirs.region,
-                letter.SPHERE_RADIUS_MM,
-                _get_rms(c),
-                _get_noise_floor(c),
-                {m: r.radius_mm for m, r in c.results.items()},
-                {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-                {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
-            )
-            for (name, c), theirs in zip(result.spheres.items(), letter.TABLE_2, strict=True)
-        ],
-        spacings=[
-            SpacingRow(name, known, measured)
-            for name, (known, measured) in result.spacings_mm.items()
-        ],
-        pairs=[
-            MergePair(
-                name,
-                merged.record.reference,
-                pair.point_to_point_rms_mm or float("nan"),
-                pair.overlap,
-                letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
-            )
-            for name, pair in merged.record.pairs.items()
-        ],
-        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, pixelwise.depth_axis),
-        rms_maps_mm=fit.rms_mm,
-        plane_maps=_make_error_maps(
-            {name: result.planes[name] for name in (f"plane_{i:02d}" for i in SHOWN_PLANES)}
-        ),
-        sphere_maps=_make_error_maps(result.spheres),
+        stereo=stereo,
+        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, axis),
+        rms_maps_mm=pixelwise.fits[axis].rms_mm,
+        planes=_list_records(result.planes),
+        spheres=_list_records(result.spheres),
+        spacings_mm=result.spacings_mm,
+        error_maps={
+            name: {
+                f"error_{m}": np.where(r.inliers, r.error_map, np.nan)
+                for m, r in each.results.items()
+            }
+            for name, each in {**shown, **result.spheres}.items()
+        },
         plane_outlines={
             name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()
         },
-        clouds=clouds,
-        merged=CloudView(
-            "merged", whole.surface.points, whole.surface.normals, whole.source, whole.names
-        ),
-        poses_left_out=stereo.excluded,
-        letter_points=letter.EXPERIMENT_3_POINTS,
+        merge=merged.record,
+        clouds={name: cloud.points for name, cloud in merged.clouds.items()},
+        fused=merged.fused,
     )
 
 
-def _make_error_maps(comparisons: Mapping[str, Comparison]) -> list[ErrorMaps]:
-    """The signed errors of every model over the pixels that counted."""
-    return [
-        ErrorMaps(
-            title,
-            {m: np.where(r.inliers, r.error_map, np.nan) for m, r in each.results.items()},
-            _get_rms(each),
-            list(_get_noise_floor(each).values())[-1],
-        )
-        for title, each in comparisons.items()
-    ]
+def _list_records(comparisons: Mapping[str, Comparison]) -> dict[str, Verification]:
+    """The figures of comparisons without their maps."""
+    return {name: each.record() for name, each in comparisons.items()}
 
 
 def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
@@ -360,13 +290,3 @@ def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
     chosen = np.arange(0, len(u), max(1, len(u) // 5000))
     d = np.column_stack([rays[v[chosen], u[chosen]], np.ones(len(chosen))])
     return d * (result.plane.offset / (d @ result.plane.normal))[:, None]
-
-
-def _get_rms(comparison: Comparison) -> Mapping[str, float]:
-    """Return the RMS of each model, mm."""
-    return {m: r.rms_mm for m, r in comparison.results.items()}
-
-
-def _get_noise_floor(comparison: Comparison) -> Mapping[str, float]:
-    """Noise floor of each model, mm."""
-    return {m: r.noise_floor_mm for m, r in comparison.results.items()}
