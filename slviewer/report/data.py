@@ -15,6 +15,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.records.record import Record
 from slviewer.records.verdict import Verdict
 from slviewer.report.page import Figure
+from slviewer.session.capture import Capture
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +36,12 @@ class PixelCurve:
 
 
 @dataclass(frozen=True)
-class CaptureRow:
-    """One capture. ``state``: used, unused, excluded, waiting or scan; ``why``: why it is not
-    used."""
+class CaptureUse:
+    """Whether the calibration uses a capture, and ``why`` it does not."""
 
-    name: str
-    role: str
+    capture: Capture
     state: Literal["used", "unused", "excluded", "scan", "waiting"]
-    camera: tuple[int, int]
-    projector: tuple[int, int] | None
-    frames: int
-    periods_px: Mapping[str, float]
     why: str = ""
-    made: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,33 +78,27 @@ class RecordsView:
 
 
 @dataclass(frozen=True, eq=False)
-class ModelsView:
-    """The models of a session: the one that is ``used`` and the one ``recommended``; ``scales``:
-    {model: what correction of scale was applied, in words}."""
-
-    used: str
-    recommended: str
-    scales: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
 class SessionData:
     """A session's captures, its calibrations, and the records made with them.
 
     ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that
     made ``calibration``. ``pixel_fits``: {axis: RMS (3, h, w) of the pixel-wise fits in z, x, y}.
-    ``region``: the region of interest that is in effect, in words; ``edits``
+    ``model``: the one that is used, and the one ``recommended``; ``scales``: {model: what
+    correction of scale was applied, in words}. ``region``: the region of interest that is in
+    effect, in words; ``edits``
     of scans in their order: scan and words.
     """
 
     name: str
-    captures: Sequence[CaptureRow]
+    captures: Sequence[CaptureUse]
     calibration: CalibrationFigures | None = None
     pixel_fits: Mapping[str, np.ndarray] = field(default_factory=dict)
     records: Sequence[RecordsView] = ()
     warnings: Sequence[str] = ()
     verdict: Verdict | None = None
     verdict_of_calibration: bool = True
-    models: ModelsView | None = None
+    model: str = ""
+    recommended: str = ""
+    scales: Mapping[str, str] = field(default_factory=dict)
     region: str = ""
     edits: Sequence[tuple[str, str]] = ()

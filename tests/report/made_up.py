@@ -2,17 +2,19 @@
 three places."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
+from slviewer.fringe.presets import p18
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.records.merge import Merge, Registered
 from slviewer.records.verification import ModelFit, Verification
 from slviewer.report.data import (
     CalibrationFigures,
-    CaptureRow,
+    CaptureUse,
     PixelCurve,
     PoseResiduals,
     RecordsView,
@@ -20,6 +22,7 @@ from slviewer.report.data import (
 )
 from slviewer.report.maps import verification_maps
 from slviewer.report.reproduction import ReproductionData
+from slviewer.session.capture import Capture, Role
 from slviewer.surface.fuse import Fused
 from slviewer.surface.shapes import PointSet
 
@@ -262,6 +265,10 @@ def reproduction_data(width: int = 1600) -> ReproductionData:
     )
 
 
+def capture(name: str, role: Role, size: tuple[int, int]) -> Capture:
+    return Capture(name, role, p18((912, 1140)), size, "", Path(), {})
+
+
 def session_data(width: int = 1600) -> SessionData:
     rng = np.random.default_rng(7)
     height = width * 3 // 4
@@ -277,37 +284,17 @@ def session_data(width: int = 1600) -> SessionData:
         noise = [rms[name][i] / np.sqrt(2) * rng.standard_normal(pixels.shape) for i in (0, 1)]
         noise[0][3] = np.nan
         residuals[name] = PoseResiduals(pixels, noise[0], pixels * [0.5, 0.8], noise[1])
-    captures = [
-        CaptureRow(
-            n, "calibration", "used", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0}
-        )
-        for n in names
-    ]
+    size = (width, height)
+    captures = [CaptureUse(capture(n, "calibration", size), "used") for n in names]
     captures += [
-        CaptureRow(
-            "pose_09",
-            "calibration",
+        CaptureUse(
+            capture("pose_09", "calibration", size),
             "unused",
-            (width, height),
-            (912, 1140),
-            52,
-            {"x": 18.0, "y": 18.0},
             "12 of 336 circles found: lower the exposure, or move the board so that all of it is in"
             " view",
         ),
-        CaptureRow(
-            "pose_17",
-            "calibration",
-            "excluded",
-            (width, height),
-            (912, 1140),
-            52,
-            {"x": 18.0, "y": 18.0},
-            "the board slipped",
-        ),
-        CaptureRow(
-            "vase <b>blue</b>", "scan", "scan", (width, height), (912, 1140), 26, {"x": 18.0}
-        ),
+        CaptureUse(capture("pose_17", "calibration", size), "excluded", "the board slipped"),
+        CaptureUse(capture("vase <b>blue</b>", "scan", size), "scan"),
     ]
     flat = {name: planes()[name] for name in ("plane_01", "plane_03")}
     maps = [

@@ -20,7 +20,7 @@ from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.table import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
-from slviewer.report.data import CalibrationFigures, ModelsView, RecordsView
+from slviewer.report.data import CalibrationFigures, RecordsView
 from slviewer.report.page import Figure, PageNotice, Section, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
@@ -342,7 +342,9 @@ def test_how_good_a_calibration_is() -> None:
     data = dataclasses.replace(
         session_data(WIDTH),
         verdict=verdict,
-        models=ModelsView("stereo", "splined", {"splined": "scale corrected by +300 ppm"}),
+        model="stereo",
+        recommended="splined",
+        scales={"splined": "scale corrected by +300 ppm"},
         records=[
             RecordsView(
                 AcceptanceTest,

@@ -25,7 +25,6 @@ from slviewer.gui.widgets import (
     properties_table,
     records_html,
     report_table,
-    table,
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
@@ -35,7 +34,7 @@ from slviewer.report.data import CalibrationFigures, PixelCurve
 from slviewer.report.maps import pixel_curves, rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
-from slviewer.report.session import lens_rows, rig_rows
+from slviewer.report.session import lens_table, rig_table
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import CalibrationView, SessionView, Snapshot
@@ -408,13 +407,7 @@ def _summary(calibration: CalibrationView) -> Html:
 
 def _parameters(details: CalibrationFigures) -> Html:
     """Return tables of the lens and rig parameters with their standard deviations."""
-    stereo = details.stereo
-    lenses = [
-        (f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)
-    ]
-    rig = [*rig_rows(stereo), ("Target", stereo.board or "imported")]
-    tables = table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig)
-    return tables + note("±: one standard deviation.")
+    return report_table(lens_table(details.stereo)) + report_table(rig_table(details.stereo))
 
 
 def verdict_html(
