@@ -7,7 +7,8 @@ Letters 2023. Its R2 is 500 to 700 mm; its target has 16x21 circles, taken in 25
 import re
 from collections.abc import Sequence
 
-from slviewer.records.verification import DEPTHS, ModelFit, Shape, Verification
+from slviewer.records.record import DEPTHS
+from slviewer.records.verification import ModelFit, Shape, Verification
 
 MODELS = ("stereo", "pixelwise")
 DEPTH_RANGE_MM = (500.0, 700.0)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from slviewer.errors import InputError
 
@@ -26,6 +26,8 @@ class Cell:
 
 
 Rows = list[list[Value | Cell]]
+Row = dict[Any, Any]
+"""{column, or its title: value or cell}."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,33 @@ class Table:
             for column, is_text in zip(self.columns, self._find_texts(), strict=True)
         ]
         object.__setattr__(self, "columns", aligned)
+
+    @classmethod
+    def of(
+        cls,
+        rows: Sequence[Row],
+        caption: str = "",
+        notes: Sequence[str] = (),
+        footer: Sequence[Row] = (),
+    ) -> "Table":
+        """Return the table of rows by column; a value that a row lacks is unknown. A title that
+        ends in % or holds ratio sets its column's decimals."""
+        headings = list(dict.fromkeys(heading for row in rows for heading in row))
+        columns = [each if isinstance(each, Column) else _make_column(each) for each in headings]
+        cells = [list(map(row.get, headings)) for row in rows]
+        below = [[row.get(heading, "") for heading in headings] for row in footer]
+        return cls(columns, cells, caption, notes, below)
+
+    @classmethod
+    def of_figures(
+        cls, figures: Mapping[str, str], caption: str, notes: Sequence[str] = ()
+    ) -> "Table":
+        """Return the table of some figures, as text with their units, by name."""
+        rows = [
+            {"quantity": name, Column("value", align="right"): text}
+            for name, text in figures.items()
+        ]
+        return cls.of(rows, caption, notes)
 
     def _find_texts(self) -> list[bool]:
         """Return whether each column holds texts, and no numbers."""
@@ -148,6 +177,10 @@ class Table:
         return self.select(
             [c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)]
         )
+
+
+def _make_column(title: str) -> Column:
+    return Column(title, digits=2 if "ratio" in title else 1 if title.endswith("%") else 3)
 
 
 def _format_cell(column: Column, cell: Value | Cell) -> tuple[str, Mark]:

@@ -11,12 +11,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 
 from slviewer.records.plain import to_plain
-from slviewer.records.record import Count, Record, Vector, list_numbers
-from slviewer.records.table import Cell, Column, Rows, Table, compare_with_first
+from slviewer.records.record import Count, Record, Vector, list_numbers, list_shares
+from slviewer.records.table import Cell, Column, Table, compare_with_first
 
 Shape = Literal["plane", "sphere"]
-DEPTHS = ("R1", "R2", "R3")
-"""In front of, inside and behind the calibrated depths."""
 MAX_EXCLUDED = 0.02
 """Share of points excluded above which the RMS does not describe the shape."""
 REPORTED_MASKED = 0.005
@@ -119,11 +117,14 @@ class Verification(Record, frozen=True, kw_only=True):
                 tables.append(list_fits(of_shape, caption))
         if distances := centre_distances_mm(found):
             models = list(dict.fromkeys(model for each in distances.values() for model in each))
-            rows: Rows = [
-                [f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()
+            rows = [
+                {
+                    "spheres": f"{a} to {b}",
+                    **{Column(model, "mm"): each.get(model) for model in models},
+                }
+                for (a, b), each in distances.items()
             ]
-            columns = [Column("spheres"), *(Column(model, "mm") for model in models)]
-            tables.append(Table(columns, rows, "Distances between the centres of spheres"))
+            tables.append(Table.of(rows, "Distances between the centres of spheres"))
         return tables
 
 
@@ -170,43 +171,30 @@ def _average(fits: list[ModelFit]) -> ModelFit:
 def list_fits(found: Mapping[str, Verification], caption: str) -> Table:
     """Return the table of measured planes or spheres: a line for each capture and model."""
     first = next(iter(next(iter(found.values())).models))
-    columns = [
-        Column("capture"),
-        Column("model"),
-        Column("RMS", "mm"),
-        Column("noise floor", "mm"),
-        Column(f"against {first}", detail=True),
-        Column("radius", "mm"),
-        *(Column(depths, "%", "share in", digits=1, detail=True) for depths in DEPTHS),
-        Column("points", detail=True),
-        Column("excluded", "%", digits=1),
-        Column("coverage", "%", digits=1),
-        Column("masked", "%", digits=1, detail=True),
-    ]
-    rows: Rows = []
+    rows = []
     for name, each in found.items():
         for model, fit in each.models.items():
             compared = compare_with_first(each.rms_mm, model)
             excluded = fit.excluded / max(1, fit.points)
+            is_best = model == each.best and len(each.models) > 1
             rows.append(
-                [
-                    name,
-                    model,
-                    Cell(
-                        fit.rms_mm,
-                        "better" if model == each.best and len(each.models) > 1 else compared.mark,
+                {
+                    "capture": name,
+                    "model": model,
+                    Column("RMS", "mm"): Cell(fit.rms_mm, "better" if is_best else compared.mark),
+                    Column("noise floor", "mm"): fit.noise_floor_mm,
+                    Column(f"against {first}", detail=True): compared,
+                    Column("radius", "mm"): fit.radius_mm,
+                    **list_shares(each.incidence),
+                    Column("points", detail=True): fit.points,
+                    Column("excluded", "%", digits=1): Cell(
+                        100 * excluded, "worse" if excluded > MAX_EXCLUDED else ""
                     ),
-                    fit.noise_floor_mm,
-                    compared,
-                    fit.radius_mm,
-                    *((each.incidence or {}).get(depths) for depths in DEPTHS),
-                    fit.points,
-                    Cell(100 * excluded, "worse" if excluded > MAX_EXCLUDED else ""),
-                    None if fit.coverage is None else 100 * fit.coverage,
-                    None if fit.masked is None else 100 * fit.masked,
-                ]
+                    Column("coverage", "%", digits=1): _percent(fit.coverage),
+                    Column("masked", "%", digits=1, detail=True): _percent(fit.masked),
+                }
             )
-    return Table(columns, rows, caption, _list_notes(found)).without_empty()
+    return Table.of(rows, caption, _list_notes(found)).without_empty()
 
 
 def _list_notes(found: Mapping[str, Verification]) -> list[str]:
@@ -242,3 +230,7 @@ def _list_notes(found: Mapping[str, Verification]) -> list[str]:
         for model, f in scaled.items()
     ]
     return notes
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share

@@ -10,7 +10,8 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.letter import find_pose
-from slviewer.records.verification import DEPTHS, Verification
+from slviewer.records.record import DEPTHS
+from slviewer.records.verification import Verification
 from slviewer.report.canvas import (
     BAND,
     FULL,

@@ -11,8 +11,17 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation import letter
 from slviewer.records.merge import Merge
-from slviewer.records.table import Cell, Column, Rows, Table, better_worse, compare_with_first
-from slviewer.records.verification import DEPTHS, Verification, average, list_fits
+from slviewer.records.record import DEPTHS
+from slviewer.records.table import (
+    Cell,
+    Column,
+    Rows,
+    Table,
+    Value,
+    better_worse,
+    compare_with_first,
+)
+from slviewer.records.verification import Verification, average, list_fits
 from slviewer.report.canvas import HALF, percentile
 from slviewer.report.data import PixelCurve
 from slviewer.report.maps import error_limit, pixel_curves, rms_maps, verification_maps
@@ -140,23 +149,26 @@ def _calibration_section(data: ReproductionData) -> Section:
     """The section about the calibration: notices, reprojection errors, per-pixel fits and
     curves."""
     stereo, curve = data.stereo, data.pixel_curve
-    rows: Rows = [
-        [f"reprojection, {device}", "px", stereo.reprojection_rms_px.get(device), theirs]
+    figures: list[tuple[str, str, float | None, Value]] = [
+        (f"reprojection, {device}", "px", stereo.reprojection_rms_px.get(device), theirs)
         for device, theirs in letter.REPROJECTION_RMS_PX.items()
     ]
-    rows += [
-        [
+    figures += [
+        (
             f"pixel-wise fit in {axis}, median over the pixels",
             "mm",
             percentile(rms, 50),
             "below 0.15",
-        ]
+        )
         for axis, rms in zip("zxy", data.rms_maps_mm, strict=True)
     ]
-    columns = [Column("RMS"), Column("unit", align="centre"), Column("this rig"), Column(THEIRS)]
+    rows = [
+        {"RMS": what, Column("unit", align="centre"): unit, "this rig": ours, THEIRS: theirs}
+        for what, unit, ours, theirs in figures
+    ]
     items: list[Item] = [
         *(PageNotice(f"{name} was excluded: {why}") for name, why in stereo.excluded.items()),
-        Table(columns, rows, "How well the calibration fits its own poses"),
+        Table.of(rows, "How well the calibration fits its own poses"),
         *([] if curve is None else [pixel_curves(curve)]),
         rms_maps(data.rms_maps_mm, "" if curve is None else curve.axis),
     ]
@@ -242,20 +254,20 @@ def _merged_section(data: ReproductionData) -> Section:
     """The section about the merged object: alignment, scans and the merged cloud."""
     items: list[Item] = []
     if data.merge is not None:
-        columns = [
-            Column("scan"),
-            Column("reference"),
-            Column("ICP RMS", "mm"),
-            Column("overlap", "%", digits=0),
-            Column("the Letter's ICP RMS", "mm", digits=2),
-        ]
-        rows: Rows = [
-            [name, data.merge.reference, pair.point_to_point_rms_mm, 100 * pair.overlap,
-             letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper())]
+        rows = [
+            {
+                "scan": name,
+                "reference": data.merge.reference,
+                Column("ICP RMS", "mm"): pair.point_to_point_rms_mm,
+                Column("overlap", "%", digits=0): 100 * pair.overlap,
+                Column("the Letter's ICP RMS", "mm", digits=2): (
+                    letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper())
+                ),
+            }
             for name, pair in data.merge.pairs.items()
-        ]  # fmt: skip
+        ]
         caption = "Alignment of the scans by point-to-plane ICP"
-        items.append(Table(columns, rows, caption).without_empty())
+        items.append(Table.of(rows, caption).without_empty())
     if data.clouds:
         items.append(draw_clouds(data.clouds))
     if data.fused is not None:

@@ -4,6 +4,7 @@ parts, with a trend chart of each characteristic."""
 import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.acceptance import MARKS, Decision
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
-from slviewer.records.table import Cell, Column, Mark, Rows, Table
+from slviewer.records.table import Cell, Column, Mark, Table, Value
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, average
 from slviewer.report.canvas import (
@@ -150,8 +151,8 @@ def _restrictions_section(data: SessionData) -> Section:
         if data.region
         else ""
     )
-    columns = [Column("scan"), Column("edit")]
-    table = Table(columns, data.edits, "Edits in effect, in their order")
+    rows = [{"scan": scan, "edit": edit} for scan, edit in data.edits]
+    table = Table.of(rows, "Edits in effect, in their order")
     return Section("Region and edits", text, [table] if data.edits else [])
 
 
@@ -159,28 +160,29 @@ def _captures_section(data: SessionData) -> Section:
     """The section with the table of captures: role, state, sizes, frames and why one is not
     used."""
     marks: dict[str, Mark] = {"used": "better", "unused": "worse", "excluded": "worse"}
-    columns = [
-        *(Column(title) for title in ("capture", "role", "state")),
-        Column("camera", "px", align="right"),
-        Column("projector", "px", align="right"),
-        Column("frames"),
-        Column("period", "px", align="centre"),
-        *(Column(title) for title in ("made", "why not used")),
-    ]
-    rows: Rows = []
+    rows = []
     for each in data.captures:
         capture, sequence = each.capture, each.capture.sequence
-        projector = sequence.projector_size
+        size = sequence.projector_size
         periods = [f"{axis} {sequence.period_px(axis):g}" for axis in sequence.axes]
-        rows.append([
-            capture.name, capture.role, Cell(each.state, marks.get(each.state, "")),
-            "{}x{}".format(*capture.size),
-            "{}x{}".format(*projector) if projector else "unknown",
-            len(sequence.frames), ", ".join(periods), capture.meta.get("created", ""), each.why,
-        ])  # fmt: skip
+        rows.append(
+            {
+                "capture": capture.name,
+                "role": capture.role,
+                "state": Cell(each.state, marks.get(each.state, "")),
+                Column("camera", "px", align="right"): "{}x{}".format(*capture.size),
+                Column("projector", "px", align="right"): (
+                    "{}x{}".format(*size) if size else "unknown"
+                ),
+                "frames": len(sequence.frames),
+                Column("period", "px", align="centre"): ", ".join(periods),
+                "made": capture.meta.get("created", ""),
+                "why not used": each.why,
+            }
+        )
     if not rows:
         return Section("Captures", "The session holds no captures yet.")
-    table = Table(columns, rows, "Captures of the session").without_empty()
+    table = Table.of(rows, "Captures of the session").without_empty()
     return Section("Captures", "", [table])
 
 
@@ -225,14 +227,14 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
 def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
     """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
     typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
-    columns = [Column("pose"), Column("camera", "px"), Column("projector", "px")]
-    rows: Rows = []
+    rows = []
     for name, values in pose_rms_px.items():
         high = np.array(values) > WORST * typical
-        cells = [Cell(v, "worse" if h else "") for v, h in zip(values, high, strict=True)]
-        rows.append([name, *cells, Cell("look at this pose" if high.any() else "", "worse")])
-    columns.append(Column(""))
-    return Table(columns, rows, "Reprojection RMS of each pose").without_empty()
+        row: dict[Any, Value | Cell] = {"pose": name}
+        for device, value, is_high in zip(DEVICES, values, high, strict=True):
+            row[Column(device, "px")] = Cell(value, "worse" if is_high else "")
+        rows.append({**row, "": Cell("look at this pose" if high.any() else "", "worse")})
+    return Table.of(rows, "Reprojection RMS of each pose").without_empty()
 
 
 def lens_table(stereo: StereoModel) -> Table:
@@ -256,32 +258,33 @@ def lens_table(stereo: StereoModel) -> Table:
     ]
     sigmas = [stereo.focal_sigma_px.get(device, np.nan) for device in DEVICES]
     lenses = map(values, (stereo.rig.camera, stereo.rig.projector), sigmas)
-    columns = [
-        Column("parameter"),
-        Column("unit", align="centre"),
-        *(Column(device, align="right") for device in DEVICES),
+    rows = [
+        {
+            "parameter": name,
+            Column("unit", align="centre"): "px" if k < 5 else "",
+            Column("camera", align="right"): of_camera,
+            Column("projector", align="right"): of_projector,
+        }
+        for k, (name, of_camera, of_projector) in enumerate(zip(names, *lenses, strict=True))
     ]
-    rows = list(zip(names, ["px"] * 5 + [""] * 5, *lenses, strict=True))
     note = "± is one standard deviation, from the lens's own calibration."
-    return Table(columns, rows, "Lenses", [note])
+    return Table.of(rows, "Lenses", [note])
 
 
 def rig_table(stereo: StereoModel) -> Table:
     """Table of the projector's pose in the camera frame."""
     R, t = stereo.rig.R, np.ravel(stereo.rig.t)
     axes_deg = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
-    rows = [
-        ["baseline (distance of the two devices)", f"{stereo.baseline_mm:.2f} mm"],
-        [
-            "t, camera to projector (x, y, z)",
-            " / ".join(f"{v:.2f}" for v in t).replace("-", "−") + " mm",
-        ],
-        ["angle between the optical axes", f"{axes_deg:.2f}°"],
-        ["rotation, camera to projector", f"{np.degrees(rotation_angle(R)):.2f}°"],
-        ["depths of the boards", _format_depths(stereo)],
-        ["target", stereo.board or "imported"],
-    ]
-    return Table([Column("quantity"), Column("value", align="right")], rows, "Rig")
+    offsets = " / ".join(f"{v:.2f}" for v in t).replace("-", "−")
+    figures = {
+        "baseline (distance of the two devices)": f"{stereo.baseline_mm:.2f} mm",
+        "t, camera to projector (x, y, z)": f"{offsets} mm",
+        "angle between the optical axes": f"{axes_deg:.2f}°",
+        "rotation, camera to projector": f"{np.degrees(rotation_angle(R)):.2f}°",
+        "depths of the boards": _format_depths(stereo),
+        "target": stereo.board or "imported",
+    }
+    return Table.of_figures(figures, "Rig")
 
 
 def _format_depths(stereo: StereoModel) -> str:
