@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.errors import InputError
 from slviewer.evaluation.letter import find_pose
 from slviewer.records.record import DEPTHS
 from slviewer.records.verification import Verification
@@ -21,7 +20,9 @@ from slviewer.report.canvas import (
     SOFT,
     TITLE_PT,
     add_legend,
+    add_legend_above,
     finish_figure,
+    label_point,
     model_colour,
     new_figure,
     style_axes,
@@ -33,8 +34,6 @@ from slviewer.report.page import Figure
 def rms_bars(found: Mapping[str, Verification]) -> Figure:
     """Bars of every plane's RMS by model with the noise floor as a tick and the Letter's figure as
     a ring, and below them the share of each plane in R1, R2 and R3."""
-    if not found:
-        raise InputError("no plane was given: their RMS cannot be drawn")
     drawing = new_figure(FULL, 390)
     upper, lower = drawing.subplots(2, 1, height_ratios=(4.4, 1), sharex=True)
     _draw_rms(upper, found)
@@ -88,25 +87,15 @@ def _draw_rms(upper: Any, found: Mapping[str, Verification]) -> None:
             )
         for place, value in zip(x, rms, strict=True):
             if np.isfinite(value):
-                upper.annotate(
-                    f"{value:.3f}".lstrip("0"),
-                    (place, value),
-                    xytext=(0, 2),
-                    textcoords="offset points",
-                    ha="center",
-                    fontsize=7.2,
-                    color=INK,
-                )
+                text = f"{value:.3f}".lstrip("0")
+                label_point(upper, text, (place, value), ha="center", fontsize=7.2, color=INK)
     handles, labels = upper.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] not in models)  # models first
-    add_legend(
+    add_legend_above(
         upper,
+        len(labels),
         handles=[handles[i] for i in order],
         labels=[labels[i] for i in order],
-        loc="lower left",
-        bbox_to_anchor=(0, 1.0),
-        ncols=len(labels),
-        borderaxespad=0.2,
     )
     upper.tick_params(labelbottom=False)
 
@@ -137,9 +126,7 @@ def planes_in_space(
     ``outlines``: by name, three or more points (n, 3) mm of a plane; their hull within the plane is
     drawn.
     """
-    hulls = {name: _convex_hull(name, points) for name, points in outlines.items()}
-    if not hulls:
-        raise InputError("no plane was given: their positions cannot be drawn")
+    hulls = {name: _convex_hull(points) for name, points in outlines.items()}
     near, far = depth_range_mm
     every = np.concatenate(list(hulls.values()))
     low, high = every.min(axis=0), every.max(axis=0)
@@ -224,14 +211,7 @@ class _Scene:
             )
             place, end = places[name], ends[name]
             axes.plot([end[2], place], [end[axis], top], color=colour, linewidth=0.5, alpha=0.6)
-            axes.annotate(
-                self.short[name],
-                (place, top),
-                xytext=(0, 2),
-                textcoords="offset points",
-                va="bottom",
-                **style,
-            )
+            label_point(axes, self.short[name], (place, top), va="bottom", **style)
         axes.set_xlim(left, right)
         axes.set_ylim(bottom, top)
 
@@ -283,16 +263,11 @@ def _spread_labels(wanted: Mapping[str, float], gap: float, end: float) -> dict[
     return dict(zip(names, np.minimum(places, end - steps[::-1]).tolist(), strict=True))
 
 
-def _convex_hull(name: str, points: np.ndarray) -> np.ndarray:
+def _convex_hull(points: np.ndarray) -> np.ndarray:
     """The corners (m, 3), in order, of the convex hull of points close to one plane."""
     from scipy.spatial import ConvexHull
 
-    points = np.asarray(points, float).reshape(-1, np.shape(points)[-1])
     points = points[np.isfinite(points).all(axis=1)]
-    if points.shape[1:] != (3,) or len(points) < 3:
-        raise InputError(
-            f"plane '{name}' has {len(points)} usable points: three or more (x, y, z) are needed"
-        )
     centred = points - points.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     return points[ConvexHull(centred @ directions[:2].T).vertices]

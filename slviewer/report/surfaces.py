@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.errors import InputError
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
 from slviewer.report.canvas import (
@@ -21,6 +20,7 @@ from slviewer.report.canvas import (
     add_colour_bar,
     add_legend,
     finish_figure,
+    label_point,
     new_figure,
     round_up,
     style_axes,
@@ -59,16 +59,6 @@ def render_points(
     ``normals`` (n, 3) NaN where unknown; ``colours`` (n, 3) 0 to 1. Points that are not finite are
     skipped.
     """
-    if (
-        points.shape != normals.shape
-        or points.shape != colours.shape
-        or points.ndim != 2
-        or points.shape[1] != 3
-    ):
-        raise InputError(
-            f"points {points.shape}, normals {normals.shape} and colours {colours.shape} make no"
-            " view: (n, 3) each is needed"
-        )
     width, height = size
     background = np.array(BACKGROUND, np.float32) / 255
     known = np.isfinite(points).all(axis=1)
@@ -278,15 +268,7 @@ def section_plot(
     for (letter, cursor), colour in zip((cursors or {}).items(), CURSOR_COLOURS, strict=False):
         axes.axvline(cursor[0], color=colour, linewidth=0.9, linestyle=":")
         axes.plot(*cursor, "o", color=colour, markersize=5)
-        axes.annotate(
-            letter,
-            cursor,
-            (4, 5),
-            textcoords="offset points",
-            color=colour,
-            fontsize=10,
-            weight="bold",
-        )
+        label_point(axes, letter, cursor, (4, 5), color=colour, fontsize=10, weight="bold")
     axes.set_aspect("auto" if enlarged else "equal", adjustable="datalim")
     axes.margins(y=0.15)
     return finish_figure(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from facts import missing_facts
-from made_up import cloud, error_map, outlines, pixel_curve, rms_maps
+from made_up import cloud, error_map, outlines, pixel_curve
 from PIL import Image
 
 from slviewer.errors import InputError
@@ -17,7 +17,7 @@ from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_fig
 from slviewer.report.data import PixelCurve
 from slviewer.report.maps import pixel_curves
 from slviewer.report.page import Figure
-from slviewer.report.planes import planes_in_space, rms_bars
+from slviewer.report.planes import planes_in_space
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
 from slviewer.surface.fuse import Fused
@@ -174,13 +174,6 @@ def test_clouds_are_counted() -> None:
     [
         lambda: maps.draw_error_maps("t", {}, {}),
         lambda: maps.draw_error_maps("t", {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, RMS),
-        lambda: maps.rms_maps(rms_maps(40)[:2]),
-        lambda: planes_in_space({}, (500, 700)),
-        lambda: planes_in_space({"p": np.zeros((2, 3))}, (500, 700)),
-        lambda: residual_arrows("t", np.zeros((3, 2)), np.zeros((4, 2)), (10, 10)),
-        lambda: pose_bars({}, {}),
-        lambda: rms_bars({}),
-        lambda: pixel_curves(PixelCurve((0, 0), "x", *(np.zeros(n) for n in (3, 4, 3, 3, 5, 3)))),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(draw: Any) -> None:
