@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import msgspec
 
 from slviewer.records.record import Count, Record, list_shares
-from slviewer.records.table import Cell, Column, Mark, Table
+from slviewer.records.table import Cell, Column, Mark, Table, format_scale, format_signed
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
@@ -267,17 +267,16 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
         if self.scale is not None:
             scale = self.scale
             notes.append(
-                f"Scale: {scale.ppm:+.0f} ppm ± {scale.U_ppm:.0f} ppm (k = 2) over"
+                f"Scale: {format_signed(scale.ppm, 'ppm')} ± {scale.U_ppm:.0f} ppm (k = 2) over"
                 f" {scale.length_mm:.3f} mm."
             )
         if self.scale_applied is not None:
             notes.append(
-                f"The scale was corrected by {1e6 * (self.scale_applied - 1):+.0f} ppm from this"
-                " test on."
+                f"The scale was corrected by {format_scale(self.scale_applied)} from this test on."
             )
         elif self.scale_factor != 1:
-            ppm = f"{1e6 * (self.scale_factor - 1):+.0f}"
-            notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
+            in_force = format_scale(self.scale_factor)
+            notes.append(f"A scale correction of {in_force} was in force during the test.")
         if self.scale is not None and self.scale_applied is None:
             notes.append("The scale was not corrected: --apply-scale does so.")
         if (still := self.repeatability) is not None:
@@ -288,4 +287,4 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
                 f" mean depth drifted by {still.wandering_mm:.4f} mm. This is not a measure of"
                 " accuracy."
             )
-        return [note.replace(" -", " −").replace("−-apply", "--apply") for note in notes]
+        return notes

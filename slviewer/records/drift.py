@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from slviewer.records.record import Record, Vector
-from slviewer.records.table import Cell, Column, Table
+from slviewer.records.table import Cell, Column, Table, format_signed
 
 DriftVerdict = Literal["still good", "recalibrate"]
 
@@ -108,7 +108,7 @@ class Drift(Record, frozen=True, kw_only=True):
         baseline = 1e3 * self.baseline_mm
         notes = [
             f"{self.summary()}.",
-            f"Baseline {baseline:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace("-", "−"),
+            f"Baseline {format_signed(baseline)} ± {1e3 * self.baseline_sigma_mm:.0f} µm.",
             (
                 "A pan and a shift along x look nearly alike, as do a nod and a shift along y:"
                 " their sum is known far better than each. Detectable: if it is the only change."

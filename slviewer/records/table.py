@@ -217,42 +217,39 @@ def compare_with_first(errors: Mapping[str, float | None], model: str) -> Cell:
     return Cell("") if model == first else compare_errors(errors.get(model), errors[first])
 
 
+def format_signed(value: float, unit: str = "", digits: int = 0) -> str:
+    """Return a difference with its sign and unit."""
+    return f"{value:+.{digits}f} {unit}".strip().replace("-", "−")
+
+
+def format_scale(factor: float) -> str:
+    """Return by how much a correction of scale lengthens, such as ``+300 ppm``."""
+    return format_signed(1e6 * (factor - 1), "ppm")
+
+
 def render_text(table: Table) -> str:
     """Return a table for the terminal: names to the left, figures to the right, and its notes
     below.
 
     Titles stand above their columns one word a line, so that wide tables stay narrow.
     """
-    body = [[text for _, text, _ in line] for line in table.format([*table.rows, *table.footer])]
-    is_left = [column.align == "left" for column in table.columns]
-    lines = align_columns(
-        [column.heading for column in table.columns], body, is_left, len(table.footer)
-    )
-    return "\n".join([*lines, *table.notes])
-
-
-def align_columns(
-    headings: Sequence[str],
-    body: Sequence[Sequence[str]],
-    is_left: Sequence[bool],
-    footers: int = 0,
-) -> list[str]:
-    """Return lines of texts in columns, below headings of one word a line, and a rule above the
-    last ``footers``."""
-    words = [heading.split() for heading in headings]
+    words = [column.heading.split() for column in table.columns]
     height = max(map(len, words), default=0)
     head = list(zip(*([""] * (height - len(each)) + each for each in words), strict=True))
-    widths = [max(map(len, cells)) for cells in zip(*head, *body, strict=True)]
+    body, footer = (
+        [[text for _, text, _ in line] for line in table.format(rows)]
+        for rows in (table.rows, table.footer)
+    )
+    widths = [max(map(len, cells)) for cells in zip(*head, *body, *footer, strict=True)]
 
     def align(line: Sequence[str]) -> str:
         """Return the cells of a line side by side."""
-        cells = zip(line, widths, is_left, strict=True)
-        return "  ".join(
-            text.ljust(width) if left else text.rjust(width) for text, width, left in cells
-        ).rstrip()
+        cells = [
+            text.ljust(width) if column.align == "left" else text.rjust(width)
+            for text, width, column in zip(line, widths, table.columns, strict=True)
+        ]
+        return "  ".join(cells).rstrip()
 
     rule = "-" * (sum(widths) + 2 * max(0, len(widths) - 1))
-    lines = [*map(align, head), rule, *map(align, body)]
-    return (
-        [*lines[: len(lines) - footers], rule, *lines[len(lines) - footers :]] if footers else lines
-    )
+    below = [rule, *map(align, footer)] if footer else []
+    return "\n".join([*map(align, head), rule, *map(align, body), *below, *table.notes])

@@ -12,7 +12,7 @@ import msgspec
 
 from slviewer.records.plain import to_plain
 from slviewer.records.record import Count, Record, Vector, list_numbers, list_shares
-from slviewer.records.table import Cell, Column, Table, compare_with_first
+from slviewer.records.table import Cell, Column, Table, compare_with_first, format_scale
 
 Shape = Literal["plane", "sphere"]
 MAX_EXCLUDED = 0.02
@@ -226,8 +226,7 @@ def _list_notes(found: Mapping[str, Verification]) -> list[str]:
         if factor != 1
     }
     notes += [
-        f"{model}: scale corrected by {1e6 * (f - 1):+.0f} ppm.".replace("-", "−")
-        for model, f in scaled.items()
+        f"{model}: scale corrected by {format_scale(factor)}." for model, factor in scaled.items()
     ]
     return notes
 

@@ -248,7 +248,7 @@ def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
 def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     """The coordinates of each axis side by side; masked pixels in the colour of their reason, with
     their shares."""
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
     h, w = next(iter(phases.values())).reason.shape
@@ -257,6 +257,7 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     drawing = new_figure(FULL, height)
     drawing.suptitle(title, x=0.004, ha="left", fontsize=SMALL_PT + 3, color=INK, fontweight="bold")
     step = max(1, -(-w // (DENSITY * map_px)))
+    palette = ListedColormap(list(REASON_COLOURS.values()))
     for axes, (axis, phase) in zip(
         np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True
     ):
@@ -273,10 +274,15 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
             aspect="equal",
             interpolation="nearest",
         )
-        cover = np.zeros((*reason.shape, 4), np.float32)
-        for code, colour in REASON_COLOURS.items():
-            cover[reason == code] = (*to_rgb(colour), 1.0)
-        axes.imshow(cover, aspect="equal", interpolation="nearest")
+        cover = np.ma.masked_equal(reason, Reason.VALID)
+        axes.imshow(
+            cover,
+            palette,
+            aspect="equal",
+            interpolation="nearest",
+            vmin=min(REASON_COLOURS),
+            vmax=max(REASON_COLOURS),
+        )
         add_colour_bar(
             drawing,
             image,
@@ -350,18 +356,12 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
         upper, lower = places[str(i)], places[f"residuals {i}"]
         lower.sharex(upper)
         stated = f"RMS {1e3 * rms:.0f} µm"
-        if narrow:
-            style_axes(upper, f"{title}: {stated}", along, f"{name}, mm")
-        else:
-            style_axes(upper, title, "", f"{name}, mm")
+        style_axes(upper, f"{title}: {stated}", along if narrow else "", f"{name}, mm")
         style_axes(lower, "", along, f"{name} - fit, µm")
         upper.tick_params(labelbottom=narrow)
         if phase.size:
             _draw_fit(upper, lower, at, values, fitted)
-            if not narrow:
-                add_legend(upper, loc="best", title=stated, title_fontsize=8.6, alignment="left")
-                upper.get_legend().get_title().set_color(INK)
-            elif i == 0:
+            if i == 0:
                 add_legend(upper, loc="best")
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel

@@ -219,30 +219,29 @@ class _Scene:
         """Draw the perspective view: depth increases to the right, the image's up is up."""
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-        def draw(polygon: np.ndarray, face: str, edge: str, alpha: float, width: float) -> None:
-            """Draw a polygon (n, 3): depth, x, and y upwards."""
-            axes.add_collection3d(
-                Poly3DCollection(
-                    [polygon],
-                    facecolors=[face],
-                    alpha=alpha,
-                    edgecolors=[edge],
-                    linewidths=width,
-                    clip_on=False,
-                )
-            )
-
         style_image_axes(axes)
         for i, (name, hull) in enumerate(self.hulls.items()):
             colour, style = self.label(name)
             shown = np.stack([hull[:, 2], hull[:, 0], -hull[:, 1]], axis=1)
-            draw(shown, colour, colour, 0.2, 1.1)
+            polygon = Poly3DCollection(
+                [shown], color=colour, alpha=0.2, linewidths=1.1, clip_on=False
+            )
+            axes.add_collection3d(polygon)
             corner, side = (np.argmin, "top") if i % 2 else (np.argmax, "bottom")
             axes.text(*shown[corner(shown[:, 2])], self.short[name], va=side, **style)
         (left, top, near), (right, bottom, far) = self.low, self.high
         for z in self.depth_range_mm:
             corners = (left, top), (right, top), (right, bottom), (left, bottom)
-            draw(np.array([[z, x, -y] for x, y in corners]), "#9fb4c6", "#7f97ab", 0.14, 0.8)
+            shown = np.array([[z, x, -y] for x, y in corners])
+            polygon = Poly3DCollection(
+                [shown],
+                facecolor="#9fb4c6",
+                edgecolor="#7f97ab",
+                alpha=0.14,
+                linewidths=0.8,
+                clip_on=False,
+            )
+            axes.add_collection3d(polygon)
             style = {"fontsize": SMALL_PT, "color": SOFT, "ha": "center", "va": "top"}
             axes.text(z, left, -bottom, f"{z:.0f} mm", **style)
         axes.set_xlim(near, far)

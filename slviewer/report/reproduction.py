@@ -20,6 +20,7 @@ from slviewer.records.table import (
     Value,
     better_worse,
     compare_with_first,
+    format_signed,
 )
 from slviewer.records.verification import Verification, average, list_fits
 from slviewer.report.canvas import HALF, percentile
@@ -363,7 +364,7 @@ def length_table(
         errors = {model: mm - known for model, mm in measured.items()}
         for model, error in errors.items():
             compared = compare_with_first(errors, model)
-            signed = Cell(f"{error:+.3f}".replace("-", "−"), compared.mark)
+            signed = Cell(format_signed(error, digits=3), compared.mark)
             theirs = letters.get(name, {}).get(model)
             rows.append([name, model, known, measured[model], signed, compared, theirs])
     sizes = mean_errors(lengths)
