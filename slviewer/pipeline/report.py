@@ -39,17 +39,17 @@ from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
 from slviewer.records.verification import Verification
-from slviewer.report.data import (
+from slviewer.report.maps import PixelCurve, verification_maps
+from slviewer.report.page import Figure, write_page
+from slviewer.report.session import (
     CalibrationFigures,
     CaptureUse,
-    PixelCurve,
-    PoseResiduals,
     RecordsView,
     SessionData,
+    session_headlines,
+    session_sections,
+    session_title,
 )
-from slviewer.report.maps import verification_maps
-from slviewer.report.page import Figure, write_page
-from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.report.surfaces import draw_deviation, section_plot
 from slviewer.session.capture import Capture
 from slviewer.session.scan_edits import list_edits, load_region
@@ -194,7 +194,7 @@ def calibration_view(store: Session) -> CalibrationFigures:
     """
     stereo, residuals = load_stereo(store), load_residuals(store)
     views = {
-        o.name: PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
+        o.name: {"camera": (o.camera, r[:, :2]), "projector": (o.projector, r[:, 2:])}
         for o in load_observations(store, list(stereo.poses))
         if (r := residuals.get(o.name)) is not None
     }

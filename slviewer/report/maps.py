@@ -2,6 +2,7 @@
 coordinate, and the Letter's picture of one pixel's fit."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -32,7 +33,6 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
 TITLE_PX = 34
@@ -321,6 +321,23 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
 
 DATA = "#c2502e"
 _Fitted = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCurve:
+    """One camera pixel's data, (n,) each, and the functions fitted to it (the Letter, eq. 9-11).
+
+    ``coefficients`` (5,) c0 ... c4 for phase in rad and lengths in mm; ``rms_mm`` (3,) in z, x, y.
+    """
+
+    pixel: tuple[int, int]
+    axis: str
+    phase: np.ndarray
+    z: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    coefficients: np.ndarray
+    rms_mm: np.ndarray
 
 
 def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:

@@ -24,8 +24,13 @@ from slviewer.records.table import (
 )
 from slviewer.records.verification import Verification, average, list_fits
 from slviewer.report.canvas import HALF, percentile
-from slviewer.report.data import PixelCurve
-from slviewer.report.maps import error_limit, pixel_curves, rms_maps, verification_maps
+from slviewer.report.maps import (
+    PixelCurve,
+    error_limit,
+    pixel_curves,
+    rms_maps,
+    verification_maps,
+)
 from slviewer.report.page import Headline, Item, PageNotice, Section
 from slviewer.report.planes import planes_in_space, rms_bars
 from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
@@ -235,12 +240,12 @@ def _spheres_section(data: ReproductionData) -> Section:
         ]
     if data.spacings_mm:
         items.append(length_table(data.spacings_mm, "Distances between the centres of spheres"))
-    shown = {name: maps for name, maps in data.error_maps.items() if name in data.spheres}
-    limit_mm = error_limit([errors for maps in shown.values() for errors in maps.values()])
-    items += [
-        verification_maps(name, data.spheres[name], maps, HALF, limit_mm)
-        for name, maps in shown.items()
-    ]
+    if shown := {name: maps for name, maps in data.error_maps.items() if name in data.spheres}:
+        limit_mm = error_limit([errors for maps in shown.values() for errors in maps.values()])
+        items += [
+            verification_maps(name, data.spheres[name], maps, HALF, limit_mm)
+            for name, maps in shown.items()
+        ]
     return Section(
         "Experiment 2b: spheres",
         "Flatness is not a measure of scale: a projector turned by a tenth of a milliradian leaves"

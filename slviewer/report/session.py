@@ -3,8 +3,9 @@ parts, with a trend chart of each characteristic."""
 
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.acceptance import MARKS, Decision
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
+from slviewer.records.record import Record
 from slviewer.records.table import Cell, Column, Mark, Table, Value
 from slviewer.records.verdict import Verdict
 from slviewer.records.verification import Verification, average
@@ -26,14 +28,70 @@ from slviewer.report.canvas import (
     percentile,
     style_axes,
 )
-from slviewer.report.data import CalibrationFigures, RecordsView, SessionData
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure, Headline, Item, PageNotice, Section, write_page
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
+from slviewer.session.capture import Capture
 
 DEVICES = ("camera", "projector")
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
+
+
+@dataclass(frozen=True)
+class CaptureUse:
+    """Whether the calibration uses a capture, and ``why`` it does not."""
+
+    capture: Capture
+    state: Literal["used", "unused", "excluded", "scan", "waiting"]
+    why: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFigures:
+    """A stereo calibration, and of each pose and device where its features are, pixels (n, 2), and
+    their residuals (n, 2) px, NaN where excluded or not read; empty where none were saved."""
+
+    stereo: StereoModel
+    residuals: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]] = field(
+        default_factory=dict
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RecordsView:
+    """The records of one kind by their labels, and pictures of them."""
+
+    kind: type[Record]
+    records: Mapping[str, Any]
+    figures: Sequence[Figure] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SessionData:
+    """A session's captures, its calibrations, and the records made with them.
+
+    ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that
+    made ``calibration``. ``pixel_fits``: {axis: RMS (3, h, w) of the pixel-wise fits in z, x, y}.
+    ``model``: the one that is used, and the one ``recommended``; ``scales``: {model: what
+    correction of scale was applied, in words}. ``region``: the region of interest that is in
+    effect, in words; ``edits``
+    of scans in their order: scan and words.
+    """
+
+    name: str
+    captures: Sequence[CaptureUse]
+    calibration: CalibrationFigures | None = None
+    pixel_fits: Mapping[str, np.ndarray] = field(default_factory=dict)
+    records: Sequence[RecordsView] = ()
+    warnings: Sequence[str] = ()
+    verdict: Verdict | None = None
+    verdict_of_calibration: bool = True
+    model: str = ""
+    recommended: str = ""
+    scales: Mapping[str, str] = field(default_factory=dict)
+    region: str = ""
+    edits: Sequence[tuple[str, str]] = ()
 
 
 def session_title(data: SessionData) -> tuple[str, str]:
@@ -190,25 +248,20 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
     """The section about reprojection errors: bars of each pose, residual arrows and image
     coverage."""
     stereo, residuals = calibration.stereo, calibration.residuals
-    rms, cameras, projectors = (
-        stereo.reprojection_rms_px,
-        stereo.rig.camera.size,
-        stereo.rig.projector.size,
-    )
+    rms = stereo.reprojection_rms_px
+    sizes = {device: getattr(stereo.rig, device).size for device in DEVICES}
     items: list[Item] = []
     if stereo.pose_rms_px:
         items.append(pose_bars(stereo.pose_rms_px, rms))
     if residuals:
         worst = max(residuals, key=lambda name: max(stereo.pose_rms_px.get(name, (0.0, 0.0))))
-        shown = residuals[worst]
-        title = f"camera, {worst} (the worst pose)"
         items += [
-            residual_arrows(title, shown.pixels, shown.camera, cameras),
-            residual_arrows(
-                f"projector, {worst}", shown.projector_pixels, shown.projector, projectors
-            ),
-            coverage("camera", cameras, [r.pixels for r in residuals.values()]),
-            coverage("projector", projectors, [r.projector_pixels for r in residuals.values()]),
+            residual_arrows(f"{device}, {worst} (the worst pose)", *residuals[worst][device], size)
+            for device, size in sizes.items()
+        ]
+        items += [
+            coverage(device, size, [each[device][0] for each in residuals.values()])
+            for device, size in sizes.items()
         ]
     if stereo.pose_rms_px:
         items.append(_pose_table(stereo.pose_rms_px))

@@ -12,16 +12,9 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.records.merge import Merge, Registered
 from slviewer.records.verification import ModelFit, Verification
-from slviewer.report.data import (
-    CalibrationFigures,
-    CaptureUse,
-    PixelCurve,
-    PoseResiduals,
-    RecordsView,
-    SessionData,
-)
-from slviewer.report.maps import verification_maps
+from slviewer.report.maps import PixelCurve, verification_maps
 from slviewer.report.reproduction import ReproductionData
+from slviewer.report.session import CalibrationFigures, CaptureUse, RecordsView, SessionData
 from slviewer.session.capture import Capture, Role
 from slviewer.surface.fuse import Fused
 from slviewer.surface.shapes import PointSet
@@ -283,7 +276,10 @@ def session_data(width: int = 1600) -> SessionData:
         pixels = np.stack([u, v], axis=1) @ turn + rng.uniform(0.05, 0.25, 2) * [width, height]
         noise = [rms[name][i] / np.sqrt(2) * rng.standard_normal(pixels.shape) for i in (0, 1)]
         noise[0][3] = np.nan
-        residuals[name] = PoseResiduals(pixels, noise[0], pixels * [0.5, 0.8], noise[1])
+        residuals[name] = {
+            "camera": (pixels, noise[0]),
+            "projector": (pixels * [0.5, 0.8], noise[1]),
+        }
     size = (width, height)
     captures = [CaptureUse(capture(n, "calibration", size), "used") for n in names]
     captures += [

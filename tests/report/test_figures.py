@@ -14,8 +14,7 @@ from PIL import Image
 from slviewer.errors import InputError
 from slviewer.report import maps
 from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
-from slviewer.report.data import PixelCurve
-from slviewer.report.maps import pixel_curves
+from slviewer.report.maps import PixelCurve, pixel_curves
 from slviewer.report.page import Figure
 from slviewer.report.planes import planes_in_space
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows

@@ -30,11 +30,10 @@ from slviewer.gui.widgets import (
 from slviewer.pipeline.report import calibration_view
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Finding, Verdict
-from slviewer.report.data import CalibrationFigures, PixelCurve
-from slviewer.report.maps import pixel_curves, rms_maps
+from slviewer.report.maps import PixelCurve, pixel_curves, rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
-from slviewer.report.session import lens_table, rig_table
+from slviewer.report.session import CalibrationFigures, lens_table, rig_table
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import CalibrationView, SessionView, Snapshot
@@ -277,12 +276,9 @@ class CalibratePanel(StepPanel):
             residuals, rig = details.residuals.get(name), details.stereo.rig
             if residuals is None:
                 return None
-            if device == "camera":
-                pixels, errors, size = residuals.pixels, residuals.camera, rig.camera.size
-            else:
-                pixels, errors = residuals.projector_pixels, residuals.projector
-                size = rig.projector.size
-            return residual_arrows(f"{name}, {device}", pixels, errors, size)
+            return residual_arrows(
+                f"{name}, {device}", *residuals[device], getattr(rig, device).size
+            )
 
         self.painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
