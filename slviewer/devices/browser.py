@@ -23,10 +23,10 @@ import numpy as np
 from slviewer.devices.drivers import Driver
 from slviewer.devices.page_channel import ANSWER_S, PageChannel, PageConnection, PageDevice
 from slviewer.devices.protocols import (
+    CameraDriver,
     CameraSettings,
     Channel,
     check_channel,
-    check_frame,
     check_index,
     check_level,
     check_sequence,
@@ -112,7 +112,7 @@ class CameraChannel(PageChannel[Video]):
         return (facts.size, in_use), {"used": in_use}
 
 
-class BrowserCamera(PageDevice[CameraChannel]):
+class BrowserCamera(PageDevice[CameraChannel], CameraDriver):
     """One `channel` of the pictures of the camera on a page.
 
     A capture that loses its page, or whose pictures change their size, ends with a DeviceError. A
@@ -167,20 +167,19 @@ class BrowserCamera(PageDevice[CameraChannel]):
         self._page = None
         super().close()
 
-    def grab(self, out: np.ndarray) -> None:
-        """Fill `out` (h, w) with a picture taken after this call."""
-        check_frame(self, out)
+    def _fill(self, out: np.ndarray) -> None:
+        """Write a picture taken after this call."""
         np.copyto(out, self._request_picture(self._channel, 1)[..., 0])
 
     def grab_colour(self) -> np.ndarray:
         """Grab a new (h, w, 3) RGB picture, as `grab`."""
         return self._request_picture("rgb", 3)
 
-    def settings(self) -> CameraSettings:
-        """Read the exposure; None where the browser does not report it."""
+    def _read_settings(self) -> CameraSettings:
+        """Return the exposure; None where the browser does not report it."""
         return CameraSettings(self._require_page().facts.exposure_ms)
 
-    def apply(self, settings: CameraSettings) -> CameraSettings:
+    def _write_settings(self, settings: CameraSettings) -> None:
         """Set the exposure; what could not be set is in `notes`."""
         page, self._note = self._require_page(), ""
         if settings.exposure_ms is not None:
@@ -192,7 +191,6 @@ class BrowserCamera(PageDevice[CameraChannel]):
                 )
         if settings.gain is not None:
             self._note = "browsers set no gain: change the exposure instead"
-        return self.settings()
 
     def _lock(self, page: PageConnection[Video], exposure_ms: float | None) -> None:
         """Lock what is automatic, at an exposure where one is given, and wait until the camera has

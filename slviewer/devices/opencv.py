@@ -25,11 +25,10 @@ import numpy as np
 from slviewer.devices.drivers import Driver
 from slviewer.devices.opencv_reader import TIMING, Connected, Reader, StreamTiming
 from slviewer.devices.protocols import (
+    CameraDriver,
     CameraSettings,
     Channel,
-    Openable,
     check_channel,
-    check_frame,
     check_image_size,
     extract_channel,
 )
@@ -303,7 +302,7 @@ size."""
 
 
 @dataclass(eq=False)
-class OpenCVCamera(Openable):
+class OpenCVCamera(CameraDriver):
     """One `channel` of the webcam with the number `source`, or of the video at a path or an
     address. `notes` lists, in sentences, settings that were refused or changed since it was opened.
 
@@ -382,10 +381,9 @@ class OpenCVCamera(Openable):
             del _IN_USE[self.source]
         super().close()
 
-    def grab(self, out: np.ndarray) -> None:
-        """Grab a picture whose exposure started after this call; of a video file, the next
+    def _fill(self, out: np.ndarray) -> None:
+        """Write a picture whose exposure started after this call; of a video file, the next
         picture."""
-        check_frame(self, out)
         extract_channel(self.grab_colour(), self.channel, out)
 
     def grab_colour(self) -> np.ndarray:
@@ -393,15 +391,15 @@ class OpenCVCamera(Openable):
         image = self._read_picture()
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
 
-    def settings(self) -> CameraSettings:
-        """Read the exposure; None where the camera does not report it."""
+    def _read_settings(self) -> CameraSettings:
+        """Return the exposure; None where the camera does not report it."""
         dialect = self._dialect
         reader = self._require_reader()
         return CameraSettings(
             None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect))
         )
 
-    def apply(self, settings: CameraSettings) -> CameraSettings:
+    def _write_settings(self, settings: CameraSettings) -> None:
         """Set the exposure; what could not be set is in `notes`."""
         dialect, ms = self._dialect, settings.exposure_ms
         reader = self._require_reader()
@@ -414,7 +412,6 @@ class OpenCVCamera(Openable):
             self._notices["gain"] = (
                 "its gain has units of its own: set it in the rig's file, as the camera's gain"
             )
-        return self.settings()
 
     def _require_reader(self) -> Reader:
         """Return the reader. Raises DeviceError unless the camera is open."""
