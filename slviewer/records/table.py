@@ -49,15 +49,16 @@ class Column:
         return " ".join(filter(None, (self.group, self.title, self.unit)))
 
     def format(self, value: Value) -> str:
-        """Return a value as text: numbers with the column's decimals, halves rounded up; a dash for
-        unknown ones."""
+        """Return a value as text: numbers with the column's decimals, halves rounded up and no
+        minus before nothing; a dash for unknown ones."""
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
             return UNKNOWN
         if isinstance(value, str):
             return value
         if isinstance(value, int):
             return f"{value:,}"
-        return f"{value * (1 + 1e-9):.{self.digits}f}".replace("-", "−")
+        rounded = round(value * (1 + 1e-9), self.digits) + 0.0
+        return f"{rounded:.{self.digits}f}".replace("-", "−")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import numpy as np
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation import letter
 from slviewer.records.merge import Merge
-from slviewer.records.record import DEPTHS
 from slviewer.records.table import (
     Cell,
     Column,
@@ -307,15 +306,16 @@ def shape_table(found: Verifications, caption: str) -> Table:
     pairs = [(each, letter.find_pose(name, shape)) for name, each in found.items()]
     ours, theirs = (average(shape, side) for side in zip(*pairs, strict=True))
     table = list_fits({**found, "mean": ours}, caption)
+    table = table.select([column for column in table.columns if column.title != "points"])
     columns = [
         *table.columns,
-        *(Column(depths, "%", THEIRS, digits=1) for depths in DEPTHS),
+        Column("R1 / R2 / R3", "%", THEIRS, "centre"),
         Column("RMS", "mm", THEIRS),
         Column(f"against {BASE}", group=THEIRS),
     ]
     letters: Rows = [
         [
-            *map((theirs.incidence or {}).get, DEPTHS),
+            " / ".join(f"{share:g}" for share in (theirs.incidence or {}).values()),
             theirs.rms_mm.get(model),
             compare_with_first(theirs.rms_mm, model).value,
         ]
