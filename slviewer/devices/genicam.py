@@ -24,11 +24,10 @@ from slviewer.devices.gentl import (
 )
 from slviewer.devices.pixel_formats import PixelFormat, best_format, pixel_format
 from slviewer.devices.protocols import (
+    CameraDriver,
     CameraSettings,
     Channel,
-    Openable,
     check_channel,
-    check_frame,
     extract_channel,
 )
 from slviewer.errors import DeviceError, InputError
@@ -273,7 +272,7 @@ _ANSWER_TIMEOUT_S = 2.0
 
 
 @dataclass(eq=False)
-class GenicamCamera(Openable):
+class GenicamCamera(CameraDriver):
     """The connected camera of that serial number or model, or the only one there is: it delivers
     grey levels unprocessed, uint8, or uint16 with its 10 or 12 bits at the bottom.
 
@@ -343,10 +342,7 @@ class GenicamCamera(Openable):
                 Features(link.node_map, self.name).release()
             link.close()
 
-    def grab(self, out: np.ndarray) -> None:
-        """Grab a frame whose exposure began after the call into `out` (h, w)."""
-        self.check_open()
-        check_frame(self, out)
+    def _fill(self, out: np.ndarray) -> None:
         with self._grab_fresh() as image:
             if self.pixels.colour:
                 extract_channel(self._convert_rgb(image), self.channel, out)
@@ -363,21 +359,15 @@ class GenicamCamera(Openable):
         """Convert the bytes of an image to (h, w, 3) RGB."""
         return self.pixels.rgb(self.pixels.view_samples(image.data, image.size, image.padding))
 
-    def settings(self) -> CameraSettings:
-        """Read the current settings; None for those that the camera lacks, and for a gain in
-        device-specific steps."""
-        self.check_open()
+    def _read_settings(self) -> CameraSettings:
         return self._get_features().settings()
 
-    def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set the nearest supported values, and return them; None for settings that the camera
-        lacks."""
-        self.check_open()
+    def _write_settings(self, settings: CameraSettings) -> None:
+        """Set them, and wait longer for frames of longer exposures."""
         features = self._get_features()
         features.apply(settings)
-        applied = features.settings()
-        self._timeout_s = _ANSWER_TIMEOUT_S + (applied.exposure_ms or 0.0) / 1000
-        return applied
+        exposure_ms = features.settings().exposure_ms
+        self._timeout_s = _ANSWER_TIMEOUT_S + (exposure_ms or 0.0) / 1000
 
     @contextlib.contextmanager
     def _grab_fresh(self) -> Iterator[Image]:

@@ -266,28 +266,14 @@ class GcodeTurntable(Openable):
         self, command: str, end: float | None = None, check: Callable[[], None] = lambda: None
     ) -> None:
         """Send a line, and wait until it is accepted; `check()` is called meanwhile."""
-        self._write(f"{command}\n".encode())
-        end = self._clock() + self.reply_s if end is None else end
-        while self._clock() < end:
-            check()
-            line = self._read_line(min(end, self._clock() + self.timing.poll_s))
-            if line is None:
-                continue
-            self._check_line(line, command)
+        for line in self._ask(f"{command}\n", f"confirm {command!r}", end, check):
             if line.startswith("ok"):
                 return
-            # it says every two seconds that it is alive
-            if line.startswith("echo:busy") and command != "M400":
-                end = self._clock() + self.reply_s
-        raise TurntableError(
-            f"{self.name} did not confirm {command!r} in time: switch it off and on, and check its"
-            " cable"
-        )
 
     def _read_grbl(self) -> tuple[str, float]:
         """Ask GRBL for its state and its axis, in units. Raises TurntableError in a state in which
         it cannot turn."""
-        for line in self._ask("?", "state"):
+        for line in self._ask("?", "report its state"):
             if match := re.fullmatch(r"<(\w+)[^|]*\|[MW]Pos:([-\d.,]+)(\|.*)?>", line):
                 state, positions = match[1], match[2].split(",")
                 if state == "Alarm":
@@ -309,7 +295,7 @@ class GcodeTurntable(Openable):
     def _read_marlin(self) -> float:
         """Ask Marlin for the position of the axis, in units."""
         position = None
-        for line in self._ask("M114\n", "angle"):
+        for line in self._ask("M114\n", "report its angle"):
             match = re.search(rf"(?<!\w){self.axis}:\s*(-?\d+(?:\.\d+)?)", line.split("Count")[0])
             position = float(match[1]) if match else position
             if line.startswith("ok"):
@@ -318,17 +304,30 @@ class GcodeTurntable(Openable):
                 return position
         raise AssertionError
 
-    def _ask(self, question: str, what: str) -> Iterator[str]:
-        """Send a question, and yield the lines that come. Raises TurntableError where one reports a
-        fault, and where none is taken for the answer in time."""
+    def _ask(
+        self,
+        question: str,
+        what: str,
+        end: float | None = None,
+        check: Callable[[], None] = lambda: None,
+    ) -> Iterator[str]:
+        """Send a line, and yield those that come until `end`, by default for so long as a reply may
+        take. Raises TurntableError where one reports a fault, and where none is taken for the
+        answer in time; then it did not do `what`."""
         self._write(question.encode())
-        end = self._clock() + self.reply_s
-        while (line := self._read_line(end)) is not None:
+        until = self._clock() + self.reply_s if end is None else end
+        while self._clock() < until:
+            check()
+            line = self._read_line(min(until, self._clock() + self.timing.poll_s))
+            if line is None:
+                continue
             self._check_line(line, question.strip())
+            # it says every two seconds that it is alive
+            if line.startswith("echo:busy") and end is None:
+                until = self._clock() + self.reply_s
             yield line
         raise TurntableError(
-            f"{self.name} did not report its {what} in time: switch it off and on, and check its"
-            " cable"
+            f"{self.name} did not {what} in time: switch it off and on, and check its cable"
         )
 
     def _check_line(self, line: str, command: str) -> None:

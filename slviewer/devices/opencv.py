@@ -25,11 +25,10 @@ import numpy as np
 from slviewer.devices.drivers import Driver
 from slviewer.devices.opencv_reader import TIMING, Connected, Reader, StreamTiming
 from slviewer.devices.protocols import (
+    CameraDriver,
     CameraSettings,
     Channel,
-    Openable,
     check_channel,
-    check_frame,
     check_image_size,
     extract_channel,
 )
@@ -42,13 +41,15 @@ UNKNOWN = -1.0
 @dataclass(frozen=True)
 class Dialect:
     """The control conventions of one backend. `automatics`: each automatic control, and the value
-    that switches it off; empty where a value that is set switches its own automatic off.
+    that switches it off; None where setting the value that it has does. `remedy`: where they can be
+    switched off otherwise.
     """
 
     to_ms: Callable[[float], float]
     from_ms: Callable[[float], float]
     white_balance: int
-    automatics: tuple[tuple[str, int, float], ...] = ()
+    automatics: tuple[tuple[str, int, float | None], ...]
+    remedy: str
 
 
 # V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us; V4L2_EXPOSURE_MANUAL is 1 (docs.kernel.org, "Camera
@@ -64,6 +65,7 @@ _V4L2 = Dialect(
         ("white balance", cv2.CAP_PROP_AUTO_WB, 0.0),
         ("focus", cv2.CAP_PROP_AUTOFOCUS, 0.0),
     ),
+    remedy="look for a switch at the camera itself",
 )
 
 
@@ -77,6 +79,12 @@ def _make_windows_dialect(white_balance: int) -> Dialect:
         lambda value: 1000 * 2.0**value,
         lambda ms: float(round(math.log2(ms / 1000))),
         white_balance,
+        (
+            ("exposure", cv2.CAP_PROP_EXPOSURE, None),
+            ("white balance", white_balance, None),
+            ("focus", cv2.CAP_PROP_FOCUS, None),
+        ),
+        "do it in the system's camera settings",
     )
 
 
@@ -104,31 +112,16 @@ def disable_automatics(capture: cv2.VideoCapture, words: Dialect) -> dict[str, s
 
     A pattern sequence means nothing when its frames are exposed differently.
     """
-    if words.automatics:
-        remedy = "look for a switch at the camera itself"
-        automatic = [
-            what
-            for what, control, off in words.automatics
-            if capture.get(control) != UNKNOWN
-            and not (capture.set(control, off) and capture.get(control) == off)
-        ]
-    else:
-        remedy = "do it in the system's camera settings"
-        controls = {
-            "exposure": cv2.CAP_PROP_EXPOSURE,
-            "white balance": words.white_balance,
-            "focus": cv2.CAP_PROP_FOCUS,
-        }
-        current = {what: capture.get(control) for what, control in controls.items()}
-        automatic = [
-            what
-            for what, now in current.items()
-            if now != UNKNOWN and not capture.set(controls[what], now)
-        ]
-    return {
-        f"automatic {what}": f"its automatic {what} cannot be switched off: {remedy}"
-        for what in automatic
-    }
+    notices = {}
+    for what, control, off in words.automatics:
+        if (now := capture.get(control)) == UNKNOWN:
+            continue
+        wanted = now if off is None else off
+        if not (capture.set(control, wanted) and capture.get(control) == wanted):
+            notices[f"automatic {what}"] = (
+                f"its automatic {what} cannot be switched off: {words.remedy}"
+            )
+    return notices
 
 
 def exposure_ms(capture: cv2.VideoCapture, words: Dialect) -> float | None:
@@ -309,7 +302,7 @@ size."""
 
 
 @dataclass(eq=False)
-class OpenCVCamera(Openable):
+class OpenCVCamera(CameraDriver):
     """One `channel` of the webcam with the number `source`, or of the video at a path or an
     address. `notes` lists, in sentences, settings that were refused or changed since it was opened.
 
@@ -388,30 +381,25 @@ class OpenCVCamera(Openable):
             del _IN_USE[self.source]
         super().close()
 
-    def grab(self, out: np.ndarray) -> None:
-        """Grab a picture whose exposure started after this call; of a video file, the next
+    def _fill(self, out: np.ndarray) -> None:
+        """Write a picture whose exposure started after this call; of a video file, the next
         picture."""
-        check_frame(self, out)
-        image = self._read_picture()
-        if image.ndim == 2:
-            np.copyto(out, image)
-        else:
-            extract_channel(image[..., ::-1], self.channel, out)
+        extract_channel(self.grab_colour(), self.channel, out)
 
     def grab_colour(self) -> np.ndarray:
         """As `grab`, (h, w, 3) RGB; three equal channels for a monochrome source."""
         image = self._read_picture()
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
 
-    def settings(self) -> CameraSettings:
-        """Read the exposure; None where the camera does not report it."""
+    def _read_settings(self) -> CameraSettings:
+        """Return the exposure; None where the camera does not report it."""
         dialect = self._dialect
         reader = self._require_reader()
         return CameraSettings(
             None if dialect is None else reader.do(lambda capture: exposure_ms(capture, dialect))
         )
 
-    def apply(self, settings: CameraSettings) -> CameraSettings:
+    def _write_settings(self, settings: CameraSettings) -> None:
         """Set the exposure; what could not be set is in `notes`."""
         dialect, ms = self._dialect, settings.exposure_ms
         reader = self._require_reader()
@@ -424,7 +412,6 @@ class OpenCVCamera(Openable):
             self._notices["gain"] = (
                 "its gain has units of its own: set it in the rig's file, as the camera's gain"
             )
-        return self.settings()
 
     def _require_reader(self) -> Reader:
         """Return the reader. Raises DeviceError unless the camera is open."""

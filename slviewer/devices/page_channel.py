@@ -18,7 +18,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import msgspec
 
-from slviewer.devices.protocols import check_image_size
+from slviewer.devices.protocols import Openable, check_image_size
 from slviewer.errors import DeviceError, InputError
 
 ANSWER_S = 1.8
@@ -280,22 +280,25 @@ def encode_message(header: dict[str, Any], payload: bytes = b"") -> bytes:
     return struct.pack("<I", len(text)) + text + payload
 
 
-def resolve_page(
-    page: Channel | None, what: str, size: Sequence[int] | None, most_px: int
-) -> tuple[Channel, tuple[int, int]]:
-    """Return the channel of a device, and its size (width, height) px, by default that of the
-    connected page.
+class PageDevice(Openable, Generic[Channel]):
+    """A device that is a page: its channel ``_pages``, and its ``size`` (width, height) px, by
+    default that of the connected page.
 
     Raises DeviceError without a channel, and where the size is None and no page is ready.
     """
-    if page is None:
-        raise DeviceError(
-            f"the browser {what}'s page is served by `slviewer wizard` and `slviewer capture`: use"
-            " one of them"
-        )
-    known = page.page_state().size if size is None else check_image_size(what, size, most_px)
-    if known is None:
-        raise DeviceError(
-            f"the {what}'s size is unknown: open the {what} page first, or give the size"
-        )
-    return page, known
+
+    def __init__(
+        self, what: str, page: Channel | None, size: Sequence[int] | None, most_px: int
+    ) -> None:
+        super().__init__(f"the browser {what}")
+        if page is None:
+            raise DeviceError(
+                f"{self.name}'s page is served by `slviewer wizard` and `slviewer capture`: use one"
+                " of them"
+            )
+        known = page.page_state().size if size is None else check_image_size(what, size, most_px)
+        if known is None:
+            raise DeviceError(
+                f"the {what}'s size is unknown: open the {what} page first, or give the size"
+            )
+        self._pages, self.size = page, known

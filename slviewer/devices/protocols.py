@@ -337,6 +337,40 @@ def check_frame(camera: Camera, out: np.ndarray) -> None:
         )
 
 
+class CameraDriver(Openable):
+    """A camera that is opened before it is used, and whose frames fit what they are written to:
+    `_fill`, `_read_settings` and `_write_settings` are called of an open one only."""
+
+    size: tuple[int, int]
+    dtype: np.dtype
+
+    def grab(self, out: np.ndarray) -> None:
+        """Fill `out` (h, w) with a frame exposed after this call."""
+        self.check_open()
+        check_frame(self, out)
+        self._fill(out)
+
+    def settings(self) -> CameraSettings:
+        """Read the current settings; None for those that are not known."""
+        self.check_open()
+        return self._read_settings()
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set the nearest values that the camera has, and return those in effect."""
+        self.check_open()
+        self._write_settings(settings)
+        return self._read_settings()
+
+    def _fill(self, out: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _read_settings(self) -> CameraSettings:
+        return CameraSettings()
+
+    def _write_settings(self, settings: CameraSettings) -> None:
+        pass
+
+
 def check_sequence(projector: Projector, sequence: PatternSequence) -> None:
     """Raise InputError unless `sequence` has frames, and the projector's size."""
     if not sequence.frames:

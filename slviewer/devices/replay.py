@@ -5,10 +5,9 @@ import numpy as np
 
 from slviewer.devices.drivers import Driver
 from slviewer.devices.protocols import (
-    CameraSettings,
+    CameraDriver,
     Openable,
     Rig,
-    check_frame,
     check_index,
     check_level,
 )
@@ -46,7 +45,7 @@ class Recording:
         self.played = (frames, sequence)
 
 
-class ReplayCamera(Openable):
+class ReplayCamera(CameraDriver):
     """Returns the recorded frames. Its settings are unknown and cannot be changed."""
 
     def __init__(self, recording: Recording) -> None:
@@ -60,23 +59,12 @@ class ReplayCamera(Openable):
         """The grey level at which the recording's camera clipped; None where it is not known."""
         return self._recording.played[1].full_scale
 
-    def grab(self, out: np.ndarray) -> None:
+    def _fill(self, out: np.ndarray) -> None:
         """Copy the recorded frame of the pattern shown; under even light of any level, the recorded
         texture."""
-        self.check_open()
-        check_frame(self, out)
         if self._recording.visible_frame is None:
             raise DeviceError("the recording holds no dark frame: show a pattern or light")
         out[:] = self._recording.visible_frame
-
-    def settings(self) -> CameraSettings:
-        """Return unknown settings: all None."""
-        self.check_open()
-        return CameraSettings()
-
-    def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set nothing; return unknown settings."""
-        return self.settings()
 
 
 class ReplayProjector(Openable):

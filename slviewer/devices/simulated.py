@@ -10,11 +10,11 @@ import numpy as np
 
 from slviewer.devices.drivers import Driver
 from slviewer.devices.protocols import (
+    CameraDriver,
     CameraSettings,
     Openable,
     Rig,
     check_angle,
-    check_frame,
     check_index,
     check_level,
     check_sequence,
@@ -39,7 +39,7 @@ _WHITE = (
 )
 
 
-class SimulatedCamera(Openable):
+class SimulatedCamera(CameraDriver):
     """Simulated 8-bit camera with the rig's noise; light grows with the exposure, and saturates at
     255."""
 
@@ -52,10 +52,8 @@ class SimulatedCamera(Openable):
         self._settings = AUTO
         self._last_grab: tuple[Shown | None, int] = (None, 0)
 
-    def grab(self, out: np.ndarray) -> None:
+    def _fill(self, out: np.ndarray) -> None:
         """Render the current scene under the projected pattern; every frame has its own noise."""
-        self.check_open()
-        check_frame(self, out)
         shown = self.world.shown
         grabs = self._last_grab[1] + 1 if self._last_grab[0] is shown else 0
         self._last_grab = (shown, grabs)
@@ -71,21 +69,17 @@ class SimulatedCamera(Openable):
         if frame is not out:
             cv2.resize(frame, self.size, dst=out, interpolation=cv2.INTER_LINEAR)
 
-    def settings(self) -> CameraSettings:
-        """Return the current settings."""
-        self.check_open()
+    def _read_settings(self) -> CameraSettings:
         return self._settings
 
-    def apply(self, settings: CameraSettings) -> CameraSettings:
+    def _write_settings(self, settings: CameraSettings) -> None:
         """Set exposure and gain, limited to 0.01 ... 100 ms and 1 ... 16 times."""
-        self.check_open()
         before = self._settings
         exposure_ms, gain = settings.exposure_ms or before.exposure_ms, settings.gain or before.gain
         assert exposure_ms is not None and gain is not None
         self._settings = CameraSettings(
             float(np.clip(exposure_ms, *_EXPOSURES_MS)), float(np.clip(gain, *_GAINS))
         )
-        return self._settings
 
 
 class SimulatedProjector(Openable):

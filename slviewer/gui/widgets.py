@@ -162,7 +162,7 @@ def properties_table(title: object, properties: Mapping[str, object]) -> Html:
 def report_table(shown: Table) -> Html:
     """Return a table of figures without its details, with its notes."""
     tones: dict[Mark, Tone] = {"better": "good", "worse": "warning", "muted": "dim"}
-    shown = shown.select([column for column in shown.columns if not column.detail])
+    shown = shown.without_details()
     titles = [
         f"{c.title[:1].upper()}{c.title[1:]}{c.unit and f', {c.unit}'}" for c in shown.columns
     ]

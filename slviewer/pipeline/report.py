@@ -39,18 +39,17 @@ from slviewer.records.calibration import ModelCalibration
 from slviewer.records.kinds import RECORDS
 from slviewer.records.measurement import Measurement
 from slviewer.records.verification import Verification
-from slviewer.report.data import (
+from slviewer.report.maps import PixelCurve, verification_maps
+from slviewer.report.page import Figure, write_page
+from slviewer.report.session import (
     CalibrationFigures,
-    CaptureRow,
-    ModelsView,
-    PixelCurve,
-    PoseResiduals,
+    CaptureUse,
     RecordsView,
     SessionData,
+    session_headlines,
+    session_sections,
+    session_title,
 )
-from slviewer.report.maps import verification_maps
-from slviewer.report.page import Figure, write_page
-from slviewer.report.session import session_headlines, session_sections, session_title
 from slviewer.report.surfaces import draw_deviation, section_plot
 from slviewer.session.capture import Capture
 from slviewer.session.scan_edits import list_edits, load_region
@@ -111,27 +110,26 @@ def _collect_data(store: Session) -> SessionData:
         if store.state_of(f"calibration/{name}") == "stale"
     ]
     excluded = store.excluded()
-    verdict, pixel_fits, models = load_last_verdict(store), dict[str, np.ndarray](), None
+    verdict, pixel_fits = load_last_verdict(store), dict[str, np.ndarray]()
     if "pixelwise" in there:
         pixelwise = load_model(store, "pixelwise")
         assert isinstance(pixelwise, PixelwiseModel)
         pixel_fits = {axis: fit.rms_mm for axis, fit in pixelwise.fits.items()}
-    if there:
-        scales = {name: words for name in there if (words := describe_scale(store, name))}
-        models = ModelsView(preferred_model(store), recommended_model(store), scales)
     judged = None if stereo is None else load_record(store, ModelCalibration, "stereo").verdict
     records, outdated = _collect_records(store)
     region = load_region(store)
     return SessionData(
         name=store.folder.name,
-        captures=[_describe_capture(c, stereo, excluded) for c in store.captures()],
+        captures=[_describe_use(c, stereo, excluded) for c in store.captures()],
         calibration=None if stereo is None else calibration_view(store),
         pixel_fits=pixel_fits,
         records=records,
         warnings=[*stale, *outdated],
         verdict=verdict,
         verdict_of_calibration=verdict is not None and verdict == judged,
-        models=models,
+        model=preferred_model(store) if there else "",
+        recommended=recommended_model(store) if there else "",
+        scales={name: words for name in there if (words := describe_scale(store, name))},
         region="" if region is None else region.text(),
         edits=[
             (scan, words)
@@ -173,34 +171,20 @@ def _draw_records(store: Session, records: Sequence[Stored[Any]]) -> Iterator[Fi
         yield draw_deviation(each.label, each.record.source, each.record.deviation, arrays)
 
 
-def _describe_capture(
+def _describe_use(
     capture: Capture, stereo: StereoModel | None, excluded: Mapping[str, str]
-) -> CaptureRow:
-    """Return the table row of a capture: sizes, frames, and whether and why it is used or
-    excluded."""
-    sequence = capture.sequence
-    why = ""
+) -> CaptureUse:
+    """Return whether and why a capture is used or excluded."""
+    name = capture.name
     if capture.role == "scan":
-        state = "scan"
-    elif capture.name in excluded:
-        state, why = "excluded", excluded[capture.name]
-    elif stereo is None or not stereo.poses:
-        state = "waiting"
-    elif capture.name in stereo.poses:
-        state = "used"
-    else:
-        state, why = "unused", stereo.excluded.get(capture.name, "added after the calibration")
-    return CaptureRow(
-        name=capture.name,
-        role=capture.role,
-        state=state,  # type: ignore[arg-type]
-        camera=capture.size,
-        projector=sequence.projector_size,
-        frames=len(sequence.frames),
-        periods_px={axis: sequence.period_px(axis) for axis in sequence.axes},
-        why=why,
-        made=str(capture.meta.get("created", "")),
-    )
+        return CaptureUse(capture, "scan")
+    if name in excluded:
+        return CaptureUse(capture, "excluded", excluded[name])
+    if stereo is None or not stereo.poses:
+        return CaptureUse(capture, "waiting")
+    if name in stereo.poses:
+        return CaptureUse(capture, "used")
+    return CaptureUse(capture, "unused", stereo.excluded.get(name, "added after the calibration"))
 
 
 def calibration_view(store: Session) -> CalibrationFigures:
@@ -210,7 +194,7 @@ def calibration_view(store: Session) -> CalibrationFigures:
     """
     stereo, residuals = load_stereo(store), load_residuals(store)
     views = {
-        o.name: PoseResiduals(o.camera, r[:, :2], o.projector, r[:, 2:])
+        o.name: {"camera": (o.camera, r[:, :2]), "projector": (o.projector, r[:, 2:])}
         for o in load_observations(store, list(stereo.poses))
         if (r := residuals.get(o.name)) is not None
     }

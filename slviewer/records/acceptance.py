@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
-from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Mark, Rows, Table
+from slviewer.records.record import Count, Record, list_shares
+from slviewer.records.table import Cell, Column, Mark, Table, format_scale, format_signed
 
 Decision = Literal["pass", "fail", "undecided"]
 Interval = tuple[float, float]
@@ -129,17 +129,21 @@ class ErrorBudget(msgspec.Struct, frozen=True):
 
     def table(self) -> Table:
         """Return the contributions, and the expanded uncertainty below."""
-        columns = [
-            Column("source"),
-            Column("standard uncertainty", "mm", digits=4),
-            Column("type", align="centre"),
-            Column("from", detail=True),
+        uncertainty = Column("standard uncertainty", "mm", digits=4)
+        rows = [
+            {
+                "source": each.source,
+                uncertainty: each.u_mm,
+                Column("type", align="centre"): each.kind,
+                Column("from", detail=True): each.how,
+            }
+            for each in self.contributions
         ]
         without = f" Unknown: {' and '.join(self.unknown)}; U excludes it." if self.unknown else ""
         notes = [f"Type A: from repeated observations; B: from anything else.{without}"]
-        rows = [[each.source, each.u_mm, each.kind, each.how] for each in self.contributions]
         caption = f"Uncertainty of a length of {self.length_mm:.0f} mm"
-        return Table(columns, rows, caption, notes, [["expanded, k = 2", self.U_mm, "", ""]])
+        footer = [{"source": "expanded, k = 2", uncertainty: self.U_mm}]
+        return Table.of(rows, caption, notes, footer)
 
 
 class StillCaptures(msgspec.Struct, frozen=True):
@@ -213,77 +217,66 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
 
     def list_tables(self, name: str) -> list[Table]:
         """Return the properties, the positions, and the budget of a length."""
-        columns = [
-            Column("property"),
-            Column("worst", "mm", digits=4),
-            Column("at", detail=True),
-            Column("uncertainty U, k = 2", "mm", digits=4),
-            *(Column(end, "mm", "95 % lie", digits=4, detail=True) for end in ("from", "to")),
-            Column("limit", "mm"),
-            Column("decision"),
-        ]
-        rows: Rows = [
-            [
-                each.property,
-                each.worst.error_mm,
-                each.worst.position,
-                each.worst.U_mm,
-                *each.worst.within_95_mm,
-                each.limit_mm,
-                Cell(each.decision or "no limit", MARKS.get(each.decision or "", "")),
-            ]
+        rows = [
+            {
+                "property": each.property,
+                Column("worst", "mm", digits=4): each.worst.error_mm,
+                Column("at", detail=True): each.worst.position,
+                Column("uncertainty U, k = 2", "mm", digits=4): each.worst.U_mm,
+                **{
+                    Column(end, "mm", "95 % lie", digits=4, detail=True): mm
+                    for end, mm in zip(("from", "to"), each.worst.within_95_mm, strict=True)
+                },
+                Column("limit", "mm"): each.limit_mm,
+                "decision": Cell(each.decision or "no limit", MARKS.get(each.decision or "", "")),
+            }
             for each in self.judgements
         ]
-        tables = [
-            Table(columns, rows, f"Test {name}: {self.artefact.name}", self._list_notes()),
-            self._list_positions(),
-        ]
+        caption = f"Test {name}: {self.artefact.name}"
+        tables = [Table.of(rows, caption, self._list_notes()), self._list_positions()]
         return tables if self.budget is None else [*tables, self.budget.table()]
 
     def _list_positions(self) -> Table:
         shown = [each.property for each in self.judgements]
-        columns = [
-            Column("position"),
-            *(Column(name, "mm", digits=4) for name in shown),
-            Column("RMS", "mm"),
-            Column("noise floor", "mm"),
-            *(
-                Column(depths, "%", "share in", digits=0, detail=True)
-                for depths in ("R1", "R2", "R3")
-            ),
-            Column("points", detail=True),
+        rows = [
+            {
+                "position": each.position,
+                **{
+                    Column(name, "mm", digits=4): each.error(name).error_mm
+                    if name in each.properties
+                    else None
+                    for name in shown
+                },
+                Column("RMS", "mm"): max(each.rms_mm),
+                Column("noise floor", "mm"): max(
+                    (mm for mm in each.floor_mm if mm is not None), default=None
+                ),
+                **list_shares(each.incidence),
+                Column("points", detail=True): each.points,
+            }
+            for each in self.positions
         ]
-        rows: Rows = []
-        for each in self.positions:
-            shares = [(each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")]
-            errors = [
-                each.error(name).error_mm if name in each.properties else None for name in shown
-            ]
-            floor = max((mm for mm in each.floor_mm if mm is not None), default=None)
-            rows.append([each.position, *errors, max(each.rms_mm), floor, *shares, each.points])
         notes = [
             f"{each.position}: {warning}" for each in self.positions for warning in each.warnings
         ]
-        return Table(
-            columns, rows, "The worst error of each property at each position", notes
-        ).without_empty()
+        caption = "The worst error of each property at each position"
+        return Table.of(rows, caption, notes).without_empty()
 
     def _list_notes(self) -> list[str]:
         notes = [f"{self.summary()}.", f"{len(self.positions)} positions.", RULE]
         if self.scale is not None:
             scale = self.scale
             notes.append(
-                f"Scale: {scale.ppm:+.0f} ppm ± {scale.U_ppm:.0f} ppm (k = 2) over"
+                f"Scale: {format_signed(scale.ppm, 'ppm')} ± {scale.U_ppm:.0f} ppm (k = 2) over"
                 f" {scale.length_mm:.3f} mm."
             )
         if self.scale_applied is not None:
             notes.append(
-                f"The scale was corrected by {1e6 * (self.scale_applied - 1):+.0f} ppm from this"
-                " test on."
+                f"The scale was corrected by {format_scale(self.scale_applied)} from this test on."
             )
         elif self.scale_factor != 1:
-            ppm = f"{1e6 * (self.scale_factor - 1):+.0f}"
-            notes.append(f"A scale correction of {ppm} ppm was in force during the test.")
+            in_force = format_scale(self.scale_factor)
+            notes.append(f"A scale correction of {in_force} was in force during the test.")
         if self.scale is not None and self.scale_applied is None:
             notes.append("The scale was not corrected: --apply-scale does so.")
         if (still := self.repeatability) is not None:
@@ -294,4 +287,4 @@ class AcceptanceTest(Record, frozen=True, kw_only=True):
                 f" mean depth drifted by {still.wandering_mm:.4f} mm. This is not a measure of"
                 " accuracy."
             )
-        return [note.replace(" -", " −").replace("−-apply", "--apply") for note in notes]
+        return notes

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from slviewer.records.record import Count, Record, Share
-from slviewer.records.table import Column, Rows, Table
+from slviewer.records.table import Column, Table
 from slviewer.records.verdict import Verdict
 
 MIN_WEIGHT = 0.7
@@ -49,21 +49,18 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
     def table(self) -> Table:
         """Return the figures of both devices, and notes on poses and features."""
         devices = ("camera", "projector")
-        columns = [Column("quantity"), *map(Column, devices), Column("both")]
-        rms, focal = (
-            self.reprojection_rms_px,
-            [self.focal_px.get(device, (None, None)) for device in devices],
-        )
-        rows: Rows = [
-            ["reprojection RMS, px", *map(rms.get, devices), rms.get("stereo")],
-            ["focal length x, px", *(x for x, _ in focal), None],
-            ["focal length y, px", *(y for _, y in focal), None],
-            [
-                "standard deviation of the focal length, px",
-                *map(self.focal_sigma_px.get, devices),
-                None,
-            ],
-            ["baseline, mm", None, None, self.baseline_mm],
+        rms, sigma = self.reprojection_rms_px, self.focal_sigma_px
+        focal = {device: self.focal_px.get(device, (None, None)) for device in devices}
+        figures: dict[str, Mapping[str, float | None]] = {
+            "reprojection RMS, px": {**rms, "both": rms.get("stereo")},
+            "focal length x, px": {device: x for device, (x, _) in focal.items()},
+            "focal length y, px": {device: y for device, (_, y) in focal.items()},
+            "standard deviation of the focal length, px": sigma,
+            "baseline, mm": {"both": self.baseline_mm},
+        }
+        rows = [
+            {"quantity": quantity, **{each: values.get(each) for each in (*devices, "both")}}
+            for quantity, values in figures.items()
         ]
         near, far = self.depth_range_mm or (float("nan"), float("nan"))
         used, total = len(self.poses), len(self.poses) + len(self.excluded)
@@ -75,7 +72,7 @@ class StereoFit(msgspec.Struct, frozen=True, tag="stereo"):
         notes += [f"Excluded: {name}: {why}." for name, why in self.excluded.items()]
         if self.features_excluded:
             notes.append(f"{self.features_excluded} features excluded beyond 6 robust sigma.")
-        return Table(columns, rows, "Stereo", notes)
+        return Table.of(rows, "Stereo", notes)
 
 
 class AxisFit(msgspec.Struct, frozen=True):
@@ -106,17 +103,18 @@ class PixelwiseFit(msgspec.Struct, frozen=True, tag="pixelwise"):
 
     def table(self) -> Table:
         """Return a line for each axis."""
-        columns = [
-            Column("axis"),
-            Column("pixels fitted", "%", digits=1),
-            Column("poses a pixel", digits=0),
-            *(Column(f"RMS in {name}", "mm") for name in "zxy"),
-        ]
-        rows: Rows = [
-            [axis, 100 * fit.fitted, fit.poses, fit.z_mm, fit.x_mm, fit.y_mm]
+        rows = [
+            {
+                "axis": axis,
+                Column("pixels fitted", "%", digits=1): 100 * fit.fitted,
+                Column("poses a pixel", digits=0): fit.poses,
+                Column("RMS in z", "mm"): fit.z_mm,
+                Column("RMS in x", "mm"): fit.x_mm,
+                Column("RMS in y", "mm"): fit.y_mm,
+            }
             for axis, fit in self.axes.items()
         ]
-        return Table(columns, rows, "Pixel-wise fits by captured axis (median over the pixels)")
+        return Table.of(rows, "Pixel-wise fits by captured axis (median over the pixels)")
 
 
 class VolumeSigma(msgspec.Struct, frozen=True):
@@ -178,24 +176,22 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
         low, high = self.board_height_mm
         near, far = sigma.depths_mm
         u, v, z = sigma.worst_at
-        rows = [
-            ["Residual noise, camera", f"{noise['camera']:.4f} px"],
-            ["Residual noise, projector x / y", f"{noise['x']:.4f} / {noise['y']:.4f} px"],
-            ["Residuals over predicted noise", f"{max(self.residuals_over_noise.values()):.1f}"],
-            [
-                "Local distortion, camera / projector",
-                f"{local['camera']:.3f} / {local['projector']:.3f} px RMS",
-            ],
-            ["Board height, peak to valley", f"{high - low:.3f} mm"],
-            ["Board feature offsets", f"{self.board_offsets_rms_mm:.4f} mm RMS"],
-            [
-                "Covered, camera / projector",
-                f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %",
-            ],
-            ["Supported volume", f"{100 * sigma.supported:.0f} % at {near:.0f} to {far:.0f} mm"],
-            ["3D uncertainty there, median / 95 %", f"{sigma.median:.4f} / {sigma.p95:.4f} mm"],
-            ["Worst uncertainty", f"{sigma.worst:.3f} mm at pixel ({u:.0f}, {v:.0f}), {z:.0f} mm"],
-        ]
+        figures = {
+            "Residual noise, camera": f"{noise['camera']:.4f} px",
+            "Residual noise, projector x / y": f"{noise['x']:.4f} / {noise['y']:.4f} px",
+            "Residuals over predicted noise": f"{max(self.residuals_over_noise.values()):.1f}",
+            "Local distortion, camera / projector": (
+                f"{local['camera']:.3f} / {local['projector']:.3f} px RMS"
+            ),
+            "Board height, peak to valley": f"{high - low:.3f} mm",
+            "Board feature offsets": f"{self.board_offsets_rms_mm:.4f} mm RMS",
+            "Covered, camera / projector": (
+                f"{100 * covered['camera']:.0f} / {100 * covered['projector']:.0f} %"
+            ),
+            "Supported volume": f"{100 * sigma.supported:.0f} % at {near:.0f} to {far:.0f} mm",
+            "3D uncertainty there, median / 95 %": f"{sigma.median:.4f} / {sigma.p95:.4f} mm",
+            "Worst uncertainty": (f"{sigma.worst:.3f} mm at pixel ({u:.0f}, {v:.0f}), {z:.0f} mm"),
+        }
         named = {
             f"Weights below {MIN_WEIGHT:g}": [
                 f"{name} {min(pair):.2f}"
@@ -213,8 +209,7 @@ class SplinedFit(msgspec.Struct, frozen=True, tag="splined"):
             f"{name} is excluded from the splined model: it {why}."
             for name, why in self.excluded.items()
         ]
-        columns = [Column("quantity"), Column("value", align="right")]
-        return Table(columns, rows, f"Joint adjustment (splined), {self.steps} steps", notes)
+        return Table.of_figures(figures, f"Joint adjustment (splined), {self.steps} steps", notes)
 
 
 class ModelCalibration(Record, frozen=True, kw_only=True):

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from slviewer.records.record import Record, Vector
-from slviewer.records.table import Cell, Column, Rows, Table
+from slviewer.records.table import Cell, Column, Table, format_signed
 
 DriftVerdict = Literal["still good", "recalibrate"]
 
@@ -70,60 +70,49 @@ class Drift(Record, frozen=True, kw_only=True):
     def tables(cls, found: Mapping[str, "Drift"]) -> list[Table]:  # type: ignore[override]
         """Return a table of the checks, the latest first, and one of what the latest found of each
         axis."""
-        columns = [
-            Column("check"),
-            Column("time, UTC", detail=True),
-            Column("capture"),
-            Column("answer"),
-            Column("change of scale", "ppm", digits=0),
-            Column("±", "ppm", digits=0),
-            Column("epipolar error", "px", digits=4),
-            Column("±", "px", digits=4, detail=True),
-            Column("misfit", "px", detail=True),
-        ]
-        rows: Rows = [
-            [
-                name,
-                each.time[:16].replace("T", " "),
-                each.capture,
-                Cell(each.verdict, "better" if each.is_good else "worse"),
-                each.scale_ppm,
-                each.scale_sigma_ppm,
-                each.across_px,
-                each.across_sigma_px,
-                each.misfit_px,
-            ]
+        rows = [
+            {
+                "check": name,
+                Column("time, UTC", detail=True): each.time[:16].replace("T", " "),
+                "capture": each.capture,
+                "answer": Cell(each.verdict, "better" if each.is_good else "worse"),
+                Column("change of scale", "ppm", digits=0): each.scale_ppm,
+                Column("±", "ppm", digits=0): each.scale_sigma_ppm,
+                Column("epipolar error", "px", digits=4): each.across_px,
+                Column("±", "px", digits=4, detail=True): each.across_sigma_px,
+                Column("misfit", "px", detail=True): each.misfit_px,
+            }
             for name, each in reversed(list(found.items()))
         ]
         *_, (name, latest) = found.items()
         return [
-            Table(columns, rows, "Drift checks, the latest first").without_empty(),
+            Table.of(rows, "Drift checks, the latest first").without_empty(),
             latest._list_movements(name),
         ]
 
     def _list_movements(self, name: str) -> Table:
-        columns = [
-            Column("axis of the projector"),
-            Column("turn", "mrad"),
-            Column("±", "mrad"),
-            Column("shift", "µm", digits=0),
-            Column("±", "µm", digits=0),
-            Column("turn", "mrad", "detectable", digits=4, detail=True),
-            Column("shift", "µm", "detectable", digits=1, detail=True),
+        rows = [
+            {
+                "axis of the projector": axis,
+                Column("turn", "mrad"): self.turn_mrad[k],
+                Column("±", "mrad"): self.turn_sigma_mrad[k],
+                Column("shift", "µm", digits=0): 1e3 * self.shift_mm[k],
+                Column("±", "µm", digits=0): 1e3 * self.shift_sigma_mm[k],
+                Column("turn", "mrad", "detectable", digits=4, detail=True): self.seen_alone[k],
+                Column("shift", "µm", "detectable", digits=1, detail=True): (
+                    1e3 * self.seen_alone[3 + k]
+                ),
+            }
+            for k, axis in enumerate("xyz")
         ]
-        shifts, sigmas, seen = ([1e3 * mm for mm in three] for three in (
-            self.shift_mm, self.shift_sigma_mm, self.seen_alone[3:]
-        ))  # fmt: skip
-        figures = self.turn_mrad, self.turn_sigma_mrad, shifts, sigmas, self.seen_alone[:3], seen
-        rows = [list(row) for row in zip("xyz", *figures, strict=True)]
         baseline = 1e3 * self.baseline_mm
         notes = [
             f"{self.summary()}.",
-            f"Baseline {baseline:+.0f} ± {1e3 * self.baseline_sigma_mm:.0f} µm.".replace("-", "−"),
+            f"Baseline {format_signed(baseline)} ± {1e3 * self.baseline_sigma_mm:.0f} µm.",
             (
                 "A pan and a shift along x look nearly alike, as do a nod and a shift along y:"
                 " their sum is known far better than each. Detectable: if it is the only change."
             ),
             *(f"Not detectable: {what}." for what in self.unseen),
         ]
-        return Table(columns, rows, f"Check {name}: how the projector has moved", notes)
+        return Table.of(rows, f"Check {name}: how the projector has moved", notes)

@@ -1,6 +1,7 @@
 """Parts that were measured and judged by an inspection plan."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -8,7 +9,7 @@ import msgspec
 
 from slviewer.records.acceptance import MARKS, Decision, worst_decision
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Rows, Table
+from slviewer.records.table import Cell, Column, Row, Table
 
 RULE = (
     "Decided with a guard band as in ISO 14253-1: pass where the value and its expanded uncertainty"
@@ -135,24 +136,20 @@ class Inspection(Record, frozen=True, kw_only=True):
 
     def list_results(self) -> Table:
         """Return the table of parts by characteristic."""
-        columns = [
-            Column("part"),
-            Column("characteristic"),
-            Column("type", detail=True),
-            Column("value", digits=4),
-            Column("U (k=2)", digits=4),
-            Column("unit"),
-            *(Column(limit, digits=4, detail=True) for limit in ("nominal", "lower", "upper")),
-            Column("decision"),
-            Column("reason", detail=True),
-        ]
-        rows: Rows = [
-            [
-                *(each.part, wanted.name, wanted.kind, result.value, result.U, wanted.unit),
-                *(wanted.nominal, wanted.lower, wanted.upper),
-                Cell(result.decision, MARKS[result.decision]),
-                result.reason,
-            ]
+        rows = [
+            {
+                "part": each.part,
+                "characteristic": wanted.name,
+                Column("type", detail=True): wanted.kind,
+                Column("value", digits=4): result.value,
+                Column("U (k=2)", digits=4): result.U,
+                "unit": wanted.unit,
+                Column("nominal", digits=4, detail=True): wanted.nominal,
+                Column("lower", digits=4, detail=True): wanted.lower,
+                Column("upper", digits=4, detail=True): wanted.upper,
+                "decision": Cell(result.decision, MARKS[result.decision]),
+                Column("reason", detail=True): result.reason,
+            }
             for each in self.parts
             for wanted, result in zip(self.characteristic, each.results, strict=True)
         ]
@@ -162,29 +159,34 @@ class Inspection(Record, frozen=True, kw_only=True):
                 "Some U hold no part of the calibration's uncertainty: the model does not"
                 " predict it."
             )
-        return Table(columns, rows, f"Parts by {self.plan}", notes)
+        return Table.of(rows, f"Parts by {self.plan}", notes)
 
     def _list_capability(self) -> list[Table]:
-        columns = [
-            Column("characteristic"),
-            Column("parts"),
-            Column("mean", digits=4),
-            Column("std. dev.", digits=4),
-            Column("unit"),
-            *(
-                Column(title, digits=2, group=index, detail=title != "value")
-                for index in ("Cp", "Cpk")
-                for title in ("value", "from", "to")
-            ),
-        ]
-        rows: Rows = [
-            [wanted.name, c.parts, c.mean, c.sigma, wanted.unit, *(c.cp or (None,) * 3), *c.cpk]
-            for wanted, c in zip(self.characteristic, self.capability, strict=False)
-            if c is not None
+        rows = [
+            {
+                "characteristic": wanted.name,
+                "parts": each.parts,
+                Column("mean", digits=4): each.mean,
+                Column("std. dev.", digits=4): each.sigma,
+                "unit": wanted.unit,
+                **_list_ends("Cp", each.cp or (None,) * 3),
+                **_list_ends("Cpk", each.cpk),
+            }
+            for wanted, each in zip(self.characteristic, self.capability, strict=False)
+            if each is not None
         ]
         note = (
             "With 95 % confidence intervals; the spread of the values includes the measurement's."
             " Not for fewer than 3 parts, without a limit, or where values do not vary; Cp needs"
             " both limits."
         )
-        return [Table(columns, rows, f"Capability by {self.plan}", [note])] if rows else []
+        return [Table.of(rows, f"Capability by {self.plan}", [note])] if rows else []
+
+
+def _list_ends(index: str, values: Sequence[float | None]) -> Row:
+    """Return a capability index and the ends of its interval by column."""
+    titles = ("value", "from", "to")
+    return {
+        Column(title, digits=2, group=index, detail=title != "value"): value
+        for title, value in zip(titles, values, strict=True)
+    }

@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.records.acceptance import COVERAGE, MARKS, Decision
 from slviewer.records.plain import from_plain
 from slviewer.records.record import Count, Matrix4, Record, Vector
-from slviewer.records.table import Cell, Column, Rows, Table
+from slviewer.records.table import Cell, Column, Table
 
 Unit = Literal["mm", "deg", "mm²", "%", ""]
 
@@ -196,35 +196,32 @@ class NominalDeviation(msgspec.Struct, frozen=True):
         """Return all figures, with the decision for each end of the range where there is a
         tolerance."""
         numbers, verdict, nominal = self.statistics_mm, self.verdict, self.nominal
-        low, high = (
-            ("", "")
-            if verdict is None
-            else (Cell(DECIDED[d], MARKS[d]) for _, d in (verdict.lowest, verdict.highest))
-        )
-        rows: Rows = [
-            ["mean", numbers.mean, "mm", ""],
-            ["RMS", numbers.rms, "mm", ""],
-            ["RMS of the scan's noise alone", self.noise_mm, "mm", ""],
-            ["95 % are off by less than", numbers.within_95, "mm", ""],
-            ["range of 99.7 %, lower end", numbers.p_low, "mm", low],
-            ["range of 99.7 %, upper end", numbers.p_high, "mm", high],
-            ["lowest", numbers.lowest, "mm", ""],
-            ["highest", numbers.highest, "mm", ""],
-            ["area of the nominal that was measured", 100 * self.coverage, "%", ""],
+        figures = [
+            *self.quantities(),
+            Quantity("lowest", numbers.lowest, "mm"),
+            Quantity("highest", numbers.highest, "mm"),
         ]
+        if self.noise_mm is not None:
+            figures.append(Quantity("RMS of the scan's noise alone", self.noise_mm, "mm"))
+        decisions: dict[str, Cell] = {}
         if verdict is not None:
-            rows += [
-                [f"within ± {verdict.tolerance_mm:g} mm", verdict.within, "%", ""],
-                ["inside by more than U", verdict.inside, "%", ""],
-                ["too close to tell", verdict.close, "%", ""],
-                ["outside by more than U", verdict.outside, "%", ""],
-                ["U of a point, k = 2", verdict.U_mm, "mm", ""],
+            for end, (_, decision) in (("lower", verdict.lowest), ("upper", verdict.highest)):
+                decided = Cell(DECIDED[decision], MARKS[decision])
+                decisions[f"range of 99.7 %, {end} end"] = decided
+            figures += [
+                Quantity("inside by more than U", verdict.inside, "%"),
+                Quantity("too close to tell", verdict.close, "%"),
+                Quantity("outside by more than U", verdict.outside, "%"),
+                Quantity("U of a point, k = 2", verdict.U_mm, "mm"),
             ]
-        columns = [
-            Column("quantity"),
-            Column("value", digits=4),
-            Column("unit"),
-            Column("decision"),
+        rows = [
+            {
+                "quantity": each.name,
+                Column("value", digits=4): each.value,
+                "unit": each.unit,
+                "decision": decisions.get(each.name, ""),
+            }
+            for each in figures
         ]
         share = 100 * numbers.left_out / max(numbers.points + numbers.left_out, 1)
         size = (
@@ -243,7 +240,7 @@ class NominalDeviation(msgspec.Struct, frozen=True):
             ),
             *([] if verdict is None else [f"{verdict.text()}, {RULE}."]),
         ]
-        return Table(columns, rows, f"Deviation from nominal: {name}", notes).without_empty()
+        return Table.of(rows, f"Deviation from nominal: {name}", notes).without_empty()
 
 
 class Measurement(Record, frozen=True, kw_only=True):
@@ -390,23 +387,23 @@ def _settings_of_comparison(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 def list_quantities(found: Mapping[str, Measurement]) -> Table:
     """Return the table of all quantities of measurements."""
-    columns = [
-        Column("measurement"),
-        Column("type", detail=True),
-        Column("scan"),
-        Column("quantity"),
-        Column("value", digits=4),
-        Column("unit"),
-        Column("U (k=2)", digits=4),
-        Column("calibration in U", detail=True),
-        Column("of", detail=True),
-    ]
-    rows: Rows = [
-        [name, each.what, each.source, q.name, q.value, q.unit, q.U,
-         None if q.U is None else "yes" if q.whole else "no", each.where]
+    rows = [
+        {
+            "measurement": name,
+            Column("type", detail=True): each.what,
+            "scan": each.source,
+            "quantity": q.name,
+            Column("value", digits=4): q.value,
+            "unit": q.unit,
+            Column("U (k=2)", digits=4): q.U,
+            Column("calibration in U", detail=True): (
+                None if q.U is None else "yes" if q.whole else "no"
+            ),
+            Column("of", detail=True): each.where,
+        }
         for name, each in found.items()
         for q in each.quantities
-    ]  # fmt: skip
+    ]
     partial = [
         name
         for name, each in found.items()
@@ -418,4 +415,4 @@ def list_quantities(found: Mapping[str, Measurement]) -> Table:
     ]
     if partial:
         notes.append(f"U lacks the calibration's part, which is unknown: {', '.join(partial)}.")
-    return Table(columns, rows, "Measured on the scans", notes)
+    return Table.of(rows, "Measured on the scans", notes)

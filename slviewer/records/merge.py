@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from slviewer.records.record import Count, Matrix4, Record, Share, Vector
-from slviewer.records.table import Cell, Column, Rows, Table
+from slviewer.records.table import Cell, Column, Table
 
 MIN_OVERLAP = 0.3
 """Share of a scan below which its overlap with another is reported."""
@@ -169,57 +169,41 @@ class Merge(Record, frozen=True, kw_only=True):
 
     def list_tables(self, name: str) -> list[Table]:
         """Return a table of the pairs and one of the loops, and notes of all that was excluded."""
-        columns = [
-            Column("scan"),
-            Column("onto"),
-            Column("RMS", "mm"),
-            Column("point to point", "mm", detail=True),
-            Column("overlap", "%", digits=0),
-            Column("sigma", "mm", digits=4),
-            Column("sigma", "°", digits=4, detail=True),
-            Column("moved", "mm", digits=2),
-            Column("turned", "°", digits=2, detail=True),
-            Column("common markers", detail=True),
-            Column("their corners", "mm", detail=True),
-        ]
         marked = {(each.scan, each.onto): each for each in self.markers}
-        rows: Rows = []
+        rows = []
         for pair in sorted(self.registered, key=lambda p: self.reference not in (p.scan, p.onto)):
             marks = marked.get((pair.scan, pair.onto))
+            overlap = Cell(100 * pair.overlap, "" if pair.overlap >= MIN_OVERLAP else "worse")
             rows.append(
-                [
-                    pair.scan,
-                    pair.onto,
-                    Cell(pair.rms_mm, "strong"),
-                    pair.point_to_point_rms_mm,
-                    Cell(100 * pair.overlap, "" if pair.overlap >= MIN_OVERLAP else "worse"),
-                    pair.sigma_shift_mm,
-                    pair.sigma_turn_deg,
-                    pair.moved_mm,
-                    pair.turned_deg,
-                    *((None, None) if marks is None else (len(marks.ids), marks.rms_mm)),
-                ]
+                {
+                    "scan": pair.scan,
+                    "onto": pair.onto,
+                    Column("RMS", "mm"): Cell(pair.rms_mm, "strong"),
+                    Column("point to point", "mm", detail=True): pair.point_to_point_rms_mm,
+                    Column("overlap", "%", digits=0): overlap,
+                    Column("sigma", "mm", digits=4): pair.sigma_shift_mm,
+                    Column("sigma", "°", digits=4, detail=True): pair.sigma_turn_deg,
+                    Column("moved", "mm", digits=2): pair.moved_mm,
+                    Column("turned", "°", digits=2, detail=True): pair.turned_deg,
+                    Column("common markers", detail=True): marks and len(marks.ids),
+                    Column("their corners", "mm", detail=True): marks and marks.rms_mm,
+                }
             )
-        pairs = Table(columns, rows, f"Merge {name}: registered pairs", self._list_notes())
-        tables = [pairs.without_empty()]
+        caption = f"Merge {name}: registered pairs"
+        tables = [Table.of(rows, caption, self._list_notes()).without_empty()]
         if self.loops:
-            columns = [
-                Column("loop"),
-                *(
-                    Column(end, unit, digits=digits, detail=unit == "°")
-                    for end in ("before", "after")
-                    for unit, digits in (("mm", 3), ("°", 4))
-                ),
-            ]
             rows = [
-                [
-                    " – ".join([*loop.scans, loop.scans[0]]),
-                    *(loop.error_mm, loop.error_deg, loop.left_mm, loop.left_deg),
-                ]
+                {
+                    "loop": " – ".join([*loop.scans, loop.scans[0]]),
+                    Column("before", "mm"): loop.error_mm,
+                    Column("before", "°", digits=4, detail=True): loop.error_deg,
+                    Column("after", "mm"): loop.left_mm,
+                    Column("after", "°", digits=4, detail=True): loop.left_deg,
+                }
                 for loop in self.loops
             ]
             caption = "closure error of its loops, before and after the joint adjustment"
-            tables.append(Table(columns, rows, f"Merge {name}: {caption}"))
+            tables.append(Table.of(rows, f"Merge {name}: {caption}"))
         return tables
 
     def _list_notes(self) -> list[str]:
@@ -286,22 +270,17 @@ class Placement(Record, frozen=True, kw_only=True):
     @classmethod
     def tables(cls, found: Mapping[str, "Placement"]) -> list[Table]:  # type: ignore[override]
         """Return one table with a line for each scan."""
-        columns = [
-            Column("scan"),
-            Column("onto"),
-            Column("RMS", "mm"),
-            Column("overlap", "%", digits=0),
-            Column("kept apart because"),
-        ]
-        rows: Rows = [
-            [
-                name,
-                p.onto,
-                p.rms_mm,
-                None if p.overlap is None else 100 * p.overlap,
-                Cell(p.why, "worse"),
-            ]
-            for name, p in found.items()
+        rows = [
+            {
+                "scan": name,
+                "onto": each.onto,
+                Column("RMS", "mm"): each.rms_mm,
+                Column("overlap", "%", digits=0): (
+                    None if each.overlap is None else 100 * each.overlap
+                ),
+                "kept apart because": Cell(each.why, "worse"),
+            }
+            for name, each in found.items()
         ]
         again = [each.seen_again for each in found.values() if each.seen_again is not None]
         notes = (
@@ -309,4 +288,4 @@ class Placement(Record, frozen=True, kw_only=True):
             if again
             else []
         )
-        return [Table(columns, rows, cls.title, notes).without_empty()]
+        return [Table.of(rows, cls.title, notes).without_empty()]

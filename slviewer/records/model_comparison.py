@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Cell, Column, Rows, Table, Value
+from slviewer.records.table import Cell, Column, Table
 
 
 class HeldOutError(msgspec.Struct, frozen=True):
@@ -76,24 +76,26 @@ class ModelComparison(Record, frozen=True, kw_only=True):
 
     def list_tables(self, name: str) -> list[Table]:
         """Return a table of the errors with a line for each model; the least ones are marked."""
-        columns = [
-            Column("model"),
-            Column("plane", "mm", digits=4),
-            Column("board", "mm", digits=4),
-            Column("scale", "ppm", digits=0),
-            Column("camera", "px"),
-            Column("projector", "px"),
-        ]
-        rows: Rows = []
+        columns = {
+            "plane_mm": Column("plane", "mm", digits=4),
+            "board_mm": Column("board", "mm", digits=4),
+            "scale_ppm": Column("scale", "ppm", digits=0),
+            "camera_px": Column("camera", "px"),
+            "projector_px": Column("projector", "px"),
+        }
+        least = {
+            figure: min(getattr(each, figure) for each in self.models.values())
+            for figure in ("plane_mm", "board_mm", "camera_px")
+            if len(self.models) > 1
+        }
+        rows = []
         for model, each in self.models.items():
-            row: list[Value | Cell] = [Cell(model, "strong" if model == self.recommended else "")]
-            for figure in HeldOutError.__struct_fields__:
+            row: dict[Any, Cell] = {
+                "model": Cell(model, "strong" if model == self.recommended else "")
+            }
+            for figure, column in columns.items():
                 value = getattr(each, figure)
-                least = min(getattr(other, figure) for other in self.models.values())
-                is_compared = (
-                    figure in ("plane_mm", "board_mm", "camera_px") and len(self.models) > 1
-                )
-                row.append(Cell(value, "better" if is_compared and value == least else ""))
+                row[column] = Cell(value, "better" if value == least.get(figure) else "")
             rows.append(row)
         count = len(next(iter(self.poses.values())))
         notes = [
@@ -105,4 +107,4 @@ class ModelComparison(Record, frozen=True, kw_only=True):
             f"Recommended of these: {self.recommended}.",
             *(f"{model} could not be compared: {why}." for model, why in self.failed.items()),
         ]
-        return [Table(columns, rows, "RMS on held-out poses", notes)]
+        return [Table.of(rows, "RMS on held-out poses", notes)]

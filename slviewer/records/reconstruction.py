@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from slviewer.records.record import Count, Record
-from slviewer.records.table import Column, Rows, Table
+from slviewer.records.table import Column, Table
 
 REPORTED_RAISE = 1.2
 """Times its predicted noise that a calibration's residual is, from which raising sigma is
@@ -59,24 +59,23 @@ class Reconstruction(Record, frozen=True, kw_only=True):
     @classmethod
     def tables(cls, found: Mapping[str, "Reconstruction"]) -> list[Table]:  # type: ignore[override]
         """Return one table with a line for each cloud."""
-        columns = [
-            Column("capture"),
-            Column("model"),
-            Column("axis", align="centre", detail=True),
-            Column("points"),
-            Column("nearest", "mm", digits=0),
-            Column("farthest", "mm", digits=0),
-            Column("noise", "mm"),
-            Column("calibration", "mm", digits=4, detail=True),
-            Column("masked", "%", digits=1, detail=True),
-            Column("scale", detail=True),
+        rows = [
+            {
+                "capture": name,
+                "model": each.model,
+                Column("axis", align="centre", detail=True): each.axis,
+                "points": each.points,
+                Column("nearest", "mm", digits=0): each.depth_mm and each.depth_mm[0],
+                Column("farthest", "mm", digits=0): each.depth_mm and each.depth_mm[1],
+                Column("noise", "mm"): each.noise_mm,
+                Column("calibration", "mm", digits=4, detail=True): each.sigma_calibration_mm,
+                Column("masked", "%", digits=1, detail=True): (
+                    None if each.masked is None else 100 * each.masked
+                ),
+                Column("scale", detail=True): each.scale,
+            }
+            for name, each in found.items()
         ]
-        rows: Rows = []
-        for name, each in found.items():
-            near, far = each.depth_mm or (None, None)
-            masked = None if each.masked is None else 100 * each.masked
-            figures = (each.points, near, far, each.noise_mm, each.sigma_calibration_mm, masked)
-            rows.append([name, each.model, each.axis, *figures, each.scale])
         raised = [
             f"{name}: sigma was raised: the calibration's residuals in {each.axis} are"
             f" {each.raised:.1f} times their predicted noise, and what disturbs its phases disturbs"
@@ -91,4 +90,4 @@ class Reconstruction(Record, frozen=True, kw_only=True):
             " leaves uncertain."
         )
         notes = [note, *raised, *(f"Frame: {frame}." for frame in frames)]
-        return [Table(columns, rows, cls.title, notes).without_empty()]
+        return [Table.of(rows, cls.title, notes).without_empty()]

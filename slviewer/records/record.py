@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import Column, Rows, Table
+from slviewer.records.table import Column, Row, Table
 
 RECORDS: dict[str, type["Record"]] = {}
 """The kinds of records by the folder of their results."""
@@ -18,6 +18,8 @@ UNITS = {
     "rad": ("rad", 4), "percent": ("%", 1), "ppm": ("ppm", 1), "s": ("s", 1), "ms": ("ms", 1),
 }  # fmt: skip
 """{last word of a figure's name: (unit, decimals)}."""
+DEPTHS = ("R1", "R2", "R3")
+"""In front of, inside and behind the calibrated depths."""
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Vector = tuple[float, float, float]
@@ -84,10 +86,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         listed = list(found.items())[:: -1 if cls.newest_first else 1]
         if own := [table for name, record in listed for table in record.list_tables(name)]:
             return own
-        figures = {name: record.figures() for name, record in found.items()}
-        names = list(dict.fromkeys(figure for each in figures.values() for figure in each))
-        rows: Rows = [[name, *(each.get(f) for f in names)] for name, each in figures.items()]
-        return [Table([Column("name"), *map(figure_column, names)], rows, cls.title)]
+        rows = [
+            {"name": name, **{figure_column(f): value for f, value in record.figures().items()}}
+            for name, record in found.items()
+        ]
+        return [Table.of(rows, cls.title)]
 
     def list_tables(self, name: str) -> list[Table]:
         """Return the record's own tables; none where records of its kind share them."""
@@ -127,6 +130,14 @@ def figure_column(name: str) -> Column:
     words = re.split(r"[ _]", name)
     unit, digits = UNITS.get(words[-1], ("", 3))
     return Column(" ".join(words[:-1] if unit else words), unit, digits=digits)
+
+
+def list_shares(incidence: Mapping[str, float] | None) -> Row:
+    """Return the percent in front of, inside and behind the calibrated depths by column."""
+    return {
+        Column(depths, "%", "share in", digits=1, detail=True): (incidence or {}).get(depths)
+        for depths in DEPTHS
+    }
 
 
 def list_numbers(values: Mapping[str, Any], outer: str = "") -> dict[str, float]:

@@ -1,9 +1,9 @@
 """Tables of figures with units: what the terminal, pages, panels and CSV files draw."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from slviewer.errors import InputError
 
@@ -26,6 +26,8 @@ class Cell:
 
 
 Rows = list[list[Value | Cell]]
+Row = dict[Any, Any]
+"""{column, or its title: value or cell}."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,16 @@ class Column:
         return " ".join(filter(None, (self.group, self.title, self.unit)))
 
     def format(self, value: Value) -> str:
-        """Return a value as text: numbers with the column's decimals, halves rounded up; a dash for
-        unknown ones."""
+        """Return a value as text: numbers with the column's decimals, halves rounded up and no
+        minus before nothing; a dash for unknown ones."""
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
             return UNKNOWN
         if isinstance(value, str):
             return value
         if isinstance(value, int):
             return f"{value:,}"
-        return f"{value * (1 + 1e-9):.{self.digits}f}".replace("-", "−")
+        rounded = round(value * (1 + 1e-9), self.digits) + 0.0
+        return f"{rounded:.{self.digits}f}".replace("-", "−")
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,33 @@ class Table:
             for column, is_text in zip(self.columns, self._find_texts(), strict=True)
         ]
         object.__setattr__(self, "columns", aligned)
+
+    @classmethod
+    def of(
+        cls,
+        rows: Sequence[Row],
+        caption: str = "",
+        notes: Sequence[str] = (),
+        footer: Sequence[Row] = (),
+    ) -> "Table":
+        """Return the table of rows by column; a value that a row lacks is unknown. A title that
+        ends in % or holds ratio sets its column's decimals."""
+        headings = list(dict.fromkeys(heading for row in rows for heading in row))
+        columns = [each if isinstance(each, Column) else _make_column(each) for each in headings]
+        cells = [list(map(row.get, headings)) for row in rows]
+        below = [[row.get(heading, "") for heading in headings] for row in footer]
+        return cls(columns, cells, caption, notes, below)
+
+    @classmethod
+    def of_figures(
+        cls, figures: Mapping[str, str], caption: str, notes: Sequence[str] = ()
+    ) -> "Table":
+        """Return the table of some figures, as text with their units, by name."""
+        rows = [
+            {"quantity": name, Column("value", align="right"): text}
+            for name, text in figures.items()
+        ]
+        return cls.of(rows, caption, notes)
 
     def _find_texts(self) -> list[bool]:
         """Return whether each column holds texts, and no numbers."""
@@ -138,12 +168,20 @@ class Table:
         names = {str(row[0]) for row in self.rows}
         return self.select(self.columns[1:]) if len(names) == 1 < len(self.rows) else self
 
+    def without_details(self) -> "Table":
+        """Return the table without the columns that are details."""
+        return self.select([column for column in self.columns if not column.detail])
+
     def without_empty(self) -> "Table":
         """Return the table without columns that hold nothing."""
         rows = list(map(self.values, self.rows))
         return self.select(
             [c for k, c in enumerate(self.columns) if any(row[k] not in (None, "") for row in rows)]
         )
+
+
+def _make_column(title: str) -> Column:
+    return Column(title, digits=2 if "ratio" in title else 1 if title.endswith("%") else 3)
 
 
 def _format_cell(column: Column, cell: Value | Cell) -> tuple[str, Mark]:
@@ -173,42 +211,46 @@ def compare_errors(error: float | None, rival: float | None) -> Cell:
     return Cell(f"{max(rival / error, error / rival):.2f} × {mark}" if mark else "equal", mark)
 
 
+def compare_with_first(errors: Mapping[str, float | None], model: str) -> Cell:
+    """Return the cell that compares a model's error with that of the first one; empty for the
+    first."""
+    first = next(iter(errors), model)
+    return Cell("") if model == first else compare_errors(errors.get(model), errors[first])
+
+
+def format_signed(value: float, unit: str = "", digits: int = 0) -> str:
+    """Return a difference with its sign and unit."""
+    return f"{value:+.{digits}f} {unit}".strip().replace("-", "−")
+
+
+def format_scale(factor: float) -> str:
+    """Return by how much a correction of scale lengthens, such as ``+300 ppm``."""
+    return format_signed(1e6 * (factor - 1), "ppm")
+
+
 def render_text(table: Table) -> str:
     """Return a table for the terminal: names to the left, figures to the right, and its notes
     below.
 
     Titles stand above their columns one word a line, so that wide tables stay narrow.
     """
-    body = [[text for _, text, _ in line] for line in table.format([*table.rows, *table.footer])]
-    is_left = [column.align == "left" for column in table.columns]
-    lines = align_columns(
-        [column.heading for column in table.columns], body, is_left, len(table.footer)
-    )
-    return "\n".join([*lines, *table.notes])
-
-
-def align_columns(
-    headings: Sequence[str],
-    body: Sequence[Sequence[str]],
-    is_left: Sequence[bool],
-    footers: int = 0,
-) -> list[str]:
-    """Return lines of texts in columns, below headings of one word a line, and a rule above the
-    last ``footers``."""
-    words = [heading.split() for heading in headings]
+    words = [column.heading.split() for column in table.columns]
     height = max(map(len, words), default=0)
     head = list(zip(*([""] * (height - len(each)) + each for each in words), strict=True))
-    widths = [max(map(len, cells)) for cells in zip(*head, *body, strict=True)]
+    body, footer = (
+        [[text for _, text, _ in line] for line in table.format(rows)]
+        for rows in (table.rows, table.footer)
+    )
+    widths = [max(map(len, cells)) for cells in zip(*head, *body, *footer, strict=True)]
 
     def align(line: Sequence[str]) -> str:
         """Return the cells of a line side by side."""
-        cells = zip(line, widths, is_left, strict=True)
-        return "  ".join(
-            text.ljust(width) if left else text.rjust(width) for text, width, left in cells
-        ).rstrip()
+        cells = [
+            text.ljust(width) if column.align == "left" else text.rjust(width)
+            for text, width, column in zip(line, widths, table.columns, strict=True)
+        ]
+        return "  ".join(cells).rstrip()
 
     rule = "-" * (sum(widths) + 2 * max(0, len(widths) - 1))
-    lines = [*map(align, head), rule, *map(align, body)]
-    return (
-        [*lines[: len(lines) - footers], rule, *lines[len(lines) - footers :]] if footers else lines
-    )
+    below = [rule, *map(align, footer)] if footer else []
+    return "\n".join([*map(align, head), rule, *map(align, body), *below, *table.notes])

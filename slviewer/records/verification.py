@@ -1,15 +1,18 @@
 """How far captures of known shapes are from these shapes."""
 
-from collections.abc import Mapping
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from itertools import combinations
 from math import dist
+from statistics import fmean
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
 from slviewer.records.plain import to_plain
-from slviewer.records.record import Count, Record, Vector, list_numbers
-from slviewer.records.table import Cell, Column, Rows, Table, compare_errors
+from slviewer.records.record import Count, Record, Vector, list_numbers, list_shares
+from slviewer.records.table import Cell, Column, Table, compare_with_first, format_scale
 
 Shape = Literal["plane", "sphere"]
 MAX_EXCLUDED = 0.02
@@ -73,15 +76,29 @@ class Verification(Record, frozen=True, kw_only=True):
         return {**meta, "models": models, "operation": cls.kind, "settings": settings}
 
     @property
+    def rms_mm(self) -> dict[str, float]:
+        """The RMS by model, NaN where it is unknown."""
+        return {
+            model: math.nan if fit.rms_mm is None else fit.rms_mm
+            for model, fit in self.models.items()
+        }
+
+    @property
+    def radii_mm(self) -> dict[str, float]:
+        """The known radii by model."""
+        fits = self.models.items()
+        return {model: fit.radius_mm for model, fit in fits if fit.radius_mm is not None}
+
+    @property
     def best(self) -> str:
         """The model with the smallest RMS."""
-        return min(self.models, key=lambda name: _or_infinite(self.models[name].rms_mm))
+        return min(
+            self.rms_mm, key=lambda model: (math.isnan(self.rms_mm[model]), self.rms_mm[model])
+        )
 
     def summary(self) -> str:
         """Return the RMS of each model in one sentence."""
-        return "RMS " + ", ".join(
-            f"{name} {_or_infinite(fit.rms_mm):.3f} mm" for name, fit in self.models.items()
-        )
+        return "RMS " + ", ".join(f"{model} {mm:.3f} mm" for model, mm in self.rms_mm.items())
 
     def figures(self) -> dict[str, float]:
         """Return the numbers of each model's fit."""
@@ -97,14 +114,17 @@ class Verification(Record, frozen=True, kw_only=True):
             ("sphere", "Spheres: RMS and radius"),
         ):
             if of_shape := {name: each for name, each in found.items() if each.shape == shape}:
-                tables.append(_make_table(of_shape, caption))
+                tables.append(list_fits(of_shape, caption))
         if distances := centre_distances_mm(found):
             models = list(dict.fromkeys(model for each in distances.values() for model in each))
-            rows: Rows = [
-                [f"{a} to {b}", *map(each.get, models)] for (a, b), each in distances.items()
+            rows = [
+                {
+                    "spheres": f"{a} to {b}",
+                    **{Column(model, "mm"): each.get(model) for model in models},
+                }
+                for (a, b), each in distances.items()
             ]
-            columns = [Column("spheres"), *(Column(model, "mm") for model in models)]
-            tables.append(Table(columns, rows, "Distances between the centres of spheres"))
+            tables.append(Table.of(rows, "Distances between the centres of spheres"))
         return tables
 
 
@@ -128,50 +148,53 @@ def centre_distances_mm(
     }
 
 
-def _make_table(found: Mapping[str, Verification], caption: str) -> Table:
+def average(shape: Shape, found: Iterable[Verification]) -> Verification:
+    """Return the means over verifications of the known figures of each model, and the sums of its
+    points."""
+    fits = defaultdict[str, list[ModelFit]](list)
+    for each in found:
+        for model, fit in each.models.items():
+            fits[model].append(fit)
+    return Verification(shape=shape, models={model: _average(of) for model, of in fits.items()})
+
+
+def _average(fits: list[ModelFit]) -> ModelFit:
+    """Return the means of the known figures."""
+    means: dict[str, Any] = {}
+    for figure in ("rms_mm", "noise_floor_mm", "coverage", "radius_mm", "masked"):
+        known = [value for fit in fits if (value := getattr(fit, figure)) is not None]
+        means[figure] = fmean(known) if known else None
+    points, excluded = (sum(getattr(f, name) for f in fits) for name in ("points", "excluded"))
+    return ModelFit(points, excluded, **means)
+
+
+def list_fits(found: Mapping[str, Verification], caption: str) -> Table:
     """Return the table of measured planes or spheres: a line for each capture and model."""
     first = next(iter(next(iter(found.values())).models))
-    columns = [
-        Column("capture"),
-        Column("model"),
-        Column("RMS", "mm"),
-        Column("noise floor", "mm"),
-        Column(f"against {first}", detail=True),
-        Column("radius", "mm"),
-        *(Column(depths, "%", "share in", digits=1, detail=True) for depths in ("R1", "R2", "R3")),
-        Column("points", detail=True),
-        Column("excluded", "%", digits=1),
-        Column("coverage", "%", digits=1),
-        Column("masked", "%", digits=1, detail=True),
-    ]
-    rows: Rows = []
+    rows = []
     for name, each in found.items():
         for model, fit in each.models.items():
-            compared = (
-                Cell("")
-                if model == first
-                else compare_errors(fit.rms_mm, each.models[first].rms_mm)
-            )
+            compared = compare_with_first(each.rms_mm, model)
             excluded = fit.excluded / max(1, fit.points)
+            is_best = model == each.best and len(each.models) > 1
             rows.append(
-                [
-                    name,
-                    model,
-                    Cell(
-                        fit.rms_mm,
-                        "better" if model == each.best and len(each.models) > 1 else compared.mark,
+                {
+                    "capture": name,
+                    "model": model,
+                    Column("RMS", "mm"): Cell(fit.rms_mm, "better" if is_best else compared.mark),
+                    Column("noise floor", "mm"): fit.noise_floor_mm,
+                    Column(f"against {first}", detail=True): compared,
+                    Column("radius", "mm"): fit.radius_mm,
+                    **list_shares(each.incidence),
+                    Column("points", detail=True): fit.points,
+                    Column("excluded", "%", digits=1): Cell(
+                        100 * excluded, "worse" if excluded > MAX_EXCLUDED else ""
                     ),
-                    fit.noise_floor_mm,
-                    compared,
-                    fit.radius_mm,
-                    *((each.incidence or {}).get(depths) for depths in ("R1", "R2", "R3")),
-                    fit.points,
-                    Cell(100 * excluded, "worse" if excluded > MAX_EXCLUDED else ""),
-                    None if fit.coverage is None else 100 * fit.coverage,
-                    None if fit.masked is None else 100 * fit.masked,
-                ]
+                    Column("coverage", "%", digits=1): _percent(fit.coverage),
+                    Column("masked", "%", digits=1, detail=True): _percent(fit.masked),
+                }
             )
-    return Table(columns, rows, caption, _list_notes(found)).without_empty()
+    return Table.of(rows, caption, _list_notes(found)).without_empty()
 
 
 def _list_notes(found: Mapping[str, Verification]) -> list[str]:
@@ -203,12 +226,10 @@ def _list_notes(found: Mapping[str, Verification]) -> list[str]:
         if factor != 1
     }
     notes += [
-        f"{model}: scale corrected by {1e6 * (f - 1):+.0f} ppm.".replace("-", "−")
-        for model, f in scaled.items()
+        f"{model}: scale corrected by {format_scale(factor)}." for model, factor in scaled.items()
     ]
     return notes
 
 
-def _or_infinite(value: float | None) -> float:
-    """Return the value, infinite where it is unknown."""
-    return float("inf") if value is None else value
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share

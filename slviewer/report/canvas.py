@@ -91,6 +91,19 @@ def add_legend(axes: Any, **options: Any) -> None:
         axes.legend(**{"fontsize": SMALL_PT, "labelcolor": INK, "frameon": False, **options})
 
 
+def add_legend_above(axes: Any, columns: int, **options: Any) -> None:
+    """Add a legend in one line above the axes, at their left."""
+    place = {"loc": "lower left", "bbox_to_anchor": (0, 1.0), "borderaxespad": 0.2}
+    add_legend(axes, ncols=columns, **{**place, **options})
+
+
+def label_point(
+    axes: Any, text: str, place: Any, offset: tuple[float, float] = (0, 2), **style: Any
+) -> None:
+    """Write text beside a point of the axes, ``offset`` typographic points away."""
+    axes.annotate(text, place, offset, textcoords="offset points", **style)
+
+
 def add_colour_bar(drawing: Any, image: Any, axes: Any, label: str, **options: Any) -> None:
     """Add a colour bar beside ``axes``, in the page's type."""
     bar = drawing.colorbar(image, ax=axes, **{"shrink": 0.9, "aspect": 24, "pad": 0.02, **options})

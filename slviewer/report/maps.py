@@ -2,6 +2,7 @@
 coordinate, and the Letter's picture of one pixel's fit."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -22,6 +23,7 @@ from slviewer.report.canvas import (
     TITLE_PT,
     add_colour_bar,
     add_legend,
+    add_legend_above,
     draw_map,
     finish_figure,
     model_colour,
@@ -31,7 +33,6 @@ from slviewer.report.canvas import (
     style_axes,
     style_image_axes,
 )
-from slviewer.report.data import PixelCurve
 from slviewer.report.page import Figure
 
 TITLE_PX = 34
@@ -44,32 +45,22 @@ def rms_maps(rms_mm: np.ndarray, axis: str = "", *, width: int = FULL) -> Figure
 
     A narrow figure has x and y below z.
     """
-    if rms_mm.ndim != 3 or rms_mm.shape[0] != 3:
-        raise InputError(
-            f"RMS maps of shape {rms_mm.shape} cannot be drawn: (3, h, w) in z, x, y is needed"
-        )
     _, h, w = rms_mm.shape
     narrow = width <= HALF
     if narrow:
-        upper, lower = (round(share * width * h / w) + TITLE_PX + 8 for share in (0.84, 0.37))
-        drawing = new_figure(width, upper + lower)
-        grid = drawing.add_gridspec(2, 2, height_ratios=(upper, lower))
-        places = [drawing.add_subplot(cell) for cell in (grid[0, :], grid[1, 0], grid[1, 1])]
+        heights = [round(share * width * h / w) + TITLE_PX + 8 for share in (0.84, 0.37)]
+        layout = [["z", "z"], ["x", "y"]]
     else:
-        drawing = new_figure(width, round(width / 3 * 0.84 * h / w) + TITLE_PX + 16)
-        places = list(drawing.subplots(1, 3))
+        heights, layout = [round(width / 3 * 0.84 * h / w) + TITLE_PX + 16], [["z", "x", "y"]]
+    drawing = new_figure(width, sum(heights))
+    places = drawing.subplot_mosaic(layout, height_ratios=heights)
     medians = [percentile(rms, 50) for rms in rms_mm]
-    for axes, name, rms, median in zip(places, "zxy", rms_mm, medians, strict=True):
-        top = round_up(percentile(rms, 99))
+    for name, rms, median in zip("zxy", rms_mm, medians, strict=True):
+        axes, top = places[name], round_up(percentile(rms, 99))
         style_image_axes(axes, f"{name}: {_format_median(median)}")
         image = draw_map(axes, rms, "viridis", 100, 0, top)
-        add_colour_bar(
-            drawing,
-            image,
-            axes,
-            "" if narrow and name != "z" else "RMS of the fit, mm",
-            extend="max",
-        )
+        label = "" if narrow and name != "z" else "RMS of the fit, mm"
+        add_colour_bar(drawing, image, axes, label, extend="max")
     named = f" along axis {axis}" if axis else ""
     return finish_figure(
         drawing,
@@ -136,17 +127,20 @@ SIGN = {"plane": "red is towards the camera", "sphere": "red is outwards"}
 
 
 def verification_maps(
-    title: str, found: Verification, arrays: Mapping[str, np.ndarray], width: int = FULL
+    title: str,
+    found: Verification,
+    arrays: Mapping[str, np.ndarray],
+    width: int = FULL,
+    limit_mm: float | None = None,
 ) -> Figure:
     """Error maps of a verification, with its arrays."""
-    fits = {model: fit for model, fit in found.models.items() if f"error_{model}" in arrays}
-    rms = {model: np.nan if fit.rms_mm is None else fit.rms_mm for model, fit in fits.items()}
-    floor = next(
-        (fit.noise_floor_mm for fit in reversed(fits.values()) if fit.noise_floor_mm is not None),
-        np.nan,
+    names = {model: f"error_{model}" for model in found.models}
+    maps = {model: arrays[name] for model, name in names.items() if name in arrays}
+    floors = [found.models[model].noise_floor_mm for model in maps]
+    floor = next((mm for mm in reversed(floors) if mm is not None), np.nan)
+    return draw_error_maps(
+        title, maps, found.rms_mm, floor, limit_mm=limit_mm, width=width, sign=SIGN[found.shape]
     )
-    maps = {model: arrays[f"error_{model}"] for model in fits}
-    return draw_error_maps(title, maps, rms, floor, width=width, sign=SIGN[found.shape])
 
 
 def error_limit(maps: list[np.ndarray]) -> float:
@@ -158,29 +152,22 @@ def error_limit(maps: list[np.ndarray]) -> float:
 
 def _arrange_axes(width: int, count: int, aspect: float) -> tuple[Any, Any, Any, int]:
     """Figure, the maps' axes, the histogram's, and the width of one map in CSS px."""
+    names = [str(index) for index in range(count)]
     if width < 800:  # more than two maps in a row would be too small to read
         across = min(count, 2)
         rows = -(-count // across)
         map_width = int((width - 70) / across)
         map_height = int(map_width * min(aspect, 1.4)) + (TITLE_PX if rows > 1 else 0)
-        drawing = new_figure(width, rows * map_height + 2 * TITLE_PX + 120)
-        grid = drawing.add_gridspec(rows + 1, across, height_ratios=(*(map_height,) * rows, 120))
-        return (
-            drawing,
-            [drawing.add_subplot(grid[i // across, i % across]) for i in range(count)],
-            drawing.add_subplot(grid[rows, :]),
-            map_width,
-        )
-    map_width = int((width - 90) / (count + 1.1))
-    map_height = int(np.clip(map_width * aspect, 200, 460))
-    drawing = new_figure(width, map_height + 2 * TITLE_PX + 8)
-    grid = drawing.add_gridspec(1, count + 1, width_ratios=(*(1.0,) * count, 1.1))
-    return (
-        drawing,
-        [drawing.add_subplot(grid[0, i]) for i in range(count)],
-        drawing.add_subplot(grid[0, count]),
-        map_width,
-    )
+        height, heights = rows * map_height + 2 * TITLE_PX + 120, (*(map_height,) * rows, 120)
+        filled = [*names, *["."] * (rows * across - count), *["histogram"] * across]
+        layout, widths = np.reshape(filled, (-1, across)).tolist(), [1.0] * across
+    else:
+        map_width = int((width - 90) / (count + 1.1))
+        height, heights = int(np.clip(map_width * aspect, 200, 460)) + 2 * TITLE_PX + 8, (1,)
+        layout, widths = [[*names, "histogram"]], [*[1.0] * count, 1.1]
+    drawing = new_figure(width, height)
+    places = drawing.subplot_mosaic(layout, width_ratios=widths, height_ratios=heights)
+    return drawing, [places[name] for name in names], places["histogram"], map_width
 
 
 def _draw_histogram(
@@ -211,14 +198,7 @@ def _draw_histogram(
     axes.set_xlim(-reach, reach)
     axes.set_ylim(bottom=0)
     axes.set_yticks([])
-    add_legend(
-        axes,
-        loc="lower left",
-        bbox_to_anchor=(-0.02, 1.0),
-        borderaxespad=0.3,
-        ncols=4,
-        columnspacing=1.1,
-    )
+    add_legend_above(axes, 4, columnspacing=1.1)
 
 
 def _crop_slices(maps: list[np.ndarray]) -> tuple[slice, slice]:
@@ -268,7 +248,7 @@ def reason_shares(phase: PhaseMap) -> dict[Reason, float]:
 def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     """The coordinates of each axis side by side; masked pixels in the colour of their reason, with
     their shares."""
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
     h, w = next(iter(phases.values())).reason.shape
@@ -277,6 +257,7 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
     drawing = new_figure(FULL, height)
     drawing.suptitle(title, x=0.004, ha="left", fontsize=SMALL_PT + 3, color=INK, fontweight="bold")
     step = max(1, -(-w // (DENSITY * map_px)))
+    palette = ListedColormap(list(REASON_COLOURS.values()))
     for axes, (axis, phase) in zip(
         np.atleast_1d(drawing.subplots(1, len(phases))), phases.items(), strict=True
     ):
@@ -293,10 +274,15 @@ def phase_maps(title: str, phases: Mapping[Axis, PhaseMap]) -> Figure:
             aspect="equal",
             interpolation="nearest",
         )
-        cover = np.zeros((*reason.shape, 4), np.float32)
-        for code, colour in REASON_COLOURS.items():
-            cover[reason == code] = (*to_rgb(colour), 1.0)
-        axes.imshow(cover, aspect="equal", interpolation="nearest")
+        cover = np.ma.masked_equal(reason, Reason.VALID)
+        axes.imshow(
+            cover,
+            palette,
+            aspect="equal",
+            interpolation="nearest",
+            vmin=min(REASON_COLOURS),
+            vmax=max(REASON_COLOURS),
+        )
         add_colour_bar(
             drawing,
             image,
@@ -337,21 +323,29 @@ DATA = "#c2502e"
 _Fitted = Callable[[np.ndarray], np.ndarray]
 
 
+@dataclass(frozen=True, eq=False)
+class PixelCurve:
+    """One camera pixel's data, (n,) each, and the functions fitted to it (the Letter, eq. 9-11).
+
+    ``coefficients`` (5,) c0 ... c4 for phase in rad and lengths in mm; ``rms_mm`` (3,) in z, x, y.
+    """
+
+    pixel: tuple[int, int]
+    axis: str
+    phase: np.ndarray
+    z: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    coefficients: np.ndarray
+    rms_mm: np.ndarray
+
+
 def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
     """The rational function and the two lines of one camera pixel with their data, residuals in um
     below.
 
     A narrow figure has one curve a row, its residuals beside it.
     """
-    n = len(curve.phase)
-    if any(np.shape(v) != (n,) for v in (curve.z, curve.x, curve.y)) or np.shape(
-        curve.coefficients
-    ) != (5,):
-        raise InputError(
-            f"pixel {curve.pixel} has {n} phases, and depths {np.shape(curve.z)}, x"
-            f" {np.shape(curve.x)}, y {np.shape(curve.y)} with coefficients"
-            f" {np.shape(curve.coefficients)}: (n,) each and (5,) are needed"
-        )
     known = np.isfinite([curve.phase, curve.z, curve.x, curve.y]).all(axis=0)
     phase, z, x, y = (np.asarray(v, float)[known] for v in (curve.phase, curve.z, curve.x, curve.y))
     c0, c1, c2, c3, c4 = curve.coefficients
@@ -366,28 +360,25 @@ def pixel_curves(curve: PixelCurve, *, width: int = FULL) -> Figure:
         ("y over z (eq. 11)", "z, mm", z, y, partial(np.multiply, c4)),
     )
     narrow = width <= HALF
-    drawing = new_figure(width, 540 if narrow else 400)
     if narrow:
-        grid = drawing.add_gridspec(3, 2, width_ratios=(1.35, 1))
+        layout = [["0", "residuals 0"], ["1", "residuals 1"], ["2", "residuals 2"]]
+        height, ratios = 540, {"width_ratios": (1.35, 1.0)}
     else:
-        grid = drawing.add_gridspec(2, 3, height_ratios=(3, 1.15))
+        layout = [["0", "1", "2"], ["residuals 0", "residuals 1", "residuals 2"]]
+        height, ratios = 400, {"height_ratios": (3.0, 1.15)}
+    drawing = new_figure(width, height)
+    places = drawing.subplot_mosaic(layout, **ratios)
     for i, (title, along, at, values, fitted) in enumerate(curves):
         name, rms = "zxy"[i], curve.rms_mm[i]
-        upper = drawing.add_subplot(grid[i, 0] if narrow else grid[0, i])
-        lower = drawing.add_subplot(grid[i, 1] if narrow else grid[1, i], sharex=upper)
+        upper, lower = places[str(i)], places[f"residuals {i}"]
+        lower.sharex(upper)
         stated = f"RMS {1e3 * rms:.0f} µm"
-        if narrow:
-            style_axes(upper, f"{title}: {stated}", along, f"{name}, mm")
-        else:
-            style_axes(upper, title, "", f"{name}, mm")
+        style_axes(upper, f"{title}: {stated}", along if narrow else "", f"{name}, mm")
         style_axes(lower, "", along, f"{name} - fit, µm")
         upper.tick_params(labelbottom=narrow)
         if phase.size:
             _draw_fit(upper, lower, at, values, fitted)
-            if not narrow:
-                add_legend(upper, loc="best", title=stated, title_fontsize=8.6, alignment="left")
-                upper.get_legend().get_title().set_color(INK)
-            elif i == 0:
+            if i == 0:
                 add_legend(upper, loc="best")
         lower.axhline(0, color=SOFT, linewidth=0.8)
     u, v = curve.pixel

@@ -1,14 +1,16 @@
 """Pictures of verified planes: RMS of each by model, with the noise floor and the Letter's value,
 and their positions in front of the camera."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os.path import commonprefix
 from typing import Any
 
 import numpy as np
 
-from slviewer.errors import InputError
+from slviewer.evaluation.letter import find_pose
+from slviewer.records.record import DEPTHS
+from slviewer.records.verification import Verification
 from slviewer.report.canvas import (
     BAND,
     FULL,
@@ -18,25 +20,24 @@ from slviewer.report.canvas import (
     SOFT,
     TITLE_PT,
     add_legend,
+    add_legend_above,
     finish_figure,
+    label_point,
     model_colour,
     new_figure,
     style_axes,
     style_image_axes,
 )
-from slviewer.report.data import PlaneRow
 from slviewer.report.page import Figure
 
 
-def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
+def rms_bars(found: Mapping[str, Verification]) -> Figure:
     """Bars of every plane's RMS by model with the noise floor as a tick and the Letter's figure as
     a ring, and below them the share of each plane in R1, R2 and R3."""
-    if not rows:
-        raise InputError("no plane was given: their RMS cannot be drawn")
     drawing = new_figure(FULL, 390)
     upper, lower = drawing.subplots(2, 1, height_ratios=(4.4, 1), sharex=True)
-    _draw_rms(upper, rows)
-    _draw_shares(lower, rows)
+    _draw_rms(upper, found)
+    _draw_shares(lower, found)
     return finish_figure(
         drawing,
         "RMS distance of the flat board from its own plane, by model. Black ticks: what the"
@@ -47,23 +48,23 @@ def rms_bars(rows: Sequence[PlaneRow]) -> Figure:
     )
 
 
-def _draw_rms(upper: Any, rows: Sequence[PlaneRow]) -> None:
+def _draw_rms(upper: Any, found: Mapping[str, Verification]) -> None:
     """Draw the bars of the RMS with noise floors, the Letter's figures and values."""
-    models = list(rows[0].rms_mm)
+    models = list(next(iter(found.values())).models)
     width = 0.8 / len(models)
     style_axes(upper, "", "", "plane RMS, mm")
     upper.grid(False, axis="x")
     for i, model in enumerate(models):
-        x = np.arange(len(rows)) + (i - (len(models) - 1) / 2) * width
-        rms, floor, letter = np.array(
-            [
-                [
-                    values.get(model, np.nan)
-                    for values in (row.rms_mm, row.noise_floor_mm, row.letter_rms_mm)
-                ]
-                for row in rows
-            ]
-        ).T
+        x = np.arange(len(found)) + (i - (len(models) - 1) / 2) * width
+        figures = [
+            (
+                each.rms_mm[model],
+                each.models[model].noise_floor_mm,
+                find_pose(name, "plane").rms_mm.get(model),
+            )
+            for name, each in found.items()
+        ]
+        rms, floor, letter = np.array(figures, float).T
         upper.bar(x, rms, 0.92 * width, color=model_colour(model), label=model)
         upper.hlines(
             floor,
@@ -82,50 +83,37 @@ def _draw_rms(upper: Any, rows: Sequence[PlaneRow]) -> None:
                 markerfacecolor="white",
                 markeredgecolor=INK,
                 markeredgewidth=1.1,
-                linestyle="none",
                 label="the Letter's rig" if not i else None,
             )
         for place, value in zip(x, rms, strict=True):
             if np.isfinite(value):
-                upper.annotate(
-                    f"{value:.3f}".lstrip("0"),
-                    (place, value),
-                    xytext=(0, 2),
-                    textcoords="offset points",
-                    ha="center",
-                    fontsize=7.2,
-                    color=INK,
-                )
+                text = f"{value:.3f}".lstrip("0")
+                label_point(upper, text, (place, value), ha="center", fontsize=7.2, color=INK)
     handles, labels = upper.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] not in models)  # models first
-    add_legend(
+    add_legend_above(
         upper,
+        len(labels),
         handles=[handles[i] for i in order],
         labels=[labels[i] for i in order],
-        loc="lower left",
-        bbox_to_anchor=(0, 1.0),
-        ncols=len(labels),
-        borderaxespad=0.2,
     )
     upper.tick_params(labelbottom=False)
 
 
-def _draw_shares(lower: Any, rows: Sequence[PlaneRow]) -> None:
+def _draw_shares(lower: Any, found: Mapping[str, Verification]) -> None:
     """Draw the shares of each plane in R1, R2 and R3 as stacked bars, with the planes' names."""
-    at = np.arange(len(rows))
+    at = np.arange(len(found))
     style_axes(lower, "", "", "share", grid=False)
-    bottom = np.zeros(len(rows))
-    for region in ("R1", "R2", "R3"):
-        share = np.array([row.incidence.get(region, 0.0) for row in rows]) / 100
+    bottom = np.zeros(len(found))
+    for region in DEPTHS:
+        share = np.array([(each.incidence or {}).get(region, 0.0) for each in found.values()]) / 100
         colour = {"R1": REGIONS["R1"], "R2": "#c3ced8", "R3": REGIONS["R3"]}[region]
         lower.bar(at, share, 0.8, bottom=bottom, color=colour, label=region)
         bottom += share
     lower.set_ylim(0, 1)
     lower.set_yticks([])
-    lower.set_xlim(-0.6, len(rows) - 0.4)
-    lower.set_xticks(
-        at, [row.name for row in rows], fontsize=SMALL_PT, rotation=45 if len(rows) > 14 else 0
-    )
+    lower.set_xlim(-0.6, len(found) - 0.4)
+    lower.set_xticks(at, list(found), fontsize=SMALL_PT, rotation=45 if len(found) > 14 else 0)
     add_legend(lower, loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True, handlelength=1.0)
 
 
@@ -138,9 +126,7 @@ def planes_in_space(
     ``outlines``: by name, three or more points (n, 3) mm of a plane; their hull within the plane is
     drawn.
     """
-    hulls = {name: _convex_hull(name, points) for name, points in outlines.items()}
-    if not hulls:
-        raise InputError("no plane was given: their positions cannot be drawn")
+    hulls = {name: _convex_hull(points) for name, points in outlines.items()}
     near, far = depth_range_mm
     every = np.concatenate(list(hulls.values()))
     low, high = every.min(axis=0), every.max(axis=0)
@@ -225,14 +211,7 @@ class _Scene:
             )
             place, end = places[name], ends[name]
             axes.plot([end[2], place], [end[axis], top], color=colour, linewidth=0.5, alpha=0.6)
-            axes.annotate(
-                self.short[name],
-                (place, top),
-                xytext=(0, 2),
-                textcoords="offset points",
-                va="bottom",
-                **style,
-            )
+            label_point(axes, self.short[name], (place, top), va="bottom", **style)
         axes.set_xlim(left, right)
         axes.set_ylim(bottom, top)
 
@@ -240,30 +219,29 @@ class _Scene:
         """Draw the perspective view: depth increases to the right, the image's up is up."""
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-        def draw(polygon: np.ndarray, face: str, edge: str, alpha: float, width: float) -> None:
-            """Draw a polygon (n, 3): depth, x, and y upwards."""
-            axes.add_collection3d(
-                Poly3DCollection(
-                    [polygon],
-                    facecolors=[face],
-                    alpha=alpha,
-                    edgecolors=[edge],
-                    linewidths=width,
-                    clip_on=False,
-                )
-            )
-
         style_image_axes(axes)
         for i, (name, hull) in enumerate(self.hulls.items()):
             colour, style = self.label(name)
             shown = np.stack([hull[:, 2], hull[:, 0], -hull[:, 1]], axis=1)
-            draw(shown, colour, colour, 0.2, 1.1)
+            polygon = Poly3DCollection(
+                [shown], color=colour, alpha=0.2, linewidths=1.1, clip_on=False
+            )
+            axes.add_collection3d(polygon)
             corner, side = (np.argmin, "top") if i % 2 else (np.argmax, "bottom")
             axes.text(*shown[corner(shown[:, 2])], self.short[name], va=side, **style)
         (left, top, near), (right, bottom, far) = self.low, self.high
         for z in self.depth_range_mm:
             corners = (left, top), (right, top), (right, bottom), (left, bottom)
-            draw(np.array([[z, x, -y] for x, y in corners]), "#9fb4c6", "#7f97ab", 0.14, 0.8)
+            shown = np.array([[z, x, -y] for x, y in corners])
+            polygon = Poly3DCollection(
+                [shown],
+                facecolor="#9fb4c6",
+                edgecolor="#7f97ab",
+                alpha=0.14,
+                linewidths=0.8,
+                clip_on=False,
+            )
+            axes.add_collection3d(polygon)
             style = {"fontsize": SMALL_PT, "color": SOFT, "ha": "center", "va": "top"}
             axes.text(z, left, -bottom, f"{z:.0f} mm", **style)
         axes.set_xlim(near, far)
@@ -284,16 +262,11 @@ def _spread_labels(wanted: Mapping[str, float], gap: float, end: float) -> dict[
     return dict(zip(names, np.minimum(places, end - steps[::-1]).tolist(), strict=True))
 
 
-def _convex_hull(name: str, points: np.ndarray) -> np.ndarray:
+def _convex_hull(points: np.ndarray) -> np.ndarray:
     """The corners (m, 3), in order, of the convex hull of points close to one plane."""
     from scipy.spatial import ConvexHull
 
-    points = np.asarray(points, float).reshape(-1, np.shape(points)[-1])
     points = points[np.isfinite(points).all(axis=1)]
-    if points.shape[1:] != (3,) or len(points) < 3:
-        raise InputError(
-            f"plane '{name}' has {len(points)} usable points: three or more (x, y, z) are needed"
-        )
     centred = points - points.mean(axis=0)
     _, _, directions = np.linalg.svd(centred, full_matrices=False)
     return points[ConvexHull(centred @ directions[:2].T).vertices]

@@ -5,16 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from slviewer.errors import InputError
 from slviewer.report.canvas import (
     FULL,
     HALF,
     INK,
     SMALL_PT,
     add_colour_bar,
-    add_legend,
+    add_legend_above,
     finish_figure,
     new_figure,
+    percentile,
     round_up,
     style_axes,
 )
@@ -31,8 +31,6 @@ def pose_bars(
 ) -> Figure:
     """Reprojection RMS of each pose, camera and projector side by side; ``rms_px``: the RMS over
     all features."""
-    if not pose_rms_px:
-        raise InputError("no pose was given: its reprojection error cannot be drawn")
     names = list(pose_rms_px)
     values = np.array([pose_rms_px[name] for name in names], float)
     narrow = width <= HALF
@@ -54,14 +52,7 @@ def pose_bars(
     crowded = len(names) * max(map(len, names)) > width / 9
     axes.set_xticks(at, names, rotation=90 if crowded else 0, fontsize=SMALL_PT)
     axes.set_xlim(-0.7, len(names) - 0.3)
-    add_legend(
-        axes,
-        loc="lower left",
-        bbox_to_anchor=(0, 1.0),
-        ncols=2,
-        borderaxespad=0.2,
-        columnspacing=1.2,
-    )
+    add_legend_above(axes, 2, columnspacing=1.2)
     worst = names[int(np.argmax(np.nan_to_num(values).max(axis=1)))]
     return finish_figure(
         drawing,
@@ -77,20 +68,12 @@ def residual_arrows(
 ) -> Figure:
     """Residuals (n, 2) px as arrows at ``pixels`` (n, 2) in an image of ``size`` = (width, height),
     magnified."""
-    if pixels.shape != residuals.shape or pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise InputError(
-            f"{pixels.shape} pixels and {residuals.shape} residuals cannot be drawn: (n, 2) are"
-            " needed"
-        )
     known = np.isfinite(pixels).all(axis=1) & np.isfinite(residuals).all(axis=1)
     at, away = pixels[known], residuals[known]
     lengths = np.hypot(away[:, 0], away[:, 1])
-    rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else float("nan")
-    scale = (
-        round_up(0.05 * size[0] / max(float(np.percentile(lengths, 95)), 1e-3))
-        if len(lengths)
-        else 1.0
-    )
+    rms = float(np.sqrt(np.mean(lengths**2))) if len(lengths) else np.nan
+    # round_up(NaN) is 1
+    scale = round_up(0.05 * size[0] / max(percentile(lengths, 95), 1e-3))
     drawing, axes = _new_image_axes(size, f"{title}: RMS {rms:.3f} px")
     if len(at):
         arrows = axes.quiver(

@@ -2,9 +2,10 @@
 parts, with a trend chart of each characteristic."""
 
 import inspect
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from slviewer.geometry.lens import Lens
 from slviewer.geometry.rigid import rotation_angle
 from slviewer.records.acceptance import MARKS, Decision
 from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection
-from slviewer.records.table import Cell, Column, Mark, Rows, Table
+from slviewer.records.record import Record
+from slviewer.records.table import Cell, Column, Mark, Table, Value
 from slviewer.records.verdict import Verdict
-from slviewer.records.verification import Verification
+from slviewer.records.verification import Verification, average
 from slviewer.report.canvas import (
     HALF,
     INK,
@@ -26,26 +28,86 @@ from slviewer.report.canvas import (
     percentile,
     style_axes,
 )
-from slviewer.report.data import CalibrationFigures, ModelsView, RecordsView, SessionData
 from slviewer.report.maps import rms_maps
 from slviewer.report.page import Figure, Headline, Item, PageNotice, Section, write_page
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
+from slviewer.session.capture import Capture
 
+DEVICES = ("camera", "projector")
 WORST = 2.0
 """A pose whose reprojection error exceeds the RMS over the poses this many times is marked."""
 
 
+@dataclass(frozen=True)
+class CaptureUse:
+    """Whether the calibration uses a capture, and ``why`` it does not."""
+
+    capture: Capture
+    state: Literal["used", "unused", "excluded", "scan", "waiting"]
+    why: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFigures:
+    """A stereo calibration, and of each pose and device where its features are, pixels (n, 2), and
+    their residuals (n, 2) px, NaN where excluded or not read; empty where none were saved."""
+
+    stereo: StereoModel
+    residuals: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]] = field(
+        default_factory=dict
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RecordsView:
+    """The records of one kind by their labels, and pictures of them."""
+
+    kind: type[Record]
+    records: Mapping[str, Any]
+    figures: Sequence[Figure] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SessionData:
+    """A session's captures, its calibrations, and the records made with them.
+
+    ``verdict`` is that on the last attempt to calibrate; ``verdict_of_calibration``: whether that
+    made ``calibration``. ``pixel_fits``: {axis: RMS (3, h, w) of the pixel-wise fits in z, x, y}.
+    ``model``: the one that is used, and the one ``recommended``; ``scales``: {model: what
+    correction of scale was applied, in words}. ``region``: the region of interest that is in
+    effect, in words; ``edits``
+    of scans in their order: scan and words.
+    """
+
+    name: str
+    captures: Sequence[CaptureUse]
+    calibration: CalibrationFigures | None = None
+    pixel_fits: Mapping[str, np.ndarray] = field(default_factory=dict)
+    records: Sequence[RecordsView] = ()
+    warnings: Sequence[str] = ()
+    verdict: Verdict | None = None
+    verdict_of_calibration: bool = True
+    model: str = ""
+    recommended: str = ""
+    scales: Mapping[str, str] = field(default_factory=dict)
+    region: str = ""
+    edits: Sequence[tuple[str, str]] = ()
+
+
 def session_title(data: SessionData) -> tuple[str, str]:
     """The page's title and the sentence below it."""
-    poses = sum(row.state == "used" for row in data.captures)
-    scans = sum(row.role == "scan" for row in data.captures)
-    return (
-        data.name,
-        (
-            f"{format_count(len(data.captures), 'capture')}: {format_count(poses, 'target pose')}"
-            f" used to calibrate, {format_count(scans, 'scan')}."
-        ),
-    )
+    roles = [each.capture.role for each in data.captures]
+    counts = [
+        format_count(len(roles), "capture"),
+        format_count(_count_used(data), "target pose"),
+        format_count(roles.count("scan"), "scan"),
+    ]
+    return data.name, "{}: {} used to calibrate, {}.".format(*counts)
+
+
+def _count_used(data: SessionData) -> int:
+    """The number of target poses that the calibration was made from."""
+    return sum(each.state == "used" for each in data.captures)
 
 
 def session_headlines(data: SessionData) -> list[Headline]:
@@ -58,18 +120,13 @@ def session_headlines(data: SessionData) -> list[Headline]:
         headlines.append(Headline(data.verdict.level, "verdict on the calibration", count, mark))
     if data.calibration is not None:
         stereo = data.calibration.stereo
-        used = sum(row.state == "used" for row in data.captures)
-        wanted = sum(row.role == "calibration" for row in data.captures)
-        note = f"boards at {_format_depths(stereo)}"
-        headlines.append(Headline(f"{used} of {wanted}", "target poses used", note))
+        wanted = sum(each.capture.role == "calibration" for each in data.captures)
+        used, note = f"{_count_used(data)} of {wanted}", f"boards at {_format_depths(stereo)}"
+        headlines.append(Headline(used, "target poses used", note))
         if rms := stereo.reprojection_rms_px:
-            headlines.append(
-                Headline(
-                    f"{rms.get('camera', np.nan):.3f} / {rms.get('projector', np.nan):.3f} px",
-                    "reprojection RMS, camera / projector",
-                    f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else "",
-                )
-            )
+            both = f"both devices together {rms['stereo']:.3f} px" if "stereo" in rms else ""
+            devices = "{} / {} px".format(*(f"{rms.get(d, np.nan):.3f}" for d in DEVICES))
+            headlines.append(Headline(devices, "reprojection RMS, camera / projector", both))
     fits = [(percentile(rms[0], 50), axis) for axis, rms in data.pixel_fits.items()]
     if known := [fit for fit in fits if np.isfinite(fit[0])]:
         rms_z, axis = min(known)
@@ -81,18 +138,19 @@ def session_headlines(data: SessionData) -> list[Headline]:
 def _plane_headline(data: SessionData) -> list[Headline]:
     """Headline of the flattest model's mean plane RMS, beside its noise floor and the other
     models'."""
-    rms, floors = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
-    for each in (each for view in data.records for each in view.records.values()):
-        if isinstance(each, Verification) and each.shape == "plane":
-            for model, fit in each.models.items():
-                rms[model] += [] if fit.rms_mm is None else [fit.rms_mm]
-                floors[model] += [] if fit.noise_floor_mm is None else [fit.noise_floor_mm]
-    means = {model: float(np.mean(values)) for model, values in rms.items() if values}
+    planes = [
+        each
+        for view in data.records
+        for each in view.records.values()
+        if isinstance(each, Verification) and each.shape == "plane"
+    ]
+    found = average("plane", planes)
+    means = {model: mm for model, mm in found.rms_mm.items() if np.isfinite(mm)}
     if not means:
         return []
-    best = min(means, key=lambda model: means[model])
-    notes = [f"noise floor {np.mean(floors[best]):.3f} mm"] if floors[best] else []
-    notes += [f"{other} {mean:.3f} mm" for other, mean in means.items() if other != best]
+    best, floor = found.best, found.models[found.best].noise_floor_mm
+    notes = [] if floor is None else [f"noise floor {floor:.3f} mm"]
+    notes += [f"{other} {mm:.3f} mm" for other, mm in means.items() if other != best]
     mark: Mark = "better" if len(means) > 1 else ""
     return [Headline(f"{means[best]:.3f} mm", f"mean plane RMS, {best}", "; ".join(notes), mark)]
 
@@ -106,10 +164,19 @@ def session_sections(data: SessionData) -> list[Section]:
     if data.calibration is not None:
         sections += [
             _reprojection_section(data.calibration),
-            _parameters_section(data.calibration.stereo),
+            Section(
+                "Parameters",
+                "Pinhole and Brown distortion of both devices, and where the projector stands in"
+                " the camera's frame.",
+                [lens_table(data.calibration.stereo), rig_table(data.calibration.stereo)],
+            ),
         ]
-    if data.models is not None:
-        sections.append(_models_section(data.models))
+    if data.model:
+        used = f"Measured with {data.model}"
+        if data.model != data.recommended:
+            used += f", as the operator has chosen; recommended: {data.recommended}"
+        scales = [PageNotice(f"{model}: {words}.", "plain") for model, words in data.scales.items()]
+        sections.append(Section("Model in use", f"{used}.", scales))
     if data.pixel_fits:
         text = (
             "Each camera pixel's own rational function from phase to depth, and lines from depth to"
@@ -126,12 +193,12 @@ def session_sections(data: SessionData) -> list[Section]:
 def _notice_section(data: SessionData) -> list[Section]:
     """The section with warnings and with captures that are not used; an empty list if there are
     none."""
-    unused = [row for row in data.captures if row.state in ("unused", "excluded")]
-    items: list[Item] = [PageNotice(warning) for warning in data.warnings]
-    items += [
-        PageNotice(f"{row.name} is {row.state}: {row.why or 'no reason was given'}")
-        for row in unused
+    unused = [
+        f"{each.capture.name} is {each.state}: {each.why or 'no reason was given'}"
+        for each in data.captures
+        if each.state in ("unused", "excluded")
     ]
+    items = list(map(PageNotice, [*data.warnings, *unused]))
     return [Section("Warnings", "", items)] if items else []
 
 
@@ -142,8 +209,8 @@ def _restrictions_section(data: SessionData) -> Section:
         if data.region
         else ""
     )
-    columns = [Column("scan"), Column("edit")]
-    table = Table(columns, data.edits, "Edits in effect, in their order")
+    rows = [{"scan": scan, "edit": edit} for scan, edit in data.edits]
+    table = Table.of(rows, "Edits in effect, in their order")
     return Section("Region and edits", text, [table] if data.edits else [])
 
 
@@ -151,31 +218,29 @@ def _captures_section(data: SessionData) -> Section:
     """The section with the table of captures: role, state, sizes, frames and why one is not
     used."""
     marks: dict[str, Mark] = {"used": "better", "unused": "worse", "excluded": "worse"}
-    columns = [
-        *(Column(title) for title in ("capture", "role", "state")),
-        Column("camera", "px", align="right"),
-        Column("projector", "px", align="right"),
-        Column("frames"),
-        Column("period", "px", align="centre"),
-        *(Column(title) for title in ("made", "why not used")),
-    ]
-    rows: Rows = [
-        [
-            row.name,
-            row.role,
-            Cell(row.state, marks.get(row.state, "")),
-            "{}x{}".format(*row.camera),
-            "{}x{}".format(*row.projector) if row.projector else "unknown",
-            row.frames,
-            ", ".join(f"{axis} {period:g}" for axis, period in row.periods_px.items()),
-            row.made,
-            row.why,
-        ]
-        for row in data.captures
-    ]
+    rows = []
+    for each in data.captures:
+        capture, sequence = each.capture, each.capture.sequence
+        size = sequence.projector_size
+        periods = [f"{axis} {sequence.period_px(axis):g}" for axis in sequence.axes]
+        rows.append(
+            {
+                "capture": capture.name,
+                "role": capture.role,
+                "state": Cell(each.state, marks.get(each.state, "")),
+                Column("camera", "px", align="right"): "{}x{}".format(*capture.size),
+                Column("projector", "px", align="right"): (
+                    "{}x{}".format(*size) if size else "unknown"
+                ),
+                "frames": len(sequence.frames),
+                Column("period", "px", align="centre"): ", ".join(periods),
+                "made": capture.meta.get("created", ""),
+                "why not used": each.why,
+            }
+        )
     if not rows:
         return Section("Captures", "The session holds no captures yet.")
-    table = Table(columns, rows, "Captures of the session").without_empty()
+    table = Table.of(rows, "Captures of the session").without_empty()
     return Section("Captures", "", [table])
 
 
@@ -183,40 +248,31 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
     """The section about reprojection errors: bars of each pose, residual arrows and image
     coverage."""
     stereo, residuals = calibration.stereo, calibration.residuals
-    rms, cameras, projectors = (
-        stereo.reprojection_rms_px,
-        stereo.rig.camera.size,
-        stereo.rig.projector.size,
-    )
+    rms = stereo.reprojection_rms_px
+    sizes = {device: getattr(stereo.rig, device).size for device in DEVICES}
     items: list[Item] = []
     if stereo.pose_rms_px:
         items.append(pose_bars(stereo.pose_rms_px, rms))
     if residuals:
         worst = max(residuals, key=lambda name: max(stereo.pose_rms_px.get(name, (0.0, 0.0))))
-        shown = residuals[worst]
         items += [
-            residual_arrows(
-                f"camera, {worst} (the worst pose)", shown.pixels, shown.camera, cameras
-            ),
-            residual_arrows(
-                f"projector, {worst}", shown.projector_pixels, shown.projector, projectors
-            ),
-            coverage("camera", cameras, [r.pixels for r in residuals.values()]),
-            coverage("projector", projectors, [r.projector_pixels for r in residuals.values()]),
+            residual_arrows(f"{device}, {worst} (the worst pose)", *residuals[worst][device], size)
+            for device, size in sizes.items()
+        ]
+        items += [
+            coverage(device, size, [each[device][0] for each in residuals.values()])
+            for device, size in sizes.items()
         ]
     if stereo.pose_rms_px:
         items.append(_pose_table(stereo.pose_rms_px))
-    excluded = stereo.features_excluded
-    text = [
-        (
-            "How far the target's features lie from where the calibration predicts them, in px: "
-            + ", ".join(f"{device} {value:.3f}" for device, value in rms.items())
-            + f". Target: {stereo.board}."
-            if rms
-            else "This calibration was made elsewhere, without a reprojection error."
-        )
-    ]
-    if excluded:
+    text = ["This calibration was made elsewhere, without a reprojection error."]
+    if rms:
+        errors = ", ".join(f"{device} {value:.3f}" for device, value in rms.items())
+        text = [
+            "How far the target's features lie from where the calibration predicts them, in px:"
+            f" {errors}. Target: {stereo.board}."
+        ]
+    if excluded := stereo.features_excluded:
         text.append(f"Excluded: {format_count(excluded, 'feature')} beyond 6 robust sigma.")
     return Section("Reprojection", text, items)
 
@@ -224,18 +280,18 @@ def _reprojection_section(calibration: CalibrationFigures) -> Section:
 def _pose_table(pose_rms_px: Mapping[str, tuple[float, float]]) -> Table:
     """Table of reprojection RMS by pose, px, with conspicuous poses marked."""
     typical = np.sqrt(np.nanmean(np.square(list(pose_rms_px.values())), axis=0))
-    columns = [Column("pose"), Column("camera", "px"), Column("projector", "px")]
-    rows: Rows = []
+    rows = []
     for name, values in pose_rms_px.items():
         high = np.array(values) > WORST * typical
-        cells = [Cell(v, "worse" if h else "") for v, h in zip(values, high, strict=True)]
-        rows.append([name, *cells, Cell("look at this pose" if high.any() else "", "worse")])
-    columns.append(Column(""))
-    return Table(columns, rows, "Reprojection RMS of each pose").without_empty()
+        row: dict[Any, Value | Cell] = {"pose": name}
+        for device, value, is_high in zip(DEVICES, values, high, strict=True):
+            row[Column(device, "px")] = Cell(value, "worse" if is_high else "")
+        rows.append({**row, "": Cell("look at this pose" if high.any() else "", "worse")})
+    return Table.of(rows, "Reprojection RMS of each pose").without_empty()
 
 
-def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
-    """Table rows with both lenses' parameters as text: (name, unit, camera's, projector's)."""
+def lens_table(stereo: StereoModel) -> Table:
+    """Table of both lenses' parameters."""
 
     def values(lens: Lens, sigma: float) -> list[str]:
         """Image size, focal lengths with standard deviation ``sigma``, principal point (px) and
@@ -253,28 +309,35 @@ def lens_rows(stereo: StereoModel) -> list[tuple[str, str, str, str]]:
         *("focal length fx", "focal length fy", "principal point cx", "principal point cy"),
         *("radial k1", "radial k2", "tangential p1", "tangential p2", "radial k3"),
     ]
-    sigmas = stereo.focal_sigma_px
-    camera = values(stereo.rig.camera, sigmas.get("camera", np.nan))
-    projector = values(stereo.rig.projector, sigmas.get("projector", np.nan))
-    return list(zip(names, ["px"] * 5 + [""] * 5, camera, projector, strict=True))
-
-
-def rig_rows(stereo: StereoModel) -> list[tuple[str, str]]:
-    """Table rows with the projector's pose in the camera frame as text: (quantity, value with its
-    unit)."""
-    R, t = stereo.rig.R, np.asarray(stereo.rig.t, float).ravel()
-    angle = np.degrees(rotation_angle(R))
-    axes = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
-    return [
-        ("baseline (distance of the two devices)", f"{np.linalg.norm(t):.2f} mm"),
-        (
-            "t, camera to projector (x, y, z)",
-            " / ".join(f"{v:.2f}" for v in t).replace("-", "−") + " mm",
-        ),
-        ("angle between the optical axes", f"{axes:.2f}°"),
-        ("rotation, camera to projector", f"{angle:.2f}°"),
-        ("depths of the boards", _format_depths(stereo)),
+    sigmas = [stereo.focal_sigma_px.get(device, np.nan) for device in DEVICES]
+    lenses = map(values, (stereo.rig.camera, stereo.rig.projector), sigmas)
+    rows = [
+        {
+            "parameter": name,
+            Column("unit", align="centre"): "px" if k < 5 else "",
+            Column("camera", align="right"): of_camera,
+            Column("projector", align="right"): of_projector,
+        }
+        for k, (name, of_camera, of_projector) in enumerate(zip(names, *lenses, strict=True))
     ]
+    note = "± is one standard deviation, from the lens's own calibration."
+    return Table.of(rows, "Lenses", [note])
+
+
+def rig_table(stereo: StereoModel) -> Table:
+    """Table of the projector's pose in the camera frame."""
+    R, t = stereo.rig.R, np.ravel(stereo.rig.t)
+    axes_deg = np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))
+    offsets = " / ".join(f"{v:.2f}" for v in t).replace("-", "−")
+    figures = {
+        "baseline (distance of the two devices)": f"{stereo.baseline_mm:.2f} mm",
+        "t, camera to projector (x, y, z)": f"{offsets} mm",
+        "angle between the optical axes": f"{axes_deg:.2f}°",
+        "rotation, camera to projector": f"{np.degrees(rotation_angle(R)):.2f}°",
+        "depths of the boards": _format_depths(stereo),
+        "target": stereo.board or "imported",
+    }
+    return Table.of_figures(figures, "Rig")
 
 
 def _format_depths(stereo: StereoModel) -> str:
@@ -282,26 +345,6 @@ def _format_depths(stereo: StereoModel) -> str:
     if stereo.depth_range_mm is None:
         return "unknown"
     return "{:.0f} to {:.0f} mm".format(*stereo.depth_range_mm)
-
-
-def _parameters_section(stereo: StereoModel) -> Section:
-    """The section with the parameters of both lenses and the pose of the projector."""
-    columns = [
-        Column("parameter"),
-        Column("unit", align="centre"),
-        Column("camera", align="right"),
-        Column("projector", align="right"),
-    ]
-    note = "± is one standard deviation, from the lens's own calibration."
-    return Section(
-        "Parameters",
-        "Pinhole and Brown distortion of both devices, and where the projector stands in the"
-        " camera's frame.",
-        [
-            Table(columns, lens_rows(stereo), "Lenses", [note]),
-            Table([Column("quantity"), Column("value", align="right")], rig_rows(stereo), "Rig"),
-        ],
-    )
 
 
 def _records_section(view: RecordsView) -> Section:
@@ -338,20 +381,6 @@ def _verdict_section(verdict: Verdict, of_calibration: bool) -> Section:
         else "This verdict is on the last attempt to calibrate, which gave no calibration."
     )
     return Section("Verdict", text, items)
-
-
-def _models_section(models: ModelsView) -> Section:
-    """The section about the model that is used, and corrections of scale."""
-    items: list[Item] = [
-        PageNotice(f"{model}: {words}.", "plain") for model, words in models.scales.items()
-    ]
-    used = f"Measured with {models.used}"
-    used += (
-        "."
-        if models.used == models.recommended
-        else f", as the operator has chosen; recommended: {models.recommended}."
-    )
-    return Section("Model in use", used, items)
 
 
 COLOURS: dict[Decision, str] = {"pass": "#1f9673", "fail": "#c2362e", "undecided": "#c98a12"}

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slviewer.errors import InputError
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
 from slviewer.records.measurement import NominalDeviation
 from slviewer.report.canvas import (
@@ -21,13 +20,14 @@ from slviewer.report.canvas import (
     add_colour_bar,
     add_legend,
     finish_figure,
+    label_point,
     new_figure,
     round_up,
     style_axes,
     style_image_axes,
 )
-from slviewer.report.data import CloudView
 from slviewer.report.page import Figure
+from slviewer.surface.fuse import Fused
 
 LIGHT = np.array([-0.45, -0.36, -0.82]) / np.linalg.norm([-0.45, -0.36, -0.82])
 """Towards the light, in the view's frame (x right, y down, z away): from above, left of the
@@ -59,16 +59,6 @@ def render_points(
     ``normals`` (n, 3) NaN where unknown; ``colours`` (n, 3) 0 to 1. Points that are not finite are
     skipped.
     """
-    if (
-        points.shape != normals.shape
-        or points.shape != colours.shape
-        or points.ndim != 2
-        or points.shape[1] != 3
-    ):
-        raise InputError(
-            f"points {points.shape}, normals {normals.shape} and colours {colours.shape} make no"
-            " view: (n, 3) each is needed"
-        )
     width, height = size
     background = np.array(BACKGROUND, np.float32) / 255
     known = np.isfinite(points).all(axis=1)
@@ -130,29 +120,29 @@ SQUARES, FINER = 14, 8
 """Squares across a chequered view, and how much finer it is told which scans measured there."""
 
 
-def draw_clouds(views: Sequence[CloudView]) -> Figure:
-    """The scans side by side, each coloured by its own depth."""
+def draw_clouds(clouds: Mapping[str, np.ndarray]) -> Figure:
+    """The scans, points (h, w, 3) mm, side by side, each coloured by its own depth."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
-    columns = min(len(views), 3)
-    rows = -(-len(views) // columns)
+    columns = min(len(clouds), 3)
+    rows = -(-len(clouds) // columns)
     width = FULL // 3 if columns > 1 else 760
     across, down = round(0.76 * width), round(0.66 * width)
     drawing = new_figure(columns * width, rows * (down + 62))
     axes = drawing.subplots(rows, columns, squeeze=False).ravel()
     size = (DENSITY * across, DENSITY * down)
     palette = ListedColormap(colormaps["YlGnBu_r"](np.linspace(0.18, 0.92, 256)))
-    for ax, view in zip(axes, views, strict=False):
-        points, normals, _ = _sample_points(view)
+    for ax, (name, cloud) in zip(axes, clouds.items(), strict=False):
+        points, normals = _sample_grid(cloud)
         z = points[:, 2]
         near, far = (np.percentile(z, [1, 99]) if len(z) else (0.0, 1.0)) + np.array([-1e-3, 1e-3])
         shades = palette(np.clip((z - near) / (far - near), 0, 1))[:, :3]
         picture = render_points(points, normals, shades, size, view_rotation(YAW_DEG, PITCH_DEG))
-        style_image_axes(ax, view.name)
+        style_image_axes(ax, name)
         ax.imshow(picture)
-        ax.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
+        ax.set_xlabel(_format_count(cloud), fontsize=TEXT_PT, color=INK, loc="left")
         add_colour_bar(
             drawing,
             ScalarMappable(Normalize(near, far), palette),
@@ -161,69 +151,65 @@ def draw_clouds(views: Sequence[CloudView]) -> Figure:
             shrink=0.7,
             aspect=20,
         )
-    for ax in axes[len(views) :]:
+    for ax in axes[len(clouds) :]:
         ax.set_axis_off()
     return finish_figure(
         drawing,
         "Each scan as measured, seen from above and aside, shaded by its own surface normals and"
         " coloured by depth.",
-        "Shaded views of " + ", ".join(f"{view.name} ({_format_count(view)})" for view in views),
+        "Shaded views of "
+        + ", ".join(f"{name} ({_format_count(cloud)})" for name, cloud in clouds.items()),
     )
 
 
-def draw_merged_cloud(view: CloudView) -> Figure:
+def draw_merged_cloud(fused: Fused) -> Figure:
     """The merged cloud: illuminated as one surface, and coloured by the scan that each point comes
     from."""
     from matplotlib.colors import to_rgba_array
 
-    points, normals, source = _sample_points(view)
+    surface = fused.surface
+    assert surface.normals is not None
+    step = max(1, -(-len(surface.points) // MOST_POINTS))
+    points, normals = surface.points[::step], surface.normals[::step]
+    source, count = fused.source[::step].astype(np.intp), _format_count(surface.points)
     size = (2 * HALF - 40, 2 * HALF - 240)
     rotation = view_rotation(YAW_DEG, PITCH_DEG)
     drawing = new_figure(FULL, HALF - 40)
     left, right = drawing.subplots(1, 2)
     style_image_axes(left, "as one surface")
     left.imshow(render_points(points, normals, np.broadcast_to(CLAY, points.shape), size, rotation))
-    left.set_xlabel(_format_count(view), fontsize=TEXT_PT, color=INK, loc="left")
+    left.set_xlabel(count, fontsize=TEXT_PT, color=INK, loc="left")
     style_image_axes(right, "by scan, in turns")
     palette = to_rgba_array(SCANS)[:, :3]
     shown = _select_mosaic(points, source) if len(points) else np.arange(0)
     points, normals, source = points[shown], normals[shown], source[shown]
     right.imshow(render_points(points, normals, palette[source % len(SCANS)], size, rotation))
-    for i, name in enumerate(view.names):
+    for i, name in enumerate(fused.names):
         right.plot([], [], "s", color=SCANS[i % len(SCANS)], markersize=8, label=name)
     add_legend(
         right,
         loc="upper left",
         bbox_to_anchor=(0, 0),
-        ncols=max(len(view.names), 1),
+        ncols=max(len(fused.names), 1),
         handletextpad=0.2,
     )
     return finish_figure(
         drawing,
         "The merged cloud in the reference scan's frame. Right: each square shows the points of one"
         " scan alone, so that a step where squares meet would be a misalignment.",
-        f"Shaded views of the merged cloud, {_format_count(view)}, as one surface and coloured by"
-        " scan",
+        f"Shaded views of the merged cloud, {count}, as one surface and coloured by scan",
     )
 
 
-def _sample_points(view: CloudView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals and source (n,) of at most MOST_POINTS measured points, evenly thinned."""
-    from slviewer.reconstruction.reconstruct import normals as grid_normals
+def _sample_grid(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals (n, 3) of at most MOST_POINTS measured points (h, w, 3), evenly
+    thinned."""
+    from slviewer.reconstruction.reconstruct import normals
 
-    points = view.points
-    if view.normals is None or view.source is None:
-        step = max(1, int(np.ceil(np.sqrt(np.isfinite(points[..., 2]).sum() / MOST_POINTS))))
-        points = np.ascontiguousarray(points[::step, ::step], np.float32)
-        normals = grid_normals(points).reshape(-1, 3)
-        points = points.reshape(-1, 3)
-        source = np.zeros(len(points), np.intp)
-    else:
-        step = max(1, -(-len(points) // MOST_POINTS))
-        points, normals = points[::step], view.normals[::step]
-        source = view.source[::step].astype(np.intp)
-    known = np.isfinite(points).all(axis=1)
-    return points[known], normals[known], source[known]
+    step = max(1, int(np.ceil(np.sqrt(np.isfinite(points[..., 2]).sum() / MOST_POINTS))))
+    points = np.ascontiguousarray(points[::step, ::step], np.float32)
+    known = np.isfinite(points).all(axis=2)
+    return points[known], normals(points)[known]
 
 
 def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
@@ -246,9 +232,9 @@ def _select_mosaic(points: np.ndarray, source: np.ndarray) -> np.ndarray:
     return np.flatnonzero(rank[place, source] == turn)
 
 
-def _format_count(view: CloudView) -> str:
-    """Text with the number of valid points of a view."""
-    return f"{int(np.isfinite(view.points[..., 2]).sum()):,} points"
+def _format_count(points: np.ndarray) -> str:
+    """Text with the number of valid points."""
+    return f"{np.isfinite(points[..., 2]).sum():,} points"
 
 
 Lines = Sequence[NDArray[np.floating]]
@@ -282,15 +268,7 @@ def section_plot(
     for (letter, cursor), colour in zip((cursors or {}).items(), CURSOR_COLOURS, strict=False):
         axes.axvline(cursor[0], color=colour, linewidth=0.9, linestyle=":")
         axes.plot(*cursor, "o", color=colour, markersize=5)
-        axes.annotate(
-            letter,
-            cursor,
-            (4, 5),
-            textcoords="offset points",
-            color=colour,
-            fontsize=10,
-            weight="bold",
-        )
+        label_point(axes, letter, cursor, (4, 5), color=colour, fontsize=10, weight="bold")
     axes.set_aspect("auto" if enlarged else "equal", adjustable="datalim")
     axes.margins(y=0.15)
     return finish_figure(

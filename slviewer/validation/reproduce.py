@@ -2,48 +2,41 @@
 JSON and report."""
 
 import json
-import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import PixelwiseModel
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
-from slviewer.evaluation.render import render
-from slviewer.geometry.vectors import rms
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import MergeSettings, merge_scans
+from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.reconstruct import VerifySettings, compare_captures
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.simulate import TARGET, TRUTH, simulate
-from slviewer.records.merge import Merge
 from slviewer.records.plain import to_plain
-from slviewer.records.verification import Shape, centre_distances_mm
-from slviewer.report.data import (
-    CloudView,
-    ErrorMaps,
-    MergePair,
-    PlaneRow,
-    ReproductionData,
-    SpacingRow,
-    SphereRow,
-)
+from slviewer.records.table import render_text
+from slviewer.records.verification import Shape, Verification, centre_distances_mm
 from slviewer.report.page import write_page
 from slviewer.report.reproduction import (
+    ReproductionData,
     inside_ratio,
+    radius_table,
     reproduction_headlines,
     reproduction_sections,
     reproduction_title,
+    shape_table,
 )
 from slviewer.session.layout import is_session
 from slviewer.session.store import Session
@@ -55,82 +48,88 @@ PIXEL = (500, 500)
 OBJECTS = ("object_r1", "object_r2", "object_r3")
 SHAPES: tuple[tuple[Shape, float, float], ...] = (("plane", 0.65, 0.75), ("sphere", 0.75, 0.82))
 """Shapes whose captures are compared, and the progress from and to which that takes."""
-SHOWN_PLANES = ("plane_01", "plane_03", "plane_08")
+SHOWN_PLANES = (1, 3, 8)
 """Those whose error maps the Letter shows."""
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The results of all experiments: the report's ``data``, and what its text and JSON show
-    besides."""
+    """The results of all experiments."""
 
-    data: ReproductionData
+    quick: bool
+    stereo: StereoModel
+    pixelwise: PixelwiseModel
     planes: Mapping[str, Comparison]
     spheres: Mapping[str, Comparison]
-    merge: Merge
+    spacings_mm: Mapping[str, tuple[float, Mapping[str, float]]]
+    merged: MergedScans
     report: Path
 
     @property
     def in_range_ratio(self) -> float:
         """Mean stereo RMS over mean pixelwise RMS, over the planes with at least 87 % of their
         points in R2."""
-        return inside_ratio(self.data.planes)[0]
+        return inside_ratio(_list_records(self.planes))[0]
 
     @property
     def spacing_rms_mm(self) -> dict[str, float]:
         """RMS error of the distances between all pairs of sphere centres, by model."""
-        return {
-            m: rms([each.measured_mm[m] - each.known_mm for each in self.data.spacings])
+        errors = {
+            m: [(measured[m] - known) ** 2 for known, measured in self.spacings_mm.values()]
             for m in MODELS
         }
+        return {m: float(np.sqrt(np.mean(squares))) for m, squares in errors.items()}
 
     def to_json(self) -> dict[str, Any]:
         """All figures that ``text`` shows, and the values that they are computed from."""
         return {
-            "quick": self.data.quick,
-            "reprojection_rms_px": dict(self.data.reprojection_rms_px),
-            "fit_rms_mm": self.data.fit_rms_mm,
-            "planes": {name: to_plain(c.record()) for name, c in self.planes.items()},
-            "spheres": {name: to_plain(c.record()) for name, c in self.spheres.items()},
+            "quick": self.quick,
+            "reprojection_rms_px": dict(self.stereo.reprojection_rms_px),
+            "fit_rms_mm": self.pixelwise.median_rms_mm(self.pixelwise.depth_axis),
+            "planes": to_plain(_list_records(self.planes)),
+            "spheres": to_plain(_list_records(self.spheres)),
             "in_range_ratio": self.in_range_ratio,
             "spacing_rms_mm": self.spacing_rms_mm,
-            "merge": to_plain(self.merge),
+            "merge": to_plain(self.merged.record),
             "report": str(self.report),
         }
 
     def text(self) -> str:
         """Both tables with the Letter's figures beside ours, and further results."""
-        reprojection, theirs = self.data.reprojection_rms_px, letter.REPROJECTION_RMS_PX
-        icp, spacing = letter.EXPERIMENT_3_ICP_RMS_MM, self.spacing_rms_mm
+        rms, theirs = self.stereo.reprojection_rms_px, letter.REPROJECTION_RMS_PX
+        icp = letter.EXPERIMENT_3_ICP_RMS_MM
+        spacing = self.spacing_rms_mm
+        planes, spheres = _list_records(self.planes), _list_records(self.spheres)
         pairs = [
             f"  {name}: RMS {pair.point_to_point_rms_mm:.3f} mm point to point "
             f"(the Letter: {icp[name[-2:].upper()]:.2f}), "
             f"{pair.rms_mm:.3f} mm point to plane, overlap {100 * pair.overlap:.0f} %"
-            for name, pair in self.merge.pairs.items()
+            for name, pair in self.merged.record.pairs.items()
         ]
-        size = "x".join(map(str, self.data.camera))
+        size = "x".join(map(str, self.stereo.rig.camera.size))
         session = self.report.parent / "session"
         used_gb = sum(f.stat().st_size for f in session.rglob("*") if f.is_file()) / 1e9
         return "\n".join(
             [
-                f"Simulated rig, camera {size}, {self.data.poses} target poses. RMS in mm.",
+                f"Simulated rig, camera {size}, {len(self.stereo.poses)} target poses. RMS in mm.",
                 (
-                    f"Reprojection RMS: camera {reprojection['camera']:.3f} px, projector"
-                    f" {reprojection['projector']:.3f} px (the Letter: {theirs['camera']:.3f},"
+                    f"Reprojection RMS: camera {rms['camera']:.3f} px, projector"
+                    f" {rms['projector']:.3f} px (the Letter: {theirs['camera']:.3f},"
                     f" {theirs['projector']:.3f})."
                 ),
                 "",
                 "Flat board (Table 1)",
-                _render_table(self.planes),
+                render_text(shape_table(planes, "")),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                _render_table(self.spheres),
+                render_text(shape_table(spheres, "")),
+                render_text(radius_table(spheres, "")),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
                 "",
-                f"Object at three depths (experiment 3), reference {self.merge.reference}",
+                f"Object at three depths (experiment 3), reference {self.merged.record.reference}",
                 *pairs,
                 "",
                 f"Report: {self.report}",
@@ -188,46 +187,20 @@ def reproduce(
         planes, spheres = comparisons
         settings = MergeSettings(OBJECTS, OBJECTS[-1], out / "merged.ply", "pixelwise")
         with merge_scans(Job(store, part(progress, 0.82, 0.9)), settings) as merged:
-            record, whole = merged.record, merged.fused
+            spacings = _compare_spacings(session, spheres)
+    result = Reproduction(
+        quick=quick,
+        stereo=stereo,
+        pixelwise=pixelwise,
+        planes=planes,
+        spheres=spheres,
+        spacings_mm=spacings,
+        merged=merged,
+        report=out / "report.html",
+    )
     progress(0.92, "drawing the report")
     pixel = (round((PIXEL[0] + 0.5) * scale - 0.5), round((PIXEL[1] + 0.5) * scale - 0.5))
-    axis, rays = pixelwise.depth_axis, stereo.rig.camera.rays()
-    data = ReproductionData(
-        camera=stereo.rig.camera.size,
-        projector=stereo.rig.projector.size,
-        quick=quick,
-        seed=seed,
-        poses=len(stereo.poses),
-        depth_range_mm=letter.DEPTH_RANGE_MM,
-        reprojection_rms_px=stereo.reprojection_rms_px,
-        letter_reprojection_rms_px=letter.REPROJECTION_RMS_PX,
-        fit_rms_mm=pixelwise.median_rms_mm(axis),
-        planes=_list_planes(planes),
-        spheres=_list_spheres(spheres),
-        spacings=_list_spacings(session, spheres),
-        pairs=[
-            MergePair(
-                name,
-                record.reference,
-                pair.point_to_point_rms_mm or float("nan"),
-                pair.overlap,
-                letter.EXPERIMENT_3_ICP_RMS_MM.get(name[-2:].upper(), float("nan")),
-            )
-            for name, pair in record.pairs.items()
-        ],
-        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, axis),
-        rms_maps_mm=pixelwise.fits[axis].rms_mm,
-        plane_maps=_make_error_maps({name: planes[name] for name in SHOWN_PLANES}),
-        sphere_maps=_make_error_maps(spheres),
-        plane_outlines={name: _outline_plane(c, rays) for name, c in planes.items()},
-        clouds=[CloudView(name, cloud.points) for name, cloud in merged.clouds.items()],
-        merged=CloudView(
-            "merged", whole.surface.points, whole.surface.normals, whole.source, whole.names
-        ),
-        poses_left_out=stereo.excluded,
-        letter_points=letter.EXPERIMENT_3_POINTS,
-    )
-    result = Reproduction(data, planes, spheres, record, out / "report.html")
+    data = _make_report_data(result, observations, pixel, seed)
     headlines, sections = reproduction_headlines(data), reproduction_sections(data)
     write_page(result.report, *reproduction_title(data), headlines, sections)
     progress(1.0, "reproduced")
@@ -258,69 +231,56 @@ def _load_truth(session: Path) -> dict[str, Any]:
     return truth
 
 
-def _list_planes(planes: Mapping[str, Comparison]) -> list[PlaneRow]:
-    """The report's rows of the planes, beside the Letter's values."""
-    return [
-        PlaneRow(
-            name,
-            comparison.incidence or {},
-            _get_rms(comparison),
-            _get_noise_floor(comparison),
-            dict(zip(("R1", "R2", "R3"), theirs.incidence, strict=True)),
-            {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-        )
-        for (name, comparison), theirs in zip(planes.items(), letter.TABLE_1, strict=True)
-    ]
+def _compare_spacings(
+    session: Path, spheres: Mapping[str, Comparison]
+) -> dict[str, tuple[float, Mapping[str, float]]]:
+    """{pair: (true distance, distance by model)} of the sphere centres, mm: scored against the
+    simulation's truth."""
+    centres = {
+        name: np.array(record["centres"][0])
+        for name, record in _load_truth(session)["spheres"].items()
+    }
+    return {
+        f"{a} - {b}": (float(np.linalg.norm(centres[a] - centres[b])), measured)
+        for (a, b), measured in centre_distances_mm(_list_records(spheres)).items()
+    }
 
 
-def _list_spheres(spheres: Mapping[str, Comparison]) -> list[SphereRow]:
-    """The report's rows of the spheres, beside the Letter's values."""
-    return [
-        SphereRow(
-            name,
-            theirs.region,
-            letter.SPHERE_RADIUS_MM,
-            _get_rms(comparison),
-            _get_noise_floor(comparison),
-            {m: r.radius_mm for m, r in comparison.results.items()},
-            {"stereo": theirs.stereo_mm, "pixelwise": theirs.pixelwise_mm},
-            {"stereo": theirs.stereo_radius_mm, "pixelwise": theirs.pixelwise_radius_mm},
-        )
-        for (name, comparison), theirs in zip(spheres.items(), letter.TABLE_2, strict=True)
-    ]
+def _make_report_data(
+    result: Reproduction, observations: Sequence[Observation], pixel: tuple[int, int], seed: int
+) -> ReproductionData:
+    """The report's input from the results, with the curves of one camera pixel (u, v)."""
+    stereo, pixelwise, merged = result.stereo, result.pixelwise, result.merged
+    axis = pixelwise.depth_axis
+    shown = {name: result.planes[name] for name in (f"plane_{i:02d}" for i in SHOWN_PLANES)}
+    return ReproductionData(
+        quick=result.quick,
+        seed=seed,
+        stereo=stereo,
+        pixel_curve=curve_at(pixel, pixelwise, stereo, observations, axis),
+        rms_maps_mm=pixelwise.fits[axis].rms_mm,
+        planes=_list_records(result.planes),
+        spheres=_list_records(result.spheres),
+        spacings_mm=result.spacings_mm,
+        error_maps={
+            name: {
+                f"error_{m}": np.where(r.inliers, r.error_map, np.nan)
+                for m, r in each.results.items()
+            }
+            for name, each in {**shown, **result.spheres}.items()
+        },
+        plane_outlines={
+            name: _outline_plane(c, stereo.rig.camera.rays()) for name, c in result.planes.items()
+        },
+        merge=merged.record,
+        clouds={name: cloud.points for name, cloud in merged.clouds.items()},
+        fused=merged.fused,
+    )
 
 
-def _list_spacings(session: Path, spheres: Mapping[str, Comparison]) -> list[SpacingRow]:
-    """The report's rows of the distances between sphere centres: true in the simulation, and by
-    model."""
-    true = {name: record["centres"][0] for name, record in _load_truth(session)["spheres"].items()}
-    records = {name: found.record() for name, found in spheres.items()}
-    return [
-        SpacingRow(f"{a} - {b}", math.dist(true[a], true[b]), measured)
-        for (a, b), measured in centre_distances_mm(records).items()
-    ]
-
-
-def _render_table(comparisons: Mapping[str, Comparison]) -> str:
-    """The table with the columns that fit a terminal, without coverage and excluded points, which
-    the report has."""
-    return render([
-        {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
-        for row in letter.letter_rows(comparisons)
-    ])  # fmt: skip
-
-
-def _make_error_maps(comparisons: Mapping[str, Comparison]) -> list[ErrorMaps]:
-    """The signed errors of every model over the pixels that counted."""
-    return [
-        ErrorMaps(
-            title,
-            {m: np.where(r.inliers, r.error_map, np.nan) for m, r in each.results.items()},
-            _get_rms(each),
-            list(_get_noise_floor(each).values())[-1],
-        )
-        for title, each in comparisons.items()
-    ]
+def _list_records(comparisons: Mapping[str, Comparison]) -> dict[str, Verification]:
+    """The figures of comparisons without their maps."""
+    return {name: each.record() for name, each in comparisons.items()}
 
 
 def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
@@ -330,13 +290,3 @@ def _outline_plane(comparison: Comparison, rays: np.ndarray) -> np.ndarray:
     chosen = np.arange(0, len(u), max(1, len(u) // 5000))
     d = np.column_stack([rays[v[chosen], u[chosen]], np.ones(len(chosen))])
     return d * (result.plane.offset / (d @ result.plane.normal))[:, None]
-
-
-def _get_rms(comparison: Comparison) -> Mapping[str, float]:
-    """Return the RMS of each model, mm."""
-    return {m: r.rms_mm for m, r in comparison.results.items()}
-
-
-def _get_noise_floor(comparison: Comparison) -> Mapping[str, float]:
-    """Noise floor of each model, mm."""
-    return {m: r.noise_floor_mm for m, r in comparison.results.items()}

@@ -18,7 +18,7 @@ from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
 from slviewer.pipeline.scan_edits import restrict_cloud
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.report.data import PixelCurve
+from slviewer.report.maps import PixelCurve
 from slviewer.session.capture import Capture
 from slviewer.session.ply import Ply, read_ply
 from slviewer.session.scan_edits import load_region

@@ -10,7 +10,7 @@ import pytest
 from clocks import HANG_S
 from facts import missing_facts, raises
 
-from slviewer.devices.browser_camera import SETTLING_MS, BrowserCamera, CameraChannel, Video
+from slviewer.devices.browser import SETTLING_MS, BrowserCamera, CameraChannel, Video
 from slviewer.devices.protocols import CameraSettings
 from slviewer.errors import DeviceError, InputError
 

@@ -5,7 +5,7 @@ import msgspec
 import pytest
 from facts import missing_facts, raises
 
-from slviewer.devices.browser_projector import ProjectorChannel, Screen, browser_projector
+from slviewer.devices.browser import BrowserProjector, ProjectorChannel, Screen
 from slviewer.devices.drivers import driver
 from slviewer.errors import DeviceError, InputError
 
@@ -61,23 +61,23 @@ def test_windows_that_would_spoil_patterns_are_refused_with_what_to_change(shown
 def test_without_a_server_the_driver_says_who_has_one():
     assert driver("browser").page and not driver("browser").missing
     with raises(DeviceError, "slviewer wizard"):
-        browser_projector()
+        BrowserProjector()
 
 
 def test_the_size_is_the_pages_unless_it_is_given():
     channel = ProjectorChannel()
-    assert browser_projector([912, 1140], channel).size == (912, 1140)
+    assert BrowserProjector([912, 1140], channel).size == (912, 1140)
     with pytest.raises(DeviceError):
-        browser_projector(page=channel)
+        BrowserProjector(page=channel)
     channel.connect(hello(), lambda message: None)
-    assert browser_projector(page=channel).size == (1920, 1080)
+    assert BrowserProjector(page=channel).size == (1920, 1080)
     for size in ([0, 5], [5], [1.5, 2], "912x1140"):
         with pytest.raises(InputError):
-            browser_projector(size, channel)  # type: ignore[arg-type]
+            BrowserProjector(size, channel)  # type: ignore[arg-type]
 
 
 def test_no_page_is_said_at_once():
-    projector = browser_projector([912, 1140], ProjectorChannel())
+    projector = BrowserProjector([912, 1140], ProjectorChannel())
     for _ in range(2):
         with pytest.raises(DeviceError):
             projector.open()

@@ -7,7 +7,7 @@ from colour_camera import ColouredCamera, coloured
 from facts import raises
 from faulty_rig import breakable
 
-from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel, Screen
+from slviewer.devices.browser import BrowserProjector, ProjectorChannel, Screen
 from slviewer.devices.capture import capture_colour, capture_frames, capture_with_texture
 from slviewer.devices.protocols import CameraSettings, ColourCamera, Rig
 from slviewer.devices.replay import replay
@@ -142,7 +142,7 @@ class _Page:
 def test_a_page_that_is_reloaded_between_two_exposures_ends_the_capture():
     channel, camera = ProjectorChannel(), rig().camera
     first = _Page(channel, SEQUENCE.projector)
-    with Rig("r", camera, BrowserProjector(channel, SEQUENCE.projector)).opened() as one:
+    with Rig("r", camera, BrowserProjector(SEQUENCE.projector, channel)).opened() as one:
         assert len(capture_with_texture(one, SEQUENCE, (0.5, 4.0)).frames) == 2 * N
         assert first.asked.count("load") == 1 and first.asked.count("show") == 2 * (N + 1)
 

@@ -11,12 +11,10 @@ from slviewer.errors import InputError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison, fit_clouds
 from slviewer.evaluation.incidence import incidence
-from slviewer.evaluation.letter import letter_rows
-from slviewer.evaluation.render import render
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text
-from slviewer.records.verification import Verification
+from slviewer.records.verification import Verification, average
 
 
 def seen(points: np.ndarray, model: str, sigma: float = 0.05) -> Cloud:
@@ -127,69 +125,25 @@ def test_incidence_counts_points_by_depth() -> None:
         incidence(points, z < 450, (500.0, 700.0))
 
 
-def test_the_letters_means_follow_from_its_rows() -> None:
-    stereo, pixelwise = (
-        np.mean([getattr(row, name) for row in letter.TABLE_1])
-        for name in ("stereo_mm", "pixelwise_mm")
-    )
-    assert stereo == pytest.approx(letter.TABLE_1_MEAN_MM[0], abs=6e-4)
-    assert pixelwise == pytest.approx(letter.TABLE_1_MEAN_MM[1], abs=6e-4)
-    assert stereo / pixelwise == pytest.approx(letter.TABLE_1_RATIO_OF_MEANS, abs=0.005)
-    assert max(row.stereo_mm / row.pixelwise_mm for row in letter.TABLE_1) == pytest.approx(
-        3.59, abs=0.005
-    )
-    assert all(sum(row.incidence) == pytest.approx(100.0, abs=0.11) for row in letter.TABLE_1)
-    inside = [i for i, row in enumerate(letter.TABLE_1, 1) if row.incidence[1] >= 87.0]
-    assert inside == [3, 4, 9, 10]
-
-    for k, name in enumerate(("stereo", "pixelwise")):
-        rms = np.mean([getattr(row, f"{name}_mm") for row in letter.TABLE_2])
-        radii = [getattr(row, f"{name}_radius_mm") for row in letter.TABLE_2]
-        assert rms == pytest.approx(letter.TABLE_2_MEAN_MM[k], abs=6e-4)
-        assert np.mean(radii) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][0], abs=1e-3)
-        # rows have 2 decimals
-        assert np.std(radii, ddof=1) == pytest.approx(letter.TABLE_2_RADIUS_MM[k][1], abs=2e-3)
+def test_the_letters_tables_have_its_means() -> None:
+    planes, spheres = average("plane", letter.TABLE_1), average("sphere", letter.TABLE_2)
+    stereo, pixelwise = planes.rms_mm.values()
+    assert [stereo, pixelwise] == pytest.approx([0.184, 0.087], abs=6e-4)
+    assert stereo / pixelwise == pytest.approx(2.13, abs=0.005)
+    ratios = [row.rms_mm["stereo"] / row.rms_mm["pixelwise"] for row in letter.TABLE_1]
+    assert max(ratios) == pytest.approx(3.59, abs=0.005)
+    shares = [row.incidence or {} for row in letter.TABLE_1]
+    assert all(sum(each.values()) == pytest.approx(100.0, abs=0.11) for each in shares)
+    assert [i for i, each in enumerate(shares, 1) if each["R2"] >= 87.0] == [3, 4, 9, 10]
+    assert [*spheres.rms_mm.values()] == pytest.approx([0.091, 0.072], abs=6e-4)
+    assert [*spheres.radii_mm.values()] == pytest.approx([98.256, 98.060], abs=1e-3)
 
 
-def test_tables_show_the_letters_figures_beside_ours(
-    two: tuple[dict[str, Cloud], np.ndarray, Comparison],
-) -> None:
-    comparison = two[2]
-    table = letter_rows({"plane_01": comparison, "plane_03": comparison})
-    assert [row["capture"] for row in table] == ["plane_01", "plane_03", "mean"]
-    assert table[1]["Letter stereo"] == 0.144
-    assert table[2]["Letter ratio"] == 2.13
-    assert table[2]["ratio"] == pytest.approx(
-        comparison.results["stereo"].rms_mm / comparison.results["pixelwise"].rms_mm
-    )
-    json.dumps(table)
-    lines = render(table).splitlines()
-    assert [line.split()[0] for line in lines[-5:-3]] == ["-" * len(lines[-5]), "plane_01"]
-    assert lines[-2] == lines[-5] and lines[-1].startswith("mean")
-    assert len({line.index("0.188") if "0.188" in line else 0 for line in lines}) == 2
-    assert all(len(line) <= len(lines[-2]) <= 140 for line in lines)
-
-
-def test_sphere_tables_hold_radii() -> None:
-    points = cloud(sphere_depth((0.0, 0.0, 650.0), 98.0), 0.04)
-    clouds = {"stereo": seen(points, "stereo"), "pixelwise": seen(points, "pixelwise")}
-    comparison = fit_clouds("sphere", clouds, radius=98.0)
-    table = letter_rows({"sphere_2": comparison, "sphere_7": comparison})
-    assert table[0]["Letter pixelwise radius"] == 98.00
-    assert "Letter stereo" not in table[1]
-    assert table[2]["Letter stereo radius"] == 98.256
-    assert table[2]["pixelwise radius"] == pytest.approx(98.0, abs=0.01)
-    assert " -" in render(table).splitlines()[-3]
-
-
-def test_nothing_to_show_renders_as_nothing() -> None:
-    assert render([]) == ""
-    assert letter_rows({}) == []
-    assert (
-        render([{"model": "stereo", "RMS mm": 0.1234, "noise floor mm": float("nan")}])
-        .splitlines()[-1]
-        .endswith("-")
-    )
+def test_the_letters_pose_has_the_number_of_the_capture() -> None:
+    assert letter.find_pose("plane_03", "plane").rms_mm["stereo"] == 0.144
+    assert letter.find_pose("sphere_2", "sphere").radii_mm["pixelwise"] == 98.0
+    for name in ("sphere_7", "sphere_0", "ball"):
+        assert letter.find_pose(name, "sphere").models == {}
 
 
 def test_a_plane_far_off_the_depths_is_all_in_one_range() -> None:

@@ -10,9 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 from wizard_page import CALM, PATIENCE_S, choose, click, new_page
 
-from slviewer.devices.browser import PageChannels
-from slviewer.devices.browser_camera import Video
-from slviewer.devices.browser_projector import ProjectorChannel, browser_projector
+from slviewer.devices.browser import BrowserProjector, PageChannels, ProjectorChannel, Video
 from slviewer.fringe.presets import gray
 from slviewer.gui.app import App
 from slviewer.gui.shell import encode_qr_code
@@ -31,7 +29,7 @@ def test_wizard_serves_projector_page(browser: Browser) -> None:
         try:
             page.goto(app.server.link("project"))
             assert channel.wait_ready(PATIENCE_S).words == "ready 320 x 240"
-            projector = browser_projector(page=channel)
+            projector = BrowserProjector(page=channel)
             projector.open()
             projector.load(gray((320, 240)))
             projector.show(0)

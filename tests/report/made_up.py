@@ -1,28 +1,23 @@
 """Made-up results that look like real ones: bent planes, noisy spheres, a hilly object seen from
 three places."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
 from slviewer.calibration.stereo import StereoModel
+from slviewer.fringe.presets import p18
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.records.merge import Merge, Registered
 from slviewer.records.verification import ModelFit, Verification
-from slviewer.report.data import (
-    CalibrationFigures,
-    CaptureRow,
-    CloudView,
-    ErrorMaps,
-    MergePair,
-    PixelCurve,
-    PlaneRow,
-    PoseResiduals,
-    RecordsView,
-    ReproductionData,
-    SessionData,
-    SpacingRow,
-    SphereRow,
-)
-from slviewer.report.maps import verification_maps
+from slviewer.report.maps import PixelCurve, verification_maps
+from slviewer.report.reproduction import ReproductionData
+from slviewer.report.session import CalibrationFigures, CaptureUse, RecordsView, SessionData
+from slviewer.session.capture import Capture, Role
+from slviewer.surface.fuse import Fused
+from slviewer.surface.shapes import PointSet
 
 MODELS = ("stereo", "pixelwise")
 INCIDENCE = (
@@ -37,10 +32,6 @@ INCIDENCE = (
     (2.1, 97.9),
     (0, 87),
 )
-LETTER = {
-    "stereo": (0.188, 0.237, 0.144, 0.127, 0.172, 0.205, 0.270, 0.214, 0.138, 0.146),
-    "pixelwise": (0.068, 0.066, 0.070, 0.056, 0.091, 0.104, 0.163, 0.118, 0.053, 0.076),
-}
 OURS = {
     "stereo": (0.134, 0.156, 0.198, 0.222, 0.293, 0.372, 0.456, 0.41, 0.21, 0.25),
     "pixelwise": (0.219, 0.149, 0.076, 0.079, 0.121, 0.189, 0.333, 0.41, 0.08, 0.088),
@@ -70,10 +61,12 @@ def error_map(width: int, rms: float, noise: float, seed: int, round_: bool = Fa
 
 
 def error_maps(
-    title: str, width: int, rms: dict[str, float], seed: int, round_: bool = False
-) -> ErrorMaps:
-    maps = {m: error_map(width, r, 0.036, seed + i, round_) for i, (m, r) in enumerate(rms.items())}
-    return ErrorMaps(title, maps, rms, 0.036)
+    found: Verification, width: int, seed: int, round_: bool = False
+) -> dict[str, np.ndarray]:
+    return {
+        f"error_{m}": error_map(width, rms, 0.036, seed + i, round_)
+        for i, (m, rms) in enumerate(found.rms_mm.items())
+    }
 
 
 def cloud(width: int, shift: float) -> np.ndarray:
@@ -138,21 +131,27 @@ def outlines() -> dict[str, np.ndarray]:
     return out
 
 
-def plane_rows() -> list[PlaneRow]:
-    rows = []
+def planes() -> dict[str, Verification]:
+    found = {}
     for i, (r1, r2) in enumerate(INCIDENCE):
+        fits = {
+            m: ModelFit(
+                points=812_345,
+                excluded=24000 if i and m == "pixelwise" else 1200,
+                rms_mm=OURS[m][i],
+                noise_floor_mm=0.036,
+                coverage=0.981,
+            )
+            for m in MODELS
+        }
         share = {"R1": float(r1), "R2": float(r2), "R3": 100.0 - r1 - r2}
-        rms = {m: OURS[m][i] for m in MODELS}
-        letter = {m: LETTER[m][i] for m in MODELS}
-        rows.append(
-            PlaneRow(f"plane_{i + 1:02d}", share, rms, dict.fromkeys(MODELS, 0.036), share, letter)
-        )
-    return rows
+        found[f"plane_{i + 1:02d}"] = Verification(shape="plane", models=fits, incidence=share)
+    return found
 
 
-def sphere_rows() -> list[SphereRow]:
+def spheres() -> dict[str, Verification]:
     radii = (
-        (97.94, 98.11),
+        (97.91, 98.08),
         (98.1, 98.05),
         (98.2, 98.04),
         (98.25, 98.02),
@@ -167,27 +166,41 @@ def sphere_rows() -> list[SphereRow]:
         (0.092, 0.076),
         (0.085, 0.085),
     )
-    letter = (
-        (98.44, 98.01),
-        (98.28, 98.0),
-        (98.27, 98.08),
-        (98.2, 98.06),
-        (98.25, 98.15),
-        (98.1, 98.06),
-    )
-    return [
-        SphereRow(
-            f"sphere_{i + 1}",
-            f"R{i // 2 + 1}",
-            98.03,
-            dict(zip(MODELS, rms[i], strict=True)),
-            dict.fromkeys(MODELS, 0.04),
-            dict(zip(MODELS, radii[i], strict=True)),
-            dict(zip(MODELS, rms[i], strict=True)),
-            dict(zip(MODELS, letter[i], strict=True)),
+    return {
+        f"sphere_{i + 1}": Verification(
+            shape="sphere",
+            models={
+                m: ModelFit(900, 0, rms[i][k], 0.04, radius_mm=radii[i][k])
+                for k, m in enumerate(MODELS)
+            },
         )
         for i in range(6)
-    ]
+    }
+
+
+def stereo_model(width: int) -> StereoModel:
+    K = np.array([[3510.2, 0, 801.3], [0, 3509.8, 598.2], [0, 0, 1]])
+    D = np.array([-0.0812, 0.113, 0.0003, -0.0002, -0.04])
+    a = np.radians(14.0)
+    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    rig = StereoRig(
+        Lens(K, D, (width, width * 3 // 4)),
+        Lens(K * [[0.4], [0.8], [1]], -D, (912, 1140)),
+        R,
+        np.array([-178.2, 0.4, 21.3]),
+    )
+    return StereoModel(
+        rig,
+        "circles:21x16:9",
+        ("x",),
+        {"camera": 0.041, "projector": 0.062, "stereo": 0.053},
+        {},
+        {},
+        {},
+        (498.0, 703.0),
+        {"camera": 1.2, "projector": 2.1},
+        3,
+    )
 
 
 def reproduction_data(width: int = 1600) -> ReproductionData:
@@ -203,48 +216,50 @@ def reproduction_data(width: int = 1600) -> ReproductionData:
     from slviewer.reconstruction.reconstruct import normals
 
     facing = np.concatenate([normals(c).reshape(-1, 3) for c in clouds])
-    spheres = sphere_rows()
+    names = ("object_r1", "object_r2", "object_r3")
+    flat, round_ = planes(), spheres()
+    eye = tuple(map(tuple, np.eye(4).tolist()))
+    surface = PointSet(merged[known], normals=facing[known])
     return ReproductionData(
-        camera=(width, width * 3 // 4),
-        projector=(912, 1140),
         quick=width < 1600,
         seed=0,
-        poses=25,
-        depth_range_mm=(500.0, 700.0),
-        reprojection_rms_px={"camera": 0.041, "projector": 0.065, "stereo": 0.054},
-        letter_reprojection_rms_px={"camera": 0.253, "projector": 0.141},
-        fit_rms_mm={"z": 0.041, "x": 0.008, "y": 0.006},
-        planes=plane_rows(),
-        spheres=spheres,
-        spacings=[
-            SpacingRow("sphere_1 to sphere_2", 120.0, {"stereo": 120.57, "pixelwise": 119.8}),
-            SpacingRow("pair", 150.0, {"stereo": 150.31, "pixelwise": 150.2}),
-        ],
-        pairs=[
-            MergePair("object_r1", "object_r3", 0.21, 0.84, 0.26),
-            MergePair("object_r2", "object_r3", 0.12, 0.9, 0.25),
-        ],
+        stereo=stereo_model(width),
         pixel_curve=pixel_curve(),
         rms_maps_mm=rms_maps(width),
-        plane_maps=[
-            error_maps(f"plane_{i:02d}", width, {m: OURS[m][i - 1] for m in MODELS}, i)
-            for i in (1, 3, 8)
-        ],
-        sphere_maps=[
-            error_maps(row.name, width, dict(row.rms_mm), 20 + i, True)
-            for i, row in enumerate(spheres)
-        ],
+        planes=flat,
+        spheres=round_,
+        spacings_mm={
+            "sphere_1 to sphere_2": (120.0, {"stereo": 120.57, "pixelwise": 119.8}),
+            "pair": (150.0, {"stereo": 150.31, "pixelwise": 150.2}),
+        },
+        error_maps={
+            **{
+                name: error_maps(flat[name], width, i)
+                for i, name in enumerate(("plane_01", "plane_03", "plane_08"))
+            },
+            **{
+                name: error_maps(each, width, 20 + i, True)
+                for i, (name, each) in enumerate(round_.items())
+            },
+        },
         plane_outlines=outlines(),
-        clouds=[CloudView(f"object_r{i + 1}", c) for i, c in enumerate(clouds)],
-        merged=CloudView(
-            "merged",
-            merged[known],
-            facing[known],
-            source[known],
-            ("object_r1", "object_r2", "object_r3"),
+        merge=Merge(
+            reference=names[2],
+            scans=list(names),
+            pairs={
+                name: Registered(
+                    rms_mm=0.1, point_to_point_rms_mm=mm, overlap=overlap, T_reference_scan=eye
+                )
+                for name, mm, overlap in ((names[0], 0.21, 0.84), (names[1], 0.12, 0.9))
+            },
         ),
-        letter_points={"R1": 1642179, "R2": 1476327, "R3": 1034094},
+        clouds=dict(zip(names, clouds, strict=True)),
+        fused=Fused(surface, source[known], source[known], names, {}, {}),
     )
+
+
+def capture(name: str, role: Role, size: tuple[int, int]) -> Capture:
+    return Capture(name, role, p18((912, 1140)), size, "", Path(), {})
 
 
 def session_data(width: int = 1600) -> SessionData:
@@ -261,86 +276,34 @@ def session_data(width: int = 1600) -> SessionData:
         pixels = np.stack([u, v], axis=1) @ turn + rng.uniform(0.05, 0.25, 2) * [width, height]
         noise = [rms[name][i] / np.sqrt(2) * rng.standard_normal(pixels.shape) for i in (0, 1)]
         noise[0][3] = np.nan
-        residuals[name] = PoseResiduals(pixels, noise[0], pixels * [0.5, 0.8], noise[1])
-    captures = [
-        CaptureRow(
-            n, "calibration", "used", (width, height), (912, 1140), 52, {"x": 18.0, "y": 18.0}
-        )
-        for n in names
-    ]
+        residuals[name] = {
+            "camera": (pixels, noise[0]),
+            "projector": (pixels * [0.5, 0.8], noise[1]),
+        }
+    size = (width, height)
+    captures = [CaptureUse(capture(n, "calibration", size), "used") for n in names]
     captures += [
-        CaptureRow(
-            "pose_09",
-            "calibration",
+        CaptureUse(
+            capture("pose_09", "calibration", size),
             "unused",
-            (width, height),
-            (912, 1140),
-            52,
-            {"x": 18.0, "y": 18.0},
             "12 of 336 circles found: lower the exposure, or move the board so that all of it is in"
             " view",
         ),
-        CaptureRow(
-            "pose_17",
-            "calibration",
-            "excluded",
-            (width, height),
-            (912, 1140),
-            52,
-            {"x": 18.0, "y": 18.0},
-            "the board slipped",
-        ),
-        CaptureRow(
-            "vase <b>blue</b>", "scan", "scan", (width, height), (912, 1140), 26, {"x": 18.0}
-        ),
+        CaptureUse(capture("pose_17", "calibration", size), "excluded", "the board slipped"),
+        CaptureUse(capture("vase <b>blue</b>", "scan", size), "scan"),
     ]
-    K = np.array([[3510.2, 0, 801.3], [0, 3509.8, 598.2], [0, 0, 1]])
-    D = np.array([-0.0812, 0.113, 0.0003, -0.0002, -0.04])
-    a = np.radians(14.0)
-    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    planes, maps = {}, []
-    for i, row in enumerate(plane_rows()[:3:2]):
-        fits = {
-            model: ModelFit(
-                points=812_345,
-                excluded=24000 if i and model == "pixelwise" else 1200,
-                rms_mm=row.rms_mm[model],
-                noise_floor_mm=row.noise_floor_mm[model],
-                coverage=0.981,
-            )
-            for model in row.rms_mm
-        }
-        planes[row.name] = Verification(shape="plane", models=fits, incidence=dict(row.incidence))
-        drawn = error_maps(row.name, width, dict(row.rms_mm), i).maps
-        maps.append(
-            verification_maps(
-                row.name, planes[row.name], {f"error_{m}": array for m, array in drawn.items()}
-            )
-        )
-    rig = StereoRig(
-        Lens(K, D, (width, height)),
-        Lens(K * [[0.4], [0.8], [1]], -D, (912, 1140)),
-        R,
-        np.array([-178.2, 0.4, 21.3]),
-    )
-    stereo = StereoModel(
-        rig,
-        "circles:21x16:9",
-        ("x",),
-        {"camera": 0.041, "projector": 0.062, "stereo": 0.053},
-        {},
-        rms,
-        {},
-        (498.0, 703.0),
-        {"camera": 1.2, "projector": 2.1},
-        3,
-    )
+    flat = {name: planes()[name] for name in ("plane_01", "plane_03")}
+    maps = [
+        verification_maps(name, each, error_maps(each, width, i))
+        for i, (name, each) in enumerate(flat.items())
+    ]
+    stereo = replace(stereo_model(width), pose_rms_px=rms)
     return SessionData(
         name="Vase <script>alert(1)</script>",
         captures=captures,
         calibration=CalibrationFigures(stereo, residuals),
         pixel_fits={"x": rms_maps(width)},
-        records=[RecordsView(Verification, planes, maps)],
+        records=[RecordsView(Verification, flat, maps)],
         warnings=[
             "the camera's exposure changed between pose_03 and pose_04: brightness differs by 20 %"
         ],

@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 from facts import missing_facts
-from made_up import cloud, error_map, outlines, pixel_curve, rms_maps
+from made_up import cloud, error_map, outlines, pixel_curve
 from PIL import Image
 
 from slviewer.errors import InputError
 from slviewer.report import maps
 from slviewer.report.canvas import DENSITY, FULL, MODELS, finish_figure, new_figure, round_up
-from slviewer.report.data import CloudView, PixelCurve
-from slviewer.report.maps import pixel_curves
+from slviewer.report.maps import PixelCurve, pixel_curves
 from slviewer.report.page import Figure
-from slviewer.report.planes import planes_in_space, rms_bars
+from slviewer.report.planes import planes_in_space
 from slviewer.report.reprojection import coverage, pose_bars, residual_arrows
 from slviewer.report.surfaces import draw_clouds, draw_merged_cloud
+from slviewer.surface.fuse import Fused
+from slviewer.surface.shapes import PointSet
 
 pytestmark = pytest.mark.computes
 
@@ -111,12 +112,9 @@ def test_nothing_measured_is_drawn_as_nothing() -> None:
     empty = np.full((60, 80), np.nan, np.float32)
     opened(maps.draw_error_maps("pose", {"stereo": empty}, {"stereo": float("nan")}))
     opened(maps.rms_maps(np.full((3, 60, 80), np.nan)))
-    opened(draw_clouds([CloudView("nothing", np.full((60, 80, 3), np.nan, np.float32))]))
-    opened(
-        draw_merged_cloud(
-            CloudView("nothing", *2 * [np.zeros((0, 3), np.float32)], np.zeros(0, int))
-        )
-    )
+    opened(draw_clouds({"nothing": np.full((60, 80, 3), np.nan, np.float32)}))
+    nothing = PointSet(*2 * [np.zeros((0, 3), np.float32)])
+    opened(draw_merged_cloud(Fused(nothing, *2 * [np.zeros(0, np.uint8)], (), {}, {})))
 
 
 def test_scales_end_at_round_values() -> None:
@@ -165,7 +163,7 @@ def test_reprojection_figures() -> None:
 def test_clouds_are_counted() -> None:
     points = cloud(160, 590)
     count = f"{np.isfinite(points[..., 2]).sum():,} points"
-    figure = draw_clouds([CloudView("scan <1>", points)] * 4)
+    figure = draw_clouds({f"scan <{i}>": points for i in range(4)})
     assert missing_facts(figure.alt, count) == []
     opened(figure)
 
@@ -175,13 +173,6 @@ def test_clouds_are_counted() -> None:
     [
         lambda: maps.draw_error_maps("t", {}, {}),
         lambda: maps.draw_error_maps("t", {"a": np.zeros((2, 3)), "b": np.zeros((3, 2))}, RMS),
-        lambda: maps.rms_maps(rms_maps(40)[:2]),
-        lambda: planes_in_space({}, (500, 700)),
-        lambda: planes_in_space({"p": np.zeros((2, 3))}, (500, 700)),
-        lambda: residual_arrows("t", np.zeros((3, 2)), np.zeros((4, 2)), (10, 10)),
-        lambda: pose_bars({}, {}),
-        lambda: rms_bars([]),
-        lambda: pixel_curves(PixelCurve((0, 0), "x", *(np.zeros(n) for n in (3, 4, 3, 3, 5, 3)))),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(draw: Any) -> None:

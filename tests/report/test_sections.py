@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from facts import missing_facts
-from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
+from made_up import MODELS, planes, reproduction_data, session_data, spheres
 
 from slviewer.calibration.stereo import StereoModel
 from slviewer.evaluation.crossvalidation import gather_results
@@ -20,18 +20,23 @@ from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.table import Cell, Table, better_worse, compare_errors
 from slviewer.records.verdict import Finding, Verdict
 from slviewer.records.verification import ModelFit, Verification
-from slviewer.report.data import CalibrationFigures, ModelsView, PlaneRow, RecordsView, SpacingRow
 from slviewer.report.page import Figure, PageNotice, Section, write_page
 from slviewer.report.reproduction import (
     inside_ratio,
-    plane_table,
+    length_table,
+    radius_table,
     reproduction_headlines,
     reproduction_sections,
     reproduction_title,
-    spacing_table,
-    sphere_table,
+    shape_table,
 )
-from slviewer.report.session import session_headlines, session_sections, session_title
+from slviewer.report.session import (
+    CalibrationFigures,
+    RecordsView,
+    session_headlines,
+    session_sections,
+    session_title,
+)
 
 pytestmark = pytest.mark.computes
 
@@ -49,9 +54,10 @@ def texts(section: Section) -> str:
     return "\n".join(words)
 
 
-def by_title(table: Table, row: int) -> dict[tuple[str, str], tuple[str, str]]:
-    """Text and mark of each cell of a row."""
-    return {(c.group, c.title): (text, mark) for c, text, mark in table.format(table.rows)[row]}
+def by_title(table: Table, name: str, model: str) -> dict[tuple[str, str], tuple[str, str]]:
+    """Text and mark of each cell of the row of a capture and model."""
+    (row,) = (row for row in table.rows if table.values(row[:2]) == [name, model])
+    return {(c.group, c.title): (text, mark) for c, text, mark in table.format([row])[0]}
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +69,7 @@ def reproduction() -> list[Section]:
 def tables() -> list[Section]:
     """The reproduction's sections without figures of maps and planes, which take most of the
     time."""
-    data = dataclasses.replace(
-        reproduction_data(WIDTH), plane_maps=[], sphere_maps=[], plane_outlines={}
-    )
+    data = dataclasses.replace(reproduction_data(WIDTH), error_maps={}, plane_outlines={})
     return reproduction_sections(dataclasses.replace(data, pixel_curve=None))
 
 
@@ -120,22 +124,22 @@ def test_where_pixelwise_loses_it_is_said(tables: list[Section]) -> None:
         for i in planes.items
     )
     table = next(i for i in planes.items if isinstance(i, Table))
-    first, third = by_title(table, 0), by_title(table, 2)
-    assert first["pixelwise", "RMS"] == ("0.219", "worse")
-    assert first["stereo", "RMS"] == ("0.134", "better")
-    assert first["pixelwise", "against stereo"] == ("1.63 × worse", "worse")
-    assert third["pixelwise", "RMS"] == ("0.076", "better")
-    assert third["stereo", "RMS"] == ("0.198", "")
-    assert third["pixelwise", "floor"] == ("0.036", "muted")
-    assert by_title(table, 7)["pixelwise", "against stereo"] == ("equal", "")
+    first, third = ({m: by_title(table, f"plane_0{i}", m) for m in MODELS} for i in (1, 3))
+    assert first["pixelwise"]["", "RMS"] == ("0.219", "worse")
+    assert first["stereo"]["", "RMS"] == ("0.134", "better")
+    assert first["pixelwise"]["", "against stereo"] == ("1.63 × worse", "worse")
+    assert third["pixelwise"]["", "RMS"] == ("0.076", "better")
+    assert third["stereo"]["", "RMS"] == ("0.198", "")
+    assert third["pixelwise"]["", "noise floor"] == ("0.036", "")
+    assert by_title(table, "plane_08", "pixelwise")["", "against stereo"] == ("equal", "")
 
 
 def test_the_ratio_counts_the_planes_inside() -> None:
-    ratio, count = inside_ratio(plane_rows())
-    inside = [2, 3, 8, 9]
-    ours = [np.mean([plane_rows()[i].rms_mm[m] for i in inside]) for m in MODELS]
+    ratio, count = inside_ratio(planes())
+    inside = ("plane_03", "plane_04", "plane_09", "plane_10")
+    ours = [np.mean([planes()[name].rms_mm[m] for name in inside]) for m in MODELS]
     assert count == 4 and ratio == pytest.approx(ours[0] / ours[1])
-    assert np.isnan(inside_ratio([])[0])
+    assert np.isnan(inside_ratio({})[0])
 
 
 def test_headlines_name_both_and_mark_the_loser() -> None:
@@ -143,7 +147,7 @@ def test_headlines_name_both_and_mark_the_loser() -> None:
     assert [h.mark for h in reproduction_headlines(data)] == ["better"] * 4
     assert "0.270 → 0.174 mm" in reproduction_headlines(data)[0].value
     worse = dataclasses.replace(
-        data, spacings=[SpacingRow("a", 100.0, {"stereo": 100.1, "pixelwise": 100.4})]
+        data, spacings_mm={"a": (100.0, {"stereo": 100.1, "pixelwise": 100.4})}
     )
     assert reproduction_headlines(worse)[3].mark == "worse"
 
@@ -151,20 +155,20 @@ def test_headlines_name_both_and_mark_the_loser() -> None:
 def test_an_empty_reproduction_still_makes_a_page() -> None:
     data = dataclasses.replace(
         reproduction_data(WIDTH),
-        planes=[],
-        spheres=[],
-        spacings=[],
-        pairs=[],
+        planes={},
+        spheres={},
+        spacings_mm={},
         pixel_curve=None,
-        plane_maps=[],
-        sphere_maps=[],
+        error_maps={},
         plane_outlines={},
-        clouds=[],
-        merged=None,
-        letter_points={},
-        fit_rms_mm={},
-        reprojection_rms_px={},
-        poses_left_out={"pose_02": "board not found"},
+        merge=None,
+        clouds={},
+        fused=None,
+        stereo=dataclasses.replace(
+            session_data(WIDTH).calibration.stereo,
+            reprojection_rms_px={},
+            excluded={"pose_02": "board not found"},
+        ),
     )
     sections = reproduction_sections(data)
     assert len(sections) == 4 and len(reproduction_headlines(data)) == 2
@@ -172,14 +176,12 @@ def test_an_empty_reproduction_still_makes_a_page() -> None:
 
 
 def test_missing_values_are_dashes_not_winners() -> None:
-    nan = float("nan")
-    row = PlaneRow("p", {}, {"stereo": 0.1, "pixelwise": nan}, {"stereo": nan})
-    cells = by_title(plane_table([row], "t"), 0)
-    unknown = ("–", "muted")
-    assert cells["", "R1 / R2 / R3"] == cells["pixelwise", "RMS"] == unknown
-    assert cells["stereo", "RMS"] == ("0.100", "")
-    assert cells["pixelwise", "against stereo"] == unknown
-    assert ("the Letter's rig", "stereo") not in cells
+    fits = {"stereo": ModelFit(9, 0, 0.1), "pixelwise": ModelFit(9, 0, None)}
+    table = shape_table({"p": Verification(shape="plane", models=fits)}, "t")
+    cells = by_title(table, "p", "pixelwise")
+    assert cells["", "RMS"] == ("–", "muted") and ("", "against stereo") not in cells
+    assert by_title(table, "p", "stereo")["", "RMS"] == ("0.100", "better")
+    assert not table.footer and ("the Letter's rig", "RMS") not in cells
 
 
 def test_verdicts() -> None:
@@ -189,16 +191,15 @@ def test_verdicts() -> None:
 
 
 def test_spheres_are_judged_by_their_radius_and_spacing() -> None:
-    table = sphere_table(sphere_rows(), "t")
-    row = by_title(table, 0)
-    assert row["stereo", "error"] == ("−0.090", "")
-    assert row["pixelwise", "error"] == ("+0.080", "better")
-    assert missing_facts(table.notes[0], "radius", "98.03 mm") == []
-    spacing = by_title(
-        spacing_table([SpacingRow("a to b", 150.0, {"stereo": 150.5, "pixelwise": 149.9})], "t"), 0
-    )
-    assert spacing["pixelwise", "error"] == ("−0.100", "better")
-    assert spacing["pixelwise", "against stereo"] == ("5.00 × better", "better")
+    table = radius_table(spheres(), "t")
+    assert by_title(table, "sphere_1", "stereo")["", "error"] == ("−0.090", "")
+    row = by_title(table, "sphere_1", "pixelwise")
+    assert row["", "error"] == ("+0.080", "better") and row["", "known"][0] == "98.000"
+    assert row["the Letter's rig", "measured"][0] == "98.01"
+    lengths = {"a to b": (150.0, {"stereo": 150.5, "pixelwise": 149.9})}
+    spacing = by_title(length_table(lengths, "t"), "a to b", "pixelwise")
+    assert spacing["", "error"] == ("−0.100", "better")
+    assert spacing["", "against stereo"] == ("5.00 × better", "better")
 
 
 def test_a_sessions_report(tmp_path: Path) -> None:
@@ -345,7 +346,9 @@ def test_how_good_a_calibration_is() -> None:
     data = dataclasses.replace(
         session_data(WIDTH),
         verdict=verdict,
-        models=ModelsView("stereo", "splined", {"splined": "scale corrected by +300 ppm"}),
+        model="stereo",
+        recommended="splined",
+        scales={"splined": "scale corrected by +300 ppm"},
         records=[
             RecordsView(
                 AcceptanceTest,

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from slviewer.errors import InputError
 from slviewer.report.surfaces import BACKGROUND, _select_mosaic, render_points, view_rotation
 
 SIZE = (120, 90)
@@ -69,8 +68,3 @@ def test_a_mosaic_shows_one_scan_in_each_square_and_leaves_no_hole() -> None:
     assert len(np.unique(cells, axis=0)) > 0.95 * 50 * 50
     alone = points[shown][(points[shown, 0] > 60)]
     assert len(alone) == (points[:, 0] > 60).sum()
-
-
-def test_shapes_are_checked() -> None:
-    with pytest.raises(InputError):
-        render_points(np.zeros((3, 3)), np.zeros((4, 3)), np.zeros((3, 3)), SIZE, np.eye(3))

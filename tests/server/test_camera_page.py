@@ -10,8 +10,7 @@ from clocks import HANG_S, until
 from facts import missing_facts
 from playwright.sync_api import Browser, Page, expect
 
-from slviewer.devices.browser import PageChannels
-from slviewer.devices.browser_camera import BrowserCamera, CameraChannel
+from slviewer.devices.browser import BrowserCamera, CameraChannel, PageChannels
 from slviewer.devices.protocols import CameraSettings, Rig
 from slviewer.devices.simulated import SimulatedCamera, SimulatedProjector, simulated_rig
 from slviewer.devices.world import SimulatedWorld

@@ -12,8 +12,7 @@ from facts import missing_facts, raises
 from playwright.sync_api import Browser, BrowserContext, Page, expect
 from websockets.exceptions import ConnectionClosed
 
-from slviewer.devices.browser import PageChannels
-from slviewer.devices.browser_projector import BrowserProjector, ProjectorChannel, browser_projector
+from slviewer.devices.browser import BrowserProjector, PageChannels, ProjectorChannel
 from slviewer.errors import DeviceError, InputError
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import complementary
@@ -113,7 +112,7 @@ def opens(browser: Browser, server: SafeServer, usual: Window) -> Iterator[Opens
 
 @pytest.fixture
 def projector(channel: ProjectorChannel) -> Iterator[BrowserProjector]:
-    projector = browser_projector(SIZE, channel)
+    projector = BrowserProjector(SIZE, channel)
     yield projector
     projector.close()
 
@@ -202,7 +201,7 @@ def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
     size = (912, 1140)
     opens(size)
     assert channel.wait_ready(HANG_S).state == "ready"
-    projector = browser_projector(None, channel)
+    projector = BrowserProjector(None, channel)
     assert projector.size == size
     sequence = PatternSequence(
         size, tuple(Frame("phase", axis, k, 25, 18.0) for axis in ("x", "y") for k in range(25))
@@ -233,7 +232,7 @@ def test_a_sequence_is_sent_once_and_as_profiles(opens, channel):
 def test_a_window_that_would_resample_is_refused_in_words(opens, channel):
     size = (402, 300)
     page = opens(size, ratio=1.25)
-    projector = browser_projector(size, channel)
+    projector = BrowserProjector(size, channel)
     assert until(lambda: channel.page_state().state == "refused")
     with raises(DeviceError, "402.5 x 300 px", 1.25, "scaling", "resample"):
         projector.open()

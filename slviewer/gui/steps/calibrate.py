@@ -25,17 +25,15 @@ from slviewer.gui.widgets import (
     properties_table,
     records_html,
     report_table,
-    table,
     to_html,
 )
 from slviewer.pipeline.report import calibration_view
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Finding, Verdict
-from slviewer.report.data import CalibrationFigures, PixelCurve
-from slviewer.report.maps import pixel_curves, rms_maps
+from slviewer.report.maps import PixelCurve, pixel_curves, rms_maps
 from slviewer.report.page import Figure
 from slviewer.report.reprojection import pose_bars, residual_arrows
-from slviewer.report.session import lens_rows, rig_rows
+from slviewer.report.session import CalibrationFigures, lens_table, rig_table
 from slviewer.target.board import Board
 from slviewer.wizard import result_views
 from slviewer.wizard.snapshot import CalibrationView, SessionView, Snapshot
@@ -278,12 +276,9 @@ class CalibratePanel(StepPanel):
             residuals, rig = details.residuals.get(name), details.stereo.rig
             if residuals is None:
                 return None
-            if device == "camera":
-                pixels, errors, size = residuals.pixels, residuals.camera, rig.camera.size
-            else:
-                pixels, errors = residuals.projector_pixels, residuals.projector
-                size = rig.projector.size
-            return residual_arrows(f"{name}, {device}", pixels, errors, size)
+            return residual_arrows(
+                f"{name}, {device}", *residuals[device], getattr(rig, device).size
+            )
 
         self.painter.request("arrows", (made, name, device), arrows, self._arrows.set)
 
@@ -408,13 +403,7 @@ def _summary(calibration: CalibrationView) -> Html:
 
 def _parameters(details: CalibrationFigures) -> Html:
     """Return tables of the lens and rig parameters with their standard deviations."""
-    stereo = details.stereo
-    lenses = [
-        (f"{name}, {unit}" if unit else name, *values) for name, unit, *values in lens_rows(stereo)
-    ]
-    rig = [*rig_rows(stereo), ("Target", stereo.board or "imported")]
-    tables = table(("Lens", "camera", "projector"), lenses) + table(("Rig", ""), rig)
-    return tables + note("±: one standard deviation.")
+    return report_table(lens_table(details.stereo)) + report_table(rig_table(details.stereo))
 
 
 def verdict_html(
