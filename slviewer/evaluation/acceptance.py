@@ -7,7 +7,7 @@ stray points do not decide. Of *size*, *spacing* and *scale* the error is one nu
 are where the true error lies with 95 % (99.7 %) probability, by the test's own uncertainty.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from math import hypot
@@ -17,16 +17,24 @@ import numpy as np
 from scipy.special import stdtrit
 
 from slviewer.errors import InputError
-from slviewer.evaluation.fit import ShapeResult, evaluate_plane, evaluate_spheres
+from slviewer.evaluation.fit import (
+    ShapeResult,
+    evaluate_plane,
+    evaluate_spheres,
+    finite_or_none,
+)
 from slviewer.evaluation.incidence import incidence
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import (
+    AcceptanceTest,
+    CertifiedArtefact,
     Decision,
     JudgedProperty,
     PositionErrors,
     PropertyError,
     ScaleError,
+    worst_decision,
 )
 
 Kind = Literal["ball-bar", "sphere", "plane"]
@@ -231,17 +239,6 @@ def make_length_error(name: str, position: str, error_mm: float, u_mm: float) ->
     return PropertyError(name, position, error_mm, 2 * u_mm, inner, outer)
 
 
-def judge_property(
-    name: str, figures: Sequence[PropertyError], limit_mm: float | None
-) -> JudgedProperty:
-    """The decision on one property from its figures at all positions."""
-    mine = [figure for figure in figures if figure.property == name]
-    worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
-    return JudgedProperty(
-        name, worst, limit_mm, None if limit_mm is None else decide(mine, limit_mm)
-    )
-
-
 def decide(figures: Sequence[PropertyError], limit_mm: float) -> Decision:
     """Decide with a guard band: fail if any error exceeds the limit by more than U, pass if error +
     U never does."""
@@ -278,9 +275,7 @@ def measure_artefact(
         capture=capture,
         figures=figures,
         rms_mm=[result.rms_mm for result in shown],
-        floor_mm=[
-            None if np.isnan(result.noise_floor_mm) else result.noise_floor_mm for result in shown
-        ],
+        floor_mm=[finite_or_none(result.noise_floor_mm) for result in shown],
         points=int(np.count_nonzero(region)),
         noise_mm=noise,
         incidence=None if depth_range is None else incidence(cloud.points, region, depth_range),
@@ -323,59 +318,48 @@ def _fit_covariance(points: np.ndarray, ball: ShapeResult) -> np.ndarray:
     return ball.rms_mm**2 * np.linalg.inv(J.T @ J)
 
 
-@dataclass(frozen=True)
-class Acceptance:
-    """The result of an acceptance test with one artefact and one calibration ("model")."""
-
-    artefact: Artefact
-    model: str
-    positions: tuple[PositionErrors, ...]
-    judgements: tuple[JudgedProperty, ...]
-    scale: ScaleError | None
-
-    @property
-    def decision(self) -> Decision | None:
-        """Of all properties together: one fail fails; None where no limit was given."""
-        decisions = {judgement.decision for judgement in self.judgements} - {None}
-        return next((worst for worst in ("fail", "undecided", "pass") if worst in decisions), None)
-
-    @property
-    def lacks(self) -> tuple[str, ...]:
-        """What the positions do not test."""
-        gaps = []
-        needed = POSITIONS[self.artefact.kind]
-        if len(self.positions) < needed:
-            gaps.append(f"{len(self.positions)} of {needed} positions were measured")
-        shares = [position.incidence for position in self.positions if position.incidence]
-        for part in ("R1", "R3") if shares else ():
-            if not any(share[part] >= OUTSIDE for share in shares):
-                gaps.append(f"no position lies in {part}: what is measured there is untested")
-        return tuple(gaps)
-
-
 def conclude_test(
     artefact: Artefact, model: str, positions: Sequence[PositionErrors]
-) -> Acceptance:
-    """The test's result from its positions. Raises InputError where there is none."""
+) -> AcceptanceTest:
+    """Return the record of a test with one artefact and one calibration ("model") from its
+    positions. Raises InputError where there is none."""
     if not positions:
         raise InputError(
             f"no capture shows {artefact.name}: name some in [measured] captures of its file"
         )
     figures = [figure for position in positions for figure in position.figures]
-    limits = artefact.limits
-    allowed = {
-        FORM: limits.form_mm,
-        SIZE: limits.size_mm,
-        SPACING: limits.spacing_mm,
-        FLATNESS: limits.flatness_mm,
-    }
-    present = {figure.property for figure in figures}
-    judgements = tuple(
-        judge_property(name, figures, limit) for name, limit in allowed.items() if name in present
+    limits, judgements = artefact.limits, list[JudgedProperty]()
+    for name, limit_mm in (
+        (FORM, limits.form_mm),
+        (SIZE, limits.size_mm),
+        (SPACING, limits.spacing_mm),
+        (FLATNESS, limits.flatness_mm),
+    ):
+        if mine := [figure for figure in figures if figure.property == name]:
+            worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
+            decision = None if limit_mm is None else decide(mine, limit_mm)
+            judgements.append(JudgedProperty(name, worst, limit_mm, decision))
+    decisions = {each.decision for each in judgements if each.decision is not None}
+    return AcceptanceTest(
+        artefact=CertifiedArtefact(artefact.name, artefact.certificate, artefact.kind),
+        model=model,
+        positions=list(positions),
+        judgements=judgements,
+        scale=_estimate_scale(artefact, positions),
+        decision=worst_decision(decisions) if decisions else None,
+        lacks=list(_list_gaps(artefact, positions)),
     )
-    return Acceptance(
-        artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions)
-    )
+
+
+def _list_gaps(artefact: Artefact, positions: Sequence[PositionErrors]) -> Iterator[str]:
+    """Yield what the positions do not test."""
+    needed = POSITIONS[artefact.kind]
+    if len(positions) < needed:
+        yield f"{len(positions)} of {needed} positions were measured"
+    shares = [position.incidence for position in positions if position.incidence]
+    for part in ("R1", "R3") if shares else ():
+        if not any(share[part] >= OUTSIDE for share in shares):
+            yield f"no position lies in {part}: what is measured there is untested"
 
 
 def _estimate_scale(artefact: Artefact, positions: Sequence[PositionErrors]) -> ScaleError | None:

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.fit import LEAST_PIXELS, ShapeResult, ShapeSearch, measured_pixels
+from slviewer.evaluation.fit import (
+    LEAST_PIXELS,
+    ShapeResult,
+    ShapeSearch,
+    finite_or_none,
+    measured_pixels,
+)
 from slviewer.evaluation.incidence import incidence
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
@@ -93,15 +99,15 @@ class Comparison:
                     points=result.points,
                     excluded=result.excluded,
                     rms_mm=result.rms_mm,
-                    noise_floor_mm=_known(result.noise_floor_mm),
-                    coverage=_known(self.coverage[model]),
+                    noise_floor_mm=finite_or_none(result.noise_floor_mm),
+                    coverage=finite_or_none(self.coverage[model]),
                     masked=masked.get(model),
                     **_shape_fields(result.shape),
                 )
                 for model, result in self.results.items()
             },
             incidence=self.incidence,
-            share=_known(self.share),
+            share=finite_or_none(self.share),
             region_px=self._region_px(),
             **origin,
         )
@@ -192,8 +198,3 @@ def _merge_clouds(clouds: Mapping[str, Cloud]) -> tuple[np.ndarray, np.ndarray]:
         missing = ~np.isfinite(points).all(axis=2)
         points[missing], sigma_z[missing] = cloud.points[missing], cloud.sigma_z[missing]
     return points, sigma_z
-
-
-def _known(value: float) -> float | None:
-    """Return the value, or None for NaN and infinity."""
-    return value if np.isfinite(value) else None

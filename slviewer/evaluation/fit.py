@@ -99,6 +99,11 @@ class ShapeResult:
         )
 
 
+def finite_or_none(value: float) -> float | None:
+    """Return the value, or None for NaN and infinity."""
+    return value if np.isfinite(value) else None
+
+
 class FittedShape(Protocol):
     """A surface with distances from it."""
 

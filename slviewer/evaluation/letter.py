@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.evaluation.compare import Comparison
+from slviewer.evaluation.fit import finite_or_none
 from slviewer.evaluation.render import Row
 
 DEPTH_RANGE_MM = (500.0, 700.0)
@@ -92,7 +93,7 @@ def letter_rows(comparisons: Mapping[str, Comparison]) -> list[Row]:
 
 
 def _make_row(name: str, comparison: Comparison) -> Row:
-    """Return the table row of one capture: each model's RMS, noise floor, radius and coverage."""
+    """Return the table row of one capture: each model's RMS, noise floor and radius."""
     row: Row = {"capture": name}
     if comparison.incidence is not None:
         row["R1/R2/R3 %"] = "/".join(
@@ -100,14 +101,9 @@ def _make_row(name: str, comparison: Comparison) -> Row:
         )
     for model, result in comparison.results.items():
         row[f"{model} mm"] = result.rms_mm
-        row[f"{model} floor"] = (
-            result.noise_floor_mm if np.isfinite(result.noise_floor_mm) else None
-        )
+        row[f"{model} floor"] = finite_or_none(result.noise_floor_mm)
         if comparison.shape == "sphere":
             row[f"{model} radius"] = result.radius_mm
-        if np.isfinite(comparison.coverage[model]):
-            row[f"{model} coverage %"] = 100.0 * comparison.coverage[model]
-        row[f"{model} set aside %"] = 100.0 * result.excluded_share
     return row | _rms_ratio(row, comparison)
 
 
@@ -117,11 +113,8 @@ def _rms_ratio(row: Row, comparison: Comparison) -> Row:
     first, *others = comparison.results
     if not others:
         return {}
-    return {
-        "ratio": (
-            row[f"{first} mm"] / row[f"{'pixelwise' if 'pixelwise' in others else others[-1]} mm"]
-        )
-    }
+    other = "pixelwise" if "pixelwise" in others else others[-1]
+    return {"ratio": row[f"{first} mm"] / row[f"{other} mm"]}
 
 
 def _letter_figures(capture: str, shape: str) -> Row:

@@ -1,41 +1,17 @@
 """How well a measurement repeats itself, which says nothing of how true it is."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.records.acceptance import StillCaptures
 
 CAPTURES = 10
 LEAST_CAPTURES = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Repeatability:
-    """The spread of depth at each pixel over captures of a still object, mm.
-
-    ``sigma_map`` (h, w) float32, NaN where not every capture measured; ``sigma_mm`` its median,
-    ``sigma_95_mm`` what 95 % of the pixels stay below; ``predicted_mm`` the median of what the
-    captures' noise predicts; ``wandering_mm`` how far the mean depth moved from the lowest to the
-    highest capture: warming up, not noise.
-    """
-
-    captures: int
-    pixels: int
-    sigma_mm: float
-    sigma_95_mm: float
-    predicted_mm: float
-    wandering_mm: float
-    sigma_map: np.ndarray
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields without the map as plain values."""
-        return {name: value for name, value in vars(self).items() if name != "sigma_map"}
-
-
-def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatability:
+def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> StillCaptures:
     """Repeatability of captures given as (z, sigma_z), each (h, w) mm, NaN where invalid.
 
     Raises InputError for fewer than three captures, captures of different size, and for no pixel
@@ -60,12 +36,11 @@ def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> Repeatab
             "no pixel was measured in every capture: leave the object where it is, and in view"
         )
     levels = depths[:, always].mean(axis=1, dtype=np.float64)
-    return Repeatability(
+    return StillCaptures(
         count,
         int(np.count_nonzero(always)),
         float(np.median(sigma[always])),
         float(np.percentile(sigma[always], 95)),
         float(np.nanmedian(np.sqrt((noise[:, always] ** 2).mean(axis=0)))),
         float(np.ptp(levels)),
-        sigma,
     )

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance import (
     SIZE,
     SPACING,
-    Acceptance,
     Artefact,
     conclude_test,
     measure_artefact,
@@ -35,11 +35,9 @@ from slviewer.pipeline.scale import record_scale, scale_factor
 from slviewer.pipeline.stored_records import next_name
 from slviewer.records.acceptance import (
     AcceptanceTest,
-    CertifiedArtefact,
     Contribution,
     ErrorBudget,
     PositionErrors,
-    StillCaptures,
 )
 from slviewer.records.drift import Drift
 from slviewer.session.reading import read_toml
@@ -87,22 +85,14 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
     check_capture_sizes(store, [*captures, *still])
     positions = _measure_positions(job, certified, chosen, captures, 0.5 if still else 0.9)
     test = conclude_test(certified, name, positions)
-    repeated = None
-    if still:
-        repeated = repeatability(_list_depths(job, chosen, still))
+    repeated = repeatability(_list_depths(job, chosen, still)) if still else None
     applied = record_scale(store, test) if settings.apply_scale else None
-    found = AcceptanceTest(
-        artefact=CertifiedArtefact(certified.name, certified.certificate, certified.kind),
-        model=name,
-        positions=list(test.positions),
-        judgements=list(test.judgements),
-        scale=test.scale,
-        decision=test.decision,
-        lacks=list(test.lacks),
+    found = msgspec.structs.replace(
+        test,
         scale_factor=factor,
         scale_applied=applied,
-        budget=_length_budget(test, applied, load_drift_history(store)),
-        repeatability=None if repeated is None else StillCaptures(**repeated.to_json()),
+        budget=_length_budget(certified, test, applied, load_drift_history(store)),
+        repeatability=repeated,
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         inputs=store.input_hashes(f"calibration/{name}", *captures, *still),
     )
@@ -153,14 +143,14 @@ def read_artefact(path: Path | str) -> Artefact:
 
 
 def _length_budget(
-    test: Acceptance, applied: float | None, checks: Sequence[Drift]
+    artefact: Artefact, test: AcceptanceTest, applied: float | None, checks: Sequence[Drift]
 ) -> ErrorBudget | None:
     """Error budget of the artefact's length from the test and the drift checks; None where no
     length was measured."""
     scale = test.scale
     if scale is None:
         return None
-    artefact, mm = test.artefact, scale.length_mm
+    mm = scale.length_mm
     name = SIZE if artefact.spacing is None else SPACING
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
     noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))

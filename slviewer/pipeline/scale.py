@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance import Acceptance
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.acceptance import AcceptanceTest
 from slviewer.session.store import Session
 
 LARGEST_FACTOR = 1.25
@@ -51,7 +51,7 @@ def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
     return replace(cloud, **{name: values * np.float32(factor) for name, values in known.items()})
 
 
-def record_scale(store: Session, acceptance: Acceptance) -> float:
+def record_scale(store: Session, acceptance: AcceptanceTest) -> float:
     """Record that the calibration's clouds are to be corrected by a test's scale; returns the new
     factor.
 

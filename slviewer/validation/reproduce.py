@@ -16,7 +16,7 @@ from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
 from slviewer.evaluation.compare import Comparison
-from slviewer.evaluation.render import Row, render
+from slviewer.evaluation.render import render
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans
@@ -138,11 +138,11 @@ class Reproduction:
                 ),
                 "",
                 "Flat board (Table 1)",
-                _render_table(self.planes),
+                render(letter.letter_rows(self.planes)),
                 f"Planes at least 87 % in R2: stereo over pixelwise {self.in_range_ratio:.2f}.",
                 "",
                 f"Sphere of {2 * letter.SPHERE_RADIUS_MM:.0f} mm diameter (Table 2)",
-                _render_table(self.spheres),
+                render(letter.letter_rows(self.spheres)),
                 "Distances between the sphere centres, RMS error: "
                 + ", ".join(f"{m} {spacing[m]:.3f} mm" for m in MODELS)
                 + ".",
@@ -264,16 +264,6 @@ def _compare_spacings(
             {name: found.record() for name, found in spheres.items()}
         ).items()
     }
-
-
-def _render_table(comparisons: Mapping[str, Comparison]) -> str:
-    """The table with the columns that fit a terminal, without coverage and excluded points, which
-    the report has."""
-    rows: list[Row] = [
-        {k: v for k, v in row.items() if "coverage" not in k and "set aside" not in k}
-        for row in letter.letter_rows(comparisons)
-    ]
-    return render(rows)
 
 
 def _make_report_data(
