@@ -140,77 +140,70 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
 
     Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
-    bench = _set_up_devices(choice, board, pages)
-    if "turntable" in choice:
-        table = _set_up_turntable(choice["turntable"], bench.world)
-        bench = replace(bench, rig=replace(bench.rig, turntable=table))
-    return bench
-
-
-def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable:
-    """The turntable of a choice, not opened yet; a simulated one turns the thing in `world`."""
-    options = dict(choice)
     try:
-        chosen = driver(str(options.pop("driver")))
-        if chosen.turntable is None:
-            raise InputError(f"the driver {chosen.name} offers no turntable: choose another")
-        if chosen.name != "simulated":
-            return chosen.turntable(**options)
-        if world is None:
-            raise InputError(
-                "a simulated turntable turns only what is before the simulated rig: choose another"
-            )
-        return chosen.turntable(world, **options)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"the turntable {dict(choice)} cannot be set up ({error}): choose it again"
-        ) from error
-
-
-def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | None) -> RigSetup:
-    """Camera and projector of a choice, as `set_up` returns them."""
-    options = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
-    focal, settle_ms = choice.get("focal_px"), float(choice.get("settle_ms", 0.0))
-    try:
-        if choice.get("driver") == "simulated":
-            bench = _simulated_setup(board, **options)
-            return replace(bench, rig=replace(bench.rig, settle_ms=settle_ms))
-        if choice.get("driver") == "replay":
-            played = reel(**options)
-            return RigSetup(played.rig, focal_px=focal, reel=played)
         if "driver" in choice:
-            chosen = driver(str(choice["driver"]))
-            if chosen.rig is None:
-                raise InputError(
-                    f"the driver {choice['driver']} offers no whole rig: choose a camera and a"
-                    " projector"
-                )
-            rig = chosen.rig(**options)
-            rig = replace(rig, settle_ms=settle_ms or rig.settle_ms)
+            made = _make_device("rig", _options_of_rig(choice), board=board)
         else:
-            devices: list[Any] = []
-            for part in ("camera", "projector"):
-                given = dict(options.pop(part))
-                chosen = driver(given.pop("driver"))
-                make = getattr(chosen, part)
-                if make is None:
-                    raise InputError("one of the drivers offers no such device: choose others")
-                if chosen.page:
-                    given["page"] = pages and getattr(pages, part)
-                devices.append(make(**given))
-            rig = Rig(str(choice.get("name", "rig")), devices[0], devices[1], settle_ms)
-        return RigSetup(rig, focal_px=focal)
+            camera, projector = (
+                _make_device(part, choice[part], page=pages and getattr(pages, part))
+                for part in PAGE_ROLES
+            )
+            made = Rig(str(choice.get("name", "rig")), camera, projector)
+        if isinstance(made, Reel):
+            made = RigSetup(made.rig, reel=made)
+        bench = made if isinstance(made, RigSetup) else RigSetup(made)
+        table: Turntable | None = bench.rig.turntable
+        if (turning := choice.get("turntable")) is not None:
+            if dict(turning)["driver"] == "simulated" and bench.world is None:
+                raise InputError(
+                    "a simulated turntable turns only what is before the simulated rig: choose"
+                    " another"
+                )
+            table = _make_device("turntable", turning, world=bench.world)
+        settle_ms = float(choice.get("settle_ms", 0.0)) or bench.rig.settle_ms
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"the rig {dict(choice)} cannot be set up ({error}): choose it again"
         ) from error
+    return replace(
+        bench,
+        rig=replace(bench.rig, settle_ms=settle_ms, turntable=table),
+        focal_px=bench.focal_px or choice.get("focal_px"),
+    )
+
+
+def _make_device(part: str, chosen: Choice, **provided: Any) -> Any:
+    """Return a device (camera, projector, turntable, or a whole rig) of a driver and its options,
+    with those of the ``provided`` arguments that the driver takes from the program."""
+    options = dict(chosen)
+    named = driver(str(options.pop("driver")))
+    make = driver_factory(named, part)
+    if make is None:
+        raise InputError(f"the driver {named.name} offers no {part}: choose another")
+    taken = _list_provided(named) & inspect.signature(make).parameters.keys() & provided.keys()
+    return make(**options, **{name: provided[name] for name in taken})
+
+
+def _list_provided(named: Driver) -> set[str]:
+    """Return the names of a driver's arguments that the program supplies; they are not entries of a
+    file."""
+    return {"board", "world", "timing"} | ({"page"} if named.page else set())
+
+
+def _options_of_rig(choice: Choice) -> Choice:
+    """Return the driver and its options of a choice without the keys that all rigs may have."""
+    return {key: value for key, value in choice.items() if key not in COMMON_KEYS}
 
 
 def list_needed_pages(choice: Choice) -> tuple[PageRole, ...]:
     """Return which of a choice's devices are pages in a browser."""
-    parts = {role: part for role in PAGE_ROLES if isinstance(part := choice.get(role), Mapping)}
-    named = {role: drivers().get(str(part.get("driver"))) for role, part in parts.items()}
-    return tuple(role for role, named_driver in named.items() if named_driver and named_driver.page)
+    return tuple(
+        role
+        for role in PAGE_ROLES
+        if isinstance(part := choice.get(role), Mapping)
+        and (named := drivers().get(str(part.get("driver"))))
+        and named.page
+    )
 
 
 def driver_factory(driver: Driver, part: str) -> Callable[..., Any] | None:
@@ -333,13 +326,13 @@ def check_choice(choice: Choice, where: str) -> None:
     if "turntable" in choice:
         _check_device(choice, "turntable", where)
     if "driver" in choice:
-        given = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
+        given = _options_of_rig(choice)
         if {"camera", "projector"} & set(given):
             raise InputError(
                 f"{where} names a driver of a whole rig and a camera or a projector: remove one of"
                 " both"
             )
-        _check_options(str(choice["driver"]), "rig", given, where)
+        _check_options(given, "rig", where)
         return
     unknown = sorted(set(choice) - {*COMMON_KEYS, "camera", "projector"})
     if unknown:
@@ -358,8 +351,7 @@ def _check_device(choice: Choice, part: str, where: str) -> None:
     if not isinstance(device, Mapping) or "driver" not in device:
         rather = "" if part == "turntable" else ", or a driver of a rig"
         raise InputError(f'{where} names no {part}: add [{part}] with driver = "…"{rather}')
-    options = {key: value for key, value in device.items() if key != "driver"}
-    _check_options(str(device["driver"]), part, options, f"{where}, {part}")
+    _check_options(device, part, f"{where}, {part}")
 
 
 def _read_preset(name: str, path: Path) -> Preset:
@@ -372,8 +364,11 @@ def _read_preset(name: str, path: Path) -> Preset:
     return Preset(name, what, choice, path)
 
 
-def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
-    """Raise InputError unless the driver exists, offers the part, and accepts the options."""
+def _check_options(chosen: Choice, part: str, where: str) -> None:
+    """Raise InputError unless the driver of a choice exists, offers the part, and accepts the
+    options."""
+    options = dict(chosen)
+    name = str(options.pop("driver"))
     if name not in drivers():
         offering = sorted(d.name for d in drivers().values() if driver_factory(d, part))
         why = DRIVER_PLUGINS.explain_missing(name)
@@ -383,12 +378,11 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     make = driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
-    parameters = inspect.signature(make, eval_str=True).parameters.values()
-    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+    parameters = inspect.signature(make, eval_str=True).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
         return
-    # the program supplies these; they are not entries of a file
-    provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
-    known = {each.name: each for each in parameters if each.name not in provided}
+    provided = _list_provided(drivers()[name])
+    known = {key: each for key, each in parameters.items() if key not in provided}
     if unknown := sorted(options.keys() - known.keys()):
         use = f"use {', '.join(known)}" if known else "it takes none"
         raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
@@ -396,19 +390,14 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
         if key not in options and each.default is each.empty:
             raise InputError(f"{where}: the driver {name} needs {key}: add it")
     for key, value in options.items():
-        _check_type(f"{where}: {key} = {value!r}", value, known[key].annotation)
-
-
-def _check_type(stated: str, value: Any, kind: Any) -> None:
-    """Raise InputError where an option is not of the type of the driver's parameter, or no number
-    that is finite."""
-    if isinstance(value, float) and not isfinite(value):
-        raise InputError(f"{stated} is not a number: correct it")
-    try:
-        with suppress(TypeError):  # a path, which the driver checks itself
-            msgspec.convert(value, Any if kind is inspect.Parameter.empty else kind)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{stated} is of the wrong type ({error}): correct it") from error
+        stated, kind = f"{where}: {key} = {value!r}", known[key].annotation
+        if isinstance(value, float) and not isfinite(value):
+            raise InputError(f"{stated} is not a number: correct it")
+        try:
+            with suppress(TypeError):  # a path, which the driver checks itself
+                msgspec.convert(value, Any if kind is inspect.Parameter.empty else kind)
+        except msgspec.ValidationError as error:
+            raise InputError(f"{stated} is of the wrong type ({error}): correct it") from error
 
 
 def _driver_names(choice: Choice) -> list[str]:
