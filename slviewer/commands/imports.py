@@ -107,7 +107,7 @@ def run_frames(import_captures: Function, arguments: Arguments) -> None:
 
 def run_import_calibration(import_calibration: Function, arguments: Arguments) -> None:
     """Import a calibration, and print what was read from its file."""
-    from slviewer.pipeline.import_calibration import identify_calibration_keys
+    from slviewer.pipeline.import_captures import identify_calibration_keys
 
     if arguments["keys"] is None:
         identified = identify_calibration_keys(arguments["file"])
@@ -129,10 +129,10 @@ def run_import_calibration(import_calibration: Function, arguments: Arguments) -
 def _propose_description(options: GuessOptions, projector: str | None, channel: Any) -> None:
     """Write the proposed TOML of a capture folder to ``out`` or standard output. Raises InputError
     for doubts."""
-    from slviewer.pipeline.import_captures import guess_description
+    from slviewer.session.importers.frames import guess_description
 
     assert options.guess is not None
-    guessed = guess_description(options.guess, projector=projector, channel=channel)
+    guessed = guess_description(options.guess, projector, channel)
     if (out := options.out) is None:
         print(guessed.toml, end="")
     else:
@@ -209,7 +209,7 @@ def make_import_command() -> Command:
             optional=("source", "session"),
         ),
         "opencv-calibration": read_command(
-            "pipeline.import_calibration:import_opencv_calibration",
+            "pipeline.import_captures:import_opencv_calibration",
             "file",
             run=run_import_calibration,
         ),

@@ -22,8 +22,8 @@ from slviewer.evaluation.fit import (
     evaluate_plane,
     evaluate_spheres,
     finite_or_none,
+    incidence,
 )
-from slviewer.evaluation.incidence import incidence
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import (
@@ -57,6 +57,8 @@ FORM, SIZE, SPACING, FLATNESS = (
     "sphere-spacing error",
     "flatness",
 )
+LIMITS = {FORM: "form_mm", SIZE: "size_mm", SPACING: "spacing_mm", FLATNESS: "flatness_mm"}
+"""Names of the operator's limits, mm, in the file; without one there is no decision."""
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}
 OUTSIDE = 50.0
 """Percent of an artefact's points in R1 (R3) from which on it stands there."""
@@ -72,22 +74,12 @@ class CertifiedValue:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """The operator's limits, mm; None: no decision."""
-
-    form_mm: float | None = None
-    size_mm: float | None = None
-    spacing_mm: float | None = None
-    flatness_mm: float | None = None
-
-
-@dataclass(frozen=True)
 class Artefact:
     """The content of an artefact's certificate, and how the test was made.
 
     ``spacing`` of a ball bar's centres; ``diameters``: one a ball; ``form``: how far its balls (or
     its plane) are from ideal ones, range, mm. All at ``reference_celsius``. ``positions``:
-    {position: capture, or a pattern of captures}.
+    {position: capture, or a pattern of captures}. ``limits``, mm, by the names in `LIMITS`.
     """
 
     kind: Kind
@@ -100,7 +92,7 @@ class Artefact:
     expansion: CertifiedValue
     temperature: CertifiedValue
     positions: Mapping[str, str]
-    limits: Limits
+    limits: Mapping[str, float]
 
     def at_measurement(self, length: CertifiedValue) -> tuple[float, float]:
         """(mm, its standard uncertainty in mm) of a calibrated length at the temperature of the
@@ -156,7 +148,7 @@ class Artefact:
                 _number(measured, "temperature_U_K", least=0),
             ),
             positions=_read_positions(measured.get("captures")),
-            limits=Limits(**{key: _number(limits, key) for key in limits}),
+            limits={key: _number(limits, key) for key in limits},
         )
 
 
@@ -328,13 +320,9 @@ def conclude_test(
             f"no capture shows {artefact.name}: name some in [measured] captures of its file"
         )
     figures = [figure for position in positions for figure in position.figures]
-    limits, judgements = artefact.limits, list[JudgedProperty]()
-    for name, limit_mm in (
-        (FORM, limits.form_mm),
-        (SIZE, limits.size_mm),
-        (SPACING, limits.spacing_mm),
-        (FLATNESS, limits.flatness_mm),
-    ):
+    judgements = list[JudgedProperty]()
+    for name, key in LIMITS.items():
+        limit_mm = artefact.limits.get(key)
         if mine := [figure for figure in figures if figure.property == name]:
             worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
             decision = None if limit_mm is None else decide(mine, limit_mm)

@@ -23,20 +23,19 @@ def process_capability(
     """
     x = np.asarray(values, np.float64)
     n = len(x)
+    low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
     if (
         n < MIN_PARTS
-        or (lower is None and upper is None)
+        or not np.isfinite([low, high]).any()
         or not (sigma := float(x.std(ddof=1))) > 0
     ):
         return None
     mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
     cp = None
-    if lower is not None and upper is not None:
-        value = (upper - lower) / (6 * sigma)
-        low, high = (float(value * np.sqrt(chi2.ppf(p, n - 1) / (n - 1))) for p in (tail, 1 - tail))
-        cp = (value, low, high)
-    sides = [mean - lower] if lower is not None else []
-    sides += [upper - mean] if upper is not None else []
-    cpk = min(sides) / (3 * sigma)
+    if np.isfinite(high - low):
+        value = (high - low) / (6 * sigma)
+        ends = value * np.sqrt(chi2.ppf([tail, 1 - tail], n - 1) / (n - 1))
+        cp = (value, float(ends[0]), float(ends[1]))
+    cpk = min(mean - low, high - mean) / (3 * sigma)
     reach = float(norm.ppf(1 - tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
     return Capability(n, mean, sigma, cp, (cpk, cpk - reach, cpk + reach))

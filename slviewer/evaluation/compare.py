@@ -13,9 +13,9 @@ from slviewer.evaluation.fit import (
     ShapeResult,
     ShapeSearch,
     finite_or_none,
+    incidence,
     measured_pixels,
 )
-from slviewer.evaluation.incidence import incidence
 from slviewer.geometry.shapes import Plane, Sphere
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.record import to_vector
@@ -62,10 +62,11 @@ class Comparison:
                 f" ({self.region_text()}), and the figures are of it alone: is this a capture of a"
                 " plane?"
             )
-        ratios = {
-            model: result.rms_mm / result.noise_floor_mm for model, result in self.results.items()
+        known = {
+            model: ratio
+            for model, result in self.results.items()
+            if np.isfinite(ratio := result.rms_mm / result.noise_floor_mm)
         }
-        known = {model: ratio for model, ratio in ratios.items() if np.isfinite(ratio)}
         best = min(known, key=lambda model: known[model], default="")
         if best and known[best] > MOST_OVER_FLOOR:
             messages.append(

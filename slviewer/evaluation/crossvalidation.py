@@ -6,7 +6,7 @@ out, how long, and how near its features lie to where they are on it when it is 
 without stretching.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -95,11 +95,12 @@ def measure_held_out(
     results = {}
     for name, points in clouds.items():
         measured, X = points[common].astype(float), features[name][read]
-        placed, scale = _align_board(board, X)
+        placed, middle = move_points(fit_rigid(board, X), board), X.mean(0)
+        scale = np.sum((placed - middle) * (X - middle)) / np.sum((placed - middle) ** 2)
         results[name] = HeldOutPose(
             plane_mm=rms(fit_plane(measured).distance(measured)),
             board_mm=rms_length(X - placed),
-            scale_ppm=1e6 * (scale - 1),
+            scale_ppm=1e6 * (float(scale) - 1),
             camera_px=rms_length(rig.camera.project(X) - rig.camera.project(placed)),
             projector_px=rms_length(rig.project(X) - rig.project(placed)),
             pixels=len(measured),
@@ -109,26 +110,21 @@ def measure_held_out(
 
 
 def gather_results(
-    names: Sequence[str],
-    measured: Sequence[Mapping[str, Mapping[str, HeldOutPose]]],
+    poses: Mapping[str, Mapping[str, HeldOutPose]],
     folds: tuple[tuple[str, ...], ...],
     failed: Mapping[str, str],
 ) -> ModelComparison:
-    """Combine the results of the folds, {pose: {model: ...}}; models in the order of ``names``.
+    """Combine the results of the folds, {model: {pose: ...}}, in the order of simplicity; models
+    that failed are not among them.
 
     Raises InputError where no model could be judged.
     """
-    poses: dict[str, dict[str, HeldOutPose]] = {}
-    for model in (name for name in names if name not in failed):
-        by_pose = {
-            pose: by_model[model]
-            for fold in measured
-            for pose, by_model in fold.items()
-            if model in by_model
-        }
-        if by_pose:
-            poses[model] = by_pose
-    if not poses:
+    judged = {
+        model: dict(measured)
+        for model, measured in poses.items()
+        if measured and model not in failed
+    }
+    if not judged:
         why = "; ".join(f"{model}: {reason}" for model, reason in failed.items())
         raise InputError(
             f"no model could be made without some of the poses ({why}): capture more poses"
@@ -136,14 +132,18 @@ def gather_results(
     models = {
         model: HeldOutError(
             *(
-                rms([getattr(each, name) for each in of_poses.values()])
+                rms([getattr(each, name) for each in measured.values()])
                 for name in HeldOutError.__struct_fields__
             )
         )
-        for model, of_poses in poses.items()
+        for model, measured in judged.items()
     }
     return ModelComparison(
-        recommended=_recommend(models), models=models, poses=poses, folds=folds, failed=dict(failed)
+        recommended=_recommend(models),
+        models=models,
+        poses=judged,
+        folds=folds,
+        failed=dict(failed),
     )
 
 
@@ -165,11 +165,3 @@ def _interpolate(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         map_coordinates(points[..., k].astype(float), v_u, order=1, cval=np.nan) for k in range(3)
     )
     return np.stack(list(maps), axis=1)
-
-
-def _align_board(board: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, float]:
-    """The board's points (n, 3) after the rigid best fit to the measured ones, and the scale of the
-    measured ones."""
-    laid, middle = move_points(fit_rigid(board, measured), board), measured.mean(0)
-    scale = float(np.sum((laid - middle) * (measured - middle)) / np.sum((laid - middle) ** 2))
-    return laid, scale

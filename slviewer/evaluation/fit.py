@@ -14,6 +14,7 @@ from typing import Protocol, TypeVar
 
 import cv2
 import numpy as np
+from scipy.ndimage import label
 
 from slviewer.errors import InputError
 from slviewer.geometry.robust import robust_sigma
@@ -278,9 +279,15 @@ class ShapeSearch:
         floor = np.nan
         if sigma_z is not None:
             floor = noise_floor(fitted, chosen[is_inlier], sigma_z[inliers])
-        excluded = int(np.count_nonzero(~is_inlier))
-        error = rms(residuals[is_inlier])
-        return ShapeResult(fitted, error, floor, len(chosen), excluded, error_map, inliers)
+        return ShapeResult(
+            fitted,
+            rms(residuals[is_inlier]),
+            floor,
+            len(chosen),
+            int(np.count_nonzero(~is_inlier)),
+            error_map,
+            inliers,
+        )
 
     def _typical_noise(self, measured: Map) -> float:
         """Median noise of the measured pixels in mm; 0 where none is known."""
@@ -351,21 +358,34 @@ def _largest_patch(agreeing: Map) -> Map:
     """Return the largest 4-connected patch; gaps of up to four unmeasured pixels do not cut it, and
     small holes are filled."""
     closed = cv2.morphologyEx(agreeing.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=4)
-    if count < 2:
+    patches, count = label(closed)
+    if not count:
         return np.zeros_like(agreeing)
-    patch = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        (~patch).astype(np.uint8), connectivity=8
-    )
-    small = stats[:, cv2.CC_STAT_AREA] < 0.005 * np.count_nonzero(patch)
-    h, w = patch.shape
-    inside = (
-        (stats[:, 0] > 0)
-        & (stats[:, 1] > 0)
-        & (stats[:, 0] + stats[:, 2] < w)
-        & (stats[:, 1] + stats[:, 3] < h)
-    )
-    holes = small & inside
-    holes[0] = False  # label 0 is the patch itself
-    return patch | holes[labels]
+    patch = patches == 1 + np.argmax(np.bincount(patches.ravel())[1:])
+    # in a frame, which joins what reaches the image's border
+    others, _ = label(np.pad(~patch, 1, constant_values=True), np.ones((3, 3)))
+    is_hole = np.bincount(others.ravel()) < 0.005 * np.count_nonzero(patch)
+    is_hole[[0, others[0, 0]]] = False  # the patch itself, and what surrounds it
+    return np.asarray(patch | is_hole[others[1:-1, 1:-1]])
+
+
+def incidence(
+    points: np.ndarray, mask: np.ndarray, depth_range: tuple[float, float]
+) -> dict[str, float]:
+    """Percent of the points ``(h, w, 3)`` under ``mask`` with z < z0 (R1), z0 <= z <= z1 (R2), z >
+    z1 (R3), mm.
+
+    The Letter's "incidence" (Table 1, 500 and 700 mm). Pixels without a measured point are
+    excluded.
+    """
+    z0, z1 = depth_range
+    if not z0 < z1:
+        raise InputError(
+            f"The depth range {z0:g} to {z1:g} mm is empty: give the smaller depth first."
+        )
+    z = points[..., 2][mask]
+    z = z[np.isfinite(z)]
+    if z.size == 0:
+        raise InputError("No point was measured in the region: its depths are unknown.")
+    r1, r3 = 100.0 * np.count_nonzero(z < z0) / z.size, 100.0 * np.count_nonzero(z > z1) / z.size
+    return {"R1": r1, "R2": 100.0 - r1 - r3, "R3": r3}

@@ -5,7 +5,7 @@ Letters 2023. Its R2 is 500 to 700 mm; its target has 16x21 circles, taken in 25
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,26 +121,22 @@ def _letter_figures(capture: str, shape: str) -> Row:
     """Return the Letter's figures of the pose whose number the capture's name ends with; {} without
     one."""
     number = re.search(r"(\d+)$", capture)
-    table = TABLE_1 if shape == "plane" else TABLE_2
+    table: Sequence[PlanePose | SpherePose] = TABLE_1 if shape == "plane" else TABLE_2
     if not number or not 0 < int(number[1]) <= len(table):
         return {}
-    theirs = table[int(number[1]) - 1]
-    radii = None
-    if isinstance(theirs, SpherePose):
-        radii = theirs.stereo_radius_mm, theirs.pixelwise_radius_mm
-    return _letter_row(theirs.stereo_mm, theirs.pixelwise_mm, radii)
+    return _letter_row(table[int(number[1]) - 1])
 
 
-def _letter_row(stereo: float, pixelwise: float, radii: tuple[float, float] | None = None) -> Row:
-    """Return the Letter's RMS of both models in mm, their ratio, and the sphere's radii if
-    given."""
+def _letter_row(theirs: PlanePose | SpherePose) -> Row:
+    """Return the Letter's RMS of both models in mm, their ratio, and a sphere's radii."""
     row: Row = {
-        "Letter stereo": stereo,
-        "Letter pixelwise": pixelwise,
-        "Letter ratio": stereo / pixelwise,
+        "Letter stereo": theirs.stereo_mm,
+        "Letter pixelwise": theirs.pixelwise_mm,
+        "Letter ratio": theirs.stereo_mm / theirs.pixelwise_mm,
     }
-    if radii is not None:
-        row["Letter stereo radius"], row["Letter pixelwise radius"] = radii
+    if isinstance(theirs, SpherePose):
+        row["Letter stereo radius"] = theirs.stereo_radius_mm
+        row["Letter pixelwise radius"] = theirs.pixelwise_radius_mm
     return row
 
 
@@ -154,5 +150,7 @@ def _average_rows(table: list[Row], comparisons: Mapping[str, Comparison]) -> Ro
     first = next(iter(comparisons.values()))
     row |= _rms_ratio(row, first)
     if first.shape == "plane":
-        return row | _letter_row(*TABLE_1_MEAN_MM) | {"Letter ratio": TABLE_1_RATIO_OF_MEANS}
-    return row | _letter_row(*TABLE_2_MEAN_MM, (TABLE_2_RADIUS_MM[0][0], TABLE_2_RADIUS_MM[1][0]))
+        means = _letter_row(PlanePose((0.0, 0.0, 0.0), *TABLE_1_MEAN_MM))
+        return row | means | {"Letter ratio": TABLE_1_RATIO_OF_MEANS}
+    radii = (mean for mean, _ in TABLE_2_RADIUS_MM)
+    return row | _letter_row(SpherePose("", *TABLE_2_MEAN_MM, *radii))

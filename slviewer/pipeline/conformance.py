@@ -8,7 +8,6 @@ test reads ``assert check_camera(MyCamera()) == []``.
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, ParamSpec
@@ -207,9 +206,7 @@ def check_importer(layout: FolderLayout, capture: Path, **options: Any) -> Itera
             continue
         try:
             new = recording.read()
-            check_imported_capture(
-                replace(new, frames=new.merged_frames(), exposures_ms=()), ignore_warnings
-            )
+            check_imported_capture(new, ignore_warnings)
         except InputError as error:
             yield str(error)
     with tempfile.TemporaryDirectory() as folder:

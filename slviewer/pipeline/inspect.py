@@ -1,12 +1,13 @@
 """What a session holds, in words, and whether it is what was saved; and what is in its trash."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 
 from slviewer.errors import DamagedError, InputError, SlviewerError
-from slviewer.evaluation.render import render
+from slviewer.evaluation.render import format_count, render
 from slviewer.pipeline.calibrate import load_last_verdict
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.measure import describe_measurement
@@ -34,7 +35,7 @@ def inspect(
             return _check(store, progress)
         captures, faults = store.read_captures()
         damage = [*faults.values(), *store.decision_faults()]
-        lines = [f"{store.folder}: {len(captures)} capture{'s' * (len(captures) != 1)}"]
+        lines = [f"{store.folder}: {format_count(len(captures), 'capture')}"]
         lines += [
             f"  {name} was complete, and not yet in its place: it is now"
             for name in store.recovered
@@ -54,7 +55,7 @@ def inspect(
                 lines.append(verdict.text())
         with _collecting(damage):
             if measured := list_records(store, Measurement):
-                lines.append(f"{len(measured)} measurement{'s' * (len(measured) != 1)}:")
+                lines.append(f"{format_count(len(measured), 'measurement')}:")
                 lines += [f"  {describe_measurement(each)}" for each in measured]
         if not models:
             lines.append("no calibration yet: run `slviewer calibrate` with the --target in use")
@@ -67,15 +68,12 @@ def _check(store: Session, progress: Progress) -> str:
     damaged, if anything."""
     (captures, faults), results = store.read_captures(), store.result_names()
     damage = [*faults.values(), *store.decision_faults()]
-    everything: list[Capture | str] = [*captures, *results]
-    for i, each in enumerate(everything):
-        name = each if isinstance(each, str) else each.name
-        progress(i / len(everything), f"checking {name}")
+    checks: list[tuple[str, Callable[[], object]]] = [(each.name, each.verify) for each in captures]
+    checks += [(name, partial(verify_result, store.folder / "results" / name)) for name in results]
+    for i, (name, verify) in enumerate(checks):
+        progress(i / len(checks), f"checking {name}")
         with _collecting(damage):
-            if isinstance(each, str):
-                verify_result(store.folder / "results" / each)
-            else:
-                each.verify()
+            verify()
     progress(1.0, "checked")
     counts = f"{len(captures)} captures and {len(results)} results"
     if damage:
@@ -169,9 +167,11 @@ def restore(session: SessionLike, names: Sequence[str] = ()) -> str:
         latest = {each.name: each for each in reversed(trashed)}
         latest |= {each.place.name: each for each in trashed}
         found = match_names(list(latest), names, "item of the trash", InputError)
-        # patterns match no folders
-        chosen = [latest[name] for name in found if name in names or name == latest[name].name]
-        chosen = list(dict.fromkeys(chosen))
+        chosen = list(
+            dict.fromkeys(  # patterns match no folders
+                latest[name] for name in found if name in names or name == latest[name].name
+            )
+        )
         store.restore(chosen)
         return "\n".join(
             f"restored: {each.name}, deleted {each.time:%Y-%m-%d %H:%M:%S} UTC" for each in chosen

@@ -148,11 +148,8 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     on = load_surface(
         job, settings.scan, settings.model, settings.roi, settings.accept_rejected, settings.load
     )
-    if settings.what in FITTED:
-        fields, arrays = _fit(on, settings)
-    else:
-        makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
-        fields, arrays = makers[settings.what](on, settings.places(on))
+    makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
+    fields, arrays = makers.get(settings.what, _fit)(on, settings)
     record = Measurement(
         what=settings.what, name=clean_label(settings.name), **provenance(on), **fields
     )
@@ -191,17 +188,17 @@ def uncertainty_notes(store: Session, measured: Measurement) -> tuple[str, ...]:
     return (f"U is too small, as {cause} does not know the calibration's part: {remedy}",)
 
 
-def _pick(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
+def _pick(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """A picked point, to relate it with fits."""
-    feature, spread = on.picked(places[0])
+    feature, spread = on.picked(settings.places(on)[0])
     fields, arrays = _describe_feature(feature, spread)
     at = zip("xyz", feature.place.tolist(), strict=True)
     return fields | {"quantities": [Quantity(axis, value, "mm") for axis, value in at]}, arrays
 
 
-def _measure_distance(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
+def _measure_distance(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """The distance between two picked points."""
-    (first, first_spread), (second, second_spread) = (on.picked(place) for place in places)
+    (first, first_spread), (second, second_spread) = map(on.picked, settings.places(on))
     length = distance(first.place, second.place, first_spread, second_spread)
     return {"quantities": [length], "ends": (to_vector(first.place), to_vector(second.place))}, {}
 
@@ -227,10 +224,10 @@ def _fit(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     return fields, arrays
 
 
-def _cut(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
+def _cut(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """A section: the surface cut along a line between two picked points, as nearly parallel to the
     camera's viewing direction as possible."""
-    first, second = (on.picked(place)[0].place for place in places)
+    first, second = (on.picked(place)[0].place for place in settings.places(on))
     plane = CutPlane.through(first, second, -(first + second) / 2)
     if on.organised or on.faces is not None:
         vertices, faces = triangulate_surface(on)

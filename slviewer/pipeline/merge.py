@@ -1,7 +1,7 @@
 """Registering scans of one object, and fusing them into one surface."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,10 +18,11 @@ from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.feedback import Warn, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
-from slviewer.pipeline.open_session import next_number, placed_file
+from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.scale import describe_scale, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
+from slviewer.pipeline.stored_records import next_name
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import (
     ContradictingPair,
@@ -235,7 +236,7 @@ def _write_merge(
     frame = f"{frame_of(store, model)}, at {settings.reference}"
     scans = f"scans {', '.join(settings.names)}, frame: {frame}"
     comments = (scans, f"calibration {model}", *record.restrictions)
-    number = next_number(store, "merge") if settings.out is None else 0
+    number = next_name(store, Merge) if settings.out is None else ""
     with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
         write_ply(
             written, surface.points, surface.colours, surface.normals, scalars, notes=comments
@@ -251,8 +252,9 @@ def _write_merge(
                 " name"
             )
         placed = msgspec.structs.replace(record, ply=path.name)
-        name = str(number or path.stem)
-        yield Found(name, placed, files=(path,), notes=tuple(notes), stored=bool(number))
+        yield Found(
+            number or path.stem, placed, files=(path,), notes=tuple(notes), stored=bool(number)
+        )
 
 
 def _check_markers(measured: Mapping[str, MeasuredMarkers], warn: Warn) -> None:
@@ -277,13 +279,11 @@ def _is_mat(
     them."""
     compared = []
     for a, b in pairwise(name for name in measured if name in table_deg):
-        try:
+        with suppress(Refused):
             pose = fit_marker_pose(measured[a], measured[b])
-        except Refused:
-            pose = None
-        if pose is not None and len(pose.ids) >= MAT_MARKERS:
-            turn_deg = abs(shortest_turn(table_deg[b] - table_deg[a]))
-            compared.append(abs(float(np.degrees(rotation_angle(pose.T[:3, :3]))) - turn_deg))
+            if pose is not None and len(pose.ids) >= MAT_MARKERS:
+                turn_deg = abs(shortest_turn(table_deg[b] - table_deg[a]))
+                compared.append(abs(float(np.degrees(rotation_angle(pose.T[:3, :3]))) - turn_deg))
     if compared and max(compared) > MAT_TURN_DEG:
         warn(
             f"coded markers are in view, and they turn by {max(compared):.1f} degrees more or less"
@@ -295,35 +295,33 @@ def _is_mat(
 
 def _list_warnings(
     clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool
-) -> list[str]:
-    """Warnings of markers that have moved, of pairs that were dropped, and of points that are not
-    the object, or contradict another scan, with the remedy."""
-    alignment = registered.alignment
-    messages = [
-        f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is"
-        " ignored: glue it on, or take it away"
-        for (a, b), pose in alignment.markers.items()
-        if pose.moved
-    ]
-    messages += alignment.dropped.values()
+) -> Iterator[str]:
+    """Yield warnings of markers that have moved, of pairs that were dropped, and of points that are
+    not the object, or contradict another scan, with the remedy."""
+    for (a, b), pose in registered.alignment.markers.items():
+        if pose.moved:
+            yield (
+                f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the"
+                " scans, and is ignored: glue it on, or take it away"
+            )
+    yield from registered.alignment.dropped.values()
     still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
     if still:
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
         where = "in the merge once for each scan" if keep_background else "not part of the merge"
-        messages.append(
+        yield (
             f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while"
             f" the object moves: they are {where}"
         )
     for (one, other), contradiction in registered.contradictions.items():
         if contradiction.share > MAX_CONTRADICTION_SHARE:
-            messages.append(
+            yield (
                 f"{one} -> {other}: {100 * contradiction.share:.2g} % of the points contradict,"
                 f" they lie more than {contradiction.gate_mm:.2g} mm in front of what the other"
                 " scan sees there: something moved alone or stands still; restrict the scans to"
                 " the object, or scan again"
             )
-    return messages
 
 
 def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Merge:

@@ -373,10 +373,8 @@ def warn_if_stale(store: Session, warn: Warn) -> None:
     names = available_models(store)
     stale = [name for name in names if store.state_of(f"calibration/{name}") == "stale"]
     if stale:
-        which = f"{stale[0]} calibration was"
-        if len(stale) > 1:
-            which = f"{', '.join(stale[:-1])} and {stale[-1]} calibrations were"
+        which = "calibration was" if len(stale) == 1 else "calibrations were"
         warn(
-            f"the {which} made from target poses that have since been replaced or removed: run"
-            " `slviewer calibrate` again"
+            f"the {' and '.join(stale)} {which} made from target poses that have since been"
+            " replaced or removed: run `slviewer calibrate` again"
         )

@@ -86,8 +86,3 @@ def numbered_names(store: Session, kind: str) -> list[str]:
     order of their numbers."""
     names = (name for name in store.result_names() if name.startswith(f"{kind}/"))
     return sorted((name.removeprefix(f"{kind}/") for name in names), key=natural_key)
-
-
-def next_number(store: Session, kind: str) -> int:
-    """Return the number of the next result of a kind."""
-    return 1 + max(map(int, numbered_names(store, kind)), default=0)

@@ -208,7 +208,8 @@ class Callbacks:
 
 
 def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Callable[P, V]]:
-    """Return a decorator of a function of such settings: it is called with their fields.
+    """Return a decorator of a function of such settings: it is called with their fields; further
+    keywords become their field ``options``, if they have one.
 
     The function's docstring describes it, and those of the settings and their bases the fields.
     """
@@ -216,12 +217,17 @@ def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Cal
     def decorate(function: Callable[[S], V]) -> Callable[P, V]:
         """Return the function that takes the fields."""
 
+        signature = inspect.signature(settings)
+
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> V:
+            if "options" in signature.parameters:
+                further = kwargs.keys() - signature.parameters.keys()
+                options = {name: kwargs.pop(name) for name in further}
+                kwargs.setdefault("options", options)
             return function(settings(*args, **kwargs))
 
         call.__doc__ = describe(function, settings)
-        signature = inspect.signature(settings)
         returned = inspect.signature(function).return_annotation
         call.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
         return call

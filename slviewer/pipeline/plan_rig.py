@@ -178,11 +178,9 @@ class RigPlanSettings(Callbacks):
     @property
     def baseline_mm(self) -> float:
         """The baseline, or the one for the usual angle."""
-        return (
-            math.tan(math.radians(ANGLE_DEG)) * self.distance
-            if self.baseline is None
-            else self.baseline
-        )
+        if self.baseline is not None:
+            return self.baseline
+        return math.tan(math.radians(ANGLE_DEG)) * self.distance
 
 
 @takes_settings(RigPlanSettings)

@@ -132,11 +132,9 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
         )
         for n, m in chosen.items()
     }  # fmt: skip
-    cloud, region, board = clouds[name], None, tuple[str, ...]()
-    restrictions = tuple[str, ...]()
-    if is_pose:
-        region = segment_board(store, shot, texture, warn)
-    else:
+    cloud, region = clouds[name], segment_board(store, shot, texture, warn) if is_pose else None
+    restrictions, board = tuple[str, ...](), tuple[str, ...]()
+    if not is_pose:
         box = resolve_region(store, settings.roi)
         cloud = restrict_cloud(store, capture, cloud, box)
         restrictions = restriction_notes(store, [capture], box)
@@ -343,7 +341,16 @@ def verify(
         )
         if store.is_writable and (best := preferred_model(store)) in models:
             # by its own best axis, as reconstruct
-            yield _reconstruct_best(store, load_model(store, best), each, settings)
+            shot, axis, accepts = each.capture, settings.axis, settings.accept_rejected
+            fitted = load_model(store, best)
+            texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
+            cloud = capture_cloud(
+                store, fitted, shot, each.phases, axis=axis, texture=texture,
+                accept_rejected=accepts,
+            )  # fmt: skip
+            how = ReconstructSettings(name, axis=axis, accept_rejected=accepts)
+            region = None if each.found.is_searched else each.found.region
+            yield cloud_record(store, how, fitted, cloud, each.phases[cloud.axis], region)
 
 
 def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
@@ -384,22 +391,10 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
             raise InputError(f"{shot.name}: {error}") from error
         for message in found.warnings:
             job.warn(f"{shot.name}: {message}")
-        shares = {name: masked_share(each, phase, found.region) for name, each in chosen.items()}
-        masked = {name: share for name, share in shares.items() if share is not None}
+        masked = {
+            name: share
+            for name, each in chosen.items()
+            if (share := masked_share(each, phase, found.region)) is not None
+        }
         yield ComparedCapture(shot, frames, phases, found, masked)
     job.progress(1.0, "measured")
-
-
-def _reconstruct_best(
-    store: Session, model: Model, each: ComparedCapture, settings: VerifySettings
-) -> Found[Reconstruction]:
-    """Return the cloud of a capture as `reconstruct` stores it."""
-    shot, found = each.capture, each.found
-    texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
-    axis, accepts = settings.axis, settings.accept_rejected
-    cloud = capture_cloud(
-        store, model, shot, each.phases, axis=axis, texture=texture, accept_rejected=accepts
-    )
-    region = None if found.is_searched else found.region
-    as_reconstructed = ReconstructSettings(shot.name, axis=axis, accept_rejected=accepts)
-    return cloud_record(store, as_reconstructed, model, cloud, each.phases[cloud.axis], region)

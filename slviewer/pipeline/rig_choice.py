@@ -390,14 +390,19 @@ def _check_options(chosen: Choice, part: str, where: str) -> None:
         if key not in options and each.default is each.empty:
             raise InputError(f"{where}: the driver {name} needs {key}: add it")
     for key, value in options.items():
-        stated, kind = f"{where}: {key} = {value!r}", known[key].annotation
-        if isinstance(value, float) and not isfinite(value):
-            raise InputError(f"{stated} is not a number: correct it")
-        try:
-            with suppress(TypeError):  # a path, which the driver checks itself
-                msgspec.convert(value, Any if kind is inspect.Parameter.empty else kind)
-        except msgspec.ValidationError as error:
-            raise InputError(f"{stated} is of the wrong type ({error}): correct it") from error
+        _check_type(f"{where}: {key} = {value!r}", value, known[key].annotation)
+
+
+def _check_type(stated: str, value: Any, kind: Any) -> None:
+    """Raise InputError where an option is not of the type of the driver's parameter, or no number
+    that is finite."""
+    if isinstance(value, float) and not isfinite(value):
+        raise InputError(f"{stated} is not a number: correct it")
+    try:
+        with suppress(TypeError):  # a path, which the driver checks itself
+            msgspec.convert(value, Any if kind is inspect.Parameter.empty else kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{stated} is of the wrong type ({error}): correct it") from error
 
 
 def _driver_names(choice: Choice) -> list[str]:

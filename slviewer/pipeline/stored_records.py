@@ -80,8 +80,7 @@ def load_stored(store: Session, kind: type[R], name: str) -> Stored[R]:
         raise InputError(f"there is no {noun} {name!r}: there are {', '.join(there) or 'none'}")
     record, labels = load_record(store, kind, name), store.valid_decision(kind.labels) or {}
     label = str(labels.get(name) or record.label(name))
-    is_current = store.state_of(result) == "fresh" and _has_scales(store, record)
-    return Stored(name, label, record, stale=not is_current)
+    return Stored(name, label, record, stale=not is_up_to_date(store, result))
 
 
 def list_records(store: Session, kind: type[R]) -> list[Stored[R]]:

@@ -30,6 +30,7 @@ Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 STATES = ("unlit", "measured", "saturated", "dark")
 """States of a pixel, by their numbers in `ExposureSuggestion.state`."""
+_UNLIT, _MEASURED, _SATURATED, _DARK = range(len(STATES))
 
 _PIXELS = 150_000
 _STOP = 4.0  # between exposures of the bracket
@@ -212,7 +213,7 @@ class _Bracket:
             self._classify(each, lit) for each in (chosen, self._applied(current_ms))
         )
         share, share_before = (
-            float(np.mean(each[lit] == STATES.index("measured"))) for each in (state, state_before)
+            float(np.mean(each[lit] == _MEASURED)) for each in (state, state_before)
         )
         return ExposureSuggestion(
             chosen,
@@ -383,12 +384,12 @@ class _Bracket:
         """State (h, w) of each pixel if it is used from the longest of these exposures that does
         not saturate it."""
         variance = self._noise()
-        state = np.full(lit.shape, STATES.index("saturated"), np.uint8)
+        state = np.full(lit.shape, _SATURATED, np.uint8)
         for look in (self._looks[exposure] for exposure in exposures_ms):
             is_measured = self._required_factor(look, variance) <= 1
-            reached = np.where(is_measured, STATES.index("measured"), STATES.index("dark"))
+            reached = np.where(is_measured, _MEASURED, _DARK)
             state = np.where(look.peak < self._clip, reached, state).astype(np.uint8)
-        state[~lit] = STATES.index("unlit")
+        state[~lit] = _UNLIT
         return state
 
     def _required_factor(self, look: _Look, variance: tuple[float, float]) -> Values:

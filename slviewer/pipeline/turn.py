@@ -7,19 +7,13 @@ before it stay, and the missing steps can be captured later.
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.protocols import Rig, Turntable
-from slviewer.errors import (
-    Cancelled,
-    DeviceError,
-    InputError,
-    SlviewerError,
-    TurntableError,
-    UsageError,
-)
+from slviewer.errors import Cancelled, InputError, SlviewerError, UsageError
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import (
     RigSettings,
@@ -217,10 +211,7 @@ def plan_turn(name: str, steps: int = STEPS, range_deg: float = FULL_TURN_DEG) -
 def next_turn(store: Session) -> str:
     """Return the next unused name of a turn: turn1, turn2 and so on."""
     taken = {name.rpartition("_")[0] for name in store.taken_names()}
-    number = 1
-    while f"turn{number}" in taken:
-        number += 1
-    return f"turn{number}"
+    return next(name for number in count(1) if (name := f"turn{number}") not in taken)
 
 
 def recorded_steps(store: Session, name: str) -> list[TurnStep]:
@@ -294,9 +285,7 @@ def capture_turn(
                 raise
             except SlviewerError as error:
                 saved = len(recorded) + k
-                kinds = (TurntableError, DeviceError, InputError, SlviewerError)
-                kind = next(each for each in kinds if isinstance(error, each))
-                raise kind(
+                raise type(error)(
                     f"{label}, at {step.deg:g} degrees: {error}. {saved}"
                     f" scan{'s are' if saved != 1 else ' is'} saved: correct the cause, then resume"
                     " the turn"

@@ -1,6 +1,6 @@
 """Each calibration measured on target poses that it was not made from."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -107,7 +107,7 @@ def cross_validate(
     parts, steps = split_folds(depths, folds), len(models) + 1
     axis = best_axis(observations, stereo)
     failed: dict[str, str] = {}
-    measured: list[Mapping[str, Mapping[str, HeldOutPose]]] = []
+    measured: dict[str, dict[str, HeldOutPose]] = {model: {} for model in models}
     for k, fold in enumerate(parts):
         report = part(progress, k / len(parts), (k + 1) / len(parts))
         training = [o for o in observations if o.name not in fold]
@@ -127,6 +127,8 @@ def cross_validate(
             except (CalibrationRejected, InputError) as error:
                 failed[name] = str(error)
         report(len(models) / steps, f"measuring fold {k + 1} of {len(parts)}")
-        held_out = [o for o in observations if o.name in fold]
-        measured.append({o.name: measure_held_out(fitted, o, axis, stereo.rig) for o in held_out})
-    return gather_results(models, measured, parts, failed)
+        for held_out in (o for o in observations if o.name in fold):
+            errors = measure_held_out(fitted, held_out, axis, stereo.rig)
+            for name, held in errors.items():
+                measured[name][held_out.name] = held
+    return gather_results(measured, parts, failed)
