@@ -7,7 +7,7 @@ stray points do not decide. Of *size*, *spacing* and *scale* the error is one nu
 are where the true error lies with 95 % (99.7 %) probability, by the test's own uncertainty.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from math import hypot
@@ -34,6 +34,7 @@ from slviewer.records.acceptance import (
     PositionErrors,
     PropertyError,
     ScaleError,
+    StillCaptures,
     worst_decision,
 )
 
@@ -60,6 +61,8 @@ FORM, SIZE, SPACING, FLATNESS = (
 LIMITS = {FORM: "form_mm", SIZE: "size_mm", SPACING: "spacing_mm", FLATNESS: "flatness_mm"}
 """Names of the operator's limits, mm, in the file; without one there is no decision."""
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}
+CAPTURES, LEAST_CAPTURES = 10, 3
+"""Of one still object, for the repeatability: how many are asked for, and how many it takes."""
 OUTSIDE = 50.0
 """Percent of an artefact's points in R1 (R3) from which on it stands there."""
 
@@ -365,4 +368,39 @@ def _estimate_scale(artefact: Artefact, positions: Sequence[PositionErrors]) -> 
     u_mean = float(errors.std(ddof=1) * per_deviation) if n > 1 else positions[0].noise_mm
     return ScaleError(
         1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n
+    )
+
+
+def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> StillCaptures:
+    """Repeatability of captures given as (z, sigma_z), each (h, w) mm, NaN where invalid.
+
+    Raises InputError for fewer than three captures, captures of different size, and for no pixel
+    that all measured.
+    """
+    pairs = [(np.asarray(z, np.float32), np.asarray(sigma, np.float32)) for z, sigma in measured]
+    count, shapes = len(pairs), {z.shape for z, _ in pairs}
+    if len(shapes) > 1:
+        raise InputError(
+            f"captures of {' and '.join(map(str, shapes))} pixels do not repeat each other"
+        )
+    if count < LEAST_CAPTURES:
+        raise InputError(
+            f"{count} captures show no repeatability: take {CAPTURES} of the same still object"
+        )
+    depths, noise = (np.stack(maps) for maps in zip(*pairs, strict=True))
+    depths -= depths[0].copy()  # small, so that squares keep their digits
+    sigma = depths.std(axis=0, ddof=1)
+    always = np.isfinite(sigma)
+    if not always.any():
+        raise InputError(
+            "no pixel was measured in every capture: leave the object where it is, and in view"
+        )
+    levels = depths[:, always].mean(axis=1, dtype=np.float64)
+    return StillCaptures(
+        count,
+        int(np.count_nonzero(always)),
+        float(np.median(sigma[always])),
+        float(np.percentile(sigma[always], 95)),
+        float(np.nanmedian(np.sqrt((noise[:, always] ** 2).mean(axis=0)))),
+        float(np.ptp(levels)),
     )

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slviewer.evaluation.compare import Comparison
-from slviewer.evaluation.fit import finite_or_none
+from slviewer.evaluation.fit import Comparison, finite_or_none
 from slviewer.evaluation.render import Row
 
 DEPTH_RANGE_MM = (500.0, 700.0)

@@ -15,8 +15,8 @@ from slviewer.evaluation.acceptance import (
     Artefact,
     conclude_test,
     measure_artefact,
+    repeatability,
 )
-from slviewer.evaluation.repeatability import repeatability
 from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
 from slviewer.pipeline.check import load_drift_history

@@ -17,11 +17,11 @@ from slviewer.inspection.deviation import (
 )
 from slviewer.pipeline.feedback import part, stage
 from slviewer.pipeline.inspect_parts import fit_to_nominal
-from slviewer.pipeline.measure import provenance
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
     load_surface,
+    provenance,
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName

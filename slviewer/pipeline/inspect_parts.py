@@ -10,9 +10,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from scipy.stats import chi2, norm
 
 from slviewer.errors import InputError, SlviewerError, UsageError
-from slviewer.evaluation.capability import process_capability
 from slviewer.geometry.rigid import move_points
 from slviewer.inspection.deviation import Deviation, deviation, judge_limits
 from slviewer.inspection.features import Feature, relation
@@ -28,14 +28,19 @@ from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import RigidSpread, Shared
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.measure import load_feature
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
 from slviewer.pipeline.open_session import SessionLike, match_names, opened
 from slviewer.pipeline.operation import Findings, Found, Job, operation
 from slviewer.pipeline.stored_records import Stored, list_records, next_name
 from slviewer.printable import format_csv
-from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection, PartResult
+from slviewer.records.inspection import (
+    Capability,
+    Characteristic,
+    CharacteristicResult,
+    Inspection,
+    PartResult,
+)
 from slviewer.records.measurement import Measurement, Quantity
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.report.session import write_parts_page
@@ -63,6 +68,8 @@ LEAST_TOLERANCE_MM, MOST_TOLERANCE_MM = 1e-3, 1e3
 _DECIMALS = 4
 """Of nominal values and limits in a plan."""
 FORM_OF = {"plane": "flatness", "sphere": "roundness", "cylinder": "cylindricity"}
+CONFIDENCE, MIN_PARTS = 0.95, 3
+"""Of a capability: of its intervals, and the parts that it takes."""
 DATUM_ROUNDS = 4
 """Fits of the datums, each with the regions moved by the frame of the last."""
 
@@ -261,6 +268,35 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
 def _undecided(wanted: Characteristic, reason: str) -> CharacteristicResult:
     """The result of a characteristic that could not be measured."""
     return CharacteristicResult(wanted.name, None, None, "undecided", reason)
+
+
+def process_capability(
+    values: Sequence[float], lower: float | None, upper: float | None
+) -> Capability | None:
+    """Estimate the capability of a process; None for fewer than 3 values, without a limit, or where
+    they do not vary.
+
+    Cp's interval is exact for normal values (chi squared), Cpk's is Bissell's approximation
+    (Applied Statistics 39, 1990). The spread of the values includes that of the measurement.
+    """
+    x = np.asarray(values, np.float64)
+    n = len(x)
+    low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
+    if (
+        n < MIN_PARTS
+        or not np.isfinite([low, high]).any()
+        or not (sigma := float(x.std(ddof=1))) > 0
+    ):
+        return None
+    mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
+    cp = None
+    if np.isfinite(high - low):
+        value = (high - low) / (6 * sigma)
+        ends = value * np.sqrt(chi2.ppf([tail, 1 - tail], n - 1) / (n - 1))
+        cp = (value, float(ends[0]), float(ends[1]))
+    cpk = min(mean - low, high - mean) / (3 * sigma)
+    reach = float(norm.ppf(1 - tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
+    return Capability(n, mean, sigma, cp, (cpk, cpk - reach, cpk + reach))
 
 
 class AlignedPart:

@@ -20,7 +20,7 @@ from slviewer.pipeline.feedback import Warn, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
 from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scale import describe_calibration
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.pipeline.stored_records import next_name
 from slviewer.reconstruction.cloud import Cloud
@@ -209,16 +209,9 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     progress = stage(job.progress, 0.75, 0.9, "fusing")
     fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
     job.progress(0.9, "writing")
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{fitted.name}"))
-    record = _make_record(
-        registered,
-        fused,
-        model=fitted.name,
-        scale=describe_scale(store, fitted.name),
-        restrictions=list(restrictions),
-        scales={fitted.name: scale_factor(store, fitted.name)},
-        inputs={**store.input_hashes(*fused.names, *calibrations), **inputs},
-    )
+    used = describe_calibration(store, fitted.name, fused.names)
+    used["inputs"] |= inputs
+    record = _make_record(registered, fused, restrictions=list(restrictions), **used)
     with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")

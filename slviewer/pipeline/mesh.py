@@ -19,7 +19,7 @@ from slviewer.pipeline.capture_clouds import (
 )
 from slviewer.pipeline.export import check_export
 from slviewer.pipeline.feedback import ignore_progress, part, stage
-from slviewer.pipeline.measured_surface import MERGED
+from slviewer.pipeline.measure import MERGED
 from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
 from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
 from slviewer.pipeline.open_session import SessionLike, opened
@@ -199,8 +199,9 @@ def mesh(settings: MeshSettings) -> MeshResult:
     else:
         write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
-    made = None if merged is None else show_found(merged.found)
-    return MeshResult(meshed, sources, path, made, textured)
+    return MeshResult(
+        meshed, sources, path, None if merged is None else show_found(merged.found), textured
+    )
 
 
 def _textured_scans(

@@ -10,7 +10,7 @@ import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import DetectionError, InputError, UsageError
-from slviewer.evaluation.compare import Comparison, fit_clouds
+from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
@@ -29,7 +29,7 @@ from slviewer.pipeline.models import (
 )
 from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation, plain_settings
-from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scale import describe_calibration, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals, triangulate_grid
@@ -216,11 +216,9 @@ def cloud_record(
     }
     known = {name: array for name, array in arrays.items() if array is not None}
     left = cloud.sigma_calibration
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model.name}"))
     record = Reconstruction(
         operation="reconstruct",
         settings=plain_settings(settings),
-        model=cloud.model,
         axis=cloud.axis,
         points=int(np.count_nonzero(cloud.mask)),
         depth_mm=(float(near), float(far)),
@@ -229,9 +227,7 @@ def cloud_record(
         raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
         masked=masked_share(model, phase, region),
         frame=frame_of(store, cloud.model),
-        scale=describe_scale(store, cloud.model),
-        scales={cloud.model: scale_factor(store, cloud.model)},
-        inputs=store.input_hashes(settings.capture, *calibrations),
+        **describe_calibration(store, cloud.model, [settings.capture]),
     )
     return Found(settings.capture, record, known)
 

@@ -1,6 +1,7 @@
 """A scale that an acceptance test measured and the operator applied: what later clouds are
 multiplied by."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -40,6 +41,17 @@ def describe_scale(store: Session, model: str) -> str:
         return ""
     ppm = f"{1e6 * (applied['factor'] - 1):+.0f}".replace("-", "−")
     return f"scale corrected by {ppm} ppm, by certificate {applied['certificate']}"
+
+
+def describe_calibration(store: Session, model: str, captures: Iterable[str]) -> dict[str, Any]:
+    """Return what a record of clouds of captures states of their calibration, and its inputs."""
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+    return {
+        "model": model,
+        "scale": describe_scale(store, model),
+        "scales": {model: scale_factor(store, model)},
+        "inputs": store.input_hashes(*captures, *calibrations),
+    }
 
 
 def scale_cloud(cloud: Cloud, factor: float) -> Cloud:

@@ -216,8 +216,8 @@ def next_turn(store: Session) -> str:
 
 def recorded_steps(store: Session, name: str) -> list[TurnStep]:
     """List the captured steps of a turn, in their order."""
-    steps = [capture.turn_step for capture in store.captures("scan")]
-    turned = [step for step in steps if step is not None and step.turn == name]
+    steps = (capture.turn_step for capture in store.captures("scan"))
+    turned = (step for step in steps if step is not None and step.turn == name)
     return sorted(turned, key=lambda step: step.step)
 
 

@@ -12,7 +12,7 @@ from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_history
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
 from slviewer.pipeline.feedback import Progress, Warn, part
-from slviewer.pipeline.measured_surface import MERGED
+from slviewer.pipeline.measure import MERGED
 from slviewer.pipeline.merge import MergeSettings, Picked, StartKind, merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import (

@@ -24,8 +24,8 @@ from slviewer.evaluation.acceptance import (
     make_length_error,
     measure_artefact,
     narrowest_range,
+    repeatability,
 )
-from slviewer.evaluation.repeatability import repeatability
 from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.fringe.sequence import one_axis

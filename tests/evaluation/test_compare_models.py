@@ -9,8 +9,7 @@ from planted import board_before_a_wall, cloud, plane_depth, rectangle, sphere_d
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter
-from slviewer.evaluation.compare import Comparison, fit_clouds
-from slviewer.evaluation.fit import incidence
+from slviewer.evaluation.fit import Comparison, fit_clouds, incidence
 from slviewer.evaluation.letter import letter_rows
 from slviewer.evaluation.render import render
 from slviewer.reconstruction.cloud import Cloud

@@ -10,17 +10,17 @@ from facts import missing_facts, raises
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.evaluation.crossvalidation import (
-    LEAST_POSES,
-    gather_results,
-    measure_held_out,
-    split_folds,
-)
 from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.stored_records import read_record
+from slviewer.pipeline.validate import (
+    LEAST_POSES,
+    gather_results,
+    measure_held_out,
+    split_folds,
+)
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text

@@ -477,8 +477,15 @@ def guess_description(
     Of a folder of captures, the first is read. Raises InputError where there are no images, or they
     cannot belong to one capture (other sizes, damaged).
     """
-    folder = _capture_folder(folder)
-    files = images_by_name(folder)
+    source, files = folder, list[Path]()
+    for folder in list_folders(source):
+        if len(files := images_by_name(folder)) >= 3:
+            break
+    else:
+        raise InputError(
+            f"{source} and the folders in it hold fewer than three images: give the folder of a"
+            " capture"
+        )
     images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
     size = None if projector is None else parse_size(projector)
     guess = guess_sequence(images.stack, size)
@@ -490,17 +497,6 @@ def guess_description(
         f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts
     )
     return GuessedDescription(_format_toml(folder, names, guess, shown, size, doubts), doubts)
-
-
-def _capture_folder(source: Path) -> Path:
-    """Return the source or its first inner folder with three images or more; InputError without
-    one."""
-    for folder in list_folders(source):
-        if len(images_by_name(folder)) >= 3:
-            return folder
-    raise InputError(
-        f"{source} and the folders in it hold fewer than three images: give the folder of a capture"
-    )
 
 
 def _format_span(names: list[str], indices: tuple[int, ...]) -> str:
