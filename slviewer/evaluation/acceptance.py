@@ -11,8 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from math import hypot
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from scipy.special import stdtrit
 
@@ -37,20 +38,10 @@ from slviewer.records.acceptance import (
     StillCaptures,
     worst_decision,
 )
+from slviewer.records.plain import from_plain
 
 Kind = Literal["ball-bar", "sphere", "plane"]
 BALLS = {"ball-bar": 2, "sphere": 1, "plane": 0}
-_KEYS = {
-    "": {"kind", "name", "certificate", "calibrated", "measured", "limits"},
-    "calibrated": {
-        "temperature_C", "expansion_ppm_K", "expansion_U_ppm_K",
-        "spacing_mm", "spacing_U_mm", "diameter_mm", "diameter_U_mm", "form_mm", "form_U_mm",
-    },
-    "measured": {"temperature_C", "temperature_U_K", "captures"},
-    "limits": {"form_mm", "size_mm", "spacing_mm", "flatness_mm"},
-}  # fmt: skip
-_MOST = {"_mm": 1e5, "_ppm_K": 1e4, "_C": 1e3, "_K": 1e3}
-"""The largest value that a certificate may state, by the end of its name."""
 K_95, K_997 = 1.96, 2.97
 FORM, SIZE, SPACING, FLATNESS = (
     "probing error of form",
@@ -69,150 +60,142 @@ OUTSIDE = 50.0
 
 @dataclass(frozen=True)
 class CertifiedValue:
-    """A value of a certificate with its expanded uncertainty ``U`` (k = 2): a length in mm, the
-    thermal expansion in ppm/K, the temperature in degrees Celsius (and K)."""
+    """A length of a certificate with its expanded uncertainty ``U`` (k = 2), mm."""
 
     value: float
     U: float
 
 
-@dataclass(frozen=True)
-class Artefact:
-    """The content of an artefact's certificate, and how the test was made.
+_Length = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
+_Spread = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
+_Celsius = Annotated[float, msgspec.Meta(ge=-50, le=1e3)]
 
-    ``spacing`` of a ball bar's centres; ``diameters``: one a ball; ``form``: how far its balls (or
-    its plane) are from ideal ones, range, mm. All at ``reference_celsius``. ``positions``:
-    {position: capture, or a pattern of captures}. ``limits``, mm, by the names in `LIMITS`.
-    """
+
+class Calibrated(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The values of a certificate with their expanded uncertainties ``U`` (k = 2): the ``spacing``
+    of a ball bar's centres, one ``diameter`` or one a ball, and ``form``: how far its balls (or its
+    plane) are from ideal ones, range. All at ``temperature_C``."""
+
+    expansion_ppm_K: Annotated[float, msgspec.Meta(ge=-10, le=1e4)]  # noqa: N815
+    expansion_U_ppm_K: Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # noqa: N815
+    temperature_C: _Celsius = 20.0  # noqa: N815
+    spacing_mm: _Length | None = None
+    spacing_U_mm: _Spread | None = None  # noqa: N815
+    diameter_mm: _Length | list[_Length] | None = None
+    diameter_U_mm: _Spread | None = None  # noqa: N815
+    form_mm: _Spread = 0.0
+    form_U_mm: _Spread = 0.0  # noqa: N815
+
+
+class Measured(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the test was made: the artefact's temperature, and the captures or patterns of them, by
+    the names of the positions where these are others."""
+
+    temperature_C: _Celsius  # noqa: N815
+    temperature_U_K: Annotated[float, msgspec.Meta(ge=0, le=1e3)]  # noqa: N815
+    captures: list[str] | dict[str, str]
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The operator's limits; None: no decision."""
+
+    form_mm: _Length | None = None
+    size_mm: _Length | None = None
+    spacing_mm: _Length | None = None
+    flatness_mm: _Length | None = None
+
+
+class Artefact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of an artefact's certificate, and how the test was made."""
 
     kind: Kind
-    name: str
-    certificate: str
-    spacing: CertifiedValue | None
-    diameters: tuple[CertifiedValue, ...]
-    form: CertifiedValue
-    reference_celsius: float
-    expansion: CertifiedValue
-    temperature: CertifiedValue
-    positions: Mapping[str, str]
-    limits: Mapping[str, float]
+    calibrated: Calibrated
+    measured: Measured
+    name: str = ""
+    certificate: str = "none given"
+    limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "name", self.name or self.kind)
+        values, balls = self.calibrated, BALLS[self.kind]
+        needed = ["spacing_mm", "spacing_U_mm"] if balls == 2 else []
+        needed += ["diameter_mm", "diameter_U_mm"] if balls else []
+        if missing := [key for key in needed if getattr(values, key) is None]:
+            raise ValueError(f"a {self.kind} lacks {missing[0]}: give what its certificate states")
+        if balls and isinstance(values.diameter_mm, list) and len(values.diameter_mm) != balls:
+            raise ValueError(
+                f"{len(values.diameter_mm)} diameters are given for {balls}: give one a ball"
+            )
+        if not self.measured.captures:
+            raise ValueError(
+                'it names no captures: in [measured] write captures = ["bar_*"], or a table'
+                " [measured.captures] of position = capture"
+            )
+
+    @property
+    def positions(self) -> dict[str, str]:
+        """Return {position: capture, or a pattern of captures}."""
+        captures = self.measured.captures
+        return captures if isinstance(captures, dict) else {name: name for name in captures}
+
+    @property
+    def spacing(self) -> CertifiedValue | None:
+        """Return the spacing of a ball bar's centres; None for other artefacts."""
+        values = self.calibrated
+        if BALLS[self.kind] < 2 or values.spacing_mm is None:
+            return None
+        return CertifiedValue(values.spacing_mm, values.spacing_U_mm or 0.0)
+
+    @property
+    def diameters(self) -> tuple[CertifiedValue, ...]:
+        """Return the diameter of each ball."""
+        values, balls = self.calibrated, BALLS[self.kind]
+        each = values.diameter_mm or []
+        listed = each if isinstance(each, list) else [each] * balls
+        return tuple(CertifiedValue(mm, values.diameter_U_mm or 0.0) for mm in listed[:balls])
 
     def at_measurement(self, length: CertifiedValue) -> tuple[float, float]:
         """(mm, its standard uncertainty in mm) of a calibrated length at the temperature of the
         measurement."""
-        warmer, ppm = self.temperature.value - self.reference_celsius, 1e-6 * length.value
+        values, test, ppm = self.calibrated, self.measured, 1e-6 * length.value
+        warmer = test.temperature_C - values.temperature_C
         parts = (
             length.U / 2,
-            ppm * self.expansion.U / 2 * warmer,
-            ppm * self.expansion.value * self.temperature.U / 2,
+            ppm * values.expansion_U_ppm_K / 2 * warmer,
+            ppm * values.expansion_ppm_K * test.temperature_U_K / 2,
         )
-        return length.value + ppm * self.expansion.value * warmer, hypot(*parts)
+        return length.value + ppm * values.expansion_ppm_K * warmer, hypot(*parts)
 
     @property
     def form_U_mm(self) -> float:
         """Expanded uncertainty (k = 2) that the artefact's own form brings into a range: 2
         sqrt((F/2)^2 + u(F)^2)."""
-        return 2 * hypot(self.form.value / 2, self.form.U / 2)
+        return 2 * hypot(self.calibrated.form_mm / 2, self.calibrated.form_U_mm / 2)
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
         """Return an artefact from the table of its file. Raises InputError for what is missing,
         unknown or impossible."""
-        for table, known in _KEYS.items():
-            part = given if not table else given.get(table, {})
-            if not isinstance(part, Mapping):
-                raise InputError(
-                    f"the artefact's [{table}] must be a table: write [{table}] and its values"
-                    " below it"
-                )
-            if unknown := set(part) - known:
-                place = f" in [{table}]" if table else ""
-                raise InputError(
-                    f"the artefact's file says {min(unknown)!r}{place}, which is unknown: use"
-                    f" {', '.join(sorted(known))}"
-                )
-        kind = given.get("kind")
-        if kind not in tuple(BALLS):  # it may be of any type
-            raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
-        calibrated, measured, limits = (
-            given.get(table, {}) for table in ("calibrated", "measured", "limits")
-        )
-        return cls(
-            kind=kind,
-            name=str(given.get("name", kind)),
-            certificate=str(given.get("certificate", "none given")),
-            spacing=_read_value(calibrated, "spacing") if kind == "ball-bar" else None,
-            diameters=_read_diameters(calibrated, BALLS[kind]),
-            form=_read_value(calibrated, "form", least=0, otherwise=0.0),
-            reference_celsius=_number(calibrated, "temperature_C", 20.0, -50),
-            expansion=_read_value(calibrated, "expansion", "ppm_K", least=-10),
-            temperature=CertifiedValue(
-                _number(measured, "temperature_C", least=-50),
-                _number(measured, "temperature_U_K", least=0),
-            ),
-            positions=_read_positions(measured.get("captures")),
-            limits={key: _number(limits, key) for key in limits},
-        )
+        try:
+            return from_plain(given, cls)
+        except InputError as error:
+            place, _, reason = str(error).partition(": ")
+            table, _, key = place.partition(".")
+            entries = given.get(table)
+            if isinstance(entries, Mapping):
+                place, entries = f"[{table}] {key}", entries.get(key)
+            known = BALLS if table == "kind" else _TABLES.get(table, cls).__struct_fields__
+            remedy = f"use {', '.join(known)}"
+            if entries is not None and table != "kind":
+                remedy = f"{entries!r} is impossible: check unit and sign"
+            raise InputError(f"the artefact's file: {place.strip()}: {reason}; {remedy}") from error
 
 
-def _read_value(
-    table: Mapping[str, Any],
-    name: str,
-    unit: str = "mm",
-    least: float | None = None,
-    otherwise: float | None = None,
-) -> CertifiedValue:
-    """The value ``name`` in a unit, above 0 or at least ``least``, and its uncertainty."""
-    return CertifiedValue(
-        _number(table, f"{name}_{unit}", otherwise, least),
-        _number(table, f"{name}_U_{unit}", otherwise, 0),
-    )
-
-
-def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[CertifiedValue, ...]:
-    """Return the diameter of each of so many balls, from one number or a list."""
-    if not balls:
-        return ()
-    U = _number(calibrated, "diameter_U_mm", least=0)
-    each = calibrated.get("diameter_mm")
-    listed = each if isinstance(each, list) else [each] * balls
-    if len(listed) != balls:
-        raise InputError(f"{len(listed)} diameters are given for {balls}: give one a ball")
-    return tuple(CertifiedValue(_number({"diameter_mm": d}, "diameter_mm"), U) for d in listed)
-
-
-def _read_positions(captures: object) -> dict[str, str]:
-    """Return {position: capture} from a list of captures or a table."""
-    if isinstance(captures, list):
-        captures = {str(name): name for name in captures}  # any values: they are checked next
-    if (
-        not isinstance(captures, Mapping)
-        or not captures
-        or not all(isinstance(c, str) for c in captures.values())
-    ):
-        raise InputError(
-            'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a'
-            " table [measured.captures] of position = capture"
-        )
-    return {str(position): capture for position, capture in captures.items()}
-
-
-def _number(
-    table: Mapping[str, Any], key: str, otherwise: float | None = None, least: float | None = None
-) -> float:
-    """The number at ``key``, above 0 or at least ``least``, and at most what `_MOST` says of its
-    unit."""
-    value = table.get(key, otherwise)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(
-            f"the artefact's file says {key} = {value!r}: give a number, as its certificate does"
-        )
-    most = next(most for unit, most in _MOST.items() if key.endswith(unit))
-    if not ((value > 0 if least is None else value >= least) and value <= most):
-        raise InputError(
-            f"the artefact's file says {key} = {value:g}, which is impossible: check unit and sign"
-        )
-    return float(value)
+_TABLES: dict[str, type[msgspec.Struct]] = {
+    "calibrated": Calibrated,
+    "measured": Measured,
+    "limits": Limits,
+}
 
 
 def narrowest_range(deviations: np.ndarray, share: float) -> float:
@@ -325,7 +308,7 @@ def conclude_test(
     figures = [figure for position in positions for figure in position.figures]
     judgements = list[JudgedProperty]()
     for name, key in LIMITS.items():
-        limit_mm = artefact.limits.get(key)
+        limit_mm = getattr(artefact.limits, key)
         if mine := [figure for figure in figures if figure.property == name]:
             worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
             decision = None if limit_mm is None else decide(mine, limit_mm)

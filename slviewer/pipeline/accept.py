@@ -158,7 +158,7 @@ def _length_budget(
     # known, not removed
     uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0
     board = mm * 1e-6 * float(np.hypot(scale.u_ppm, uncorrected_ppm))
-    warmth = mm * 1e-6 * artefact.expansion.value * artefact.temperature.U / 2
+    warmth = mm * 1e-6 * artefact.calibrated.expansion_ppm_K * artefact.measured.temperature_U_K / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
     if checks:
         last = checks[-1]
@@ -181,7 +181,7 @@ def _length_budget(
                 "temperature",
                 warmth,
                 "B",
-                f"{artefact.expansion.value:g} ppm/K of the artefact",
+                f"{artefact.calibrated.expansion_ppm_K:g} ppm/K of the artefact",
             ),
             Contribution("drift", drift, "B", since),
         ],

@@ -41,8 +41,7 @@ from slviewer.pipeline.stored_records import (
 )
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
-from slviewer.reconstruction.reconstruct import normals as grid_normals
-from slviewer.reconstruction.reconstruct import triangulate_grid
+from slviewer.reconstruction.reconstruct import normals, triangulate_grid
 from slviewer.records.measurement import (
     MeasuredFeature,
     MeasuredRegion,
@@ -214,7 +213,7 @@ def surface_from_cloud(
         fitted.name,
         inputs,
         left_mm=cloud.sigma_calibration,
-        normals=grid_normals(cloud.points),
+        normals=normals(cloud.points),
         shared=shared,
         calibration="" if shared is None else inputs[calibration],
         texture=cloud.texture,

@@ -177,7 +177,7 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
         # or it fails now, not after minutes
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
     table_deg = _list_table_angles(store, settings)
-    starts = _initial_alignments(store, settings, table_deg, warn)
+    starts = _initial_alignments(job, settings, table_deg)
     check_accepted(store, settings.accept_rejected)
     fitted = load_model(store, settings.model)
     warn_if_stale(store, warn)
@@ -394,13 +394,13 @@ def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, flo
 
 
 def _initial_alignments(
-    store: Session, settings: MergeSettings, table_deg: Mapping[str, float] | None, warn: Warn
+    job: Job, settings: MergeSettings, table_deg: Mapping[str, float] | None
 ) -> Starts:
     """Return the initial alignments for the requested start; raises for options that do not fit
     it."""
     names, poses = settings.names, settings.poses
     if settings.start == "placed":
-        poses = load_places(store)
+        poses = load_places(job.store)
         if missing := [name for name in names if name not in poses]:
             raise InputError(
                 f"{' and '.join(missing)} were not aligned: align them first, or start from"
@@ -412,7 +412,9 @@ def _initial_alignments(
     picks = {}
     for (scan, onto), (pick, apart) in settings.fit_picks().items():
         picks[scan, onto] = pick
-        warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
+        job.warn(
+            f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other"
+        )
     for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
         # pairs without picked points start there too
         others = [name for name in names if name != base]

@@ -46,7 +46,7 @@ _RESTORED: dict[str, type[PixelwiseModel | SplinedModel]] = {
 
 
 def describe_model(
-    model: Model, verdict: Verdict | None = None, inputs: Mapping[str, str] | None = None
+    model: Model, verdict: Verdict | None, inputs: Mapping[str, str] | None
 ) -> Found[ModelCalibration]:
     """Return the record of a model and its arrays; ``inputs``: {pose that it was made from: its
     hash}."""

@@ -221,7 +221,7 @@ def gather_evidence(
     examination: Examination,
     detection: Detection | None,
     observation: Observation | None,
-    refused: str = "",
+    refused: str,
 ) -> PoseEvidence:
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
     None where they could not be read, for the reason ``refused``; ``examination``: of its frames.

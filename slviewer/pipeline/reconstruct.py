@@ -248,7 +248,7 @@ def segment_board(
     return board_mask(board, detection, texture.shape[:2])
 
 
-def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None = None) -> float | None:
+def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None) -> float | None:
     """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are
     masked, because they look through parts of camera or projector that no target pose illuminated;
     None for models that mask none.

@@ -13,6 +13,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import cycle
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -58,8 +59,8 @@ class Reel:
     def __init__(self, recorded: Sequence[Recorded]) -> None:
         """Play these captures in order."""
         self.names = [each.name for each in recorded]
-        self._recorded, self._at = recorded, 0
-        self._recording = Recording(*_read_shot(recorded[0]))
+        self._following = cycle(recorded)
+        self._recording = Recording(*_read_shot(next(self._following)))
         self.rig: Rig = recording_rig(self._recording)
 
     @property
@@ -75,9 +76,8 @@ class Reel:
     def advance(self) -> None:
         """Play the next capture; the first after the last. Raises InputError where it is not of the
         same rig."""
-        self._at = (self._at + 1) % len(self.names)
         if len(self.names) > 1:
-            self._recording.play(*_read_shot(self._recorded[self._at]))
+            self._recording.play(*_read_shot(next(self._following)))
 
 
 def _read_shot(recorded: Recorded) -> tuple[np.ndarray, PatternSequence]:

@@ -21,7 +21,7 @@ C = TypeVar("C", bound=Cloud)
 _EXAMPLE = "such as --roi=-50,50,-40,40,300,500"
 
 
-def resolve_region(store: Session, roi: str = "") -> RegionOfInterest | None:
+def resolve_region(store: Session, roi: str) -> RegionOfInterest | None:
     """Return the region that an option ``--roi`` states; empty: the session's, ``off``: None."""
     if not roi:
         return load_region(store)

@@ -364,7 +364,7 @@ class _Bracket:
         if most <= first:
             return ()
         grid = np.unique([_round(each) for each in np.geomspace(first, most, _CANDIDATES)])
-        values, counts = _tabulate_values(grid, low, high)
+        values = _tabulate_values(grid, low, high)
         best: list[tuple[float, Exposures]] = []
         for count in range(1, MAX_SUGGESTED + 1):
             sets = np.array(list(combinations(range(len(grid)), count))).reshape(-1, count)
@@ -374,9 +374,10 @@ class _Bracket:
             if not len(sets):
                 break
             following = np.concatenate([sets[:, 1:], np.full((len(sets), 1), len(grid))], axis=1)
-            chosen = int(values[sets, following].sum(1).argmax())
-            measured = float(counts[sets[chosen], following[chosen]].sum())
-            best.append((measured, tuple(grid[sets[chosen]].tolist())))
+            chosen = grid[sets[values[sets, following].sum(1).argmax()]]
+            used = np.searchsorted(chosen, high, side="right") - 1  # the longest of each pixel
+            measured = float(np.count_nonzero((used >= 0) & (low <= chosen[used])))
+            best.append((measured, tuple(chosen.tolist())))
         largest = max((measured for measured, _ in best), default=0.0)
         good = (each for measured, each in best if measured >= largest - _WORTH * low.size)
         return next(good, ())
@@ -421,19 +422,18 @@ def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
     return (layout.white, layout.black), False
 
 
-def _tabulate_values(grid: Values, low: Values, high: Values) -> tuple[Values, Values]:
-    """Value and number (n, n + 1) of the pixels that exposure i of the grid measures where exposure
-    j, the next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is
-    weakly modulated."""
+def _tabulate_values(grid: Values, low: Values, high: Values) -> Values:
+    """Value (n, n + 1) of the pixels that exposure i of the grid measures where exposure j, the
+    next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is weakly
+    modulated."""
     n = len(grid)
     saturated_by = np.searchsorted(grid, high, side="right")
-    values, counts = np.zeros((n, n + 1)), np.zeros((n, n + 1))
+    values = np.zeros((n, n + 1))
     for i, exposure in enumerate(grid):
         measured = (low <= exposure) & (high >= exposure)
         value = 1 - _WEAK_COST * np.square(low[measured] / exposure)
         values[i] = np.cumsum(np.bincount(saturated_by[measured], value, n + 1))
-        counts[i] = np.cumsum(np.bincount(saturated_by[measured], minlength=n + 1))
-    return values, counts
+    return values
 
 
 def _round(exposure_ms: float) -> float:

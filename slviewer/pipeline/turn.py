@@ -25,10 +25,8 @@ from slviewer.pipeline.capture import (
     warn_of_captured,
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import MergeSettings
-from slviewer.pipeline.merge import merge as merge_operation
-from slviewer.pipeline.mesh import MeshResult
-from slviewer.pipeline.mesh import mesh as mesh_merge
+from slviewer.pipeline.merge import MergeSettings, merge
+from slviewer.pipeline.mesh import MeshResult, mesh
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
 from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.operation import Findings, takes_settings
@@ -170,7 +168,7 @@ def turn(settings: TurnSettings) -> Turn:
         merging = MergeSettings(names, names[0], model=model, accept_rejected=accepts)
         merged = merge_turn(store, merging, part(progress, 0.5, 0.8), warn)
         out = settings.mesh or store.exports / f"{turn_name}_mesh.ply"
-        meshed = mesh_merge(
+        meshed = mesh(
             store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model,
             accept_rejected=accepts, progress=part(progress, 0.8, 1.0), warn=warn,
         )  # fmt: skip
@@ -304,13 +302,13 @@ def merge_turn(
     switched off.
     """
     try:
-        return merge_operation.run(store, replace(settings, start="turntable"), progress, warn)
+        return merge.run(store, replace(settings, start="turntable"), progress, warn)
     except (Refused, InputError) as error:
         warn(
             "the angles of the turntable do not align the scans, they are aligned by features"
             f" instead: {error}"
         )
-    return merge_operation.run(store, replace(settings, start="features"), progress, warn)
+    return merge.run(store, replace(settings, start="features"), progress, warn)
 
 
 def _origin(table: Turntable, recorded: Sequence[TurnStep], warn: Warn) -> float:

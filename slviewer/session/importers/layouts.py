@@ -45,7 +45,7 @@ from slviewer.entry_points import IMPORTERS, PluginGroup
 from slviewer.errors import InputError
 from slviewer.fringe.presets import AXES, gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
-from slviewer.session.importers import frames as described_frames
+from slviewer.session.importers.frames import LAYOUT as FRAMES
 from slviewer.session.importers.images import read_frames, read_image
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -430,7 +430,7 @@ BUILT_IN = {
     layout.name: layout
     for layout in (
         *(P18, PROCAM_CALIBRATION, SLSTUDIO, SLTK),
-        *(OPENCV_GRAYCODE, described_frames.LAYOUT),
+        *(OPENCV_GRAYCODE, FRAMES),
     )
 }
 LAYOUT_PLUGINS = PluginGroup(IMPORTERS, FolderLayout, lambda: BUILT_IN)
