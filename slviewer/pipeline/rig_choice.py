@@ -144,11 +144,11 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
         if "driver" in choice:
             made = _make_device("rig", _options_of_rig(choice), board=board)
         else:
-            camera, projector = (
-                _make_device(part, choice[part], page=pages and getattr(pages, part))
+            devices = {
+                part: _make_device(part, choice[part], page=pages and getattr(pages, part))
                 for part in PAGE_ROLES
-            )
-            made = Rig(str(choice.get("name", "rig")), camera, projector)
+            }
+            made = Rig(str(choice.get("name", "rig")), **devices)
         if isinstance(made, Reel):
             made = RigSetup(made.rig, reel=made)
         bench = made if isinstance(made, RigSetup) else RigSetup(made)
