@@ -30,9 +30,15 @@ from slviewer.inspection.uncertainty import RigidSpread, Shared
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.open_session import SessionLike, match_names, opened
 from slviewer.pipeline.operation import Findings, Found, Job, operation
-from slviewer.pipeline.stored_records import Stored, list_records, next_name
+from slviewer.pipeline.stored_records import (
+    SessionLike,
+    Stored,
+    list_records,
+    match_names,
+    next_name,
+    opened,
+)
 from slviewer.printable import format_csv
 from slviewer.records.inspection import (
     Capability,

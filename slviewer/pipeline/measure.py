@@ -4,7 +4,6 @@ are listed, renamed, deleted and written as CSV."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -17,7 +16,6 @@ from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane, section, triangulate_near
 from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
-from slviewer.pipeline.capture_clouds import read_merge, scan_cloud
 from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
@@ -28,16 +26,16 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import OPERATIONS, Found, Job, operation
+from slviewer.pipeline.reconstruct import read_merge, scan_cloud
 from slviewer.pipeline.scale import load_scale_correction
-from slviewer.pipeline.scan_edits import refuse_region
 from slviewer.pipeline.stored_records import (
+    SessionLike,
     Stored,
     list_records,
     load_arrays,
     load_stored,
-    next_name,
+    opened,
 )
 from slviewer.printable import format_csv
 from slviewer.reconstruction.cloud import Cloud
@@ -178,12 +176,11 @@ def load_surface(
     if load is not None:
         return load(store)
     if scan.startswith(MERGED):
-        refuse_region(scan, roi)
-        return load_merged_surface(store, scan, warn)
+        return load_merged_surface(store, scan, warn, roi)
     check_accepted(store, accept_rejected)
     warn_if_stale(store, warn)
     model = model or preferred_model(store)
-    cloud = scan_cloud(store, scan, model, job.progress, warn, accept_rejected, roi)
+    cloud = scan_cloud(job, scan, model, accept_rejected, roi)
     job.progress(1.0, "reconstructed")
     return surface_from_cloud(
         store, scan, cloud, load_model(store, cloud.model), with_region=not roi
@@ -222,10 +219,11 @@ def surface_from_cloud(
 
 
 def load_merged_surface(
-    store: Session, merge: str, warn: Warn = ignore_warnings
+    store: Session, merge: str, warn: Warn = ignore_warnings, roi: str = ""
 ) -> MeasuredSurface:
-    """A stored merge ``merge/<number>``, in the frame of its reference's camera."""
-    record, points = read_merge(store, merge, warn)
+    """A stored merge ``merge/<number>``, in the frame of its reference's camera; ``roi`` as in
+    `read_merge`."""
+    record, points = read_merge(store, merge, warn, roi)
     sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
     return MeasuredSurface(
         points.points,
@@ -334,16 +332,15 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     )
     used = replace(settings, model=on.model)  # type: ignore[arg-type]
     notes = uncertainty_notes(store, record)
-    yield Found(next_name(store, Measurement), record, arrays, notes=notes, settings=used)
+    yield Found("", record, arrays, notes=notes, settings=used)
     job.progress(1.0, "measured")
 
 
 def provenance(on: MeasuredSurface) -> dict[str, Any]:
-    """Return what a measurement states of the surface that it was made on, and its time."""
+    """Return what a measurement states of the surface that it was made on."""
     return {
         "source": on.source,
         "model": on.model,
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "inputs": dict(on.inputs),
         "scales": {on.model: on.scale} if on.model else {},
     }
@@ -475,11 +472,10 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
         quantities=relation(*features),
         where=f"{first.label} and {second.label}",
         of=(settings.a, settings.b),
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
         inputs=store.input_hashes(_FOLDER + settings.a, _FOLDER + settings.b),
         scales=a.scales | b.scales,
     )
-    yield Found(next_name(store, Measurement), record, notes=uncertainty_notes(store, record))
+    yield Found("", record, notes=uncertainty_notes(store, record))
 
 
 def load_feature(store: Session, measured: Stored[Measurement]) -> tuple[Feature, Spread]:

@@ -14,9 +14,14 @@ from slviewer.errors import CalibrationRejected, InputError, SessionError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Found
-from slviewer.pipeline.stored_records import load_record, read_record, save_record
+from slviewer.pipeline.stored_records import (
+    SessionLike,
+    load_record,
+    opened,
+    read_record,
+    save_record,
+)
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict

@@ -1,4 +1,5 @@
-"""Rigs: from what the operator chose to devices, choices by name, and recorded captures as a rig.
+"""Rigs: from what the operator chose to devices, choices by name, recorded captures as a rig, and
+what there is to choose from.
 
 A choice is a plain mapping, as the session keeps it: ``{"driver": "simulated", "scale": 0.5,
 "seed": 0}`` for a rig that one driver makes, or ``{"name": "bench", "camera": {"driver": …},
@@ -22,12 +23,12 @@ import msgspec
 import numpy as np
 
 from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
-from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, driver, drivers
+from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, available, driver, drivers
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.replay import Recording, recording_rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
-from slviewer.errors import InputError
+from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
@@ -410,3 +411,27 @@ def _driver_names(choice: Choice) -> list[str]:
     of a turntable."""
     parts = [choice, *(choice.get(part, {}) for part in ("camera", "projector", "turntable"))]
     return [str(part["driver"]) for part in parts if "driver" in part]
+
+
+def devices() -> str:
+    """List the drivers: which can be used here, what is connected, what each needs, and the rigs to
+    choose from."""
+    blocks = []
+    for each in available():  # those that can be used here first
+        parts = ("camera", "projector", "turntable", "rig")
+        offers = ", ".join(part for part in parts if getattr(each, part) is not None)
+        lines = [
+            f"{each.name} ({offers}): {each.what}",
+            f"  cannot be used here, {each.missing}" if each.missing else "  can be used",
+        ]
+        if each.needs:
+            lines.append(f"  needs {each.needs}")
+        if each.list_connected is not None and not each.missing:
+            try:
+                connected = each.list_connected() or ["no device"]
+                lines += [f"  connected: {line}" for line in connected]
+            except Exception as error:  # a broken library of a maker must not hide other devices
+                kind = "" if isinstance(error, SlviewerError) else f" ({type(error).__name__})"
+                lines.append(f"  could not look for what is connected: {error}{kind}")
+        blocks.append("\n".join(lines))
+    return "\n".join([*blocks, rigs()])

@@ -51,16 +51,6 @@ def parse_region(roi: str) -> RegionOfInterest:
     return RegionOfInterest.between(low, high)
 
 
-def refuse_region(merge: str, roi: str) -> None:
-    """Raise UsageError where a region was stated for a merge, whose scans were cut when it was
-    made."""
-    if roi:
-        raise UsageError(
-            f"{merge} was cut by the region when its scans were merged: merge them again with --roi"
-            f" {roi}"
-        )
-
-
 def restrict_cloud(store: Session, scan: str, cloud: C, region: RegionOfInterest | None) -> C:
     """Return a scan's cloud with NaN for what was deleted from it and what lies outside of the
     region.

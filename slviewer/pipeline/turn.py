@@ -28,9 +28,9 @@ from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_w
 from slviewer.pipeline.merge import MergeSettings, merge
 from slviewer.pipeline.mesh import MeshResult, mesh
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
-from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.operation import Findings, takes_settings
 from slviewer.pipeline.rig_choice import RigLike, RigSetup, load_rig
+from slviewer.pipeline.stored_records import opened_or_made
 from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused

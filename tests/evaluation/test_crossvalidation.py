@@ -14,13 +14,13 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import fit_polynomial
 from slviewer.geometry.rig import StereoRig
-from slviewer.pipeline.stored_records import read_record
-from slviewer.pipeline.validate import (
+from slviewer.pipeline.accept import (
     LEAST_POSES,
     gather_results,
     measure_held_out,
     split_folds,
 )
+from slviewer.pipeline.stored_records import read_record
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text

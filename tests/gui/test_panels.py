@@ -36,9 +36,9 @@ from slviewer.gui.steps.calibrate import named_poses, verdict_html
 from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
+from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.calibrate import save_verdict
 from slviewer.pipeline.stored_records import Stored
-from slviewer.pipeline.validate import gather_results
 from slviewer.records.measurement import Measurement
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain

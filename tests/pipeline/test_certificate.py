@@ -116,8 +116,7 @@ def test_the_figures_of_a_report_follow_from_the_frames(
     assert sorted(path.name for path in folder.rglob("*")) == before
     certificate = read_certificate(page)[1]
     assert all(
-        len(c["frames"]) in (26, 52) and len(set(c["frames"])) > 20
-        for c in certificate.captures.values()
+        len(c.frames) in (26, 52) and len(set(c.frames)) > 20 for c in certificate.captures.values()
     )
     assert "verify-report" in page.read_text() and "<script" not in page.read_text()
 

@@ -11,8 +11,8 @@ from facts import missing_facts
 from made_up import MODELS, plane_rows, reproduction_data, session_data, sphere_rows
 
 from slviewer.calibration.stereo import StereoModel
+from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.stored_records import read_record
-from slviewer.pipeline.validate import gather_results
 from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
 from slviewer.records.drift import Drift
