@@ -52,8 +52,7 @@ if TYPE_CHECKING:
     from slviewer.fringe.presets import complementary, gray, micro, multifrequency, p18
     from slviewer.fringe.sequence import Frame, PatternSequence, one_axis
     from slviewer.pipeline import datasets
-    from slviewer.pipeline.accept import accept
-    from slviewer.pipeline.align import align
+    from slviewer.pipeline.accept import accept, check
     from slviewer.pipeline.batch import batch
     from slviewer.pipeline.calibrate import (
         CalibrationResult,
@@ -62,13 +61,12 @@ if TYPE_CHECKING:
         save_calibration,
     )
     from slviewer.pipeline.capture import capture
-    from slviewer.pipeline.check import check
     from slviewer.pipeline.compare import compare
     from slviewer.pipeline.export import export
     from slviewer.pipeline.import_captures import import_captures, read_captures
     from slviewer.pipeline.inspect_parts import run_plan
     from slviewer.pipeline.measure import measure
-    from slviewer.pipeline.merge import merge
+    from slviewer.pipeline.merge import align, merge
     from slviewer.pipeline.mesh import mesh
     from slviewer.pipeline.models import load_calibration
     from slviewer.pipeline.reconstruct import reconstruct, verify
@@ -112,9 +110,11 @@ _EXPORTS = {
     "SimulatedWorld": "devices.world",
     "SlviewerError": "errors",
     "Verification": "records.verification",
+    "align": "pipeline.merge",
     "align_clouds": "registration.multiway:register_all",
     "calibrate_frames": "pipeline.calibrate",
     "capture_frames": "devices.capture",
+    "check": "pipeline.accept",
     "complementary": "fringe.presets",
     "datasets": "pipeline.datasets:*",
     "decode": "fringe.decode",

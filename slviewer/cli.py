@@ -20,7 +20,6 @@ import tyro
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 from slviewer import __version__, terminal
-from slviewer.commands.calibration import run_calibrate
 from slviewer.commands.command import (
     JSON,
     Arguments,
@@ -31,9 +30,14 @@ from slviewer.commands.command import (
     take_options,
     union,
 )
-from slviewer.commands.devices import run_capture, run_preflight, run_turn
-from slviewer.commands.imports import make_import_command
-from slviewer.commands.wizard import wizard
+from slviewer.commands.runs import (
+    make_import_command,
+    run_calibrate,
+    run_capture,
+    run_preflight,
+    run_turn,
+    wizard,
+)
 from slviewer.errors import Cancelled, SlviewerError
 
 
@@ -70,7 +74,7 @@ CONFIG = (
 DESCRIPTION = (
     "Structured-light 3D scanning: calibrate a camera and a projector, prove it, scan, merge."
 )
-PAGES = ("commands.devices:PageOptions",)
+PAGES = ("commands.runs:PageOptions",)
 MESHING = ("surface.meshing:MeshingPlan",)
 MESHING_NAMES = {"fill_holes_mm": "fill_holes"}
 
@@ -82,11 +86,11 @@ def _define_command(source: str, *positional: str, **options: Any) -> Callable[[
 
 COMMANDS: dict[str, Callable[[], Function]] = {
     "wizard": lambda: wizard,
-    "devices": _define_command("pipeline.devices:devices"),
-    "plugins": _define_command("pipeline.plugins:plugins"),
+    "devices": _define_command("pipeline.rig_choice:devices"),
+    "plugins": _define_command("plugins:plugins"),
     "preflight": _define_command(
         "preflight.check_rig:check_rig",
-        options=("commands.devices:CheckedOptions", *PAGES, *JSON),
+        options=("commands.runs:CheckedOptions", *PAGES, *JSON),
         run=run_preflight,
     ),
     "capture": _define_command("pipeline.capture:capture", "name", options=PAGES, run=run_capture),
@@ -97,12 +101,12 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     "import": make_import_command,
     "calibrate": _define_command(
         "pipeline.calibrate:calibrate",
-        options=("commands.calibration:CalibrateOptions", *JSON),
+        options=("commands.runs:CalibrateOptions", *JSON),
         run=run_calibrate,
     ),
-    "validate": _define_command("pipeline.validate:validate", options=JSON),
+    "validate": _define_command("pipeline.accept:validate", options=JSON),
     "decode": _define_command(
-        "pipeline.decode:write_decoded", "capture", names={"file_format": "format"}
+        "pipeline.capture_phases:write_decoded", "capture", names={"file_format": "format"}
     ),
     "reconstruct": _define_command("pipeline.reconstruct:reconstruct", "capture"),
     "region": _define_command("pipeline.edit:set_region"),
@@ -113,7 +117,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
         options=JSON,
         names={"models": "model", "depth_range": "range"},
     ),
-    "align": _define_command("pipeline.align:align", "captures", options=JSON),
+    "align": _define_command("pipeline.merge:align", "captures", options=JSON),
     "merge": _define_command("pipeline.merge:merge", "captures", options=JSON),
     "mesh": _define_command(
         "pipeline.mesh:mesh",
@@ -145,7 +149,7 @@ COMMANDS: dict[str, Callable[[], Function]] = {
         run=_run_meshing,
     ),
     "batch": _define_command("pipeline.batch:batch", "sessions", options=JSON),
-    "check": _define_command("pipeline.check:check", "capture", options=JSON),
+    "check": _define_command("pipeline.accept:check", "capture", options=JSON),
     "accept": _define_command("pipeline.accept:accept", options=JSON),
     "fetch": _define_command("pipeline.datasets:fetch", "name", "folder", run=_run_fetch),
     "simulate": _define_command("pipeline.simulate:simulate", run=_run_simulate),
@@ -158,8 +162,8 @@ COMMANDS: dict[str, Callable[[], Function]] = {
     ),
     "report": _define_command("pipeline.report:report"),
     "verify-report": _define_command("pipeline.certificate:verify_report", "report", options=JSON),
-    "inspect": _define_command("pipeline.inspect:inspect"),
-    "restore": _define_command("pipeline.inspect:restore", "names"),
+    "inspect": _define_command("pipeline.report:inspect"),
+    "restore": _define_command("pipeline.report:restore", "names"),
     "bench": _define_command("validation.bench:bench", options=JSON),
 }
 """The commands by name, each made when it is used: that reads the source of its function."""

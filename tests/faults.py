@@ -33,7 +33,7 @@ import pytest
 
 import slviewer
 from slviewer import cli
-from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.report import inspect
 from slviewer.session.store import Session
 
 KILL = 0

@@ -94,9 +94,9 @@ def read_command(
     ``description``: in place of the function's own, ``run``: what to do with the function and its
     arguments, by default `show_result`.
     """
-    module, name = _split_place(source)
-    text, described, accepted = _read_function(module, name)
-    parts = [(described, accepted), *(_read_settings(*_split_place(each)) for each in options)]
+    module, name = _find_module(source)
+    text, own = _read_function(module, name)
+    parts = [own, *(_read_settings(*_find_module(each)) for each in options)]
     described = "\n".join(each for each, _ in parts)
     shown = [
         argument
@@ -107,8 +107,8 @@ def read_command(
     parameters = []
     for argument, default, place in shown:
         assert argument.annotation is not None
-        kind = _terminal_type(_evaluate(argument.annotation, place))
-        value = inspect.Parameter.empty if default is None else _evaluate(default, place)
+        kind = _terminal_type(place.evaluate(argument.annotation))
+        value = inspect.Parameter.empty if default is None else place.evaluate(default)
         if argument.arg in optional:
             kind, value = kind | None, None
         if argument.arg in positional or (argument.arg == "session" and default is None):
@@ -127,7 +127,7 @@ def read_command(
             _check_numbers(
                 {names.get(option, option): value for option, value in arguments.items()}
             )
-            (run or show_result)(getattr(import_module(module), name), arguments)
+            (run or show_result)(getattr(import_module(module.name), name), arguments)
 
         return work
 
@@ -206,20 +206,62 @@ def _check_numbers(arguments: Mapping[str, Any]) -> None:
                 )
 
 
-Argument = tuple[ast.arg, ast.expr | None, str]
+Argument = tuple[ast.arg, ast.expr | None, "_Module"]
 """A parameter, its default, None where it has none, and the module in which both are evaluated."""
+Described = tuple[str, list[Argument]]
+"""What a docstring says of parameters below ``Args:``, and these."""
 
 
-def _split_place(source: str) -> tuple[str, str]:
+def _find_module(source: str) -> tuple["_Module", str]:
     """Return module and name of ``module:name``, of slviewer or of a module in use."""
     module, _, name = source.partition(":")
-    return module if module in sys.modules else f"slviewer.{module}", name
+    return _read_module(module if module in sys.modules else f"slviewer.{module}"), name
 
 
-def _read_function(module: str, name: str) -> tuple[str, str, list[Argument]]:
+class _Module(dict[str, Any]):
+    """Types and constants of a module by name. Those of slviewer are evaluated from their source,
+    whose functions, classes, values and imports are the ``nodes``; the module is not imported."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(TYPES)
+        self.name = name
+        spec = find_spec(name)
+        assert spec is not None and spec.origin is not None
+        self.nodes: dict[str, ast.AST | None] = {}
+        for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+            match node:
+                case ast.FunctionDef(defined) | ast.ClassDef(defined):
+                    self.nodes[defined] = node
+                case ast.Assign([ast.Name(defined)], value):
+                    self.nodes[defined] = value
+                case ast.AnnAssign(ast.Name(defined), _, default):
+                    self.nodes[defined] = default
+                case ast.ImportFrom():
+                    self.nodes |= {alias.asname or alias.name: node for alias in node.names}
+
+    def __missing__(self, name: str) -> Any:
+        """Evaluate a name from the module's source, or import it. Raises KeyError."""
+        match self.nodes.get(name):
+            case ast.expr() as value:
+                return self.evaluate(value)
+            case ast.ImportFrom(str(origin)) if origin.startswith("slviewer."):
+                return _read_module(origin)[name]
+            case ast.ImportFrom(str(origin)):
+                return getattr(import_module(origin), name)
+        raise KeyError(name)
+
+    def evaluate(self, expression: ast.expr) -> Any:
+        """Evaluate an annotation or a default of the module."""
+        return eval(ast.unparse(expression), {}, self)  # noqa: S307, our own source
+
+
+_read_module = cache(_Module)
+
+
+def _read_function(module: _Module, name: str) -> tuple[str, Described]:
     """Return what the docstring of a function says before ``Args:`` and below it, and the
     function's parameters; where it has settings, the latter are those of the settings."""
-    definition = _read_definitions(module)[name]
+    definition = module.nodes[name]
     assert isinstance(definition, ast.FunctionDef)
     text, _, described = (ast.get_docstring(definition) or "").partition("\n\nArgs:\n")
     for decorator in definition.decorator_list:
@@ -227,9 +269,10 @@ def _read_function(module: str, name: str) -> tuple[str, str, list[Argument]]:
             case ast.Call(ast.Name("operation"), [_, _, ast.Name(settings)]):
                 described, accepted = _read_settings(module, settings)
                 session = ast.arg("session", ast.Name("SessionLike")), None, module
-                return text, f"    session: Session folder.\n{described}", [session, *accepted]
+                described = f"    session: Session folder.\n{described}"
+                return text, (described, [session, *accepted])
             case ast.Call(ast.Name("takes_settings"), [ast.Name(settings)]):
-                return text, *_read_settings(module, settings)
+                return text, _read_settings(module, settings)
     arguments = definition.args
     required = [None] * (len(arguments.args) - len(arguments.defaults))
     pairs = [
@@ -238,73 +281,28 @@ def _read_function(module: str, name: str) -> tuple[str, str, list[Argument]]:
     ]
     if not described:
         text = text.partition("\n\n")[0]
-    return text, described.partition("\n\n")[0], [(*pair, module) for pair in pairs]
+    return text, (described.partition("\n\n")[0], [(*pair, module) for pair in pairs])
 
 
-def _read_settings(module: str, name: str) -> tuple[str, list[Argument]]:
+def _read_settings(module: _Module, name: str) -> Described:
     """Return what a dataclass of settings and its bases describe of their fields, and these
     fields."""
-    settings = _read_definitions(module)[name]
-    if isinstance(settings, ast.ImportFrom):
-        assert settings.module is not None
-        return _read_settings(settings.module, name)
-    assert isinstance(settings, ast.ClassDef)
-    doc = ast.get_docstring(settings) or ""
+    match module.nodes[name]:
+        case ast.ImportFrom(str(origin)):
+            return _read_settings(_read_module(origin), name)
+        case ast.ClassDef() as settings:
+            doc = ast.get_docstring(settings) or ""
     described = [doc.partition("Args:\n")[2].partition("\n\n")[0]]
-    nodes = [node for node in settings.body if isinstance(node, ast.AnnAssign)]
     accepted = [
-        (ast.arg(ast.unparse(node.target), node.annotation), node.value, module) for node in nodes
+        (ast.arg(ast.unparse(node.target), node.annotation), node.value, module)
+        for node in settings.body
+        if isinstance(node, ast.AnnAssign)
     ]
     for base in settings.bases:
         inherited, further = _read_settings(module, ast.unparse(base))
         described.append(inherited)
         accepted += further
     return "\n".join(filter(None, described)), accepted
-
-
-@cache
-def _read_definitions(module: str) -> dict[str, ast.stmt]:
-    """Return {name: node that defines or imports it} of a module's functions, types, constants and
-    imports."""
-    spec = find_spec(module)
-    assert spec is not None and spec.origin is not None
-    definitions: dict[str, ast.stmt] = {}
-    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            definitions[node.name] = node
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-            if isinstance(target, ast.Name):
-                definitions[target.id] = node
-        elif isinstance(node, ast.ImportFrom):
-            definitions |= {alias.asname or alias.name: node for alias in node.names}
-    return definitions
-
-
-class _Names(dict[str, Any]):
-    """Mapping of a module's names to their types and constants; those of slviewer are read from
-    their source."""
-
-    def __init__(self, module: str) -> None:
-        super().__init__(TYPES)
-        self._module = module
-
-    def __missing__(self, name: str) -> Any:
-        """Evaluate a name from the module's source, or import it. Raises KeyError."""
-        node = _read_definitions(self._module).get(name)
-        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
-            return _evaluate(node.value, self._module)
-        if isinstance(node, ast.ImportFrom) and node.module is not None:
-            inside = node.module.startswith("slviewer.")
-            return (
-                _Names(node.module)[name] if inside else getattr(import_module(node.module), name)
-            )
-        raise KeyError(name)
-
-
-def _evaluate(expression: ast.expr, module: str) -> Any:
-    """Evaluate an annotation or a default of a module, without importing the module."""
-    return eval(ast.unparse(expression), {}, _Names(module))  # noqa: S307, our own source
 
 
 def _terminal_type(kind: Any) -> Any:

@@ -7,41 +7,41 @@ stray points do not decide. Of *size*, *spacing* and *scale* the error is one nu
 are where the true error lies with 95 % (99.7 %) probability, by the test's own uncertainty.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from math import hypot
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from scipy.special import stdtrit
 
 from slviewer.errors import InputError
-from slviewer.evaluation.fit import ShapeResult, evaluate_plane, evaluate_spheres
-from slviewer.evaluation.incidence import incidence
+from slviewer.evaluation.fit import (
+    ShapeResult,
+    evaluate_plane,
+    evaluate_spheres,
+    finite_or_none,
+    incidence,
+)
 from slviewer.geometry.vectors import unit_vectors
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.acceptance import (
+    AcceptanceTest,
+    CertifiedArtefact,
     Decision,
     JudgedProperty,
     PositionErrors,
     PropertyError,
     ScaleError,
+    StillCaptures,
+    worst_decision,
 )
+from slviewer.records.plain import from_plain
 
 Kind = Literal["ball-bar", "sphere", "plane"]
 BALLS = {"ball-bar": 2, "sphere": 1, "plane": 0}
-_KEYS = {
-    "": {"kind", "name", "certificate", "calibrated", "measured", "limits"},
-    "calibrated": {
-        "temperature_C", "expansion_ppm_K", "expansion_U_ppm_K",
-        "spacing_mm", "spacing_U_mm", "diameter_mm", "diameter_U_mm", "form_mm", "form_U_mm",
-    },
-    "measured": {"temperature_C", "temperature_U_K", "captures"},
-    "limits": {"form_mm", "size_mm", "spacing_mm", "flatness_mm"},
-}  # fmt: skip
-_MOST = {"_mm": 1e5, "_ppm_K": 1e4, "_C": 1e3, "_K": 1e3}
-"""The largest value that a certificate may state, by the end of its name."""
 K_95, K_997 = 1.96, 2.97
 FORM, SIZE, SPACING, FLATNESS = (
     "probing error of form",
@@ -49,167 +49,153 @@ FORM, SIZE, SPACING, FLATNESS = (
     "sphere-spacing error",
     "flatness",
 )
+LIMITS = {FORM: "form_mm", SIZE: "size_mm", SPACING: "spacing_mm", FLATNESS: "flatness_mm"}
+"""Names of the operator's limits, mm, in the file; without one there is no decision."""
 POSITIONS = {"ball-bar": 7, "sphere": 7, "plane": 6}
+CAPTURES, LEAST_CAPTURES = 10, 3
+"""Of one still object, for the repeatability: how many are asked for, and how many it takes."""
 OUTSIDE = 50.0
 """Percent of an artefact's points in R1 (R3) from which on it stands there."""
 
 
 @dataclass(frozen=True)
 class CertifiedValue:
-    """A value of a certificate with its expanded uncertainty ``U`` (k = 2): a length in mm, the
-    thermal expansion in ppm/K, the temperature in degrees Celsius (and K)."""
+    """A length of a certificate with its expanded uncertainty ``U`` (k = 2), mm."""
 
     value: float
     U: float
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The operator's limits, mm; None: no decision."""
-
-    form_mm: float | None = None
-    size_mm: float | None = None
-    spacing_mm: float | None = None
-    flatness_mm: float | None = None
+_Length = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
+_Spread = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
+_Celsius = Annotated[float, msgspec.Meta(ge=-50, le=1e3)]
 
 
-@dataclass(frozen=True)
-class Artefact:
-    """The content of an artefact's certificate, and how the test was made.
+class Calibrated(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The values of a certificate with their expanded uncertainties ``U`` (k = 2): the ``spacing``
+    of a ball bar's centres, one ``diameter`` or one a ball, and ``form``: how far its balls (or its
+    plane) are from ideal ones, range. All at ``temperature_C``."""
 
-    ``spacing`` of a ball bar's centres; ``diameters``: one a ball; ``form``: how far its balls (or
-    its plane) are from ideal ones, range, mm. All at ``reference_celsius``. ``positions``:
-    {position: capture, or a pattern of captures}.
-    """
+    expansion_ppm_K: Annotated[float, msgspec.Meta(ge=-10, le=1e4)]  # noqa: N815
+    expansion_U_ppm_K: Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # noqa: N815
+    temperature_C: _Celsius = 20.0  # noqa: N815
+    spacing_mm: _Length | None = None
+    spacing_U_mm: _Spread | None = None  # noqa: N815
+    diameter_mm: _Length | list[_Length] | None = None
+    diameter_U_mm: _Spread | None = None  # noqa: N815
+    form_mm: _Spread = 0.0
+    form_U_mm: _Spread = 0.0  # noqa: N815
+
+
+class Measured(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the test was made: the artefact's temperature, and the captures or patterns of them, by
+    the names of the positions where these are others."""
+
+    temperature_C: _Celsius  # noqa: N815
+    temperature_U_K: Annotated[float, msgspec.Meta(ge=0, le=1e3)]  # noqa: N815
+    captures: list[str] | dict[str, str]
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The operator's limits; None: no decision."""
+
+    form_mm: _Length | None = None
+    size_mm: _Length | None = None
+    spacing_mm: _Length | None = None
+    flatness_mm: _Length | None = None
+
+
+class Artefact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of an artefact's certificate, and how the test was made."""
 
     kind: Kind
-    name: str
-    certificate: str
-    spacing: CertifiedValue | None
-    diameters: tuple[CertifiedValue, ...]
-    form: CertifiedValue
-    reference_celsius: float
-    expansion: CertifiedValue
-    temperature: CertifiedValue
-    positions: Mapping[str, str]
-    limits: Limits
+    calibrated: Calibrated
+    measured: Measured
+    name: str = ""
+    certificate: str = "none given"
+    limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "name", self.name or self.kind)
+        values, balls = self.calibrated, BALLS[self.kind]
+        needed = ["spacing_mm", "spacing_U_mm"] if balls == 2 else []
+        needed += ["diameter_mm", "diameter_U_mm"] if balls else []
+        if missing := [key for key in needed if getattr(values, key) is None]:
+            raise ValueError(f"a {self.kind} lacks {missing[0]}: give what its certificate states")
+        if balls and isinstance(values.diameter_mm, list) and len(values.diameter_mm) != balls:
+            raise ValueError(
+                f"{len(values.diameter_mm)} diameters are given for {balls}: give one a ball"
+            )
+        if not self.measured.captures:
+            raise ValueError(
+                'it names no captures: in [measured] write captures = ["bar_*"], or a table'
+                " [measured.captures] of position = capture"
+            )
+
+    @property
+    def positions(self) -> dict[str, str]:
+        """Return {position: capture, or a pattern of captures}."""
+        captures = self.measured.captures
+        return captures if isinstance(captures, dict) else {name: name for name in captures}
+
+    @property
+    def spacing(self) -> CertifiedValue | None:
+        """Return the spacing of a ball bar's centres; None for other artefacts."""
+        values = self.calibrated
+        if BALLS[self.kind] < 2 or values.spacing_mm is None:
+            return None
+        return CertifiedValue(values.spacing_mm, values.spacing_U_mm or 0.0)
+
+    @property
+    def diameters(self) -> tuple[CertifiedValue, ...]:
+        """Return the diameter of each ball."""
+        values, balls = self.calibrated, BALLS[self.kind]
+        each = values.diameter_mm or []
+        listed = each if isinstance(each, list) else [each] * balls
+        return tuple(CertifiedValue(mm, values.diameter_U_mm or 0.0) for mm in listed[:balls])
 
     def at_measurement(self, length: CertifiedValue) -> tuple[float, float]:
         """(mm, its standard uncertainty in mm) of a calibrated length at the temperature of the
         measurement."""
-        warmer, ppm = self.temperature.value - self.reference_celsius, 1e-6 * length.value
+        values, test, ppm = self.calibrated, self.measured, 1e-6 * length.value
+        warmer = test.temperature_C - values.temperature_C
         parts = (
             length.U / 2,
-            ppm * self.expansion.U / 2 * warmer,
-            ppm * self.expansion.value * self.temperature.U / 2,
+            ppm * values.expansion_U_ppm_K / 2 * warmer,
+            ppm * values.expansion_ppm_K * test.temperature_U_K / 2,
         )
-        return length.value + ppm * self.expansion.value * warmer, hypot(*parts)
+        return length.value + ppm * values.expansion_ppm_K * warmer, hypot(*parts)
 
     @property
     def form_U_mm(self) -> float:
         """Expanded uncertainty (k = 2) that the artefact's own form brings into a range: 2
         sqrt((F/2)^2 + u(F)^2)."""
-        return 2 * hypot(self.form.value / 2, self.form.U / 2)
+        return 2 * hypot(self.calibrated.form_mm / 2, self.calibrated.form_U_mm / 2)
 
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> "Artefact":
         """Return an artefact from the table of its file. Raises InputError for what is missing,
         unknown or impossible."""
-        for table, known in _KEYS.items():
-            part = given if not table else given.get(table, {})
-            if not isinstance(part, Mapping):
-                raise InputError(
-                    f"the artefact's [{table}] must be a table: write [{table}] and its values"
-                    " below it"
-                )
-            if unknown := set(part) - known:
-                place = f" in [{table}]" if table else ""
-                raise InputError(
-                    f"the artefact's file says {min(unknown)!r}{place}, which is unknown: use"
-                    f" {', '.join(sorted(known))}"
-                )
-        kind = given.get("kind")
-        if kind not in tuple(BALLS):  # it may be of any type
-            raise InputError(f"the artefact's kind is {kind!r}: use ball-bar, sphere or plane")
-        calibrated, measured, limits = (
-            given.get(table, {}) for table in ("calibrated", "measured", "limits")
-        )
-        return cls(
-            kind=kind,
-            name=str(given.get("name", kind)),
-            certificate=str(given.get("certificate", "none given")),
-            spacing=_read_value(calibrated, "spacing") if kind == "ball-bar" else None,
-            diameters=_read_diameters(calibrated, BALLS[kind]),
-            form=_read_value(calibrated, "form", least=0, otherwise=0.0),
-            reference_celsius=_number(calibrated, "temperature_C", 20.0, -50),
-            expansion=_read_value(calibrated, "expansion", "ppm_K", least=-10),
-            temperature=CertifiedValue(
-                _number(measured, "temperature_C", least=-50),
-                _number(measured, "temperature_U_K", least=0),
-            ),
-            positions=_read_positions(measured.get("captures")),
-            limits=Limits(**{key: _number(limits, key) for key in limits}),
-        )
+        try:
+            return from_plain(given, cls)
+        except InputError as error:
+            place, _, reason = str(error).partition(": ")
+            table, _, key = place.partition(".")
+            entries = given.get(table)
+            if isinstance(entries, Mapping):
+                place, entries = f"[{table}] {key}", entries.get(key)
+            known = BALLS if table == "kind" else _TABLES.get(table, cls).__struct_fields__
+            remedy = f"use {', '.join(known)}"
+            if entries is not None and table != "kind":
+                remedy = f"{entries!r} is impossible: check unit and sign"
+            raise InputError(f"the artefact's file: {place.strip()}: {reason}; {remedy}") from error
 
 
-def _read_value(
-    table: Mapping[str, Any],
-    name: str,
-    unit: str = "mm",
-    least: float | None = None,
-    otherwise: float | None = None,
-) -> CertifiedValue:
-    """The value ``name`` in a unit, above 0 or at least ``least``, and its uncertainty."""
-    return CertifiedValue(
-        _number(table, f"{name}_{unit}", otherwise, least),
-        _number(table, f"{name}_U_{unit}", otherwise, 0),
-    )
-
-
-def _read_diameters(calibrated: Mapping[str, Any], balls: int) -> tuple[CertifiedValue, ...]:
-    """Return the diameter of each of so many balls, from one number or a list."""
-    if not balls:
-        return ()
-    U = _number(calibrated, "diameter_U_mm", least=0)
-    each = calibrated.get("diameter_mm")
-    listed = each if isinstance(each, list) else [each] * balls
-    if len(listed) != balls:
-        raise InputError(f"{len(listed)} diameters are given for {balls}: give one a ball")
-    return tuple(CertifiedValue(_number({"diameter_mm": d}, "diameter_mm"), U) for d in listed)
-
-
-def _read_positions(captures: object) -> dict[str, str]:
-    """Return {position: capture} from a list of captures or a table."""
-    if isinstance(captures, list):
-        captures = {str(name): name for name in captures}  # any values: they are checked next
-    if (
-        not isinstance(captures, Mapping)
-        or not captures
-        or not all(isinstance(c, str) for c in captures.values())
-    ):
-        raise InputError(
-            'the artefact\'s file names no captures: in [measured] write captures = ["bar_*"], or a'
-            " table [measured.captures] of position = capture"
-        )
-    return {str(position): capture for position, capture in captures.items()}
-
-
-def _number(
-    table: Mapping[str, Any], key: str, otherwise: float | None = None, least: float | None = None
-) -> float:
-    """The number at ``key``, above 0 or at least ``least``, and at most what `_MOST` says of its
-    unit."""
-    value = table.get(key, otherwise)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(
-            f"the artefact's file says {key} = {value!r}: give a number, as its certificate does"
-        )
-    most = next(most for unit, most in _MOST.items() if key.endswith(unit))
-    if not ((value > 0 if least is None else value >= least) and value <= most):
-        raise InputError(
-            f"the artefact's file says {key} = {value:g}, which is impossible: check unit and sign"
-        )
-    return float(value)
+_TABLES: dict[str, type[msgspec.Struct]] = {
+    "calibrated": Calibrated,
+    "measured": Measured,
+    "limits": Limits,
+}
 
 
 def narrowest_range(deviations: np.ndarray, share: float) -> float:
@@ -229,17 +215,6 @@ def make_length_error(name: str, position: str, error_mm: float, u_mm: float) ->
     """Return the error of a length with its standard uncertainty."""
     inner, outer = ((error_mm - k * u_mm, error_mm + k * u_mm) for k in (K_95, K_997))
     return PropertyError(name, position, error_mm, 2 * u_mm, inner, outer)
-
-
-def judge_property(
-    name: str, figures: Sequence[PropertyError], limit_mm: float | None
-) -> JudgedProperty:
-    """The decision on one property from its figures at all positions."""
-    mine = [figure for figure in figures if figure.property == name]
-    worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
-    return JudgedProperty(
-        name, worst, limit_mm, None if limit_mm is None else decide(mine, limit_mm)
-    )
 
 
 def decide(figures: Sequence[PropertyError], limit_mm: float) -> Decision:
@@ -278,9 +253,7 @@ def measure_artefact(
         capture=capture,
         figures=figures,
         rms_mm=[result.rms_mm for result in shown],
-        floor_mm=[
-            None if np.isnan(result.noise_floor_mm) else result.noise_floor_mm for result in shown
-        ],
+        floor_mm=[finite_or_none(result.noise_floor_mm) for result in shown],
         points=int(np.count_nonzero(region)),
         noise_mm=noise,
         incidence=None if depth_range is None else incidence(cloud.points, region, depth_range),
@@ -323,59 +296,44 @@ def _fit_covariance(points: np.ndarray, ball: ShapeResult) -> np.ndarray:
     return ball.rms_mm**2 * np.linalg.inv(J.T @ J)
 
 
-@dataclass(frozen=True)
-class Acceptance:
-    """The result of an acceptance test with one artefact and one calibration ("model")."""
-
-    artefact: Artefact
-    model: str
-    positions: tuple[PositionErrors, ...]
-    judgements: tuple[JudgedProperty, ...]
-    scale: ScaleError | None
-
-    @property
-    def decision(self) -> Decision | None:
-        """Of all properties together: one fail fails; None where no limit was given."""
-        decisions = {judgement.decision for judgement in self.judgements} - {None}
-        return next((worst for worst in ("fail", "undecided", "pass") if worst in decisions), None)
-
-    @property
-    def lacks(self) -> tuple[str, ...]:
-        """What the positions do not test."""
-        gaps = []
-        needed = POSITIONS[self.artefact.kind]
-        if len(self.positions) < needed:
-            gaps.append(f"{len(self.positions)} of {needed} positions were measured")
-        shares = [position.incidence for position in self.positions if position.incidence]
-        for part in ("R1", "R3") if shares else ():
-            if not any(share[part] >= OUTSIDE for share in shares):
-                gaps.append(f"no position lies in {part}: what is measured there is untested")
-        return tuple(gaps)
-
-
 def conclude_test(
     artefact: Artefact, model: str, positions: Sequence[PositionErrors]
-) -> Acceptance:
-    """The test's result from its positions. Raises InputError where there is none."""
+) -> AcceptanceTest:
+    """Return the record of a test with one artefact and one calibration ("model") from its
+    positions. Raises InputError where there is none."""
     if not positions:
         raise InputError(
             f"no capture shows {artefact.name}: name some in [measured] captures of its file"
         )
     figures = [figure for position in positions for figure in position.figures]
-    limits = artefact.limits
-    allowed = {
-        FORM: limits.form_mm,
-        SIZE: limits.size_mm,
-        SPACING: limits.spacing_mm,
-        FLATNESS: limits.flatness_mm,
-    }
-    present = {figure.property for figure in figures}
-    judgements = tuple(
-        judge_property(name, figures, limit) for name, limit in allowed.items() if name in present
+    judgements = list[JudgedProperty]()
+    for name, key in LIMITS.items():
+        limit_mm = getattr(artefact.limits, key)
+        if mine := [figure for figure in figures if figure.property == name]:
+            worst = max(mine, key=lambda figure: abs(figure.error_mm) + figure.U_mm)
+            decision = None if limit_mm is None else decide(mine, limit_mm)
+            judgements.append(JudgedProperty(name, worst, limit_mm, decision))
+    decisions = {each.decision for each in judgements if each.decision is not None}
+    return AcceptanceTest(
+        artefact=CertifiedArtefact(artefact.name, artefact.certificate, artefact.kind),
+        model=model,
+        positions=list(positions),
+        judgements=judgements,
+        scale=_estimate_scale(artefact, positions),
+        decision=worst_decision(decisions) if decisions else None,
+        lacks=list(_list_gaps(artefact, positions)),
     )
-    return Acceptance(
-        artefact, model, tuple(positions), judgements, _estimate_scale(artefact, positions)
-    )
+
+
+def _list_gaps(artefact: Artefact, positions: Sequence[PositionErrors]) -> Iterator[str]:
+    """Yield what the positions do not test."""
+    needed = POSITIONS[artefact.kind]
+    if len(positions) < needed:
+        yield f"{len(positions)} of {needed} positions were measured"
+    shares = [position.incidence for position in positions if position.incidence]
+    for part in ("R1", "R3") if shares else ():
+        if not any(share[part] >= OUTSIDE for share in shares):
+            yield f"no position lies in {part}: what is measured there is untested"
 
 
 def _estimate_scale(artefact: Artefact, positions: Sequence[PositionErrors]) -> ScaleError | None:
@@ -393,4 +351,39 @@ def _estimate_scale(artefact: Artefact, positions: Sequence[PositionErrors]) -> 
     u_mean = float(errors.std(ddof=1) * per_deviation) if n > 1 else positions[0].noise_mm
     return ScaleError(
         1e6 * float(errors.mean()) / mm, 1e6 * float(np.hypot(u_mean, u_shared)) / mm, mm, n
+    )
+
+
+def repeatability(measured: Iterable[tuple[np.ndarray, np.ndarray]]) -> StillCaptures:
+    """Repeatability of captures given as (z, sigma_z), each (h, w) mm, NaN where invalid.
+
+    Raises InputError for fewer than three captures, captures of different size, and for no pixel
+    that all measured.
+    """
+    pairs = [(np.asarray(z, np.float32), np.asarray(sigma, np.float32)) for z, sigma in measured]
+    count, shapes = len(pairs), {z.shape for z, _ in pairs}
+    if len(shapes) > 1:
+        raise InputError(
+            f"captures of {' and '.join(map(str, shapes))} pixels do not repeat each other"
+        )
+    if count < LEAST_CAPTURES:
+        raise InputError(
+            f"{count} captures show no repeatability: take {CAPTURES} of the same still object"
+        )
+    depths, noise = (np.stack(maps) for maps in zip(*pairs, strict=True))
+    depths -= depths[0].copy()  # small, so that squares keep their digits
+    sigma = depths.std(axis=0, ddof=1)
+    always = np.isfinite(sigma)
+    if not always.any():
+        raise InputError(
+            "no pixel was measured in every capture: leave the object where it is, and in view"
+        )
+    levels = depths[:, always].mean(axis=1, dtype=np.float64)
+    return StillCaptures(
+        count,
+        int(np.count_nonzero(always)),
+        float(np.median(sigma[always])),
+        float(np.percentile(sigma[always], 95)),
+        float(np.nanmedian(np.sqrt((noise[:, always] ** 2).mean(axis=0)))),
+        float(np.ptp(levels)),
     )

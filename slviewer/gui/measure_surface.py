@@ -11,7 +11,7 @@ from slviewer.gui.scene import Click
 from slviewer.gui.steps.scan import sort_scans
 from slviewer.gui.widgets import Html, Text, colour_bar, paint
 from slviewer.inspection.deviation import EXCLUDED_COLOUR, colour_limit, deviation_colours
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, Place
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, Place
 from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.measurement import Measurement
 from slviewer.wizard.snapshot import SessionView

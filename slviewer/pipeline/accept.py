@@ -1,48 +1,86 @@
-"""The acceptance test: artefacts with certificates against the session's calibration."""
+"""Tests of a calibration: with artefacts that have certificates; with a later capture of its board,
+for drift; and of each model on target poses that it was not made from.
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+A pose that is held out is measured from its smoothed phase, so that what remains is the
+calibration's error and hardly any camera noise. The board itself is the standard: how flat it comes
+out, how long, and how near its features lie to where they are on it when it is laid over them
+without stretching.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
+from scipy.ndimage import map_coordinates
 
-from slviewer.errors import InputError
+from slviewer.calibration.centres import move_to_centres
+from slviewer.calibration.drift.check import DriftReference, build_reference, check_drift
+from slviewer.calibration.drift.view import DriftView
+from slviewer.calibration.observe import Observation, observe
+from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
+from slviewer.calibration.splined.model import calibrate_splined
+from slviewer.calibration.stereo import StereoModel, calibrate_stereo
+from slviewer.errors import CalibrationRejected, InputError, UsageError
 from slviewer.evaluation.acceptance import (
     SIZE,
     SPACING,
-    Acceptance,
     Artefact,
     conclude_test,
     measure_artefact,
+    repeatability,
 )
-from slviewer.evaluation.repeatability import repeatability
-from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.check import load_drift_history
+from slviewer.fringe.phase import PhaseMap, Reason
+from slviewer.fringe.sequence import Axis
+from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import fit_rigid, move_points
+from slviewer.geometry.shapes import fit_plane
+from slviewer.geometry.vectors import finite_rows, rms, rms_length
+from slviewer.pipeline.calibrate import CalibrateSettings
+from slviewer.pipeline.capture_phases import capture_texture, check_capture, decode_capture
+from slviewer.pipeline.feedback import Progress, part, stage
 from slviewer.pipeline.models import (
+    MODELS,
     Model,
     ModelName,
+    available_models,
     check_accepted,
     load_model,
     load_stereo,
+    preferred_model,
+    warn_if_frame_changed,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import match_names
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.reconstruct import segment_board
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.reconstruct import check_capture_sizes, reconstruct_captures, segment_board
 from slviewer.pipeline.scale import record_scale, scale_factor
-from slviewer.pipeline.stored_records import next_name
-from slviewer.records.acceptance import (
-    AcceptanceTest,
-    CertifiedArtefact,
-    Contribution,
-    ErrorBudget,
-    PositionErrors,
-    StillCaptures,
-)
+from slviewer.pipeline.stored_records import list_records, load_record, match_names
+from slviewer.reconstruction.axis_agreement import check_sizes
+from slviewer.records.acceptance import AcceptanceTest, Contribution, ErrorBudget, PositionErrors
+from slviewer.records.calibration import ModelCalibration
 from slviewer.records.drift import Drift
+from slviewer.records.model_comparison import HeldOutError, HeldOutPose, ModelComparison
 from slviewer.session.reading import read_toml
+from slviewer.session.store import Session
+from slviewer.target.board import Board
+from slviewer.target.detect import detect
+
+REFERENCE = "drift_reference"
+Fit = Callable[[Sequence[Observation], StereoModel, Callable[[float], None]], Model]
+FITS: dict[str, Fit] = {
+    "stereo": lambda observations, stereo, progress: stereo,
+    "pixelwise": calibrate_pixelwise,
+    "splined": calibrate_splined,
+}
+"""How each model is made from the poses that stereo was made from."""
+FOLDS = 5
+LEAST_POSES = 5
+"""Fewer poses cannot spare any: a pixel-wise fit takes four."""
+LEAST_FEATURES = 12
+BETTER = 0.98
+"""A model must bring the error down to this share of a simpler one's to be recommended instead."""
 
 
 @dataclass(frozen=True)
@@ -85,62 +123,45 @@ def accept(job: Job, settings: AcceptSettings) -> Iterator[Found[AcceptanceTest]
         matches = match_names(store.capture_names(), [pattern], "capture", InputError)
         captures |= {each: position if len(matches) == 1 else each for each in matches}
     check_capture_sizes(store, [*captures, *still])
-    positions = _measure_positions(job, certified, chosen, captures, 0.5 if still else 0.9)
-    test = conclude_test(certified, name, positions)
+    measuring = replace(job, progress=part(job.progress, 0.0, 0.5 if still else 0.9))
+    test = conclude_test(
+        certified, name, _measure_positions(measuring, certified, chosen, captures)
+    )
     repeated = None
     if still:
-        repeated = repeatability(_list_depths(job, chosen, still))
+        again = replace(job, progress=part(job.progress, 0.5, 0.95))
+        repeats = reconstruct_captures(again, chosen, still, "repeating", examine=False)
+        repeated = repeatability((cloud.points[..., 2], cloud.sigma_z) for *_, cloud in repeats)
     applied = record_scale(store, test) if settings.apply_scale else None
-    found = AcceptanceTest(
-        artefact=CertifiedArtefact(certified.name, certified.certificate, certified.kind),
-        model=name,
-        positions=list(test.positions),
-        judgements=list(test.judgements),
-        scale=test.scale,
-        decision=test.decision,
-        lacks=list(test.lacks),
+    found = msgspec.structs.replace(
+        test,
         scale_factor=factor,
         scale_applied=applied,
-        budget=_length_budget(test, applied, load_drift_history(store)),
-        repeatability=None if repeated is None else StillCaptures(**repeated.to_json()),
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        budget=_length_budget(certified, test, applied, load_drift_history(store)),
+        repeatability=repeated,
         inputs=store.input_hashes(f"calibration/{name}", *captures, *still),
     )
-    yield Found(next_name(store, AcceptanceTest), found)
+    yield Found("", found)
     job.progress(1.0, "tested")
 
 
 def _measure_positions(
-    job: Job, certified: Artefact, chosen: Model, captures: Mapping[str, str], end: float
+    job: Job, certified: Artefact, chosen: Model, captures: Mapping[str, str]
 ) -> list[PositionErrors]:
-    """Measure the artefact at each position, {capture: position}; ``end``: share of the work that
-    is done then."""
-    store, positions = job.store, list[PositionErrors]()
-    depth_range = load_stereo(store).depth_range_mm
-    for i, (shot, frames, phases) in enumerate(decode_captures(store, list(captures), job.warn)):
-        job.progress(end * i / len(captures), f"measuring {shot.name}")
-        cloud, plate = capture_cloud(store, chosen, shot, phases, warn=job.warn), None
+    """Measure the artefact at each position, {capture: position}."""
+    positions = list[PositionErrors]()
+    depth_range = load_stereo(job.store).depth_range_mm
+    for shot, frames, cloud in reconstruct_captures(job, chosen, list(captures), "measuring"):
+        plate, name = None, shot.name
         if certified.kind == "plane" and shot.role == "calibration":
-            plate = segment_board(store, shot, capture_texture(shot, frames), job.warn)
+            plate = segment_board(job.store, shot, capture_texture(shot, frames), job.warn)
         try:
             positions.append(
-                measure_artefact(
-                    certified, cloud, captures[shot.name], shot.name, depth_range, plate
-                )
+                measure_artefact(certified, cloud, captures[name], name, depth_range, plate)
             )
         except InputError as error:
-            raise InputError(f"{shot.name}: {error}") from error
+            raise InputError(f"{name}: {error}") from error
     return positions
-
-
-def _list_depths(
-    job: Job, chosen: Model, still: Sequence[str]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield depth and its standard deviation (h, w) mm of each capture of the still object."""
-    for i, (shot, _, phases) in enumerate(decode_captures(job.store, list(still))):
-        job.progress(0.5 + 0.45 * i / len(still), f"repeating {shot.name}")
-        cloud = capture_cloud(job.store, chosen, shot, phases, warn=job.warn)
-        yield cloud.points[..., 2], cloud.sigma_z
 
 
 def read_artefact(path: Path | str) -> Artefact:
@@ -153,14 +174,14 @@ def read_artefact(path: Path | str) -> Artefact:
 
 
 def _length_budget(
-    test: Acceptance, applied: float | None, checks: Sequence[Drift]
+    artefact: Artefact, test: AcceptanceTest, applied: float | None, checks: Sequence[Drift]
 ) -> ErrorBudget | None:
     """Error budget of the artefact's length from the test and the drift checks; None where no
     length was measured."""
     scale = test.scale
     if scale is None:
         return None
-    artefact, mm = test.artefact, scale.length_mm
+    mm = scale.length_mm
     name = SIZE if artefact.spacing is None else SPACING
     errors = np.array([f.error_mm for p in test.positions for f in p.figures if f.property == name])
     noise = float(np.sqrt(np.mean([p.noise_mm**2 for p in test.positions])))
@@ -168,7 +189,7 @@ def _length_budget(
     # known, not removed
     uncorrected_ppm = abs(scale.ppm) if applied is None and abs(scale.ppm) > scale.U_ppm else 0.0
     board = mm * 1e-6 * float(np.hypot(scale.u_ppm, uncorrected_ppm))
-    warmth = mm * 1e-6 * artefact.expansion.value * artefact.temperature.U / 2
+    warmth = mm * 1e-6 * artefact.calibrated.expansion_ppm_K * artefact.measured.temperature_U_K / 2
     drift, since = None, "no drift check of this calibration: run `slviewer check`"
     if checks:
         last = checks[-1]
@@ -191,8 +212,314 @@ def _length_budget(
                 "temperature",
                 warmth,
                 "B",
-                f"{artefact.expansion.value:g} ppm/K of the artefact",
+                f"{artefact.calibrated.expansion_ppm_K:g} ppm/K of the artefact",
             ),
             Contribution("drift", drift, "B", since),
         ],
     )
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """What a calibration is checked with.
+
+    Args:
+        capture: Name of a capture, of any role, that shows the calibration's board.
+    """
+
+    capture: str
+
+
+@operation("check", Drift, CheckSettings)
+def check(job: Job, settings: CheckSettings) -> Iterator[Found[Drift]]:
+    """Determine from one capture of the board whether the saved calibration is still good, and why
+    if it is not.
+
+    The session stores the answer as ``drift/1``, ``drift/2``, ... Raises DetectionError where the
+    capture does not show the board, InputError where the calibration has too few poses for a
+    decision, or was made elsewhere.
+    """
+    store, capture = job.store, settings.capture
+    stereo = load_stereo(store)
+    if not stereo.poses:
+        raise InputError(
+            f"the calibration of {store.folder} was made elsewhere and has no poses: a drift check"
+            " needs them to know how well one board determines the projector's pose; run `slviewer"
+            " calibrate` first"
+        )
+    warn_if_stale(store, job.warn)
+    shot = store.load_capture(capture)
+    job.progress(0.0, f"reading {capture}")
+    frames = shot.stack()
+    phases = decode_capture(shot, frames)
+    check_capture(capture, shot.sequence, frames, phases, files=shot.files)
+    check_sizes(capture, shot.size, shot.sequence.projector_size, stereo.rig)
+    board = Board.parse(stereo.board)
+    detection = detect(board, capture_texture(shot, frames))
+    calibrated = CalibrateSettings(**load_record(store, ModelCalibration, "stereo").settings)
+    observation = observe(capture, board, detection, phases, calibrated.step_2)
+    job.progress(0.3, "fitting the calibration's own poses")
+    drift = check_drift(
+        _drift_reference(store, stereo, capture), DriftView.from_observation(observation)
+    )
+    before = load_drift_history(store)
+    inputs = store.input_hashes(capture, "calibration/stereo")
+    notes = ["earlier checks of this calibration:"] if before else []
+    notes += [f"  {each.time[:16].replace('T', ' ')}  {each.summary()}" for each in before]
+    yield Found("", msgspec.structs.replace(drift, inputs=inputs), notes=tuple(notes))
+    job.progress(1.0, "checked")
+
+
+def _drift_reference(store: Session, stereo: StereoModel, capture: str) -> DriftReference:
+    """Load or build the drift reference from the calibration's poses except the capture; stored, as
+    it is slow."""
+    if capture not in stereo.poses:
+        saved = store.decode_fresh(
+            REFERENCE, lambda _, arrays: DriftReference.from_arrays(stereo.rig, arrays)
+        )
+        if saved is not None:
+            return saved
+    poses = [name for name in stereo.poses if name != capture]
+    reference = build_reference(
+        stereo.rig, [DriftView.from_observation(o) for o in load_observations(store, poses)]
+    )
+    if capture not in stereo.poses and store.is_writable:
+        meta = {"inputs": store.input_hashes("calibration/stereo", *poses)}
+        store.save_result(REFERENCE, meta, reference.to_arrays())
+    return reference
+
+
+def load_drift_history(store: Session) -> list[Drift]:
+    """Load the drift checks of the session's present calibration, the oldest first."""
+    now = store.input_hashes("calibration/stereo")["calibration/stereo"]
+    checks = [each.record for each in list_records(store, Drift)]
+    return [each for each in checks if each.inputs.get("calibration/stereo") == now]
+
+
+def split_folds(depths_mm: Mapping[str, float], folds: int = FOLDS) -> tuple[tuple[str, ...], ...]:
+    """Deal the poses into folds in the order of their depths, so that each fold holds near and far
+    ones.
+
+    Raises InputError for fewer than ``LEAST_POSES`` poses.
+    """
+    if len(depths_mm) < LEAST_POSES:
+        raise InputError(
+            f"{len(depths_mm)} target poses, and none can be spared of fewer than {LEAST_POSES}:"
+            " capture more poses to compare the models on poses that they were not made from"
+        )
+    if folds < 2:
+        raise InputError(f"{folds} folds leave no pose out of any calibration: use 2 or more")
+    ordered = sorted(depths_mm, key=lambda name: depths_mm[name])
+    count = min(folds, len(ordered))
+    return tuple(tuple(ordered[k::count]) for k in range(count))
+
+
+def map_board_phase(observation: Observation, axis: Axis) -> PhaseMap:
+    """Return the phase map over the board alone, from the stored smoothed phase of a pose."""
+    width, height = observation.size
+    u0, v0, u1, v1 = observation.box
+    phase = np.full((height, width), np.nan, np.float32)
+    phase[v0:v1, u0:u1] = observation.smoothed_phase(axis)
+    illuminated = np.isfinite(phase).astype(np.float32)
+    return PhaseMap(
+        axis,
+        observation.periods_px[axis],
+        phase,
+        np.full_like(phase, np.nan),
+        illuminated,
+        illuminated,
+        np.where(illuminated > 0, Reason.VALID, Reason.DARK).astype(np.uint8),
+        (1.0, 0.0),
+        18,
+    )
+
+
+def measure_held_out(
+    models: Mapping[str, Model], observation: Observation, axis: Axis, rig: StereoRig
+) -> dict[str, HeldOutPose]:
+    """Measure the errors of each model on a pose, all from the same axis and over the pixels and
+    features that all of them measure; empty where these are too few, or the pose lacks the axis.
+    ``rig`` converts millimetres to pixels.
+    """
+    if axis not in observation.surfaces:
+        return {}
+    phase = map_board_phase(observation, axis)
+    clouds = {name: np.asarray(model.points(phase)) for name, model in models.items()}
+    common = np.logical_and.reduce([np.isfinite(points[..., 2]) for points in clouds.values()])
+    features = {
+        name: _interpolate(np.where(common[..., None], points, np.nan), observation.camera)
+        for name, points in clouds.items()
+    }
+    read = finite_rows(*features.values())
+    if np.count_nonzero(read) < LEAST_FEATURES:
+        return {}
+    board = observation.points[read]
+    results = {}
+    for name, points in clouds.items():
+        measured, X = points[common].astype(float), features[name][read]
+        placed, middle = move_points(fit_rigid(board, X), board), X.mean(0)
+        scale = np.sum((placed - middle) * (X - middle)) / np.sum((placed - middle) ** 2)
+        results[name] = HeldOutPose(
+            plane_mm=rms(fit_plane(measured).distance(measured)),
+            board_mm=rms_length(X - placed),
+            scale_ppm=1e6 * (float(scale) - 1),
+            camera_px=rms_length(rig.camera.project(X) - rig.camera.project(placed)),
+            projector_px=rms_length(rig.project(X) - rig.project(placed)),
+            pixels=len(measured),
+            depth_mm=float(X[:, 2].mean()),
+        )
+    return results
+
+
+def gather_results(
+    poses: Mapping[str, Mapping[str, HeldOutPose]],
+    folds: tuple[tuple[str, ...], ...],
+    failed: Mapping[str, str],
+) -> ModelComparison:
+    """Combine the results of the folds, {model: {pose: ...}}, in the order of simplicity; models
+    that failed are not among them.
+
+    Raises InputError where no model could be judged.
+    """
+    judged = {
+        model: dict(measured)
+        for model, measured in poses.items()
+        if measured and model not in failed
+    }
+    if not judged:
+        why = "; ".join(f"{model}: {reason}" for model, reason in failed.items())
+        raise InputError(
+            f"no model could be made without some of the poses ({why}): capture more poses"
+        )
+    models = {
+        model: HeldOutError(
+            *(
+                rms([getattr(each, name) for each in measured.values()])
+                for name in HeldOutError.__struct_fields__
+            )
+        )
+        for model, measured in judged.items()
+    }
+    return ModelComparison(
+        recommended=_recommend(models),
+        models=models,
+        poses=judged,
+        folds=folds,
+        failed=dict(failed),
+    )
+
+
+def _recommend(models: Mapping[str, HeldOutError]) -> str:
+    """Return the model with the least error on boards, of nearly equal ones the simplest, which
+    comes first."""
+    chosen, *others = models
+    for model in others:
+        if models[model].board_mm < BETTER * models[chosen].board_mm:
+            chosen = model
+    return chosen
+
+
+def _interpolate(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(n, 3): an organised cloud (h, w, 3) at pixels (n, 2), linear between its own; NaN beside
+    invalid ones."""
+    v_u = pixels[:, ::-1].T
+    maps = (
+        map_coordinates(points[..., k].astype(float), v_u, order=1, cval=np.nan) for k in range(3)
+    )
+    return np.stack(list(maps), axis=1)
+
+
+@dataclass(frozen=True)
+class ValidateSettings:
+    """How models are compared.
+
+    Args:
+        models: Which models to compare; by default all there are. The recommended one is used where
+            none is named.
+        folds: Into how many parts the poses are split, each excluded once.
+    """
+
+    models: Sequence[ModelName] = ()
+    folds: int = FOLDS
+
+
+@operation("validate", ModelComparison, ValidateSettings)
+def validate(job: Job, settings: ValidateSettings) -> Iterator[Found[ModelComparison]]:
+    """Measure target poses with calibrations made without them, and recommend the best model.
+
+    Nothing is decoded again: the session stores what it needs of the poses. The result stays in the
+    session as ``validation/1``.
+    """
+    store = job.store
+    stereo = load_stereo(store)
+    if not stereo.poses:
+        raise InputError(
+            "this calibration was made elsewhere, without target poses: calibrate here to"
+            " cross-validate"
+        )
+    names = [name for name in MODELS if name in (settings.models or available_models(store))]
+    if not names:
+        raise UsageError(
+            f"no model is called {', '.join(settings.models)}: use {', '.join(MODELS)}"
+        )
+    warn_if_stale(store, job.warn)
+    observations = load_observations(store, list(stereo.poses))
+    if missing := sorted(set(stereo.poses) - {o.name for o in observations}):
+        raise InputError(
+            f"the session no longer holds the observations of {', '.join(missing)}: run `slviewer"
+            " calibrate` again"
+        )
+    compared = cross_validate(
+        move_to_centres(observations, stereo), stereo, names, settings.folds, job.progress
+    )
+    for model, why in compared.failed.items():
+        job.warn(f"{model} is not judged: {why}")
+    judged = [f"calibration/{name}" for name in compared.models if name in available_models(store)]
+    inputs = store.input_hashes(*stereo.poses, *dict.fromkeys(["calibration/stereo", *judged]))
+    before = preferred_model(store)
+    yield Found("1", msgspec.structs.replace(compared, inputs=inputs))
+    warn_if_frame_changed(store, before, job.warn)
+    job.progress(1.0, "validated")
+
+
+def cross_validate(
+    observations: Sequence[Observation],
+    stereo: StereoModel,
+    models: Sequence[str],
+    folds: int,
+    progress: Progress,
+) -> ModelComparison:
+    """Cross-validate models on observations, with circles at their centres, and their stereo
+    calibration."""
+    depths = {
+        o.name: float(np.median(move_points(stereo.poses[o.name], o.points)[:, 2]))
+        for o in observations
+    }
+    parts, steps = split_folds(depths, folds), len(models) + 1
+    axis = best_axis(observations, stereo)
+    failed: dict[str, str] = {}
+    measured: dict[str, dict[str, HeldOutPose]] = {model: {} for model in models}
+    for k, fold in enumerate(parts):
+        report = part(progress, k / len(parts), (k + 1) / len(parts))
+        training = [o for o in observations if o.name not in fold]
+        try:
+            without = calibrate_stereo(training, stereo.rig.projector.size, stereo.board)
+        except CalibrationRejected as error:
+            raise InputError(
+                f"without {', '.join(fold)} the rig cannot be calibrated, and no poses can be "
+                f"excluded from the fit ({error}): capture more poses"
+            ) from error
+        fitted: dict[str, Model] = {}
+        for i, name in enumerate(n for n in models if n not in failed):
+            doing = f"{name} without fold {k + 1} of {len(parts)}"
+            fitting = stage(report, i / steps, (i + 1) / steps, doing)
+            try:
+                fitted[name] = FITS[name](training, without, fitting)
+            except (CalibrationRejected, InputError) as error:
+                failed[name] = str(error)
+        report(len(models) / steps, f"measuring fold {k + 1} of {len(parts)}")
+        for held_out in (o for o in observations if o.name in fold):
+            errors = measure_held_out(fitted, held_out, axis, stereo.rig)
+            for name, held in errors.items():
+                measured[name][held_out.name] = held
+    return gather_results(measured, parts, failed)

@@ -235,36 +235,51 @@ def list_captures(address: str, task: Task) -> list[str]:
     _check_version(task)
     patterns = task.settings.captures
     with _fetch_session(address) as folder, Session.open(folder) as store:
-        if not patterns:
-            if not (names := store.capture_names("scan")):
-                raise InputError("it holds no scan: name the captures, such as 'pose_*'")
-            return names
-        there = store.capture_names()
-        names = [name for name in there if any(fnmatchcase(name, pattern) for pattern in patterns)]
-        if not names:
-            raise InputError(
-                f"no capture is called {' or '.join(patterns)}: there are"
-                f" {', '.join(there) or 'none'}"
-            )
-        return names
+        there = store.capture_names(None if patterns else "scan")
+    names = [name for name in there if any(fnmatchcase(name, each) for each in patterns or "*")]
+    if not names:
+        raise InputError(
+            f"no capture is called {' or '.join(patterns)}: there are {', '.join(there) or 'none'}"
+            if patterns
+            else "it holds no scan: name the captures, such as 'pose_*'"
+        )
+    return names
 
 
 def run_task(address: str, capture: str, task: Task) -> TaskResult:
     """Do the task with one capture; its files are in the session's exports when this returns."""
-    warnings, verification = list[str](), None
+    warnings, verification, settings = list[str](), None, task.settings
+    model, accepts = settings.model, settings.accept_rejected
+    figures: dict[str, Any]
     started = time.perf_counter()
     try:
         _check_version(task)
         with _fetch_session(address, capture) as folder, _TASK_LOCK, Session.open(folder) as store:
-            job = Job(store, warn=warnings.append)
-            if task.settings.do == "verify":
-                verification = _verify(job, capture, task.settings)
-                figures: dict[str, Any] = {
-                    f"{model} RMS mm": fit.rms_mm for model, fit in verification.models.items()
+            if settings.shape is not None:
+                measuring = VerifySettings(
+                    (capture,),
+                    settings.shape,
+                    models=(model,) if model else (),
+                    radius=settings.radius,
+                    accept_rejected=accepts,
+                )
+                verification = verify.run(store, measuring, warn=warnings.append)[capture]
+                figures = {
+                    f"{name} RMS mm": fit.rms_mm for name, fit in verification.models.items()
                 }
             else:
+                job, is_mesh = Job(store, warn=warnings.append), settings.do == "mesh"
                 with export_folder(address, task.batch) as made:
-                    figures = _reconstruct(job, capture, task.settings, made)
+                    out = made / "cloud.ply"
+                    reconstructing = ReconstructSettings(
+                        capture, model=model, out=out, mesh=is_mesh, accept_rejected=accepts
+                    )
+                    with reconstruct_capture(job, reconstructing) as result:
+                        cloud = result.cloud
+                    name = f"{capture}_{cloud.model}{'_mesh' if is_mesh else ''}.ply"
+                    out.rename(made / name)
+                noise = float(np.median(cloud.sigma_z[cloud.mask]))
+                figures = {"points": result.points, "noise mm": noise, "file": name}
     except Exception as error:  # any error ends this capture alone
         return TaskResult(address, capture, warnings=tuple(warnings), failed=describe_error(error))
     figures["s"] = round(time.perf_counter() - started, 1)
@@ -291,37 +306,6 @@ def _check_version(task: Task) -> None:
             f"the worker runs slviewer {__version__}, the batch {task.version}: install the same on"
             " both"
         )
-
-
-def _reconstruct(job: Job, capture: str, settings: BatchSettings, made: Path) -> dict[str, Any]:
-    """Reconstruct a capture to a cloud or mesh in the folder ``made``, and return its figures."""
-    is_mesh = settings.do == "mesh"
-    how = ReconstructSettings(
-        capture,
-        model=settings.model,
-        out=made / "cloud.ply",
-        mesh=is_mesh,
-        accept_rejected=settings.accept_rejected,
-    )
-    with reconstruct_capture(job, how) as result:
-        cloud = result.cloud
-    name = f"{capture}_{cloud.model}{'_mesh' if is_mesh else ''}.ply"
-    result.found.files[0].rename(made / name)
-    sigma = float(np.median(cloud.sigma_z[cloud.mask]))
-    return {"points": result.points, "noise mm": sigma, "file": name}
-
-
-def _verify(job: Job, capture: str, settings: BatchSettings) -> Verification:
-    """Verify one capture of a plane or a sphere."""
-    assert settings.shape is not None
-    how = VerifySettings(
-        (capture,),
-        settings.shape,
-        models=(settings.model,) if settings.model else (),
-        radius=settings.radius,
-        accept_rejected=settings.accept_rejected,
-    )
-    return verify.run(job.store, how, warn=job.warn)[capture]
 
 
 @contextmanager

@@ -3,21 +3,25 @@
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from slviewer import __version__
+from slviewer.calibration.camera import CameraCalibration, calibrate_camera
 from slviewer.calibration.diagnosis.diagnose import DiagnosedCalibration, calibrate_with_diagnosis
 from slviewer.calibration.diagnosis.evidence import Evidence
 from slviewer.calibration.diagnosis.rules import judge_evidence, judge_splined
-from slviewer.calibration.observe import Observation, Smoothing
+from slviewer.calibration.observe import Smoothing
 from slviewer.calibration.pixelwise import PixelwiseModel, calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.stereo import StereoModel
-from slviewer.errors import CalibrationRejected, InputError, SessionError
+from slviewer.errors import CalibrationRejected, DetectionError, InputError, SessionError
+from slviewer.fringe.decode import texture
 from slviewer.fringe.layout import axis_layout
 from slviewer.fringe.sequence import PatternSequence
-from slviewer.pipeline.capture_phases import decode_or_explain, texture_8bit
+from slviewer.pipeline.capture_phases import capture_texture, convert_to_8bit, decode_or_explain
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part, stage
 from slviewer.pipeline.models import (
     MODELS,
@@ -32,15 +36,20 @@ from slviewer.pipeline.models import (
     trash_models,
     warn_if_frame_changed,
 )
-from slviewer.pipeline.open_session import SessionLike, match_names, opened_or_made
 from slviewer.pipeline.operation import Found, Job, operation
 from slviewer.pipeline.poses import DecodedPose, Judged, read_pose, read_stored_poses
-from slviewer.pipeline.stored_records import load_record
+from slviewer.pipeline.stored_records import SessionLike, load_record, match_names, opened_or_made
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Verdict
+from slviewer.session.capture import Capture
+from slviewer.session.exporters import write_calibration
+from slviewer.session.importers.images import read_image
+from slviewer.session.importers.imported import images_by_name
+from slviewer.session.layout import is_session
 from slviewer.session.store import Session
 from slviewer.target.board import Board
+from slviewer.target.detect import Detection, detect
 
 SmoothingKind = Literal["spline", "polynomial"]
 
@@ -140,7 +149,6 @@ def calibrate(job: Job, settings: CalibrateSettings) -> Iterator[Found[ModelCali
     )
     if diagnosed.stereo is None:
         save_verdict(store, diagnosed.verdict, names)
-        raise rejection_error(diagnosed.verdict, is_saved=False)
     result = _fit_models(diagnosed, settings, part(job.progress, 0.66, 0.97), job.warn, excluded)
     job.progress(0.97, "saving")
     inputs = store.input_hashes(*result.stereo.poses)
@@ -193,7 +201,7 @@ def calibrate_frames(
                 sequence,
                 frames,
                 decode_or_explain(name, sequence, frames),
-                texture_8bit(sequence, frames),
+                convert_to_8bit(texture(sequence, frames)),
                 board,
             ),
             settings.step_2,
@@ -201,8 +209,6 @@ def calibrate_frames(
         for name, frames in poses.items()
     )
     diagnosed = _diagnose_poses(judged, len(poses), sequence, board, {}, part(progress, 0, 0.65))
-    if diagnosed.stereo is None:
-        raise rejection_error(diagnosed.verdict, is_saved=False)
     result = _fit_models(diagnosed, settings, part(progress, 0.66, 1.0), warn)
     if result.is_rejected:
         raise rejection_error(result.verdict, is_saved=False)
@@ -239,8 +245,8 @@ def _choose_poses(
     }
     if settings.poses:
         chosen = match_names(names, settings.poses, "target pose")
-        others = [name for name in names if name not in chosen]
-        excluded |= dict.fromkeys(others, "not among the poses that were named")
+        why = "not among the poses that were named"
+        excluded |= {name: why for name in names if name not in chosen}
     skipped = match_names(names, settings.exclude, "target pose")
     excluded |= dict.fromkeys(skipped, "excluded for this calibration")
     names = [name for name in names if name not in excluded]
@@ -272,36 +278,28 @@ def _diagnose_poses(
 ) -> DiagnosedCalibration:
     """Calibrate stereo from ``count`` target poses as they are read, and judge it. ``excluded``:
     {pose: why}."""
-    if contradiction := _describe_period_conflict(sequence):
-        evidence = Evidence(str(board), sequence.projector, (), contradiction=contradiction)
+    try:
+        for axis in sequence.axes:
+            if sequence.periods_px(axis) and sequence.find("gray", axis):
+                axis_layout(sequence, axis)
+    except InputError as error:  # its periods and its Gray code conflict
+        evidence = Evidence(str(board), sequence.projector, (), contradiction=str(error))
         return DiagnosedCalibration(judge_evidence(evidence), evidence, None, (), dict(excluded))
-    observations, evidence_of_poses, refused = list[Observation](), [], dict(excluded)
-    for i, pose in enumerate(poses, 1):
-        progress(i / count, f"read {pose.name}")
-        if pose.observation is None:
-            refused[pose.name] = pose.refused
-        else:
-            observations.append(pose.observation)
-        if pose.evidence is not None:
-            evidence_of_poses.append(pose.evidence)
+    judged = list[Judged]()
+    for pose in poses:
+        judged.append(pose)
+        progress(len(judged) / count, f"read {pose.name}")
+    refused = {pose.name: pose.refused for pose in judged if pose.observation is None}
     result = calibrate_with_diagnosis(
-        observations, evidence_of_poses, sequence.projector, board, refused
+        [pose.observation for pose in judged if pose.observation is not None],
+        [pose.evidence for pose in judged if pose.evidence is not None],
+        sequence.projector,
+        board,
+        {**excluded, **refused},
     )
     if result.stereo is None:
         return result
     return replace(result, stereo=replace(result.stereo, excluded=result.excluded))
-
-
-def _describe_period_conflict(sequence: PatternSequence) -> str:
-    """Describe why the fringe periods and the Gray code of a sequence conflict; empty where they do
-    not."""
-    for axis in sequence.axes:
-        if sequence.periods_px(axis) and sequence.find("gray", axis):
-            try:
-                axis_layout(sequence, axis)
-            except InputError as error:
-                return str(error)
-    return ""
 
 
 def _fit_models(
@@ -316,9 +314,11 @@ def _fit_models(
     other.
 
     Warns of poses that were excluded, but for those ``excluded`` before, and of what is doubtful.
+    Raises CalibrationRejected without a stereo calibration.
     """
     stereo, observations, verdict = diagnosed.stereo, diagnosed.observations, diagnosed.verdict
-    assert stereo is not None
+    if stereo is None:
+        raise rejection_error(verdict, is_saved=False)
     if verdict.level == "rejected":
         return CalibrationResult(stereo, verdict=verdict)
     if diagnosed.warning:
@@ -389,3 +389,89 @@ def rejection_error(verdict: Verdict, is_saved: bool) -> CalibrationRejected:
     others = f" (and {more} more finding{'s' * (more != 1)})" if more else ""
     saved_note = "; the calibration is saved for inspection, and not used" if is_saved else ""
     return CalibrationRejected(f"{first.text()}{others}{saved_note}")
+
+
+def calibrate_camera_alone(
+    source: Path | str,
+    target: str,
+    *,
+    poses: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+    out: Path | str | None = None,
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
+) -> CameraCalibration:
+    """Calibrate the camera from a folder of pictures, or from the target poses of a session; a
+    session stays as it is.
+
+    ``poses``, ``exclude``: names or patterns of pictures. ``out``: .yml, .xml or .json for OpenCV.
+    Pictures in which the board is not detected are excluded with the reason. Raises
+    CalibrationRejected for fewer than three.
+    """
+    board, source = Board.parse(target), Path(source)
+    there: list[Capture] | list[Path]
+    if is_session(source):
+        with Session.open(source) as store:
+            there = store.captures("calibration")
+    elif source.is_dir():
+        there = images_by_name(source)
+    else:
+        raise InputError(
+            f"{source} is not a folder: give a folder of pictures of the board, or a session"
+        )
+    pictures = {each.name: each for each in there}
+    without = match_names([*pictures], exclude, "picture")
+    chosen = match_names([*pictures], poses, "picture") if poses else [*pictures]
+    chosen = [name for name in chosen if name not in without]
+    detections, excluded = dict[str, Detection](), dict[str, str]()
+    size: tuple[int, int] | None = None
+    for i, name in enumerate(chosen):
+        progress(i / len(chosen), f"detecting the board in {name}")
+        image = _read_picture(pictures[name])
+        height, width = image.shape[:2]
+        if size is not None and size != (width, height):
+            raise InputError(
+                f"{name} is {width}x{height} px, others are {size[0]}x{size[1]}: use pictures of"
+                " one size"
+            )
+        size = width, height
+        try:
+            detections[name] = detect(board, image)
+        except DetectionError as error:
+            excluded[name] = str(error)
+            warn(f"{name} is excluded: {error}")
+    if size is None:
+        raise InputError(f"{source} holds no picture to calibrate from: name some")
+    calibration = calibrate_camera(board, detections, size, excluded)
+    if out is not None:
+        entries = {
+            "program": f"slviewer {__version__}",
+            "target": calibration.board,
+            "camera_size": np.array(calibration.lens.size),
+            "K_camera": calibration.lens.K,
+            "D_camera": calibration.lens.D,
+            "focal_sigma_px": np.array(calibration.focal_sigma_px),
+            "reprojection_rms_px_camera": calibration.rms_px,
+            "verdict": calibration.verdict.level,
+        }
+        write_calibration(Path(out), entries, _MEANINGS)
+    progress(1.0, "calibrated")
+    return calibration
+
+
+def _read_picture(source: Capture | Path) -> np.ndarray:
+    """Return the picture (h, w) or (h, w, 3) RGB of a capture or a file."""
+    if isinstance(source, Capture):
+        return capture_texture(source, source.frames)
+    image = read_image(source)
+    return np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
+
+
+_MEANINGS = {
+    "camera_size": (
+        "width and height of the image, px; pixel (0, 0) is the centre of the top left one"
+    ),
+    "K_camera": "intrinsics: fx 0 cx, 0 fy cy, 0 0 1, px",
+    "D_camera": "distortion: k1 k2 p1 p2 k3, as OpenCV orders them",
+    "focal_sigma_px": "standard deviations of fx and fy, px",
+}

@@ -24,12 +24,12 @@ from slviewer.fringe.presets import PRESETS
 from slviewer.fringe.sequence import Axis, PatternSequence
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.capture_phases import decode_frames
-from slviewer.pipeline.examination import save_examination
+from slviewer.pipeline.examination import load_or_save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
 from slviewer.pipeline.feedback import Warn, ignore_warnings, part
-from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.operation import Callbacks, takes_settings
 from slviewer.pipeline.rig_choice import Choice, RigLike, RigSetup, SetUp, load_rig, set_up
+from slviewer.pipeline.stored_records import opened_or_made
 from slviewer.pipeline.suggest_exposure import (
     BUDGET_S,
     MAX_SUGGESTED,
@@ -73,8 +73,11 @@ class RigSettings(Callbacks):
     set_up: SetUp = set_up
 
     def __post_init__(self) -> None:
-        if self.exposure_ms is not None and self.exposures_ms:
-            raise InputError("the exposure was given in several ways: give one, or several")
+        is_chosen = getattr(self, "auto_exposure", False)  # of a capture alone
+        if (self.exposure_ms is not None) + bool(self.exposures_ms) + is_chosen > 1:
+            raise InputError(
+                "the exposure was given in several ways: give one, several, or let it be chosen"
+            )
         _ = self.exposures
 
     @property
@@ -82,6 +85,13 @@ class RigSettings(Callbacks):
         """The exposures of each frame, ms, ascending; empty for the one that the camera is set
         to."""
         return check_exposures(self.exposures_ms) if self.exposures_ms else []
+
+    def camera_settings(self, choice: Choice) -> CameraSettings:
+        """Return the requested settings, else those of the choice. Raises InputError for impossible
+        ones."""
+        given = {"exposure_ms": self.exposure_ms, "gain": self.gain}
+        chosen = {n: choice.get(n) if value is None else value for n, value in given.items()}
+        return CameraSettings(**chosen)
 
 
 @dataclass(frozen=True)
@@ -117,13 +127,6 @@ class CaptureSettings(RigSettings):
     budget_s: float = BUDGET_S
     force: bool = False
     say: Callable[[str], None] = ignore_warnings
-
-    def __post_init__(self) -> None:
-        if (self.exposure_ms is not None) + bool(self.exposures_ms) + self.auto_exposure > 1:
-            raise InputError(
-                "the exposure was given in several ways: give one, several, or let it be chosen"
-            )
-        super().__post_init__()
 
 
 @takes_settings(CaptureSettings)
@@ -181,7 +184,7 @@ def capture(settings: CaptureSettings) -> Capture:
             force=settings.force,
         )
         try:
-            for message in save_examination(store, saved).warnings():
+            for message in load_or_save_examination(store, saved).warnings():
                 warn(f"{name}: {message}")
         except SlviewerError as error:  # it is saved, and can be looked at later
             warn(f"{name} is saved, and its frames could not be checked: {error}")
@@ -195,7 +198,7 @@ def set_up_rig(
 ) -> tuple[RigSetup, PatternSequence]:
     """Return the devices of a choice, not opened yet, and the sequence that they capture. What the
     settings or the choice state wrongly is refused before."""
-    _camera_settings(choice, settings)
+    settings.camera_settings(choice)
     patterns = settings.patterns or str(store.decision("patterns") or DEFAULT_PATTERNS)
     if choice.get("driver") != "replay":
         _check_patterns(patterns)
@@ -221,24 +224,13 @@ def warn_of_captured(name: str, captured: CapturedFrames | Capture, warn: Warn) 
 def set_camera(rig: Rig, choice: Choice, settings: RigSettings) -> None:
     """Set the open rig's camera to the requested values, else to those of its choice; warns of
     those refused or changed."""
-    wanted = applied = _camera_settings(choice, settings)
+    wanted = applied = settings.camera_settings(choice)
     with report_driver_faults(rig.camera):
         if wanted != CameraSettings():
             applied = rig.camera.apply(wanted)
         notes = (*list_notes(rig.camera), *list_changed_settings(rig.camera, wanted, applied))
     for note in notes:
         settings.warn(note)
-
-
-def _camera_settings(choice: Choice, settings: RigSettings) -> CameraSettings:
-    """Return the requested settings, else those of the choice. Raises InputError for impossible
-    ones."""
-    exposure_ms = (
-        choice.get("exposure_ms") if settings.exposure_ms is None else settings.exposure_ms
-    )
-    return CameraSettings(
-        exposure_ms, choice.get("gain") if settings.gain is None else settings.gain
-    )
 
 
 def _check_patterns(patterns: str) -> None:

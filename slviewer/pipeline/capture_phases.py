@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -18,14 +20,14 @@ from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.fringe.reference import dark_limit, dark_sigmas
 from slviewer.fringe.scatter import SIGNIFICANT, measure_scatter
 from slviewer.fringe.sequence import Axis, PatternSequence
-from slviewer.pipeline.examination import (
-    examine_frames,
-    load_examination,
-    load_or_save_examination,
-)
-from slviewer.pipeline.feedback import Warn, ignore_warnings
+from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination
+from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
+from slviewer.pipeline.stored_records import SessionLike, opened
 from slviewer.records.verdict import Examination
+from slviewer.report.maps import REASON_LABELS, phase_maps, reason_shares
+from slviewer.session.atomic import to_json
 from slviewer.session.capture import Capture
+from slviewer.session.exporters import write_exr
 from slviewer.session.store import Session
 
 T = TypeVar("T")
@@ -37,23 +39,17 @@ it."""
 MIN_DECODED = 0.05
 """Share of the illuminated pixels that must decode: of sound captures, also cluttered ones, half
 and more do."""
-_REASONS = {
-    Reason.SATURATED: ("are saturated", "lower the exposure or the gain, and capture again"),
+_FAULTS = {
+    Reason.SATURATED: "are saturated: lower the exposure or the gain, and capture again",
     Reason.INCONSISTENT: (
-        "contradict themselves or their neighbours",
-        (
-            "keep the scene and the light still, raise the exposure, and check the description of"
-            " the frames"
-        ),
+        "contradict themselves or their neighbours: keep the scene and the light still, raise the"
+        " exposure, and check the description of the frames"
     ),
     Reason.INDIRECT: (
-        "receive much light from other surfaces or through the material",
-        "use the patterns micro, and see docs/howto/difficult-surfaces.md",
+        "receive much light from other surfaces or through the material: use the patterns micro,"
+        " and see docs/howto/difficult-surfaces.md"
     ),
-    Reason.OUTSIDE: (
-        "lie outside the projector",
-        "check the size of the projector and the periods",
-    ),
+    Reason.OUTSIDE: "lie outside the projector: check the size of the projector and the periods",
 }
 """Why illuminated pixels do not decode, and what to do."""
 
@@ -147,16 +143,12 @@ def check_capture(
         if decoded and decoded >= MIN_DECODED * illuminated:
             continue
         if illuminated:
-            share = (
-                f"{decoded} of {illuminated} illuminated pixels ({100 * decoded / illuminated:.1f}"
-                " %) give a coordinate"
-            )
-            shares = [np.mean(phase.reason[phase.illuminated] == reason) for reason in _REASONS]
-            worst = int(np.argmax(shares))
-            symptom, cure = list(_REASONS.values())[worst]
+            reasons = phase.reason[phase.illuminated]
+            share, fault = max((np.mean(reasons == each), fault) for each, fault in _FAULTS.items())
             raise InputError(
-                f"{name}: {share} along {axis}; {100 * shares[worst]:.0f} % of them {symptom}:"
-                f" {cure}"
+                f"{name}: {decoded} of {illuminated} illuminated pixels"
+                f" ({100 * decoded / illuminated:.1f} %) give a coordinate along {axis};"
+                f" {100 * share:.0f} % of them {fault}"
             )
         if unexplained := estimate_frame_light(sequence, frames).unexplained:
             raise InputError(
@@ -192,23 +184,17 @@ def loss_warnings(
             float(np.median(m[phase.mask])) for m in (phase.modulation, phase.background)
         )
         white = white_level(sequence, frames, sequence.select(axis))
-        least = dark_limit(
-            np.array([background], np.float32),
-            phase.noise,
-            white,
-            dark_sigmas(axis_layout(sequence, axis)),
-        )
-        if modulation < NEAR_DARK * float(least[0]):
+        sigmas = dark_sigmas(axis_layout(sequence, axis))
+        (least,) = dark_limit(np.array([background], np.float32), phase.noise, white, sigmas)
+        if modulation < NEAR_DARK * least:
             if unexplained := estimate_frame_light(sequence, frames).unexplained:
                 cause = describe_disturbance(unexplained).text()
-                messages.append(
-                    f"{cause}; pixels of a modulation below {float(least[0]):.1f} are masked"
-                )
+                messages.append(f"{cause}; pixels of a modulation below {least:.1f} are masked")
                 break
             messages.append(
                 f"the {axis} fringes are weak for the noise of these frames: their modulation is"
                 f" {modulation:.0f} grey levels in the median, and pixels below"
-                f" {float(least[0]):.1f} are masked; make the patterns brighter (longer exposure,"
+                f" {least:.1f} are masked; make the patterns brighter (longer exposure,"
                 " wider aperture, nearer projector, darker room)"
             )
             break
@@ -251,11 +237,6 @@ def capture_texture(capture: Capture, frames: np.ndarray, *, stretch: bool = Tru
     )
 
 
-def texture_8bit(sequence: PatternSequence, frames: np.ndarray) -> np.ndarray:
-    """Return the scene under white light (h, w) uint8, from the frames (n, h, w) of a sequence."""
-    return convert_to_8bit(texture(sequence, frames))
-
-
 def convert_to_8bit(image: np.ndarray) -> np.ndarray:
     """Convert an image to uint8, its brightest pixel 255 where it has 16 bits."""
     if image.dtype == np.uint16:
@@ -288,9 +269,8 @@ def decode_captures(
                 if check
                 else load_examination(session, capture.name)
             )
-            for message in compared.warnings() if compared else ():
-                warn(f"{capture.name}: {message}")
-            for message in loss_warnings(capture.sequence, frames, phases):
+            messages = compared.warnings() if compared else []
+            for message in [*messages, *loss_warnings(capture.sequence, frames, phases)]:
                 warn(f"{capture.name}: {message}")
         yield capture, frames, phases
 
@@ -307,3 +287,155 @@ def compute_ahead(
             wait([computed])
             ahead += [worker.submit(compute, following) for following in items[i + 1 : i + 2]]
             yield item, computed
+
+
+MapFormat = Literal["npy", "exr"]
+REASONS = {
+    Reason.VALID: "the phase is valid",
+    Reason.DARK: (
+        "too little modulation for the noise: shadow, black surface, or outside of the projector's"
+        " light"
+    ),
+    Reason.SATURATED: "the camera clipped the patterns",
+    Reason.INCONSISTENT: (
+        "a bit could not be decided, or the fringe order contradicts the phase or the neighbourhood"
+    ),
+    Reason.OUTSIDE: "the coordinate lies outside of the projector",
+    Reason.INDIRECT: "much of the light came by way of other surfaces or through the material",
+}
+"""What the codes of the files `reason_<axis>` stand for."""
+_UNITS = {
+    "phase": "rad, 2 pi u / period_px, 0 at the centre of projector column (row) 0; NaN: masked",
+    "coordinate": (
+        "projector px, 0 at the centre of column (row) 0; modulo unambiguous_px where that is a"
+        " number; NaN: masked"
+    ),
+    "sigma": (
+        "projector px, standard deviation of the coordinate by the camera's noise; NaN: masked"
+    ),
+    "modulation": "grey levels, amplitude of the fringes; of Gray code alone half its contrast",
+    "reason": "uint8 code, see reasons",
+}
+_AXIS_FIGURES = (
+    "coordinate_px", "median_modulation", "median_background", "noise_levels", "median_sigma_px",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DecodedFiles:
+    """A decoded capture and the files that it was written to, by what they hold."""
+
+    capture: str
+    phases: Mapping[Axis, PhaseMap]
+    folder: Path
+    files: Mapping[str, str]
+
+    def to_json(self) -> dict[str, Any]:
+        """What `decoded.json` explains: files, units, codes, and the figures of each axis."""
+        return {
+            "capture": self.capture,
+            "files": dict(self.files),
+            "units": _UNITS,
+            "reasons": {
+                str(int(reason)): f"{REASON_LABELS[reason]}: {words}"
+                for reason, words in REASONS.items()
+            },
+            "axes": {axis: axis_figures(phase) for axis, phase in self.phases.items()},
+        }
+
+    def text(self) -> str:
+        """Return the result as a report for the terminal."""
+        lines = []
+        for axis, phase in self.phases.items():
+            figures = axis_figures(phase)
+            shares = (f"{name} {100 * share:.1f} %" for name, share in figures["shares"].items())
+            lines.append(f"{self.capture}, axis {axis}: {', '.join(shares)}")
+            if figures["coordinate_px"] is None:
+                continue
+            low, high = figures["coordinate_px"]
+            what = "period" if phase.steps else "cells of Gray code"
+            only = f", known only modulo {phase.unambiguous_px:g} px" if phase.is_relative else ""
+            lines.append(
+                f"  {what} {phase.period_px:g} px{only}: coordinates {low:.1f}-{high:.1f} px,"
+                f" modulation {figures['median_modulation']:.1f} and noise"
+                f" {figures['noise_levels']:.2f} grey levels, sigma"
+                f" {figures['median_sigma_px']:.4f} px (medians)"
+            )
+        lines.append(f"{len(self.files)} files -> {self.folder}; decoded.json explains them")
+        return "\n".join(lines)
+
+
+def axis_figures(phase: PhaseMap) -> dict[str, Any]:
+    """Shares of the pixels by reason, and medians over the valid ones; None where no pixel is
+    valid.
+
+    ``noise_levels`` is the standard deviation of one frame at the median background, in grey
+    levels.
+    """
+    valid, shares = phase.mask, reason_shares(phase)
+    figures: dict[str, Any] = dict.fromkeys(_AXIS_FIGURES)
+    if valid.any():
+        coordinate, (a, b) = phase.coordinate[valid], phase.noise
+        maps = (phase.modulation, phase.background, phase.sigma_px)
+        modulation, background, sigma = (float(np.median(each[valid])) for each in maps)
+        coordinates = [float(coordinate.min()), float(coordinate.max())]
+        noise = float(np.sqrt(a + b * background))
+        values = (coordinates, modulation, background, noise, sigma)
+        figures = dict(zip(_AXIS_FIGURES, values, strict=True))
+    return {
+        "period_px": phase.period_px,
+        "steps": phase.steps,
+        "unambiguous_px": phase.unambiguous_px if phase.is_relative else None,
+        "shares": {REASON_LABELS[why]: round(share, 6) for why, share in shares.items()},
+        **figures,
+    }
+
+
+def write_decoded(
+    session: SessionLike,
+    capture: str,
+    out: Path | str,
+    *,
+    file_format: MapFormat = "npy",
+    progress: Progress = ignore_progress,
+    warn: Warn = ignore_warnings,
+) -> DecodedFiles:
+    """Decode a capture: absolute phase and projector coordinate of each pixel, the mask with its
+    reasons, a picture.
+
+    Args:
+        session: Session folder.
+        capture: Name of the capture.
+        out: Folder for the files; made if it does not exist. decoded.json in it explains them.
+        file_format: npy (NumPy) or exr (OpenEXR) for the maps, float32, NaN where masked.
+
+    For each axis ``phase`` (rad), ``coordinate`` and ``sigma`` (projector px), ``modulation`` (grey
+    levels, not masked) as (h, w) maps, and ``reason``, uint8 codes, as .npy or .png; the picture is
+    ``decoded.png``. Files of the same names are replaced. Raises InputError like `decode_capture`.
+    """
+    if file_format not in get_args(MapFormat):
+        raise InputError(f"maps cannot be written as '{file_format}': use npy or exr")
+    folder, files = Path(out), dict[str, str]()
+    with opened(session) as store:
+        progress(0.1, "decoding")
+        _, _, phases = next(decode_captures(store, [capture], warn, relative=True))
+    progress(0.6, "writing")
+    folder.mkdir(parents=True, exist_ok=True)
+    for axis, phase in phases.items():
+        for name in _UNITS:
+            values = getattr(phase, "sigma_px" if name == "sigma" else name)
+            suffix = "png" if name == "reason" and file_format == "exr" else file_format
+            files[f"{name}_{axis}"] = f"{name}_{axis}.{suffix}"
+            path = folder / f"{name}_{axis}.{suffix}"
+            if suffix == "png":
+                path.write_bytes(cv2.imencode(".png", values)[1].tobytes())
+            elif suffix == "exr":
+                write_exr(path, values)
+            else:
+                np.save(path, values)
+    files["picture"] = "decoded.png"
+    (folder / "decoded.png").write_bytes(phase_maps(capture, phases).png)
+    result = DecodedFiles(capture, phases, folder, files)
+    (folder / "decoded.json").write_bytes(to_json(result.to_json()))
+    progress(1.0, "decoded")
+    return result

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -25,15 +25,20 @@ from slviewer.evaluation.render import format_count
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, ignore_progress
 from slviewer.pipeline.models import available_models
-from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.scale import load_scale_correction
-from slviewer.pipeline.stored_records import list_records, load_record, save_record
+from slviewer.pipeline.stored_records import (
+    SessionLike,
+    list_records,
+    load_record,
+    opened,
+    save_record,
+)
 from slviewer.records.calibration import ModelCalibration, StereoFit
 from slviewer.records.kinds import RECORDS
 from slviewer.records.record import Record
-from slviewer.records.table import Column, Table
+from slviewer.records.table import Column, Rows, Table
 from slviewer.report.page import CERTIFICATE, Section, page_digest, split_page
 from slviewer.session.atomic import to_json
 from slviewer.session.capture import Capture
@@ -73,7 +78,7 @@ IN_WORDS: Mapping[State, str] = {
 }
 
 
-class CertifiedCapture(TypedDict):
+class CertifiedCapture(msgspec.Struct, frozen=True):
     """A capture that a report was made from; ``frames``: the hash of each."""
 
     role: str
@@ -121,19 +126,17 @@ class ReportCheck:
 
     def text(self) -> str:
         """Return the result as a report for the terminal."""
-        frames = [
-            check
-            for check in self.checks
-            if check.what.startswith(FRAMES) and check.state == "same"
+        intact = [
+            each for each in self.checks if each.what.startswith(FRAMES) and each.state == "same"
         ]
-        shown = [check for check in self.checks if check not in frames]
         lines = [
-            f"{check.what}: {IN_WORDS[check.state]}{check.detail and f' ({check.detail})'}"
-            for check in shown
+            f"{each.what}: {IN_WORDS[each.state]}{each.detail and f' ({each.detail})'}"
+            for each in self.checks
+            if each not in intact
         ]
-        if frames:
-            lines.insert(1, f"frames of {format_count(len(frames), 'capture')}: as they were")
-        left = sum(check.state == "not recomputed" for check in self.checks)
+        if intact:
+            lines.insert(1, f"frames of {format_count(len(intact), 'capture')}: as they were")
+        left = sum(each.state == "not recomputed" for each in self.checks)
         end = f"; {format_count(left, 'item')} could not be checked" if left else ""
         return "\n".join([*lines, f"{'DOES NOT HOLD' if self.failure else 'HOLDS'}{end}"])
 
@@ -141,24 +144,24 @@ class ReportCheck:
 def make_certificate(store: Session) -> Certificate:
     """Return the certificate of a session as it is, without the digest of a page; reads every
     frame."""
-    captures: dict[str, CertifiedCapture] = {
-        capture.name: {"role": capture.role, "hash": capture.hash, "frames": capture.verify()}
-        for capture in store.captures()
-    }
-    results = {name: store.input_hashes(name)[name] for name in store.result_names()}
     return Certificate(
-        SCHEMA, store.folder.name, _list_versions(), captures, results, collect_figures(store)
+        SCHEMA,
+        store.folder.name,
+        _list_versions(),
+        {c.name: CertifiedCapture(c.role, c.hash, c.verify()) for c in store.captures()},
+        {name: store.input_hashes(name)[name] for name in store.result_names()},
+        collect_figures(store),
     )
 
 
 def collect_figures(store: Session) -> Figures:
     """Return the figures of the records that are fresh."""
-    figures: Figures = {}
-    for kind in RECORDS.values():
-        for each in list_records(store, kind):
-            if not each.stale and (of_record := each.record.figures()):
-                figures[f"{kind.kind}/{each.name}"] = of_record
-    return figures
+    return {
+        f"{kind.kind}/{each.name}": figures
+        for kind in RECORDS.values()
+        for each in list_records(store, kind)
+        if not each.stale and (figures := each.record.figures())
+    }
 
 
 def verify_report(
@@ -176,39 +179,38 @@ def verify_report(
     """
     page, certificate = read_certificate(expand_user(report))
     with opened(session) as store:
-        is_same = page_digest(page) == certificate.page
+        changed_page = "its text, pictures or numbers were changed after it was written"
         checks = [
             CheckedItem("page", "same", "as it was written")
-            if is_same
-            else CheckedItem(
-                "page", "differs", "its text, pictures or numbers were changed after it was written"
-            )
+            if page_digest(page) == certificate.page
+            else CheckedItem("page", "differs", changed_page)
         ]
+        then = certificate.software
         changed = [
-            f"{name} {certificate.software.get(name, '?')} then, {now} now"
+            f"{name} {then.get(name, '?')} then, {now} now"
             for name, now in _list_versions().items()
-            if certificate.software.get(name) != now
+            if then.get(name) != now
         ]
         if changed:
             checks.append(CheckedItem("software", "not recomputed", "; ".join(changed)))
         progress(0.02, "reading the frames")
         captures = {capture.name: capture for capture in store.captures()}
-        checks += [
+        frames = [
             CheckedItem(f"{FRAMES}{name}", *_check_frames(captures.get(name), given))
             for name, given in certificate.captures.items()
         ]
-        if any(check.state != "same" for check in checks if check.what.startswith(FRAMES)):
-            return ReportCheck(tuple(checks))
-        with (
-            tempfile.TemporaryDirectory(prefix="slviewer-") as folder,
-            Session.create(Path(folder, "session")) as fresh,
-        ):
-            repetition = _Repetition(store, fresh, certificate, progress)
-            made = repetition.compute_figures()
-        checks += [
-            _compare(name, given, made.get(name), repetition.why)
-            for name, given in certificate.figures.items()
-        ]
+        checks += frames
+        if all(check.state == "same" for check in frames):
+            with (
+                tempfile.TemporaryDirectory(prefix="slviewer-") as folder,
+                Session.create(Path(folder, "session")) as fresh,
+            ):
+                repetition = _Repetition(store, fresh, certificate, progress)
+                made = repetition.compute_figures()
+            checks += [
+                _compare(name, given, made.get(name), repetition.why)
+                for name, given in certificate.figures.items()
+            ]
     progress(1.0, "compared")
     return ReportCheck(tuple(checks))
 
@@ -258,11 +260,11 @@ def _check_frames(capture: Capture | None, given: CertifiedCapture) -> tuple[Sta
         now = capture.verify()
     except SlviewerError as error:
         return "differs", str(error)
-    changed = [i for i, (a, b) in enumerate(zip(given["frames"], now, strict=False)) if a != b]
-    if changed or len(now) != len(given["frames"]) or capture.hash != given["hash"]:
-        where = f"frame {changed[0] + 1}" if changed else "the description of the capture"
-        return "differs", f"{where} is another than the report's"
-    return "same", f"{len(now)} frames"
+    if now == given.frames and capture.hash == given.hash:
+        return "same", f"{len(now)} frames"
+    changed = [i for i, (a, b) in enumerate(zip(given.frames, now, strict=False), 1) if a != b]
+    where = f"frame {changed[0]}" if changed else "the description of the capture"
+    return "differs", f"{where} is another than the report's"
 
 
 @dataclass(frozen=True)
@@ -341,32 +343,25 @@ class _Repetition:
                 run = record.operation, to_json(record.settings)
                 runs.setdefault(run, {})[result] = record
         figures: Figures = {}
-        for k, ((name, settings), records) in enumerate(runs.items()):
+        for k, ((name, _), records) in enumerate(runs.items()):
             self.progress(0.6 + 0.4 * k / len(runs), f"repeating {name}")
-            operation = OPERATIONS[name]
+            operation, (record, *_) = OPERATIONS[name], records.values()
             # the session is read alone: its files stay as they are
             with self._note_failure(*records), Session.open(self.fresh.folder) as reading:
-                missing = [
-                    each
-                    for each in next(iter(records.values())).inputs
-                    if each.partition("/")[0] in RECORDS and not reading.has_result(each)
-                ]
-                if missing:
+                made_from = (each for each in record.inputs if each.partition("/")[0] in RECORDS)
+                if missing := [each for each in made_from if not reading.has_result(each)]:
                     raise InputError(
                         f"{', '.join(missing)}, which it was made from, is not made again"
                     )
-                for found in operation.find(
-                    Job(reading), operation.settings(**msgspec.json.decode(settings))
-                ):
+                for found in operation.find(Job(reading), operation.settings(**record.settings)):
                     # a number here may be another than that of before
                     is_numbered = found.record.is_number(found.name)
                     names = records if is_numbered else [f"{found.record.kind}/{found.name}"]
                     figures |= dict.fromkeys(names, found.record.figures())
                     if is_numbered and not found.files:  # others may be made from it
                         for each in names:
-                            save_record(
-                                self.fresh, each.partition("/")[2], found.record, found.arrays
-                            )
+                            name = each.partition("/")[2]
+                            save_record(self.fresh, name, found.record, found.arrays)
         return figures
 
     @contextmanager
@@ -394,18 +389,14 @@ def _without_own(meta: Mapping[str, Any]) -> dict[str, Any]:
 def _check_restrictions(store: Session, record: Record) -> None:
     """Raise InputError where the edits and the region that a record was made with are not the
     session's."""
-    used = {
-        name: value
-        for name, value in record.inputs.items()
-        if name.startswith((f"{EDITS}/", REGION_INPUT))
-    }
-    scans = [name.removeprefix(f"{EDITS}/") for name in used if name != REGION_INPUT]
+    used, start = record.inputs, f"{EDITS}/"
+    scans = [name.removeprefix(start) for name in used if name.startswith(start)]
     if not scans:
         return
     if REGION_INPUT not in used and not record.settings.get("roi"):
         raise InputError("it was made with a region of its own")
     now = restriction_inputs(store, scans)
-    if any(now[name] != value for name, value in used.items()):
+    if any(used.get(name, value) != value for name, value in now.items()):
         raise InputError(f"edits of {', '.join(scans)}, or the region, have changed since")
 
 
@@ -414,11 +405,8 @@ def _compare(
 ) -> CheckedItem:
     """Return whether a result's figures are those that were computed again."""
     if made is None:
-        return CheckedItem(
-            name,
-            "not recomputed",
-            why.get(name, "the session no longer holds what it was made with"),
-        )
+        reason = why.get(name, "the session no longer holds what it was made with")
+        return CheckedItem(name, "not recomputed", reason)
     for key, value in given.items():
         now = made.get(key, np.nan)
         if not np.isclose(now, value, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
@@ -433,37 +421,33 @@ def certify_page(certificate: Certificate, page: str) -> str:
 
 def certificate_section(certificate: Certificate) -> Section:
     """Return what a certificate names, as a section of the report."""
-    captures = Table(
-        [
-            Column("capture", align="left"),
-            Column("role", align="left"),
-            Column("frames"),
-            Column("hash", align="left"),
-        ],
-        [
-            [name, c["role"], str(len(c["frames"])), c["hash"]]
-            for name, c in certificate.captures.items()
-        ],
-        "Captures",
-        [
+    contents: dict[str, tuple[list[str], Rows]] = {
+        "Captures": (
+            ["capture", "role", "frames", "hash"],
+            [
+                [name, each.role, len(each.frames), each.hash]
+                for name, each in certificate.captures.items()
+            ],
+        ),
+        "Calibrations and records": (
+            ["result", "hash"],
+            [[name, certificate.results[name]] for name in certificate.figures],
+        ),
+        "Software": (["software", "version"], [[*each] for each in certificate.software.items()]),
+    }
+    notes = {
+        "Captures": [
             "BLAKE2b, 160 bits, of frames and description; the hash of every single frame is kept"
             " in this file."
-        ],
-    )
-    results = Table(
-        [Column("result", align="left"), Column("hash", align="left")],
-        [[name, certificate.results[name]] for name in certificate.figures],
-        "Calibrations and records",
-    )
-    software = Table(
-        [Column("software", align="left"), Column("version", align="left")],
-        [[name, number] for name, number in certificate.software.items()],
-        "Software",
-    )
+        ]
+    }
     text = (
         "What the figures were computed from. `slviewer verify-report` reads this file and the"
         " session, computes the figures again from the frames, and says whether they agree."
     )
-    return Section(
-        "Certificate", text, [item for item in (captures, results, software) if item.rows]
-    )
+    tables = [
+        Table([*map(Column, titles)], rows, caption, notes.get(caption, ()))
+        for caption, (titles, rows) in contents.items()
+        if rows
+    ]
+    return Section("Certificate", text, tables)

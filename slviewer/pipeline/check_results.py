@@ -56,7 +56,17 @@ class Preflight:
         """The check called `name`. Raises KeyError."""
         return {check.name: check for check in self.checks}[name]
 
-    def to_dict(self) -> dict[str, Any]:
+    @property
+    def failure(self) -> str:
+        """Why the command ends with status 1; empty unless something is bad."""
+        if self.verdict != "bad":
+            return ""
+        return (
+            "the rig or the capture is not fit to measure with: correct what is marked bad, then"
+            " check, or capture, again"
+        )
+
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return to_plain(self) | {"verdict": self.verdict, "seconds": round(self.seconds, 2)}
 

@@ -17,17 +17,16 @@ from slviewer.inspection.deviation import (
 )
 from slviewer.pipeline.feedback import part, stage
 from slviewer.pipeline.inspect_parts import fit_to_nominal
-from slviewer.pipeline.measure import provenance
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.measure import (
     LoadSurface,
     MeasuredSurface,
     load_surface,
+    provenance,
     triangulate_surface,
 )
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.stored_records import next_name
+from slviewer.pipeline.stored_records import placed_file
 from slviewer.records.measurement import (
     DeviationStatistics,
     Measurement,
@@ -133,12 +132,14 @@ def compare(job: Job, settings: CompareSettings) -> Iterator[Found[Measurement]]
         deviation=described,
     )
     job.progress(0.92, "writing")
-    file_name = f"{_safe_name(settings.scan)}_{_safe_name(Path(nominal.name).stem)}_deviation.ply"
+    compared = (settings.scan, Path(nominal.name).stem)
+    valid = (re.sub(r"[^A-Za-z0-9_-]", "-", each)[:60] for each in compared)  # on every system
+    file_name = f"{'_'.join(valid)}_deviation.ply"
     with placed_file(store, settings.out, file_name) as (place, written):
         _write_points(written, on, result, nominal, settings.tolerance)
         note = f"coloured points -> {place}"
         arrays = _list_arrays(on.points[on.measured], result)
-        yield Found(next_name(store, Measurement), record, arrays, (place,), (note,), settings=used)
+        yield Found("", record, arrays, (place,), (note,), settings=used)
     job.progress(1.0, "compared")
 
 
@@ -209,9 +210,3 @@ def _list_arrays(points: np.ndarray, result: Deviation) -> dict[str, np.ndarray]
         "edges": edges,
         "counts": counts,
     }
-
-
-def _safe_name(name: str) -> str:
-    """Return a file name that is valid on every system: ASCII letters, digits, '-' and '_', 60 at
-    most."""
-    return re.sub(r"[^A-Za-z0-9_-]", "-", name)[:60]

@@ -9,14 +9,15 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.errors import DetectionError, InputError
+from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.printable import format_csv
+from slviewer.records.plain import to_plain
 from slviewer.session.atomic import replace_file
 from slviewer.session.importers.images import read_image
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, detect
-from slviewer.target.planar import fit_grid_map
+from slviewer.target.planar import GridMap, fit_grid_map
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 COLUMNS = ("image", "index", "x_mm", "y_mm", "u_px", "v_px")
@@ -24,18 +25,22 @@ _BLUE, _RED, _GREEN, _BLACK = (255, 120, 0), (40, 40, 255), (40, 200, 40), (0, 0
 _LARGEST_OVERLAY_PX = 1600
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class BoardImageResult:
-    """A photograph, and the board in it: ``detection``, or None and the reason (``refusal``).
+    """A photograph, and the board in it: the features ``index`` (n) at the ``pixels`` (n, 2), from
+    the board's mark on where that was seen (``marked``), or why it was not detected (``refusal``).
 
-    ``rms_px`` (NaN without a detection): how far the features lie from the smooth map of a flat
-    grid behind a lens.
+    ``rms_px`` (None without the board): how far the features lie from the smooth map of a flat grid
+    behind a lens.
     """
 
-    path: Path
-    detection: Detection | None
+    image: Path
+    detected: bool = False
     refusal: str = ""
-    rms_px: float = float("nan")
+    marked: bool = False
+    rms_px: float | None = None
+    index: Sequence[int] = ()
+    pixels: Sequence[Sequence[float]] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +54,7 @@ class BoardsDetected:
     @property
     def detected(self) -> int:
         """Number of photographs in which the board was detected."""
-        return sum(image.detection is not None for image in self.images)
+        return sum(image.detected for image in self.images)
 
     @property
     def failure(self) -> str:
@@ -61,16 +66,11 @@ class BoardsDetected:
     def rows(self) -> list[tuple[str, int, float, float, float, float]]:
         """The table: image, index of the feature, its place on the board in mm, and in the image in
         px."""
+        places = self.board.points[:, :2].tolist()
         return [
-            (image.path.name, index, x, y, u, v)
+            (image.image.name, index, *places[index], u, v)
             for image in self.images
-            if (found := image.detection) is not None
-            for index, (x, y), (u, v) in zip(
-                found.ids.tolist(),
-                self.board.points[found.ids][:, :2].tolist(),
-                found.pixels.tolist(),
-                strict=True,
-            )
+            for index, (u, v) in zip(image.index, image.pixels, strict=True)
         ]
 
     def text(self) -> str:
@@ -88,21 +88,7 @@ class BoardsDetected:
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as plain values."""
-        images = []
-        for image in self.images:
-            found = image.detection
-            images.append(
-                {
-                    "image": str(image.path),
-                    "detected": found is not None,
-                    "refusal": image.refusal,
-                    "marked": bool(found and found.marked),
-                    "rms_px": image.rms_px if found else None,
-                    "index": found.ids.tolist() if found else [],
-                    "pixels": found.pixels.tolist() if found else [],
-                }
-            )
-        return {"target": str(self.board), "images": images}
+        return {"target": str(self.board), "images": to_plain(self.images)}
 
 
 def detect_board(
@@ -133,29 +119,39 @@ def detect_board(
     paths = _list_photographs([Path(image) for image in images])
     results = []
     for path in paths:
+        picture, detection = None, None
         try:
             picture = read_image(path)
+            detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
+            ids, pixels = detection.ids.tolist(), detection.pixels.tolist()
+            residuals = _fit_grid(board, detection, detection.pixels).residuals
+            rms_px = float(np.sqrt((residuals**2).sum(1).mean()))
+            found = BoardImageResult(path, True, "", detection.marked, rms_px, ids, pixels)
         except InputError as error:
-            results.append(BoardImageResult(path, None, str(error)))
+            found = BoardImageResult(path, refusal=str(error))
+        results.append(found)
+        if out is None or picture is None:
             continue
-        result = _detect_board_in(board, path, picture)
-        results.append(result)
-        if out is not None:
-            overlay = Path(out)
-            if len(paths) > 1 or overlay.suffix.lower() not in IMAGE_SUFFIXES:
-                overlay = overlay / f"{path.stem}_board.png"
-            drawn = draw_detection(board, picture, result.detection)
-            done, data = cv2.imencode(overlay.suffix, drawn)
-            if not done:
-                raise InputError(
-                    f"{overlay.name} cannot be written as an image: give a name that ends in .png"
-                )
-            replace_file(overlay, data.tobytes())
+        overlay = Path(out)
+        if len(paths) > 1 or overlay.suffix.lower() not in IMAGE_SUFFIXES:
+            overlay = overlay / f"{path.stem}_board.png"
+        done, data = cv2.imencode(overlay.suffix, draw_detection(board, picture, detection))
+        if not done:
+            raise InputError(
+                f"{overlay.name} cannot be written as an image: give a name that ends in .png"
+            )
+        replace_file(overlay, data.tobytes())
     detected = BoardsDetected(board, tuple(results))
     if csv_out is not None:
         rows = [(*row, f"{u:.4f}", f"{v:.4f}") for *row, u, v in detected.rows()]
         replace_file(Path(csv_out), format_csv([COLUMNS, *rows]).encode())
     return detected
+
+
+def _fit_grid(board: Board, detection: Detection, pixels: np.ndarray) -> GridMap:
+    """Return the smooth map from the board, in pitches, to the ``pixels`` (n, 2) of what was
+    detected."""
+    return fit_grid_map(board.points[detection.ids][:, :2] / board.pitch_mm, pixels)
 
 
 def draw_detection(board: Board, image: np.ndarray, detection: Detection | None) -> np.ndarray:
@@ -174,23 +170,18 @@ def draw_detection(board: Board, image: np.ndarray, detection: Detection | None)
     pixels = (detection.pixels + 0.5) * scale - 0.5
     apart = cKDTree(pixels).query(pixels, k=2)[0][:, 1]
     size = float(np.clip(np.median(apart) / 90, 0.3, 0.8))
-    for index, (u, v) in zip(detection.ids.tolist(), _round_to_pixels(pixels), strict=True):
+    for index, (u, v) in zip(detection.ids, np.rint(pixels).astype(int).tolist(), strict=True):
         cv2.drawMarker(picture, (u, v), _BLUE, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
         for colour, width in ((_BLACK, 3), (_BLUE, 1)):
             place = u + 4, v - 4
             cv2.putText(picture, str(index), place, 0, size, colour, width, cv2.LINE_AA)
-    to_px = fit_grid_map(board.points[detection.ids][:, :2] / board.pitch_mm, pixels)
     axes = np.eye(3)[:, 1:] * (2 if board.kind == "acircles" else 1)
-    origin, *tips = _round_to_pixels(to_px.to_image(axes))
-    for tip, colour, name in zip(tips, (_RED, _GREEN), "xy", strict=True):
-        cv2.arrowedLine(picture, origin, tip, colour, 3, cv2.LINE_AA, tipLength=0.25)
-        cv2.putText(picture, name, (tip[0] + 6, tip[1] + 14), 0, 0.8, colour, 2, cv2.LINE_AA)
+    ends = _fit_grid(board, detection, pixels).to_image(axes)
+    origin, *tips = np.rint(ends).astype(int).tolist()
+    for (u, v), colour, name in zip(tips, (_RED, _GREEN), "xy", strict=True):
+        cv2.arrowedLine(picture, origin, (u, v), colour, 3, cv2.LINE_AA, tipLength=0.25)
+        cv2.putText(picture, name, (u + 6, v + 14), 0, 0.8, colour, 2, cv2.LINE_AA)
     return picture
-
-
-def _round_to_pixels(points: np.ndarray) -> list[list[int]]:
-    """Return points (n, 2) px as whole numbers."""
-    return np.rint(points).astype(int).tolist()
 
 
 def _list_photographs(given: list[Path]) -> list[Path]:
@@ -216,25 +207,13 @@ def _list_photographs(given: list[Path]) -> list[Path]:
     return paths
 
 
-def _detect_board_in(board: Board, path: Path, picture: np.ndarray) -> BoardImageResult:
-    """Detect the board in a BGR or grey picture; the result holds the reason where that fails."""
-    try:
-        detection = detect(board, picture[..., ::-1] if picture.ndim == 3 else picture)
-    except DetectionError as error:
-        return BoardImageResult(path, None, str(error))
-    residuals = fit_grid_map(
-        board.points[detection.ids][:, :2] / board.pitch_mm, detection.pixels
-    ).residuals
-    return BoardImageResult(path, detection, rms_px=float(np.sqrt((residuals**2).sum(1).mean())))
-
-
-def _describe_result(board: Board, image: BoardImageResult) -> str:
+def _describe_result(board: Board, found: BoardImageResult) -> str:
     """Describe the detection in one photograph as a line of text."""
-    if image.detection is None:
-        return f"{image.path.name}: not detected: {image.refusal}"
+    if not found.detected:
+        return f"{found.image.name}: not detected: {found.refusal}"
     features = "circles" if board.kind in ("circles", "acircles") else "corners"
-    mark = ", numbered from the board's mark" if image.detection.marked else ""
+    mark = ", numbered from the board's mark" if found.marked else ""
     return (
-        f"{image.path.name}: {len(image.detection.ids)} of {len(board.points)} {features} detected,"
-        f" {image.rms_px:.3f} px RMS from a flat grid{mark}"
+        f"{found.image.name}: {len(found.index)} of {len(board.points)} {features} detected,"
+        f" {found.rms_px:.3f} px RMS from a flat grid{mark}"
     )

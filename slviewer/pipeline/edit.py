@@ -8,12 +8,12 @@ from datetime import UTC, datetime
 import numpy as np
 
 from slviewer.errors import InputError, UsageError
-from slviewer.pipeline.capture_clouds import scan_cloud
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
 from slviewer.pipeline.models import ModelName, check_accepted
-from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.operation import Callbacks, takes_settings
+from slviewer.pipeline.operation import Callbacks, Job, takes_settings
+from slviewer.pipeline.reconstruct import scan_cloud
 from slviewer.pipeline.scan_edits import OFF, parse_region
+from slviewer.pipeline.stored_records import SessionLike, opened
 from slviewer.session.scan_edits import list_edits, load_edits, load_region, save_edits, save_region
 from slviewer.session.store import Session
 from slviewer.surface.region_of_interest import RegionOfInterest
@@ -122,42 +122,30 @@ def edit_scan(settings: EditSettings) -> ScanEdits:
     """
     scan, undo, redo, remaining = settings.scan, settings.undo, settings.redo, None
     with opened(settings.session, write=bool(settings.selects or undo or redo)) as store:
-        if settings.selects:
-            remaining = _delete_selected(store, settings)
-            settings.progress(1.0, "edited")
-        elif undo or redo:
+        if undo or redo:
             history = load_edits(store, scan)
             save_edits(store, scan, history.undo(undo) if undo else history.redo(redo))
-        else:
+        elif not settings.selects:
             store.load_capture(scan)
+        else:
+            check_accepted(store, settings.accept_rejected)
+            job, plane = Job(store, settings.progress, settings.warn), None
+            cloud = scan_cloud(job, scan, settings.model, settings.accept_rejected)
+            if settings.support:
+                plane, selected = select_support(cloud.points, cloud.sigma_z, settings.margin)
+                what = SUPPORT
+            elif settings.part:
+                u, v = settings.part
+                selected, what = select_connected(cloud.points, (u, v)), "connected part"
+            else:
+                corners = np.reshape(settings.polygon, (-1, 2))
+                selected, what = select_polygon(cloud.sigma_z.shape, corners), "polygon"
+            if settings.invert:
+                selected, what, plane = ~selected, f"all but {what}", None
+            delete_points(store, [Selection(scan, cloud.points, selected, plane)], what)
+            remaining = int(np.count_nonzero(cloud.mask & ~selected))
+            settings.progress(1.0, "edited")
         return ScanEdits(scan, *list_edits(store, scan), remaining)
-
-
-def _delete_selected(store: Session, settings: EditSettings) -> int:
-    """Delete what the settings select of a scan; returns how many points remain."""
-    check_accepted(store, settings.accept_rejected)
-    cloud = scan_cloud(
-        store,
-        settings.scan,
-        settings.model,
-        settings.progress,
-        settings.warn,
-        settings.accept_rejected,
-    )
-    plane = None
-    if settings.support:
-        plane, selected = select_support(cloud.points, cloud.sigma_z, settings.margin)
-        what = SUPPORT
-    elif settings.part:
-        u, v = settings.part
-        selected, what = select_connected(cloud.points, (u, v)), "connected part"
-    else:
-        corners = np.reshape(settings.polygon, (-1, 2))
-        selected, what = select_polygon(cloud.sigma_z.shape, corners), "polygon"
-    if settings.invert:
-        selected, what, plane = ~selected, f"all but {what}", None
-    delete_points(store, [Selection(settings.scan, cloud.points, selected, plane)], what)
-    return int(np.count_nonzero(cloud.mask & ~selected))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,24 +234,20 @@ def set_region(
             "state the region with --roi, or take it from a scan with --around: one of both"
         )
     with opened(session, write=bool(roi or around)) as store:
+        region = load_region(store, even_if_off=True)
         if around:
             check_accepted(store, accept_rejected)
-            cloud = scan_cloud(store, around, model, progress, warn, accept_rejected, OFF)
-            save_region(store, RegionOfInterest.around(cloud.points))
-        elif roi:
-            known = load_region(store, even_if_off=True)
-            if roi == "on" and known is None:
-                raise InputError(
-                    "the session has no region of interest yet: state its box, or use --around SCAN"
-                )
-            save_region(store, known if roi in (OFF, "on") else parse_region(roi), roi != OFF)
-        return describe_region(store)
-
-
-def describe_region(store: Session) -> str:
-    """Describe the region of interest of a session, and whether it is in effect."""
-    region = load_region(store, even_if_off=True)
-    if region is None:
-        return "the session has no region of interest: all points are used"
-    state = "on" if load_region(store) is not None else "off: all points are used"
-    return f"region of interest: {region.text()} ({state})"
+            cloud = scan_cloud(Job(store, progress, warn), around, model, accept_rejected, OFF)
+            region = RegionOfInterest.around(cloud.points)
+        elif roi not in ("", OFF, "on"):
+            region = parse_region(roi)
+        elif roi == "on" and region is None:
+            raise InputError(
+                "the session has no region of interest yet: state its box, or use --around SCAN"
+            )
+        if roi or around:
+            save_region(store, region, roi != OFF)
+        if region is None:
+            return "the session has no region of interest: all points are used"
+        state = "on" if load_region(store) is not None else "off: all points are used"
+        return f"region of interest: {region.text()} ({state})"

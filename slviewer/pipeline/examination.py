@@ -53,11 +53,13 @@ def examine_frames(
     return Examination(tuple(named), examination.light_rms)
 
 
-def save_examination(
+def load_or_save_examination(
     session: Session, capture: Capture, frames: np.ndarray | None = None
 ) -> Examination:
-    """Examine a capture's ``frames`` (n, h, w), read here if None, and save the result in a
-    writable session."""
+    """Return the saved examination of a capture; without one, examine its ``frames`` (n, h, w),
+    read here if None, and save the result in a writable session."""
+    if (saved := load_examination(session, capture.name)) is not None:
+        return saved
     stack = capture.frames if frames is None else frames
     examination = examine_frames(capture.sequence, stack, capture.files)
     if session.is_writable:
@@ -68,13 +70,6 @@ def save_examination(
         }
         session.save_result(f"trust/{capture.name}", meta, {})
     return examination
-
-
-def load_or_save_examination(
-    session: Session, capture: Capture, frames: np.ndarray | None = None
-) -> Examination:
-    """Return the saved examination of a capture, else a new one as `save_examination` makes it."""
-    return load_examination(session, capture.name) or save_examination(session, capture, frames)
 
 
 def load_examination(session: Session, name: str) -> Examination | None:

@@ -1,33 +1,41 @@
-"""Bringing captures that other tools made into a session.
+"""Bringing captures and calibrations that other tools made into a session.
 
 Of a folder of captures, those that can be read and decoded are saved in one step, and a warning
 names each other with its reason; with `strict`, one fault refuses the folder. Those that the
 session has already, with the same content, are skipped: an import that was interrupted continues
-when it is repeated.
+when it is repeated. A calibration becomes the session's own once it agrees with itself and with the
+session's captures.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
+from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
 from slviewer.examination.light import estimate_frame_light
 from slviewer.fringe.decode import decode
 from slviewer.fringe.origin import estimate_gray_origin
 from slviewer.fringe.phase import Reason
 from slviewer.fringe.sequence import Axis, PatternSequence, PerAxis, parse_size
-from slviewer.pipeline.capture_phases import decode_examined
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.capture_phases import decode_capture, decode_examined
 from slviewer.pipeline.examination import examine_frames, load_or_save_examination
 from slviewer.pipeline.exposure_check import warn_of_exposure
-from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.models import available_models
-from slviewer.pipeline.open_session import SessionLike, opened, opened_or_made
-from slviewer.session.capture import Capture, NewCapture
-from slviewer.session.importers import guessed_description
-from slviewer.session.importers.guessed_description import GuessedDescription
+from slviewer.pipeline.feedback import Warn, ignore_warnings
+from slviewer.pipeline.models import available_models, save_imported_stereo, trash_models
+from slviewer.pipeline.operation import Callbacks, takes_settings
+from slviewer.pipeline.stored_records import SessionLike, opened, opened_or_made
+from slviewer.reconstruction.axis_agreement import check_phases
+from slviewer.session.capture import Capture, NewCapture, Role
+from slviewer.session.importers import opencv_calibration
+from slviewer.session.importers.filestorage import read_storage
 from slviewer.session.importers.images import Channel
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -35,6 +43,7 @@ from slviewer.session.importers.imported import (
     Imports,
     Skipped,
     define_layout,
+    list_folders,
     none_usable,
 )
 from slviewer.session.importers.layouts import (
@@ -47,30 +56,15 @@ from slviewer.session.layout import is_session
 from slviewer.session.reading import expand_user
 from slviewer.session.store import Session
 
-Role = Literal["calibration", "scan"]
 Size = str | tuple[int, int]
+Keys = tuple[str, str, str, str, str, str]
 MAX_OUTSIDE = 0.01
 """Part of the pixels whose codes may lie outside of the projector: misread ones."""
 
 
-def import_captures(
-    source: Path | str,
-    session: SessionLike,
-    layout: str = "detect",
-    *,
-    sequence: Path | str | None = None,
-    role: Role = "calibration",
-    prefix: str | None = None,
-    projector: Size | None = None,
-    channel: Channel | None = None,
-    origin: str | None = None,
-    force: bool = False,
-    strict: bool = False,
-    progress: Progress = ignore_progress,
-    warn: Warn = ignore_warnings,
-    **options: Any,
-) -> list[str]:
-    """Import a folder of captures that another tool made; returns the captures' names.
+@dataclass(frozen=True)
+class ImportSettings(Callbacks):
+    """Which captures are imported, and how.
 
     Args:
         source: One capture folder, or a folder of them.
@@ -89,40 +83,47 @@ def import_captures(
     default the one in ``source``, else what the session knows of files of the same names; where
     Gray code 0 begins is estimated from the images if it does not state that. ``origin`` is
     recorded as where the captures come from, by default their folders. ``options`` are those of the
-    layout's `read`.
+    layout's `read`, which are keywords of `import_captures` too.
+    """
+
+    source: Path | str
+    session: SessionLike
+    layout: str = "detect"
+    _: KW_ONLY
+    sequence: Path | str | None = None
+    role: Role = "calibration"
+    prefix: str | None = None
+    projector: Size | None = None
+    channel: Channel | None = None
+    origin: str | None = None
+    force: bool = False
+    strict: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@takes_settings(ImportSettings)
+def import_captures(settings: ImportSettings) -> list[str]:
+    """Import a folder of captures that another tool made; returns the captures' names.
 
     Captures that cannot be read or decoded are skipped, and ``warn`` is called with the reason.
     Raises InputError where none is left, or, with ``strict``, for the first of them; nothing is
     saved then. Captures that are there already, equal in every frame, stay as they are, with a
     warning; one whose stored frames are damaged is replaced.
     """
+    role, progress, warn = settings.role, settings.progress, settings.warn
     imports = find_captures(
-        source,
-        layout,
-        sequence,
-        prefix=prefix,
-        projector=projector,
-        channel=channel,
-        session=session,
-        warn=warn,
-        **options,
-    )
+        settings.source, settings.layout, settings.sequence, prefix=settings.prefix,
+        projector=settings.projector, channel=settings.channel, session=settings.session, warn=warn,
+        **settings.options,
+    )  # fmt: skip
     for message in imports.warnings:
         warn(message)
     skipped = list(imports.skipped)
-    if strict and skipped:
+    if settings.strict and skipped:
         raise InputError(str(skipped[0]))
-
-    stated: set[str] = set()
-    names: list[str] = []
-    unchanged: list[str] = []
+    comparisons: dict[str, str] = {}  # of the captures that can be used, with those of the session
     damaged: set[str] = set()
-
-    def warn_once(message: str) -> None:
-        """Issue a warning unless the same message was issued before."""
-        if message not in stated:
-            stated.add(message)
-            warn(message)
+    assumptions: dict[str, None] = {}
 
     def read() -> Iterator[NewCapture]:
         """Yield the checked captures one by one; one that cannot be used is a warning, or raises
@@ -131,49 +132,42 @@ def import_captures(
             progress(i / len(imports), f"reading {recording.name}")
             try:
                 capture = recording.read()
-                checked_capture = check_imported_capture(
-                    replace(capture, frames=capture.merged_frames(), exposures_ms=()), warn
-                )
+                sequence = check_imported_capture(capture, warn).sequence
             except InputError as error:
-                if strict:
+                if settings.strict:
                     raise
                 skipped.append(Skipped(recording.name, str(error)))
                 continue
-            for message in _list_assumptions(recording, capture):
-                warn_once(message)
-            names.append(capture.name)
-            capture = replace(
-                capture, sequence=checked_capture.sequence, source=origin or capture.source
-            )
+            assumptions.update(dict.fromkeys(_list_assumptions(recording, capture)))
+            capture = replace(capture, sequence=sequence, source=settings.origin or capture.source)
             comparison = store.compare_capture(capture, role)
-            if comparison == "same":
-                unchanged.append(capture.name)
-                continue
+            comparisons[capture.name] = comparison
             if comparison == "damaged":
                 warn(
                     f"{capture.name}: its stored frames are damaged: the capture is replaced, and"
                     " now in the trash"
                 )
                 damaged.add(capture.name)
-            yield capture
-        if len(skipped) == len(imports.skipped) + len(imports.recordings):
+            if comparison != "same":
+                yield capture
+        if not comparisons:
             raise none_usable(skipped)
 
-    with opened_or_made(session) as store:
-        store.save_captures(read(), role, force=force or damaged)
-        for each in skipped:
-            warn(f"not imported: {each}")
-        if unchanged:
+    with opened_or_made(settings.session) as store:
+        store.save_captures(read(), role, force=settings.force or damaged)
+        for message in (*assumptions, *(f"not imported: {each}" for each in skipped)):
+            warn(message)
+        if unchanged := [name for name, comparison in comparisons.items() if comparison == "same"]:
             warn(
                 "already in the session with the same content, and not imported again:"
                 f" {', '.join(unchanged)}"
             )
-        for name in names:
+        for name in comparisons:
             progress(1.0, f"looking at {name}")
             for sentence in load_or_save_examination(store, store.load_capture(name)).warnings():
                 warn(f"{name}: {sentence}")
     progress(1.0, "imported")
-    return names
+    return list(comparisons)
 
 
 def read_captures(
@@ -197,9 +191,12 @@ def read_captures(
     )
     for message in (*imports.warnings, *map(str, imports.skipped)):
         warn(message)
-    return [
-        replace(capture, frames=capture.merged_frames(), exposures_ms=()) for capture in imports
-    ]
+    return [_merge_exposures(capture) for capture in imports]
+
+
+def _merge_exposures(capture: NewCapture) -> NewCapture:
+    """Return a capture in which each pixel comes from the longest exposure that did not clip it."""
+    return replace(capture, frames=capture.merged_frames(), exposures_ms=())
 
 
 def find_captures(
@@ -217,134 +214,114 @@ def find_captures(
     """The captures of a folder, not yet read; ``session`` knows the projector's size, and what
     files of the same names show, where it is not stated."""
     source = expand_user(source)
-    same = _layout_of_session(session, source)
+    with _opened_if_there(session) as store:
+        same = None if store is None else _layout_of_session(store, source)
+        chosen = _choose_layout(source, layout, sequence, same, warn)
+        size, assumed, assumption = None if projector is None else parse_size(projector), None, ""
+        if size is None and chosen.name != "frames":
+            if store is not None and (assumed := _known_projector_size(store)) is not None:
+                assumption = (
+                    f"the projector is assumed to have {assumed[0]}x{assumed[1]} px, as in the"
+                    " session: --projector for another size"
+                )
+            size = assumed or chosen.projector
+    try:
+        imports = chosen.read(source, prefix=prefix, projector=size, **options)
+    except InputError:
+        if assumption:
+            warn(assumption)  # it may be why
+        raise
+    sizes = {recording.sequence.projector_size for recording in imports.recordings}
+    # a layout that states the size itself does not use the assumed one
+    if assumption and assumed in sizes - {chosen.projector}:
+        warn(assumption)
+    if channel is None:
+        return imports
+    recordings = [replace(recording, channel=channel) for recording in imports.recordings]
+    return replace(imports, recordings=recordings)
+
+
+def describe_import(names: Sequence[str], role: Role) -> str:
+    """Return what was imported, as the operator reads it."""
+    noun = "target pose" if role == "calibration" else "scan"
+    count = f"1 capture imported as a {noun}"
+    if len(names) != 1:
+        count = f"{len(names)} captures imported as {noun}s"
+    return f"{count}: {', '.join(names)}"
+
+
+def _opened_if_there(session: SessionLike | None) -> AbstractContextManager[Session | None]:
+    """Return a context manager of the session; of None where there is none yet."""
+    if session is None or not (isinstance(session, Session) or is_session(expand_user(session))):
+        return nullcontext()
+    return opened(session)
+
+
+def _choose_layout(
+    source: Path, layout: str, sequence: Path | str | None, same: FolderLayout | None, warn: Warn
+) -> FolderLayout:
+    """The layout of that name, or that of a folder; frames with the TOML that describes it, or
+    ``same``, where only the session does."""
     if layout == "detect":
-        layout = "frames" if sequence is not None else _detect_layout(source, same)
+        try:
+            layout = "frames" if sequence is not None else detect_layout(source)
+        except InputError:
+            if same is None:
+                raise
+            layout = "frames"
     known = layouts()
     if layout not in known:
         raise InputError(
             f"the layout {layout!r} is unknown: use"
             f" {', '.join(known)}{LAYOUT_PLUGINS.explain_missing(layout)}"
         )
-    size = None if projector is None else parse_size(projector)
-    assumed = None
-    if layout == "frames":
-        toml = sequence or find_description(source)
-        if toml is not None:
-            options["toml"] = Path(toml)
-        elif same is not None:
-            known = {layout: same}
-            warn("the images are described as those of the session: --sequence to describe them")
-        else:
-            raise InputError(
-                f"{source} holds no TOML that describes the images: add one, or give --sequence"
-            )
-    elif size is None:
-        assumed = _known_projector_size(session)
-        size = assumed or known[layout].projector
-    try:
-        imports = known[layout].read(source, prefix=prefix, projector=size, **options)
-    except InputError:
-        _warn_of_assumed_size(assumed, warn)  # it may be why
-        raise
-    sizes = {recording.sequence.projector_size for recording in imports.recordings}
-    # a layout that states the size itself does not use the assumed one
-    if assumed in sizes - {known[layout].projector}:
-        _warn_of_assumed_size(assumed, warn)
-    if channel is not None:
-        imports = replace(
-            imports,
-            recordings=[replace(recording, channel=channel) for recording in imports.recordings],
+    if layout != "frames":
+        return known[layout]
+    if (toml := sequence or find_description(source)) is not None:
+        return replace(known[layout], read=partial(known[layout].read, toml=Path(toml)))
+    if same is None:
+        raise InputError(
+            f"{source} holds no TOML that describes the images: add one, or give --sequence"
         )
-    return imports
+    warn("the images are described as those of the session: --sequence to describe them")
+    return same
 
 
-def guess_description(
-    folder: Path | str, *, projector: Size | None = None, channel: Channel | None = None
-) -> GuessedDescription:
-    """The TOML of a capture without a description, from its images; ``doubts`` name what stays
-    open. Nothing is saved.
-
-    Of a folder of captures, the first is read. Raises InputError where the images cannot belong to
-    one capture.
-    """
-    return guessed_description.guess_toml(
-        Path(folder), None if projector is None else parse_size(projector), channel
-    )
-
-
-def describe_import(names: Sequence[str], role: Role) -> str:
-    """Return what was imported, as the operator reads it."""
-    one, several = (
-        ("a target pose", "target poses") if role == "calibration" else ("a scan", "scans")
-    )
-    count = (
-        f"1 capture imported as {one}"
-        if len(names) == 1
-        else f"{len(names)} captures imported as {several}"
-    )
-    return f"{count}: {', '.join(names)}"
-
-
-def _warn_of_assumed_size(size: tuple[int, int] | None, warn: Warn) -> None:
-    """Warn that the projector's size was taken from the session, if it was."""
-    if size is not None:
-        warn(
-            f"the projector is assumed to have {size[0]}x{size[1]} px, as in the session:"
-            " --projector for another size"
-        )
-
-
-def _detect_layout(source: Path, same: FolderLayout | None) -> str:
-    """The name of the layout of a folder; frames where only the session describes it."""
-    try:
-        return detect_layout(source)
-    except InputError:
-        if same is None:
-            raise
-        return "frames"
-
-
-def _layout_of_session(session: SessionLike | None, source: Path) -> FolderLayout | None:
+def _layout_of_session(store: Session, source: Path) -> FolderLayout | None:
     """The layout of folders whose files are named like, and show the same as, those of an imported
     capture of the session; None where the source holds no such folder."""
-    if session is None or not (isinstance(session, Session) or is_session(expand_user(session))):
+    if not source.is_dir():
         return None
-    with opened(session) as store:
-        captures = [each for each in store.captures() if each.files and not each.exposures_ms]
-
-    def find_same(folder: Path) -> Capture | None:
-        """Return a capture whose files the folder holds."""
-        named = (each for each in captures if all((folder / f).is_file() for f in each.files))
-        return next(named, None)
+    captures = [each for each in store.captures() if each.files and not each.exposures_ms]
+    same = {
+        folder: capture
+        for folder in list_folders(source)
+        for capture in reversed(captures)
+        if all((folder / file).is_file() for file in capture.files)
+    }
 
     def describe(
         folder: Path, name: str, projector: tuple[int, int] | None
     ) -> tuple[ImportableRecording, list[str]]:
         """Return the recording of a folder."""
-        same = find_same(folder)
-        assert same is not None
-        sequence = replace(same.sequence, projector_size=projector or same.sequence.projector_size)
-        files = tuple(folder / file for file in same.files)
-        channel = same.meta.get("settings", {}).get("channel")
+        capture = same[folder]
+        size = projector or capture.sequence.projector_size
+        sequence = replace(capture.sequence, projector_size=size)
+        files = tuple(folder / file for file in capture.files)
+        channel = capture.meta.get("settings", {}).get("channel")
         return ImportableRecording(name, sequence, files, folder, channel=channel), []
 
-    if not source.is_dir() or not any(map(find_same, (source, *source.iterdir()))):
-        return None
     holds = "files named as in the session"
-    return define_layout("frames", holds, describe, lambda folder: find_same(folder) is not None)
+    return define_layout("frames", holds, describe, same.__contains__) if same else None
 
 
-def _known_projector_size(session: SessionLike | None) -> tuple[int, int] | None:
+def _known_projector_size(store: Session) -> tuple[int, int] | None:
     """The projector's size by the session's captures, else by its imported calibration; None where
     both are missing."""
-    if session is None or not (isinstance(session, Session) or is_session(expand_user(session))):
-        return None
-    with opened(session) as store:
-        sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
-        if not sizes and "stereo" in available_models(store):
-            meta = store.load_result("calibration/stereo", only=())[0]
-            return tuple(meta["projector"]) if meta.get("projector") else None
+    sizes = {capture.sequence.projector_size for capture in store.captures()} - {None}
+    if not sizes and "stereo" in available_models(store):
+        meta = store.load_result("calibration/stereo", only=())[0]
+        return tuple(meta["projector"]) if meta.get("projector") else None
     return sizes.pop() if len(sizes) == 1 else None
 
 
@@ -386,44 +363,180 @@ def _centre_code(
 
 
 def check_imported_capture(capture: NewCapture, warn: Warn) -> NewCapture:
-    """The capture, with its Gray origin estimated if it was not given; InputError where its frames
-    contradict its description.
+    """The capture with merged exposures, and with its Gray origin estimated if it was not given;
+    InputError where its frames contradict its description.
     """
-    sequence = capture.sequence
-    if not capture.settings.get("gray_origin_given", True) and any(
-        f.kind == "gray" for f in sequence.frames
-    ):
-        axes = [
-            axis
-            for axis in sequence.axes
-            if sequence.periods_px(axis) and sequence.find("gray", axis)
-        ]
-        try:
-            light = estimate_frame_light(sequence, capture.frames)
-            origins = {
-                axis: estimate_gray_origin(sequence, capture.frames, axis, light) for axis in axes
-            }
-        except InputError:
-            # Frames out of order and changed light leave no common origin; name the cause.
-            unstated = ("gray-origin", "phase-offset")
-            for finding in examine_frames(sequence, capture.frames, capture.files).rejected:
-                if finding.cause not in unstated:
-                    raise InputError(finding.text()) from None
-            raise
-        if origins:
-            first = next(iter(origins.values()))
-            sequence = replace(
-                sequence, gray_origin_px=PerAxis(origins.get("x", first), origins.get("y", first))
-            )
-            listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
-            warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
+    capture = _merge_exposures(capture)
+    sequence, frames = capture.sequence, capture.frames
+    has_gray = any(frame.kind == "gray" for frame in sequence.frames)
+    if has_gray and not capture.settings.get("gray_origin_given", True):
+        sequence = _estimate_origins(capture, warn)
         for axis in (each for each in sequence.axes if not sequence.periods_px(each)):
-            if (centred := _centre_code(sequence, capture.frames, axis)) is not None:
+            if (centred := _centre_code(sequence, frames, axis)) is not None:
                 sequence = centred
                 warn(
                     f"{capture.name}: the codes along {axis} fit the projector if they are centred"
                     f" on it: gray_origin is taken for {sequence.origin_px(axis):g} px"
                 )
-    phases = decode_examined(capture.name, sequence, capture.frames, capture.files)
-    warn_of_exposure(capture.name, sequence, capture.frames, phases, warn)
+    phases = decode_examined(capture.name, sequence, frames, capture.files)
+    warn_of_exposure(capture.name, sequence, frames, phases, warn)
     return replace(capture, sequence=sequence)
+
+
+def _estimate_origins(capture: NewCapture, warn: Warn) -> PatternSequence:
+    """Return the sequence with the Gray origin of each axis that has fringes too."""
+    sequence, frames = capture.sequence, capture.frames
+    axes = [
+        each for each in sequence.axes if sequence.periods_px(each) and sequence.find("gray", each)
+    ]
+    try:
+        light = estimate_frame_light(sequence, frames)
+        origins = {axis: estimate_gray_origin(sequence, frames, axis, light) for axis in axes}
+    except InputError:
+        # Frames out of order and changed light leave no common origin; name the cause.
+        unstated = ("gray-origin", "phase-offset")
+        for finding in examine_frames(sequence, frames, capture.files).rejected:
+            if finding.cause not in unstated:
+                raise InputError(finding.text()) from None
+        raise
+    if not origins:
+        return sequence
+    listed = ", ".join(f"{origin:.2f} px along {axis}" for axis, origin in origins.items())
+    warn(f"{capture.name}: by the fringes, Gray code 0 begins at {listed}")
+    first = next(iter(origins.values()))
+    origin_px = PerAxis(origins.get("x", first), origins.get("y", first))
+    return replace(sequence, gray_origin_px=origin_px)
+
+
+def import_opencv_calibration(
+    file: Path | str,
+    session: Path | str,
+    keys: Keys | None = None,
+    *,
+    projector: Size | None = None,
+    camera: Size | None = None,
+    force: bool = False,
+    warn: Warn = ignore_warnings,
+) -> StereoModel | None:
+    """Import a stereo calibration made elsewhere, from an OpenCV FileStorage file.
+
+    Args:
+        file: The .yml, .xml or .json file.
+        session: Session folder; made if it does not exist.
+        keys: The file's names for the matrices K_camera D_camera K_projector D_projector R T; R and
+            T (mm) map camera to projector. By default the common names are recognised, and those
+            used are printed.
+        projector: Width x height of the projector, px; by default what the file states, else the
+            session's captures.
+        camera: Width x height of the camera, px; by default what the file states, else the
+            session's captures.
+        force: Replace the session's stereo calibration (the old one goes to the session's trash).
+
+    Returns the model, or None while nothing states a size. The session's other calibrations go to
+    the trash with the stereo one that they were made from.
+
+    Raises InputError, and replaces nothing, where sizes contradict each other, and where the
+    patterns of a capture in the session contradict the calibration: R and T inverted, matrices
+    exchanged or at another pixel scale, another rig.
+    """
+    path = Path(file)
+    storage = read_storage(path)
+    matrices = opencv_calibration.read_matrices(storage, keys)
+    stated = opencv_calibration.read_sizes(storage)
+    with opened_or_made(session) as store:
+        there = available_models(store)
+        if there and not force:
+            raise InputError(
+                f"{store.folder} holds a {' and a '.join(there)} calibration already: "
+                "replace it with --force (it goes to the session's trash)"
+            )
+        captures = store.captures()
+        projectors = {capture.sequence.projector_size for capture in captures} - {None}
+        sizes = {
+            device: _resolve_size(path, device, given, stated, captured)
+            for device, given, captured in (
+                ("camera", camera, {capture.size for capture in captures}),
+                ("projector", projector, projectors),
+            )
+        }
+        camera_lens, projector_lens = (  # raises what a lens cannot have
+            Lens(matrices[f"K_{device}"], matrices[f"D_{device}"], size or (1, 1))
+            for device, size in sizes.items()
+        )
+        rig = StereoRig(camera_lens, projector_lens, matrices["R"], matrices["T"])
+        model = None if None in sizes.values() else StereoModel.from_rig(rig)
+        if model is None or not _is_confirmed(model, captures, warn):
+            for device, size in sizes.items():
+                if size is not None:
+                    _check_principal_point(device, matrices[f"K_{device}"], size, warn)
+        with store.together():
+            trash_models(store, there)
+            save_imported_stereo(store, matrices, source=str(file), **sizes)
+        return model
+
+
+def identify_calibration_keys(file: Path | str) -> dict[str, str]:
+    """{entry: the file's name for it}, as ``import_opencv_calibration`` takes them by default.
+    Raises InputError."""
+    keys = opencv_calibration.identify_keys(read_storage(Path(file)))
+    return dict(zip(opencv_calibration.ENTRIES, keys, strict=True))
+
+
+def _resolve_size(
+    path: Path,
+    device: str,
+    given: Size | None,
+    stated: dict[str, tuple[tuple[int, int], str]],
+    captured: set[Any],
+) -> tuple[int, int] | None:
+    """The size that is given, else stated in the file, else the captures'; InputError where these
+    differ."""
+    sources = {f"--{device}": parse_size(given)} if given is not None else {}
+    if device in stated:
+        sources[f"{path.name}: {stated[device][1]}"] = stated[device][0]
+    if len(captured) == 1:
+        sources["the session's captures"] = next(iter(captured))
+    if len(set(sources.values())) > 1:
+        conflict = ", ".join(
+            f"{width}x{height} px by {source}" for source, (width, height) in sources.items()
+        )
+        raise InputError(
+            f"the {device} has {conflict}: the calibration does not belong to these captures, or"
+            " one size is wrong"
+        )
+    size = next(iter(sources.values()), None)
+    if len(captured) > 1 and size not in captured:
+        raise InputError(
+            f"the session's captures have several {device} sizes: give the calibrated one with"
+            f" --{device}"
+        )
+    return size
+
+
+def _is_confirmed(model: StereoModel, captures: Iterable[Capture], warn: Warn) -> bool:
+    """Whether a capture with both axes confirms the calibration; False without such a capture.
+    Raises InputError where one contradicts it."""
+    rig = model.rig
+    for capture in captures:
+        sequence = capture.sequence
+        is_same = (capture.size, sequence.projector_size) == (rig.camera.size, rig.projector.size)
+        if is_same and len(sequence.axes) > 1:
+            check = check_phases(capture.name, decode_capture(capture), model)
+            for message in check.warnings:
+                warn(message)
+            if check.agreement is not None:
+                return True
+    return False
+
+
+def _check_principal_point(device: str, K: np.ndarray, size: tuple[int, int], warn: Warn) -> None:
+    """Warn where the optical axis is outside of the image: a shifted lens, or another pixel
+    scale."""
+    (width, height), (cx, cy) = size, K[:2, 2]
+    if not (-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5):
+        warn(
+            f"the {device}'s principal point ({cx:.0f}, {cy:.0f}) lies outside of its"
+            f" {width}x{height} px: the lens is shifted, or the calibration was made at another"
+            " pixel scale; import a capture with patterns along both axes, and the calibration"
+            " after it: the patterns then tell"
+        )

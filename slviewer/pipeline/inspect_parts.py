@@ -5,13 +5,14 @@ a plan from the measurements of a session, to repeat them on other scans."""
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from scipy.stats import chi2, norm
 
 from slviewer.errors import InputError, SlviewerError, UsageError
-from slviewer.evaluation.capability import process_capability
 from slviewer.geometry.rigid import move_points
 from slviewer.inspection.deviation import Deviation, deviation, judge_limits
 from slviewer.inspection.features import Feature, relation
@@ -27,17 +28,27 @@ from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
 from slviewer.inspection.uncertainty import RigidSpread, Shared
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.measure import load_feature
-from slviewer.pipeline.measured_surface import MERGED, MeasuredSurface, load_surface
+from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
-from slviewer.pipeline.open_session import SessionLike, match_names, next_number, opened
 from slviewer.pipeline.operation import Findings, Found, Job, operation
-from slviewer.pipeline.stored_records import Stored, list_records
+from slviewer.pipeline.stored_records import (
+    SessionLike,
+    Stored,
+    list_records,
+    match_names,
+    next_name,
+    opened,
+)
 from slviewer.printable import format_csv
-from slviewer.records.inspection import Characteristic, CharacteristicResult, Inspection, PartResult
+from slviewer.records.inspection import (
+    Capability,
+    Characteristic,
+    CharacteristicResult,
+    Inspection,
+    PartResult,
+)
 from slviewer.records.measurement import Measurement, Quantity
 from slviewer.records.plain import from_plain, to_plain
-from slviewer.records.table import Value
 from slviewer.report.session import write_parts_page
 from slviewer.session.atomic import replace_file, to_json
 from slviewer.session.inspection_plan import (
@@ -63,6 +74,8 @@ LEAST_TOLERANCE_MM, MOST_TOLERANCE_MM = 1e-3, 1e3
 _DECIMALS = 4
 """Of nominal values and limits in a plan."""
 FORM_OF = {"plane": "flatness", "sphere": "roundness", "cylinder": "cylindricity"}
+CONFIDENCE, MIN_PARTS = 0.95, 3
+"""Of a capability: of its intervals, and the parts that it takes."""
 DATUM_ROUNDS = 4
 """Fits of the datums, each with the regions moved by the frame of the last."""
 
@@ -123,7 +136,7 @@ def inspect_parts(
             continue
         for name in names:
             label = name if len(folders) == 1 else f"{folder.name}/{name}"
-            sources.append((label, _part_loader(folder, name, settings, warn)))
+            sources.append((label, partial(_load_part, folder, name, settings, warn)))
     # of several sessions
     found = msgspec.structs.replace(inspect_surfaces(read, sources, progress), inputs={})
     folder = Path(f"{Path(plan).with_suffix('')}-results") if out is None else out
@@ -132,16 +145,13 @@ def inspect_parts(
     return Findings(Inspection, {found.plan: found}, files, tuple(f"-> {path}" for path in files))
 
 
-def _part_loader(session: SessionLike, scan: str, settings: RunPlanSettings, warn: Warn) -> Load:
-    """Return what loads the surface of a part."""
-
-    def load(progress: Progress) -> MeasuredSurface:
-        """Open the session, and load the surface."""
-        with opened(session) as store:
-            job, accepts = Job(store, progress, warn), settings.accept_rejected
-            return load_surface(job, scan, settings.model, accept_rejected=accepts)
-
-    return load
+def _load_part(
+    session: SessionLike, scan: str, settings: RunPlanSettings, warn: Warn, progress: Progress
+) -> MeasuredSurface:
+    """Load the surface of a part."""
+    with opened(session) as store:
+        job, accepts = Job(store, progress, warn), settings.accept_rejected
+        return load_surface(job, scan, settings.model, accept_rejected=accepts)
 
 
 def inspect_surfaces(
@@ -174,16 +184,19 @@ def inspect_surfaces(
                 raise
             results = tuple(_undecided(each, str(error)) for each in plan.characteristic)
         parts.append(PartResult(name, results))
-    capability = []
-    for k, wanted in enumerate(plan.characteristic):
-        values = [value for each in parts if (value := each.results[k].value) is not None]
-        capability.append(process_capability(values, wanted.lower, wanted.upper))
     progress(1.0, "inspected")
     return Inspection(
         plan=plan.name,
         characteristic=plan.characteristic,
         parts=tuple(parts),
-        capability=tuple(capability),
+        capability=tuple(
+            process_capability(
+                [value for each in parts if (value := each.results[k].value) is not None],
+                wanted.lower,
+                wanted.upper,
+            )
+            for k, wanted in enumerate(plan.characteristic)
+        ),
         alignment=plan.alignment.kind,
         inputs=inputs,
         scales=scales,
@@ -194,11 +207,9 @@ def write_inspection(found: Inspection, files: Sequence[Path]) -> None:
     """Write what was found of parts as HTML, CSV and JSON."""
     html, csv, json = files
     table = found.list_results()
-    rows: list[list[Value]] = [
-        [column.heading for column in table.columns],
-        *map(table.values, table.rows),
-    ]
-    replace_file(csv, format_csv(rows).encode("utf-8-sig"))
+    headings = [column.heading for column in table.columns]
+    text = format_csv([headings, *map(table.values, table.rows)])
+    replace_file(csv, text.encode("utf-8-sig"))
     replace_file(json, to_json(found))
     write_parts_page(html, found)
 
@@ -249,15 +260,15 @@ def run_plan(job: Job, settings: RunPlanSettings) -> Iterator[Found[Inspection]]
         if own.is_file():
             plan = replace(plan, alignment=replace(plan.alignment, nominal=str(own)))
     sources = [
-        (name, _part_loader(store, name, settings, job.warn))
+        (name, partial(_load_part, store, name, settings, job.warn))
         for name in match_parts(store, settings.scans)
     ]
     found = inspect_surfaces(plan, sources, job.progress)
     with ExitStack() as placed:
         write_inspection(found, [placed.enter_context(store.staged_export(name)) for name in FILES])
         files = tuple(store.exports / name for name in FILES)
-        number, notes = next_number(store, Inspection.kind), tuple(f"-> {path}" for path in files)
-        yield Found(str(number), found, files=files, notes=notes)
+        notes = tuple(f"-> {path}" for path in files)
+        yield Found(next_name(store, Inspection), found, files=files, notes=notes)
 
 
 def _undecided(wanted: Characteristic, reason: str) -> CharacteristicResult:
@@ -265,9 +276,38 @@ def _undecided(wanted: Characteristic, reason: str) -> CharacteristicResult:
     return CharacteristicResult(wanted.name, None, None, "undecided", reason)
 
 
+def process_capability(
+    values: Sequence[float], lower: float | None, upper: float | None
+) -> Capability | None:
+    """Estimate the capability of a process; None for fewer than 3 values, without a limit, or where
+    they do not vary.
+
+    Cp's interval is exact for normal values (chi squared), Cpk's is Bissell's approximation
+    (Applied Statistics 39, 1990). The spread of the values includes that of the measurement.
+    """
+    x = np.asarray(values, np.float64)
+    n = len(x)
+    low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
+    if (
+        n < MIN_PARTS
+        or not np.isfinite([low, high]).any()
+        or not (sigma := float(x.std(ddof=1))) > 0
+    ):
+        return None
+    mean, tail = float(x.mean()), (1 - CONFIDENCE) / 2
+    cp = None
+    if np.isfinite(high - low):
+        value = (high - low) / (6 * sigma)
+        ends = value * np.sqrt(chi2.ppf([tail, 1 - tail], n - 1) / (n - 1))
+        cp = (value, float(ends[0]), float(ends[1]))
+    cpk = min(mean - low, high - mean) / (3 * sigma)
+    reach = float(norm.ppf(1 - tail) * np.sqrt(1 / (9 * n) + cpk**2 / (2 * (n - 1))))
+    return Capability(n, mean, sigma, cp, (cpk, cpk - reach, cpk + reach))
+
+
 class AlignedPart:
-    """A scan's points in part coordinates, ``T_part_scan``, and the features fitted to them, each
-    when it is used.
+    """A scan's points in part coordinates, ``T_part_scan``; ``feature`` of a name fits that to
+    them, once.
 
     ``spread``: what the alignment adds to the uncertainty of places; None without one. Raises
     InputError where the part cannot be aligned.
@@ -275,7 +315,6 @@ class AlignedPart:
 
     def __init__(self, plan: Plan, surface: MeasuredSurface, nominal: Nominal | None) -> None:
         self.features = {each.name: each for each in plan.feature}
-        self._fits: dict[str, FeatureFit] = {}
         self._surface = surface
         self._scan_points = surface.points[surface.measured].astype(np.float64)
         self._nominal_surface: NominalSurface | None = None
@@ -293,13 +332,7 @@ class AlignedPart:
             self.T_part_scan = np.array(plan.alignment.start)
             self._align_datums(plan.alignment.datums)
         self.points = move_points(self.T_part_scan, self._scan_points)
-
-    def feature(self, name: str) -> FeatureFit:
-        """The fit of a feature in part coordinates; planes face the camera. Raises InputError where
-        it has none."""
-        if name not in self._fits:
-            self._fits[name] = self._fit(name)
-        return self._fits[name]
+        self.feature: Callable[[str], FeatureFit] = cache(self._fit)
 
     def profile(self, name: str) -> Quantity:
         """The profile of a region against the nominal model. Raises InputError without one."""
@@ -340,7 +373,7 @@ class AlignedPart:
 
     def _fit(self, name: str, as_planned: bool = False) -> FeatureFit:
         """Fit a feature to the part as it lies now; a plane faces the camera, or the side that it
-        has ``as_planned``."""
+        has ``as_planned``. Raises InputError where the part has none."""
         feature, T = self.features[name], self.T_part_scan
         if feature.kind == "surface":
             raise InputError(
@@ -352,9 +385,10 @@ class AlignedPart:
             fit = fit_feature(feature.kind, points[within], self.shared, self._surface.calibration)
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
+        towards = T[:3, 3] - fit.feature.place
         if as_planned and feature.direction is not None:
-            return face_towards(fit, np.array(feature.direction))
-        return face_towards(fit, T[:3, 3] - fit.feature.place)
+            towards = np.array(feature.direction)
+        return face_towards(fit, towards)
 
 
 def fit_to_nominal(
@@ -365,18 +399,14 @@ def fit_to_nominal(
 ) -> Deviation:
     """Align a surface by the best fit to the nominal model; ``reach_mm`` as in `deviation`. Raises
     SlviewerError where that cannot be trusted."""
-    points = surface.points[surface.measured].astype(np.float64)
-    normals = (
-        None if surface.normals is None else surface.normals[surface.measured].astype(np.float64)
-    )
+    measured, normals = surface.measured, surface.normals
+    points, sigma = surface.points[measured].astype(np.float64), surface.sigma_mm[measured]
     check_size(nominal, points)
-    sigma = surface.sigma_mm[surface.measured]
-    typical = float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None
     return deviation(
         points,
         nominal.mesh,
-        normals=normals,
-        sigma_mm=typical,
+        normals=None if normals is None else normals[measured].astype(np.float64),
+        sigma_mm=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else None,
         reach_mm=reach_mm,
         progress=progress,
     )
@@ -389,11 +419,11 @@ def _measure(wanted: Characteristic, part: AlignedPart) -> CharacteristicResult:
         quantity = measure_characteristic(wanted, part)
     except (SlviewerError, np.linalg.LinAlgError) as error:
         return _undecided(wanted, str(error))
-    U = quantity.U
-    if U is None or not np.isfinite(quantity.value + U):
+    value, U = quantity.value, quantity.U
+    if U is None or not np.isfinite(value + U):
         return _undecided(wanted, "its uncertainty is not known")
-    decision = judge_limits(quantity.value, U, wanted.lower, wanted.upper)
-    return CharacteristicResult(wanted.name, quantity.value, U, decision, whole=quantity.whole)
+    decision = judge_limits(value, U, wanted.lower, wanted.upper)
+    return CharacteristicResult(wanted.name, value, U, decision, whole=quantity.whole)
 
 
 def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantity:
@@ -414,12 +444,10 @@ def measure_characteristic(wanted: Characteristic, part: AlignedPart) -> Quantit
         if kind in TO_DATUM:
             return orientation_error(kind, fit, points, datum, part.shared)  # type: ignore[arg-type]
         quantities = relation(fit.feature, fit.spread, datum.feature, datum.spread)
-    for quantity in quantities:
-        if quantity.name == kind:
-            return quantity
-    raise InputError(
-        f"A {fit.feature.kind} has no {kind} here: it has {', '.join(q.name for q in quantities)}."
-    )
+    named = {quantity.name: quantity for quantity in quantities}
+    if kind in named:
+        return named[kind]
+    raise InputError(f"A {fit.feature.kind} has no {kind} here: it has {', '.join(named)}.")
 
 
 def plan(
@@ -485,19 +513,20 @@ def make_plan(
         ideal, source = read_nominal(nominal), next(iter(fits.values())).record
         T = fit_to_nominal(load_surface(job, source.source, source.model), ideal).T_nominal_scan
         alignment = Alignment("best fit", str(nominal.expanduser().absolute()))
-    listed = [_plan_feature(names[i], each, features[i], T) for i, each in fits.items()]
-    skipped = [
+    if skipped := [
         each.label
         for each in measured
         if each.record.what not in (*FORM_OF, "relation") or each.stale
-    ]
-    if skipped:
+    ]:
         job.warn(
             f"a plan holds fits and their relations that are not stale: {', '.join(skipped)} are"
             " not in it"
         )
     return Plan(
-        name, tuple(listed), tuple(_list_characteristics(measured, names, tolerance)), alignment
+        name,
+        tuple(_plan_feature(names[i], each, features[i], T) for i, each in fits.items()),
+        tuple(_list_characteristics(measured, names, tolerance)),
+        alignment,
     )
 
 
@@ -532,12 +561,14 @@ def _list_characteristics(
         for quantity in each.record.quantities:
             if quantity.name in (("diameter",) if form else KINDS):
                 nominal = round(quantity.value, _DECIMALS)
-                lower, upper = (
-                    round(nominal + each, _DECIMALS) for each in (-tolerance, tolerance)
-                )
-                name = f"{' – '.join(features)} {quantity.name}"
                 yield Characteristic(
-                    name, quantity.name, features, nominal, lower, upper, quantity.unit
+                    f"{' – '.join(features)} {quantity.name}",
+                    quantity.name,
+                    features,
+                    nominal,
+                    round(nominal - tolerance, _DECIMALS),
+                    round(nominal + tolerance, _DECIMALS),
+                    quantity.unit,
                 )
         if form:
             yield Characteristic(f"{features[0]} {form}", form, features, upper=tolerance)

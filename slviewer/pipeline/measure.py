@@ -1,40 +1,45 @@
-"""Measuring on a scan or a merge: points, distances, sections, fitted shapes, and the relations
-between them; the measurements of a session are listed, renamed, deleted and written as CSV."""
+"""Measuring on the surface of a scan or a merge, by all that is known of its errors: points,
+distances, sections, fitted shapes, and the relations between them; the measurements of a session
+are listed, renamed, deleted and written as CSV."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import InputError, UsageError
 from slviewer.inspection.features import KINDS, Feature, distance, relation
 from slviewer.inspection.fitting import fit_feature
 from slviewer.inspection.regions import Region
 from slviewer.inspection.section import CutPlane, section, triangulate_near
-from slviewer.inspection.uncertainty import Spread
+from slviewer.inspection.uncertainty import Shared, Spread, splined_shared
 from slviewer.pipeline.feedback import Warn, ignore_warnings
-from slviewer.pipeline.measured_surface import (
-    MERGED,
-    LoadSurface,
-    MeasuredSurface,
-    Place,
-    load_surface,
-    triangulate_surface,
+from slviewer.pipeline.models import (
+    Model,
+    ModelName,
+    available_models,
+    check_accepted,
+    load_model,
+    preferred_model,
+    warn_if_stale,
 )
-from slviewer.pipeline.models import ModelName, available_models
-from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import OPERATIONS, Found, Job, operation
+from slviewer.pipeline.reconstruct import read_merge, scan_cloud
+from slviewer.pipeline.scale import load_scale_correction
 from slviewer.pipeline.stored_records import (
+    SessionLike,
     Stored,
     list_records,
     load_arrays,
     load_stored,
-    next_name,
+    opened,
 )
 from slviewer.printable import format_csv
+from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.reconstruct import normals, triangulate_grid
 from slviewer.records.measurement import (
     MeasuredFeature,
     MeasuredRegion,
@@ -46,6 +51,7 @@ from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.record import to_vector
 from slviewer.session.atomic import replace_file
 from slviewer.session.names import clean_label
+from slviewer.session.scan_edits import restriction_inputs
 from slviewer.session.store import Session
 
 What = Literal["point", "distance", "section", "plane", "sphere", "cylinder"]
@@ -59,6 +65,177 @@ COLUMNS = (
     "state", "time",
 )  # fmt: skip
 _FOLDER = f"{Measurement.kind}/"
+MERGED = "merge/"
+"""Beginning of the name of a stored merge; its number follows, for meshes nothing for the last."""
+Place = tuple[int, int] | int
+"""A point of a surface: pixel (u, v) of a scan, or the index of a merged surface's point."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSurface:
+    """Points (h, w, 3) of a scan, or (n, 3) of a merged surface, mm, NaN where nothing was
+    measured.
+
+    ``sigma_mm`` like them without the last axis: of z, along the camera's ray, for a scan; along
+    ``normals`` for a merged surface; ``left_mm`` likewise: standard deviation from the calibration,
+    where known. ``faces`` (m, 3): of a merged mesh. ``source`` is the capture or result that it
+    came from, ``model`` the calibration, ``inputs`` the hashes of both; ``shared``: the covariance
+    of errors of that ``calibration``, by its hash, where known.
+    """
+
+    points: np.ndarray
+    sigma_mm: np.ndarray
+    source: str
+    model: str
+    inputs: Mapping[str, str]
+    left_mm: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    shared: Shared | None = None
+    calibration: str = ""
+    texture: np.ndarray | None = None
+    scale: float = 1.0
+
+    @property
+    def organised(self) -> bool:
+        """Whether it is a scan, pixel by pixel."""
+        return self.points.ndim == 3
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Mask of the measured points, (h, w) or (n,) bool."""
+        return np.asarray(np.isfinite(self.points).all(axis=-1))
+
+    def within(self, region: Region) -> np.ndarray:
+        """(n, 3) float64: the points of a region."""
+        return np.asarray(self.points[region.within(self.points)], np.float64)
+
+    def noise(self, region: Region) -> float:
+        """mm: the region's expected noise in the median; infinite where it is not known."""
+        sigma = self.sigma_mm[region.within(self.points)]
+        return float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("inf")
+
+    def picked(self, place: Place) -> tuple[Feature, Spread]:
+        """The point at a pixel or index, and its uncertainty. Raises InputError without one."""
+        if self.organised != isinstance(place, tuple):
+            raise InputError(
+                f"{place} is not a place on {self.source}: give"
+                f" {'pixel (u, v)' if self.organised else 'an index'}"
+            )
+        index = place[::-1] if isinstance(place, tuple) else (place,)
+        if not all(0 <= i < n for i, n in zip(index, self.points.shape, strict=False)):
+            raise InputError(f"{place} lies outside {self.source}: pick a point of it")
+        point = np.asarray(self.points[index], np.float64)
+        if not np.isfinite(point).all():
+            raise InputError(f"nothing was measured at {place} of {self.source}: pick another")
+        away, sigma = np.zeros(3), float(np.nan_to_num(self.sigma_mm[index]))
+        if self.organised:
+            away = sigma * point / point[2]
+        elif self.normals is not None:
+            away = sigma * np.asarray(self.normals[index], np.float64)
+        shared = None if self.shared is None else self.shared(point[None], np.eye(3)[:, None])
+        return Feature("point", point), Spread(np.outer(away, away), shared, self.calibration)
+
+    def sigma_along(self, normals: np.ndarray, whole: bool = False) -> np.ndarray:
+        """(n,) mm: standard deviation of the measured points along unit normals (n, 3), of noise
+        alone, or on the ``whole``, with what the calibration leaves uncertain."""
+        sigma = self.sigma_mm[self.measured].astype(np.float64)
+        if whole and self.left_mm is not None:
+            sigma = np.hypot(sigma, self.left_mm[self.measured])
+        if not self.organised:
+            return sigma
+        points = self.points[self.measured].astype(np.float64)
+        return sigma * np.abs(np.sum(points / points[:, 2:] * normals, axis=1))
+
+
+LoadSurface = Callable[[Session], MeasuredSurface]
+"""Returns a surface of a session that is at hand already."""
+
+
+def triangulate_surface(on: MeasuredSurface) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float64 and faces (m, 3) of a surface; a scan's end where its depth jumps."""
+    if on.faces is not None:
+        return np.asarray(on.points, np.float64), on.faces
+    if not on.organised:
+        raise InputError(f"{on.source} is a cloud without triangles: mesh it first")
+    return on.points[on.measured].astype(np.float64), triangulate_grid(on.points)
+
+
+def load_surface(
+    job: Job,
+    scan: str,
+    model: str | None = None,
+    roi: str = "",
+    accept_rejected: bool = False,
+    load: LoadSurface | None = None,
+) -> MeasuredSurface:
+    """Reconstruct a capture to measure on it, or read a stored merge, named ``merge/<number>``;
+    ``roi`` as in `resolve_region`, for captures alone. ``load`` returns a surface that is at
+    hand."""
+    store, warn = job.store, job.warn
+    if load is not None:
+        return load(store)
+    if scan.startswith(MERGED):
+        return load_merged_surface(store, scan, warn, roi)
+    check_accepted(store, accept_rejected)
+    warn_if_stale(store, warn)
+    model = model or preferred_model(store)
+    cloud = scan_cloud(job, scan, model, accept_rejected, roi)
+    job.progress(1.0, "reconstructed")
+    return surface_from_cloud(
+        store, scan, cloud, load_model(store, cloud.model), with_region=not roi
+    )
+
+
+def surface_from_cloud(
+    store: Session, scan: str, cloud: Cloud, fitted: Model, *, with_region: bool = True
+) -> MeasuredSurface:
+    """A capture's cloud, made with one of the session's calibrations, as a surface to measure on.
+
+    ``with_region``: whether it was cut by the session's region, where that is in effect.
+    """
+    calibration, scale, sigma = f"calibration/{fitted.name}", 1.0, 0.0
+    names = [scan, calibration]
+    if (applied := load_scale_correction(store, fitted.name)) is not None:
+        names.append(f"scale/{fitted.name}")
+        scale, sigma = float(applied["factor"]), 1e-6 * float(applied["U_ppm"]) / 2
+    inputs = store.input_hashes(*names) | restriction_inputs(store, [scan], with_region=with_region)
+    shared = None
+    if isinstance(fitted, SplinedModel):
+        shared = splined_shared(fitted.bundle, cloud.axis, scale, sigma)
+    return MeasuredSurface(
+        cloud.points,
+        cloud.sigma_z,
+        scan,
+        fitted.name,
+        inputs,
+        left_mm=cloud.sigma_calibration,
+        normals=normals(cloud.points),
+        shared=shared,
+        calibration="" if shared is None else inputs[calibration],
+        texture=cloud.texture,
+        scale=scale,
+    )
+
+
+def load_merged_surface(
+    store: Session, merge: str, warn: Warn = ignore_warnings, roi: str = ""
+) -> MeasuredSurface:
+    """A stored merge ``merge/<number>``, in the frame of its reference's camera; ``roi`` as in
+    `read_merge`."""
+    record, points = read_merge(store, merge, warn, roi)
+    sigma = points.scalars.get("sigma", np.full(len(points.points), np.nan, np.float32))
+    return MeasuredSurface(
+        points.points,
+        sigma,
+        merge,
+        record.model,
+        store.input_hashes(merge),
+        normals=points.normals,
+        faces=points.faces,
+        texture=points.colours,
+        scale=record.scales.get(record.model, 1.0),
+    )
 
 
 @dataclass(frozen=True)
@@ -148,34 +325,29 @@ def measure(job: Job, settings: MeasureSettings) -> Iterator[Found[Measurement]]
     on = load_surface(
         job, settings.scan, settings.model, settings.roi, settings.accept_rejected, settings.load
     )
-    if settings.what in FITTED:
-        fields, arrays = _fit(on, settings)
-    else:
-        makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
-        fields, arrays = makers[settings.what](on, settings.places(on))
+    makers = {"point": _pick, "distance": _measure_distance, "section": _cut}
+    fields, arrays = makers.get(settings.what, _fit)(on, settings)
     record = Measurement(
         what=settings.what, name=clean_label(settings.name), **provenance(on), **fields
     )
     used = replace(settings, model=on.model)  # type: ignore[arg-type]
     notes = uncertainty_notes(store, record)
-    yield Found(next_name(store, Measurement), record, arrays, notes=notes, settings=used)
+    yield Found("", record, arrays, notes=notes, settings=used)
     job.progress(1.0, "measured")
 
 
 def provenance(on: MeasuredSurface) -> dict[str, Any]:
-    """Return what a measurement states of the surface that it was made on, and its time."""
+    """Return what a measurement states of the surface that it was made on."""
     return {
         "source": on.source,
         "model": on.model,
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "inputs": dict(on.inputs),
         "scales": {on.model: on.scale} if on.model else {},
     }
 
 
 def uncertainty_notes(store: Session, measured: Measurement) -> tuple[str, ...]:
-    """Return what the uncertainty of a measurement lacks, with the remedy; nothing where it is
-    whole."""
+    """Return what the uncertainty of a measurement lacks, with the remedy; nothing if whole."""
     if all(quantity.whole for quantity in measured.quantities):
         return ()
     models = [each for each in measured.model.split(", ") if each != "splined"]
@@ -191,24 +363,23 @@ def uncertainty_notes(store: Session, measured: Measurement) -> tuple[str, ...]:
     return (f"U is too small, as {cause} does not know the calibration's part: {remedy}",)
 
 
-def _pick(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
+def _pick(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """A picked point, to relate it with fits."""
-    feature, spread = on.picked(places[0])
+    feature, spread = on.picked(settings.places(on)[0])
     fields, arrays = _describe_feature(feature, spread)
     at = zip("xyz", feature.place.tolist(), strict=True)
-    return fields | {"quantities": [Quantity(axis, value, "mm") for axis, value in at]}, arrays
+    return fields | {"quantities": [Quantity(*each, "mm") for each in at]}, arrays
 
 
-def _measure_distance(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
+def _measure_distance(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """The distance between two picked points."""
-    (first, first_spread), (second, second_spread) = (on.picked(place) for place in places)
+    (first, first_spread), (second, second_spread) = map(on.picked, settings.places(on))
     length = distance(first.place, second.place, first_spread, second_spread)
     return {"quantities": [length], "ends": (to_vector(first.place), to_vector(second.place))}, {}
 
 
 def _fit(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
-    """A plane, sphere or cylinder fitted to a region. Raises InputError where the region has
-    none."""
+    """A plane, sphere or cylinder fitted to a region. Raises InputError where it has none."""
     region = settings.region()
     fit = fit_feature(settings.what, on.within(region), on.shared, on.calibration)  # type: ignore[arg-type]
     noise, warnings = on.noise(region), list(fit.warnings)
@@ -227,10 +398,10 @@ def _fit(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     return fields, arrays
 
 
-def _cut(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
+def _cut(on: MeasuredSurface, settings: MeasureSettings) -> Measured:
     """A section: the surface cut along a line between two picked points, as nearly parallel to the
     camera's viewing direction as possible."""
-    first, second = (on.picked(place)[0].place for place in places)
+    first, second = (on.picked(place)[0].place for place in settings.places(on))
     plane = CutPlane.through(first, second, -(first + second) / 2)
     if on.organised or on.faces is not None:
         vertices, faces = triangulate_surface(on)
@@ -240,19 +411,21 @@ def _cut(on: MeasuredSurface, places: Sequence[Place]) -> Measured:
         vertices, faces = triangulate_near(on.points, on.normals, plane)
     lines = section(vertices, faces, plane)
     drawn = np.concatenate(lines)
-    spans = zip(("length along", "height range"), np.ptp(drawn, axis=0).tolist(), strict=True)
-    quantities = [Quantity(name, span, "mm") for name, span in spans]
+    along, up = np.ptp(drawn, axis=0).tolist()
+    fields = {
+        "quantities": [Quantity("length along", along, "mm"), Quantity("height range", up, "mm")],
+        "plane": from_plain(to_plain(plane), SectionPlane),
+    }
     lengths = np.array([len(line) for line in lines], np.int32)
-    fields = {"quantities": quantities, "plane": from_plain(to_plain(plane), SectionPlane)}
     return fields, {"lines": drawn.astype(np.float32), "lengths": lengths}
 
 
 def _describe_feature(feature: Feature, spread: Spread) -> Measured:
-    """Return a feature as a measurement holds it, with its own part of its uncertainty; and the
-    part that fits of one calibration share, as an array."""
+    """Return a feature with its own part of its uncertainty; and the part that is shared, as an
+    array."""
     own = {"scatter": spread.scatter.tolist(), "calibration": spread.calibration}
-    arrays = {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
-    return {"feature": from_plain(to_plain(feature) | own, MeasuredFeature)}, arrays
+    fields = {"feature": from_plain(to_plain(feature) | own, MeasuredFeature)}
+    return fields, {} if spread.shared is None else {"shared": spread.shared.astype(np.float32)}
 
 
 @dataclass(frozen=True)
@@ -278,11 +451,10 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
     first, second = (load_stored(store, Measurement, each) for each in (settings.a, settings.b))
     if settings.a == settings.b:
         raise InputError(f"{first.label} was chosen twice: choose two measurements")
-    for each in (first, second):
-        if each.stale:
-            raise InputError(
-                f"{each.label} is stale, what it was measured on has changed: measure it again"
-            )
+    if stale := [each.label for each in (first, second) if each.stale]:
+        raise InputError(
+            f"{stale[0]} is stale, what it was measured on has changed: measure it again"
+        )
     features = (*load_feature(store, first), *load_feature(store, second))
     a, b = first.record, second.record
     # scans are in one frame only while camera and calibration are the same; a merge has its own
@@ -300,11 +472,10 @@ def relate(job: Job, settings: RelateSettings) -> Iterator[Found[Measurement]]:
         quantities=relation(*features),
         where=f"{first.label} and {second.label}",
         of=(settings.a, settings.b),
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
         inputs=store.input_hashes(_FOLDER + settings.a, _FOLDER + settings.b),
         scales=a.scales | b.scales,
     )
-    yield Found(next_name(store, Measurement), record, notes=uncertainty_notes(store, record))
+    yield Found("", record, notes=uncertainty_notes(store, record))
 
 
 def load_feature(store: Session, measured: Stored[Measurement]) -> tuple[Feature, Spread]:
@@ -315,7 +486,8 @@ def load_feature(store: Session, measured: Stored[Measurement]) -> tuple[Feature
             f"{measured.label} is a {measured.record.what}: choose one of {', '.join(KINDS)}"
         )
     shared = load_arrays(store, _FOLDER + measured.name).get("shared")
-    shared = None if shared is None else shared.astype(np.float64)
+    if shared is not None:
+        shared = shared.astype(np.float64)
     spread = Spread(np.array(found.scatter), shared, found.calibration)
     return from_plain(to_plain(found), Feature), spread
 
@@ -372,8 +544,7 @@ def rename_measurement(store: Session, name: str, label: str) -> Stored[Measurem
 
 
 def trash_measurement(store: Session, name: str) -> None:
-    """Move a measurement to the trash; ``restore_measurement`` brings it back. What was made from
-    it becomes stale."""
+    """Move a measurement to the trash; what was made from it becomes stale."""
     load_stored(store, Measurement, name)
     store.trash_result(_FOLDER + name)
 
@@ -418,7 +589,7 @@ def edit_measurements(
         if bring_back:
             restore_measurement(store)
         found = list_records(store, Measurement)
-        lines = [describe_measurement(each) for each in found] or ["nothing was measured yet"]
+        lines = list(map(describe_measurement, found)) or ["nothing was measured yet"]
         if csv is not None:
             lines.append(f"{export_measurements(store, csv)} measurements -> {csv}")
     return "\n".join(lines)

@@ -1,7 +1,11 @@
-"""Registering scans of one object, and fusing them into one surface."""
+"""Registering scans of one object: one after the other while they are captured, each to those
+before it, and all of them, whose loops are closed, to be fused into one surface.
+
+A scan that could be aligned has a result ``placement/NAME``, which says where it is in the frame of
+the first one; one that could not has the reason. A merge of all may start from there."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -9,24 +13,26 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
-from slviewer.geometry.rigid import rotation_angle
-from slviewer.pipeline.align import load_places
-from slviewer.pipeline.capture_clouds import capture_cloud, check_capture_sizes
-from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Warn, stage
+from slviewer.geometry.rigid import move_points, rotation_angle
+from slviewer.pipeline.feedback import Warn, ignore_warnings, part, stage
 from slviewer.pipeline.models import ModelName, check_accepted, frame_of, load_model, warn_if_stale
-from slviewer.pipeline.open_session import next_number, placed_file
 from slviewer.pipeline.operation import Found, Job, operation
-from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.reconstruct import reconstruct_captures, scan_cloud
+from slviewer.pipeline.scale import describe_calibration
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.pipeline.stored_records import next_name, placed_file, read_record
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.reconstruction.reconstruct import normals
 from slviewer.records.merge import (
     ContradictingPair,
     MarkerPair,
     Merge,
+    Placement,
     RefusedPair,
     Registered,
 )
@@ -53,6 +59,13 @@ one in a million."""
 MAT_MARKERS, MAT_TURN_DEG = 3, 3.0
 """Markers in common from which on a turntable's mat is used, and how far its turn may be from the
 table's."""
+PLACEMENTS = Placement.kind
+MOST_TRIED = 3
+"""Scans that a new one is aligned to at most: the latest, then those before it."""
+_PIXELS = 130_000
+"""Of a scan that is aligned: rows and columns of larger ones are skipped."""
+_SHOWN_POINTS = 25_000  # of a scan
+_REACH = 2.5  # spacings of the shown points
 StartKind = Literal["features", "turntable", "identity", "placed", "markers"]
 Picked = Mapping[Pair, tuple[np.ndarray, np.ndarray]]
 """Of a pair (scan, onto): three or more points (n, 3) mm on either, in their cameras' frames."""
@@ -134,7 +147,6 @@ class MergeSettings:
                 "an angle from scan to scan is that of a turntable: give --start turntable too, or"
                 " neither"
             )
-
         self.fit_picks()
 
     def fit_picks(self) -> dict[Pair, tuple[Candidate, np.ndarray]]:
@@ -152,8 +164,7 @@ class MergeSettings:
     @property
     def names(self) -> list[str]:
         """The captures and the reference, each once."""
-        given = list(dict.fromkeys(self.captures))
-        return given if self.reference in given else [*given, self.reference]
+        return list(dict.fromkeys([*self.captures, self.reference]))
 
 
 @operation("merge", Merge, MergeSettings)
@@ -176,21 +187,16 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
         # or it fails now, not after minutes
         Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
     table_deg = _list_table_angles(store, settings)
-    starts = _initial_alignments(store, settings, table_deg, warn)
+    starts = _initial_alignments(job, settings, table_deg)
     check_accepted(store, settings.accept_rejected)
     fitted = load_model(store, settings.model)
     warn_if_stale(store, warn)
-    check_capture_sizes(store, names)
     region = resolve_region(store, settings.roi)
     restrictions = restriction_notes(store, names, region)
     inputs = restriction_inputs(store, names, with_region=not settings.roi)
     clouds, accepts = dict[str, Cloud](), settings.accept_rejected
-    for i, (shot, frames, phases) in enumerate(decode_captures(store, names, warn)):
-        job.progress(0.4 * i / len(names), f"reconstructing {shot.name}")
-        texture = capture_texture(shot, frames, stretch=False)
-        cloud = capture_cloud(
-            store, fitted, shot, phases, texture=texture, accept_rejected=accepts, warn=warn
-        )
+    reading = replace(job, progress=part(job.progress, 0.0, 0.4))
+    for shot, _, cloud in reconstruct_captures(reading, fitted, names, accept_rejected=accepts):
         clouds[shot.name] = restrict_cloud(store, shot.name, cloud, region)
     if settings.start == "markers" or table_deg is not None:
         markers = {name: measure_markers(cloud) for name, cloud in clouds.items()}
@@ -208,16 +214,9 @@ def merge_scans(job: Job, settings: MergeSettings) -> Iterator[MergedScans]:
     progress = stage(job.progress, 0.75, 0.9, "fusing")
     fused = fuse(clouds, alignment.T_reference_scan, progress, alignment.uncertainties)
     job.progress(0.9, "writing")
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{fitted.name}"))
-    record = _make_record(
-        registered,
-        fused,
-        model=fitted.name,
-        scale=describe_scale(store, fitted.name),
-        restrictions=list(restrictions),
-        scales={fitted.name: scale_factor(store, fitted.name)},
-        inputs={**store.input_hashes(*fused.names, *calibrations), **inputs},
-    )
+    used = describe_calibration(store, fitted.name, fused.names)
+    used["inputs"] |= inputs
+    record = _make_record(registered, fused, restrictions=list(restrictions), **used)
     with _write_merge(store, settings, fused, record) as found:
         yield MergedScans(alignment, fused, clouds, found)
     job.progress(1.0, "merged")
@@ -235,7 +234,7 @@ def _write_merge(
     frame = f"{frame_of(store, model)}, at {settings.reference}"
     scans = f"scans {', '.join(settings.names)}, frame: {frame}"
     comments = (scans, f"calibration {model}", *record.restrictions)
-    number = next_number(store, "merge") if settings.out is None else 0
+    number = next_name(store, Merge) if settings.out is None else ""
     with placed_file(store, settings.out, f"merged_{number}.ply") as (path, written):
         write_ply(
             written, surface.points, surface.colours, surface.normals, scalars, notes=comments
@@ -251,8 +250,9 @@ def _write_merge(
                 " name"
             )
         placed = msgspec.structs.replace(record, ply=path.name)
-        name = str(number or path.stem)
-        yield Found(name, placed, files=(path,), notes=tuple(notes), stored=bool(number))
+        yield Found(
+            number or path.stem, placed, files=(path,), notes=tuple(notes), stored=bool(number)
+        )
 
 
 def _check_markers(measured: Mapping[str, MeasuredMarkers], warn: Warn) -> None:
@@ -277,13 +277,11 @@ def _is_mat(
     them."""
     compared = []
     for a, b in pairwise(name for name in measured if name in table_deg):
-        try:
+        with suppress(Refused):
             pose = fit_marker_pose(measured[a], measured[b])
-        except Refused:
-            pose = None
-        if pose is not None and len(pose.ids) >= MAT_MARKERS:
-            turn_deg = abs(shortest_turn(table_deg[b] - table_deg[a]))
-            compared.append(abs(float(np.degrees(rotation_angle(pose.T[:3, :3]))) - turn_deg))
+            if pose is not None and len(pose.ids) >= MAT_MARKERS:
+                turn_deg = abs(shortest_turn(table_deg[b] - table_deg[a]))
+                compared.append(abs(float(np.degrees(rotation_angle(pose.T[:3, :3]))) - turn_deg))
     if compared and max(compared) > MAT_TURN_DEG:
         warn(
             f"coded markers are in view, and they turn by {max(compared):.1f} degrees more or less"
@@ -295,35 +293,33 @@ def _is_mat(
 
 def _list_warnings(
     clouds: Mapping[str, Cloud], registered: ObjectAlignment, keep_background: bool
-) -> list[str]:
-    """Warnings of markers that have moved, of pairs that were dropped, and of points that are not
-    the object, or contradict another scan, with the remedy."""
-    alignment = registered.alignment
-    messages = [
-        f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the scans, and is"
-        " ignored: glue it on, or take it away"
-        for (a, b), pose in alignment.markers.items()
-        if pose.moved
-    ]
-    messages += alignment.dropped.values()
+) -> Iterator[str]:
+    """Yield warnings of markers that have moved, of pairs that were dropped, and of points that are
+    not the object, or contradict another scan, with the remedy."""
+    for (a, b), pose in registered.alignment.markers.items():
+        if pose.moved:
+            yield (
+                f"{a} -> {b}: marker {', '.join(map(str, pose.moved))} has moved between the"
+                " scans, and is ignored: glue it on, or take it away"
+            )
+    yield from registered.alignment.dropped.values()
     still = {name: int(mask.sum()) for name, mask in registered.static.items() if mask.any()}
     if still:
         total = sum(int(clouds[name].mask.sum()) for name in still)
         counts = ", ".join(f"{count} of {name}" for name, count in still.items())
         where = "in the merge once for each scan" if keep_background else "not part of the merge"
-        messages.append(
+        yield (
             f"{100 * sum(still.values()) / total:.2g} % of the points ({counts}) stand still while"
             f" the object moves: they are {where}"
         )
     for (one, other), contradiction in registered.contradictions.items():
         if contradiction.share > MAX_CONTRADICTION_SHARE:
-            messages.append(
+            yield (
                 f"{one} -> {other}: {100 * contradiction.share:.2g} % of the points contradict,"
                 f" they lie more than {contradiction.gate_mm:.2g} mm in front of what the other"
                 " scan sees there: something moved alone or stands still; restrict the scans to"
                 " the object, or scan again"
             )
-    return messages
 
 
 def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Merge:
@@ -361,20 +357,16 @@ def _make_record(registered: ObjectAlignment, fused: Fused, **origin: Any) -> Me
 def _make_registered(scan: str, onto: str, registration: Registration) -> Registered:
     """Return the figures of a registration."""
     uncertainty = registration.uncertainty
+    same = ("rms_mm", "overlap", "agreement", "slack_mm", "gate_mm", "start")
     return Registered(
         scan=scan,
         onto=onto,
-        rms_mm=registration.rms_mm,
         point_to_point_rms_mm=registration.inlier_rmse_mm,
-        overlap=registration.overlap,
-        agreement=registration.agreement,
-        slack_mm=registration.slack_mm,
-        gate_mm=registration.gate_mm,
-        start=registration.start,
         sigma_shift_mm=uncertainty.shift_mm,
         sigma_turn_deg=uncertainty.turn_deg,
         middle=to_vector(uncertainty.centre),
         T_reference_scan=to_matrix(registration.T_reference_scan),
+        **{name: getattr(registration, name) for name in same},
     )
 
 
@@ -403,28 +395,198 @@ def _list_table_angles(store: Session, settings: MergeSettings) -> dict[str, flo
 
 
 def _initial_alignments(
-    store: Session, settings: MergeSettings, table_deg: Mapping[str, float] | None, warn: Warn
+    job: Job, settings: MergeSettings, table_deg: Mapping[str, float] | None
 ) -> Starts:
     """Return the initial alignments for the requested start; raises for options that do not fit
     it."""
     names, poses = settings.names, settings.poses
     if settings.start == "placed":
-        poses = load_places(store)
-        if missing := [name for name in names if name not in poses]:
+        placed = load_placements(job.store)
+        if missing := [name for name in names if name not in placed]:
             raise InputError(
                 f"{' and '.join(missing)} were not aligned: align them first, or start from"
                 " features"
             )
-        poses = {name: poses[name] for name in names}
+        poses = {name: np.array(placed[name].T_first_scan) for name in names}
     elif settings.start == "identity" and poses is None:
         poses = dict.fromkeys(names, np.eye(4))
     picks = {}
     for (scan, onto), (pick, apart) in settings.fit_picks().items():
         picks[scan, onto] = pick
-        warn(f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other")
+        job.warn(
+            f"{scan} -> {onto}: the picked points come within {apart.max():.2f} mm of each other"
+        )
     for base in {onto for _, onto in picks} if poses is None and table_deg is None else ():
         # pairs without picked points start there too
         others = [name for name in names if name != base]
         if all((name, base) in picks for name in others):
             poses = {base: np.eye(4)} | {name: picks[name, base].T for name in others}
     return Starts(poses=poses, table_deg=table_deg, axis=settings.axis, picked=picks)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedScans:
+    """What the aligned scans show together: points (n, 3) float32 mm in the frame of the first one,
+    and how many of the scans see each of them, (n,) uint8. ``facing`` (n,) float32: cosine of the
+    angle between the surface's normal and the view of its scan. ``names``: the scans, in the order
+    in which they were captured."""
+
+    names: tuple[str, ...]
+    points: NDArray[np.float32]
+    seen_by: NDArray[np.uint8]
+    facing: NDArray[np.float32]
+
+    @property
+    def share_seen_again(self) -> float:
+        """Share of the points that more than one scan sees."""
+        return float(np.mean(self.seen_by > 1)) if len(self.seen_by) else 0.0
+
+
+@dataclass(frozen=True)
+class AlignSettings:
+    """Which scans are aligned.
+
+    Args:
+        captures: Names of the captures, in the order in which they were captured; by default all
+            scans that are not in place yet.
+        accept_rejected: Use the calibration although its verdict rejects it.
+
+    ``only_reconstructed``: skip scans that were not reconstructed.
+    """
+
+    UNRECORDED: ClassVar = ("only_reconstructed",)
+    captures: Sequence[str] = ()
+    accept_rejected: bool = False
+    only_reconstructed: bool = False
+
+
+@operation("align", Placement, AlignSettings)
+def align(job: Job, settings: AlignSettings) -> Iterator[Found[Placement]]:
+    """Align scans one after the other, each to those before it, as the wizard does while they are
+    captured.
+
+    A scan that cannot be aligned is kept apart, with the reason. `merge` then starts from the
+    places found.
+    """
+    store = job.store
+    check_accepted(store, settings.accept_rejected)
+    names = list(settings.captures) or [
+        name for name, each in list_placements(store).items() if each is None
+    ]
+    if settings.only_reconstructed:
+        names = [name for name in names if store.state_of(f"clouds/{name}") == "fresh"]
+    placed, clouds = load_placements(store), dict[str, Cloud]()
+    for i, name in enumerate(names):
+        job.progress(i / len(names), f"aligning {name}")
+        placed.pop(name, None)
+        found = _align_scan(job, name, placed, clouds)
+        if found.T_first_scan is not None:
+            placed[name] = found
+        if i == len(names) - 1 and len(placed) > 1:
+            found = msgspec.structs.replace(
+                found, seen_again=view_places(placed, clouds, store).share_seen_again
+            )
+        yield Found(name, found)
+    job.progress(1.0, "aligned")
+
+
+def _align_scan(
+    job: Job, name: str, placed: Mapping[str, Placement], clouds: dict[str, Cloud]
+) -> Placement:
+    """Align one scan to those in place; clouds that are reconstructed are added to ``clouds``.
+
+    It is stale with the scan that it was aligned to, and with all that this was aligned by.
+    """
+    store, refusals = job.store, list[str]()
+    cloud = _load_cloud(store, name, clouds, job.warn)
+    inputs = store.input_hashes(name, "calibration/stereo", f"calibration/{cloud.model}")
+    if not placed:
+        return Placement(T_first_scan=to_matrix(np.eye(4)), inputs=inputs)
+    for onto in [*reversed(list(placed))][:MOST_TRIED]:
+        pair = {onto: _load_cloud(store, onto, clouds, job.warn), name: cloud}
+        try:
+            registered = register_object(pair, onto).alignment.on_reference()[name]
+        except (Refused, InputError) as error:
+            refusals.append(str(error))
+            continue
+        T = to_matrix(np.array(placed[onto].T_first_scan) @ registered.T_reference_scan)
+        return Placement(
+            T_first_scan=T,
+            onto=onto,
+            rms_mm=registered.rms_mm,
+            overlap=registered.overlap,
+            inputs=placed[onto].inputs | inputs,
+        )
+    return Placement(why=refusals[0], inputs=inputs)
+
+
+def remove_placement(store: Session, name: str) -> None:
+    """Move the placement of a scan to the trash: it is no longer shown with the others, and can be
+    aligned again."""
+    if store.has_result(f"{PLACEMENTS}/{name}"):
+        store.trash_result(f"{PLACEMENTS}/{name}")
+
+
+def list_placements(store: Session) -> dict[str, Placement | None]:
+    """The placement of every scan of an object (no planes and spheres), in the order in which they
+    were captured; None where it has none, or one that a newer calibration or capture has
+    outdated."""
+    captures = sorted(store.captures("scan"), key=lambda each: str(each.meta.get("created", "")))
+    return {
+        each.name: store.decode_fresh(
+            f"{PLACEMENTS}/{each.name}", lambda meta, _: read_record(Placement, meta), only=()
+        )
+        for each in captures
+        if each.meta.get("settings", {}).get("purpose", "scan") == "scan"
+    }
+
+
+def load_placements(store: Session) -> dict[str, Placement]:
+    """The placement of every scan that has its place, in the order in which they were captured."""
+    return {
+        name: each
+        for name, each in list_placements(store).items()
+        if each is not None and each.T_first_scan is not None
+    }
+
+
+def view_places(
+    placed: Mapping[str, Placement], clouds: dict[str, Cloud], store: Session
+) -> AlignedScans:
+    """Scans in their places, thinned, with the number of scans that have a point near each point;
+    ``clouds``: those that were loaded before."""
+    trees, facing = [], [np.zeros(0)]
+    for name, each in placed.items():
+        cloud = _load_cloud(store, name, clouds, ignore_warnings)
+        points, directions = cloud.measured, choose_pixels(normals(cloud.points), cloud.mask)
+        step = max(1, len(points) // _SHOWN_POINTS)
+        points, directions = points[::step], directions[::step]
+        trees.append(cKDTree(move_points(np.array(each.T_first_scan), points)))
+        facing.append(-np.sum(points * directions, axis=1) / np.linalg.norm(points, axis=1))
+    spacing = [np.median(tree.query(tree.data[::20], k=2)[0][:, 1]) for tree in trees]
+    reach = _REACH * max(spacing, default=0.0)
+    counts = [np.zeros(0)]
+    for tree in trees:
+        near = [
+            np.isfinite(other.query(tree.data, distance_upper_bound=reach, workers=-1)[0])
+            for other in trees
+            if other is not tree
+        ]
+        counts.append(np.sum([np.ones(tree.n), *near], axis=0))
+    return AlignedScans(
+        tuple(placed),
+        np.concatenate([np.zeros((0, 3)), *(tree.data for tree in trees)]).astype(np.float32),
+        np.concatenate(counts).astype(np.uint8),
+        np.nan_to_num(np.concatenate(facing)).astype(np.float32),
+    )
+
+
+def _load_cloud(store: Session, name: str, clouds: dict[str, Cloud], warn: Warn) -> Cloud:
+    """The cloud of a scan, of at most `_PIXELS` pixels: the saved one where it is fresh, else
+    reconstructed."""
+    if name not in clouds:
+        cloud = scan_cloud(Job(store, warn=warn), name)
+        step = max(1, int(np.ceil(np.sqrt(cloud.sigma_z.size / _PIXELS))))
+        points, sigma_z = cloud.points[::step, ::step], cloud.sigma_z[::step, ::step]
+        clouds[name] = Cloud(points, cloud.axis, cloud.model, sigma_z)
+    return clouds[name]

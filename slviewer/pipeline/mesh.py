@@ -11,22 +11,21 @@ import numpy as np
 
 from slviewer.errors import InputError, UsageError
 from slviewer.fringe.layout import to_eight_bits
-from slviewer.pipeline.capture_clouds import (
+from slviewer.pipeline.export import check_export
+from slviewer.pipeline.feedback import part, stage
+from slviewer.pipeline.measure import MERGED
+from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
+from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
+from slviewer.pipeline.operation import Callbacks, Findings, Job, show_found, takes_settings
+from slviewer.pipeline.poses import load_observations
+from slviewer.pipeline.reconstruct import (
     merge_name,
     points_with_normals,
     read_merge,
     scan_cloud,
 )
-from slviewer.pipeline.export import check_export
-from slviewer.pipeline.feedback import ignore_progress, part, stage
-from slviewer.pipeline.measured_surface import MERGED
-from slviewer.pipeline.merge import MergedScans, MergeSettings, StartKind, merge_scans
-from slviewer.pipeline.models import ModelName, check_accepted, load_stereo, warn_if_stale
-from slviewer.pipeline.open_session import SessionLike, opened
-from slviewer.pipeline.operation import Callbacks, Findings, Job, show_found, takes_settings
-from slviewer.pipeline.poses import load_observations
-from slviewer.pipeline.scan_edits import OFF, refuse_region, resolve_region, restriction_notes
-from slviewer.pipeline.stored_records import load_record
+from slviewer.pipeline.scan_edits import OFF, resolve_region, restriction_notes
+from slviewer.pipeline.stored_records import SessionLike, load_record, opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.merge import Merge
 from slviewer.session.capture import Capture
@@ -170,15 +169,13 @@ def mesh(settings: MeshSettings) -> MeshResult:
             with merge_scans(Job(store, before, warn), merging) as merged:
                 shape, restrictions = merged.fused.surface, tuple(merged.record.restrictions)
         elif sources[0].startswith(MERGED):
-            refuse_region(sources[0], settings.roi)
             name = merge_name(store, sources[0].removeprefix(MERGED))
-            stored, points = read_merge(store, f"merge/{name}", warn)
+            stored, points = read_merge(store, f"merge/{name}", warn, settings.roi)
             shape, restrictions = points_with_normals(points), tuple(stored.restrictions)
         else:
             warn_if_stale(store, warn)
-            shape = scan_cloud(
-                store, sources[0], settings.model, before, warn, accept_rejected, settings.roi
-            )
+            job = Job(store, before, warn)
+            shape = scan_cloud(job, sources[0], settings.model, accept_rejected, settings.roi)
             restrictions = restriction_notes(store, sources, resolve_region(store, settings.roi))
         if texture is not None:
             clouds, poses = _textured_scans(store, settings, shape, merged)
@@ -199,8 +196,9 @@ def mesh(settings: MeshSettings) -> MeshResult:
     else:
         write_textured(path, textured.mesh, textured.uv, textured.image, (*notes, textured.text()))
     progress(1.0, "meshed")
-    made = None if merged is None else show_found(merged.found)
-    return MeshResult(meshed, sources, path, made, textured)
+    return MeshResult(
+        meshed, sources, path, None if merged is None else show_found(merged.found), textured
+    )
 
 
 def _textured_scans(
@@ -218,11 +216,9 @@ def _textured_scans(
     placed = {made.reference: np.eye(4)}
     placed |= {name: np.array(pair.T_reference_scan) for name, pair in made.pairs.items()}
     used = made.model or settings.model
+    job = Job(store, warn=settings.warn)
     clouds = {  # what lies outside of the region still hides the surface from a scan
-        name: scan_cloud(
-            store, name, used, ignore_progress, settings.warn, settings.accept_rejected, OFF
-        )
-        for name in made.scans
+        name: scan_cloud(job, name, used, settings.accept_rejected, OFF) for name in made.scans
     }
     return clouds, placed
 

@@ -14,9 +14,14 @@ from slviewer.errors import CalibrationRejected, InputError, SessionError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.feedback import Warn
-from slviewer.pipeline.open_session import SessionLike, opened
 from slviewer.pipeline.operation import Found
-from slviewer.pipeline.stored_records import load_record, read_record, save_record
+from slviewer.pipeline.stored_records import (
+    SessionLike,
+    load_record,
+    opened,
+    read_record,
+    save_record,
+)
 from slviewer.records.calibration import ModelCalibration
 from slviewer.records.model_comparison import ModelComparison
 from slviewer.records.verdict import Verdict
@@ -46,7 +51,7 @@ _RESTORED: dict[str, type[PixelwiseModel | SplinedModel]] = {
 
 
 def describe_model(
-    model: Model, verdict: Verdict | None = None, inputs: Mapping[str, str] | None = None
+    model: Model, verdict: Verdict | None, inputs: Mapping[str, str] | None
 ) -> Found[ModelCalibration]:
     """Return the record of a model and its arrays; ``inputs``: {pose that it was made from: its
     hash}."""
@@ -373,10 +378,8 @@ def warn_if_stale(store: Session, warn: Warn) -> None:
     names = available_models(store)
     stale = [name for name in names if store.state_of(f"calibration/{name}") == "stale"]
     if stale:
-        which = f"{stale[0]} calibration was"
-        if len(stale) > 1:
-            which = f"{', '.join(stale[:-1])} and {stale[-1]} calibrations were"
+        which = "calibration was" if len(stale) == 1 else "calibrations were"
         warn(
-            f"the {which} made from target poses that have since been replaced or removed: run"
-            " `slviewer calibrate` again"
+            f"the {' and '.join(stale)} {which} made from target poses that have since been"
+            " replaced or removed: run `slviewer calibrate` again"
         )

@@ -5,6 +5,7 @@ import inspect
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
+from datetime import UTC, datetime
 from functools import partial, update_wrapper, wraps
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, cast
@@ -13,8 +14,7 @@ import msgspec
 import numpy as np
 
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings
-from slviewer.pipeline.open_session import SessionLike, opened_to_save
-from slviewer.pipeline.stored_records import save_record
+from slviewer.pipeline.stored_records import SessionLike, next_name, opened_to_save, save_record
 from slviewer.records.plain import to_plain
 from slviewer.records.record import Record
 from slviewer.records.table import render_text
@@ -38,9 +38,9 @@ class Job:
 @dataclass(frozen=True, eq=False)
 class Found(Generic[R]):
     """One record that an operation found, and its arrays. ``name``: the capture that it is of, or
-    its number; where it is not to be ``stored``, that of its file. ``files``: what else was
-    written, ``notes`` on it in words. ``settings``: with what was chosen for want of any, where
-    these are not the operation's.
+    its number, empty for the next one; where it is not to be ``stored``, that of its file.
+    ``files``: what else was written, ``notes`` on it in words. ``settings``: with what was chosen
+    for want of any, where these are not the operation's.
     """
 
     name: str
@@ -164,15 +164,18 @@ class Operation(Generic[P, S, R]):
         with closing(everything):  # a file that it is about to place is given up where saving fails
             for found in everything:
                 record = found.record
+                name = found.name or next_name(job.store, type(record))
                 if not record.operation:
-                    record = msgspec.structs.replace(
-                        record,
-                        operation=self.name,
-                        settings=plain_settings(found.settings or settings),
-                    )
+                    origin: dict[str, Any] = {
+                        "operation": self.name,
+                        "settings": plain_settings(found.settings or settings),
+                    }
+                    if hasattr(record, "time"):
+                        origin["time"] = datetime.now(UTC).isoformat(timespec="seconds")
+                    record = msgspec.structs.replace(record, **origin)
                 if found.stored and job.store.is_writable:
-                    save_record(job.store, found.name, record, found.arrays)
-                yield replace(found, record=record)
+                    save_record(job.store, name, record, found.arrays)
+                yield replace(found, name=name, record=record)
 
 
 def plain_settings(settings: Any) -> dict[str, Any]:
@@ -208,7 +211,8 @@ class Callbacks:
 
 
 def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Callable[P, V]]:
-    """Return a decorator of a function of such settings: it is called with their fields.
+    """Return a decorator of a function of such settings: it is called with their fields; further
+    keywords become their field ``options``, if they have one.
 
     The function's docstring describes it, and those of the settings and their bases the fields.
     """
@@ -216,12 +220,17 @@ def takes_settings(settings: Callable[P, S]) -> Callable[[Callable[[S], V]], Cal
     def decorate(function: Callable[[S], V]) -> Callable[P, V]:
         """Return the function that takes the fields."""
 
+        signature = inspect.signature(settings)
+
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> V:
+            if "options" in signature.parameters:
+                further = kwargs.keys() - signature.parameters.keys()
+                options = {name: kwargs.pop(name) for name in further}
+                kwargs.setdefault("options", options)
             return function(settings(*args, **kwargs))
 
         call.__doc__ = describe(function, settings)
-        signature = inspect.signature(settings)
         returned = inspect.signature(function).return_annotation
         call.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
         return call

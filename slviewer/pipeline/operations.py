@@ -2,14 +2,11 @@
 
 from slviewer.pipeline import (  # noqa: F401 (each registers its own)
     accept,
-    align,
     calibrate,
-    check,
     compare,
     inspect_parts,
     measure,
     merge,
     reconstruct,
-    validate,
 )
 from slviewer.pipeline.operation import OPERATIONS as OPERATIONS

@@ -111,39 +111,42 @@ def read_stored_pose(
     pose = DecodedPose(capture.name, capture.sequence, frames, phases, texture, board)
     examined = partial(load_or_save_examination, store, capture, frames)
     judged = read_pose(pose, smoothing, True, examined, observed)
-    inputs, target = {capture.name: capture.hash}, str(board)
-    meta = {
-        "target": target,
-        "look": EVIDENCE_VERSION,
-        "evidence": to_plain(judged.evidence),
-        "inputs": inputs,
-    }
-    store.save_result(f"evidence/{capture.name}", meta, {})
-    meta = {
-        "target": target,
-        "smoothing": _list_settings(smoothing),
-        "reading": READING_VERSION,
-        "refused": judged.refused,
-        "inputs": inputs,
-    }
+    inputs = {capture.name: capture.hash}
+    evidence = {"evidence": to_plain(judged.evidence), "inputs": inputs}
+    store.save_result(f"evidence/{capture.name}", _evidence_settings(board) | evidence, {})
+    reading = {"refused": judged.refused, "inputs": inputs}
     arrays = judged.observation.to_arrays() if judged.observation else {}
-    store.save_result(f"poses/{capture.name}", meta, arrays)
+    store.save_result(
+        f"poses/{capture.name}", _reading_settings(board, smoothing) | reading, arrays
+    )
     return judged
+
+
+def _evidence_settings(board: Board) -> dict[str, Any]:
+    """Return what stored evidence must agree with to be used."""
+    return {"target": str(board), "look": EVIDENCE_VERSION}
+
+
+def _reading_settings(board: Board, smoothing: Smoothing) -> dict[str, Any]:
+    """Return what a stored reading must agree with to be used."""
+    settings: list[str | int] = [smoothing.kind]
+    if smoothing.kind != "spline":
+        settings.append(smoothing.degree)
+    return {"target": str(board), "smoothing": settings, "reading": READING_VERSION}
 
 
 def load_judged(store: Session, name: str, board: Board, smoothing: Smoothing) -> Judged | None:
     """Load the stored reading of a pose, and the evidence of its frames; None where one is missing,
-    or of other frames, another board or another smoothing."""
+    or of other frames, another board, another smoothing or another version."""
 
     def decode_evidence(meta: Mapping[str, Any], _: object) -> PoseEvidence | None:
-        """Return the evidence, unless it is of another board or version."""
-        current = (meta["target"], meta.get("look")) == (str(board), EVIDENCE_VERSION)
-        return PoseEvidence.from_json(meta["evidence"]) if current else None
+        """Return the evidence, if it is current."""
+        is_current = _evidence_settings(board).items() <= meta.items()
+        return PoseEvidence.from_json(meta["evidence"]) if is_current else None
 
     def decode(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Judged | None:
-        """Return the reading, unless it is of another board, smoothing or version."""
-        settings = (meta["target"], meta["smoothing"], meta.get("reading"))
-        if settings != (str(board), _list_settings(smoothing), READING_VERSION):
+        """Return the reading, if it is current."""
+        if not _reading_settings(board, smoothing).items() <= meta.items():
             return None
         return Judged(name, _decode_observation(name, meta, arrays), meta["refused"], evidence)
 
@@ -208,11 +211,6 @@ def _decode_observation(
     return None if meta["refused"] else Observation.from_arrays(name, arrays)
 
 
-def _list_settings(smoothing: Smoothing) -> list[str | int]:
-    """Return the smoothing as plain values, to compare with stored ones."""
-    return [smoothing.kind] if smoothing.kind == "spline" else [smoothing.kind, smoothing.degree]
-
-
 def _wxh(size: tuple[int, int]) -> str:
     """Format a size (width, height) px as "WxH"."""
     return f"{size[0]}x{size[1]}"
@@ -223,7 +221,7 @@ def gather_evidence(
     examination: Examination,
     detection: Detection | None,
     observation: Observation | None,
-    refused: str = "",
+    refused: str,
 ) -> PoseEvidence:
     """Evidence from a decoded pose. ``detection`` and ``observation``: its board and its phase,
     None where they could not be read, for the reason ``refused``; ``examination``: of its frames.

@@ -1,21 +1,22 @@
-"""From a capture to a cloud; and known shapes measured with each model, which compares them."""
+"""From captures to clouds, stored or by one of the session's calibrations; known shapes measured
+with each model, which compares them; the points of merges."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
+import cv2
 import numpy as np
 
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.errors import DetectionError, InputError, UsageError
-from slviewer.evaluation.compare import Comparison, fit_clouds
+from slviewer.evaluation.fit import Comparison, fit_clouds
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.capture_clouds import absolute_phases, capture_cloud, check_capture_sizes
 from slviewer.pipeline.capture_phases import capture_texture, decode_captures
-from slviewer.pipeline.feedback import Warn
+from slviewer.pipeline.feedback import Warn, ignore_warnings
 from slviewer.pipeline.models import (
     Model,
     ModelName,
@@ -27,18 +28,22 @@ from slviewer.pipeline.models import (
     preferred_model,
     warn_if_stale,
 )
-from slviewer.pipeline.open_session import placed_file
 from slviewer.pipeline.operation import Found, Job, operation, plain_settings
-from slviewer.pipeline.scale import describe_scale, scale_factor
+from slviewer.pipeline.scale import describe_calibration, scale_cloud, scale_factor
 from slviewer.pipeline.scan_edits import resolve_region, restrict_cloud, restriction_notes
+from slviewer.pipeline.stored_records import is_up_to_date, load_record, numbered_names, placed_file
+from slviewer.reconstruction.axis_agreement import check_phases, check_sizes
 from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
-from slviewer.reconstruction.reconstruct import normals, triangulate_grid
+from slviewer.reconstruction.reconstruct import normals, reconstruct_cloud, triangulate_grid
+from slviewer.reconstruction.relative_phase import resolve_phase
+from slviewer.records.merge import Merge
 from slviewer.records.reconstruction import Reconstruction
 from slviewer.records.table import render_text
 from slviewer.records.verification import Shape, Verification
 from slviewer.session.capture import Capture
-from slviewer.session.ply import write_ply
+from slviewer.session.ply import Ply, read_ply, write_ply
 from slviewer.session.store import Session
+from slviewer.surface.shapes import PointSet
 from slviewer.target.board import Board
 from slviewer.target.detect import board_mask, detect
 
@@ -132,11 +137,9 @@ def reconstruct_capture(job: Job, settings: ReconstructSettings) -> Iterator[Rec
         )
         for n, m in chosen.items()
     }  # fmt: skip
-    cloud, region, board = clouds[name], None, tuple[str, ...]()
-    restrictions = tuple[str, ...]()
-    if is_pose:
-        region = segment_board(store, shot, texture, warn)
-    else:
+    cloud, region = clouds[name], segment_board(store, shot, texture, warn) if is_pose else None
+    restrictions, board = tuple[str, ...](), tuple[str, ...]()
+    if not is_pose:
         box = resolve_region(store, settings.roi)
         cloud = restrict_cloud(store, capture, cloud, box)
         restrictions = restriction_notes(store, [capture], box)
@@ -218,11 +221,9 @@ def cloud_record(
     }
     known = {name: array for name, array in arrays.items() if array is not None}
     left = cloud.sigma_calibration
-    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model.name}"))
     record = Reconstruction(
         operation="reconstruct",
         settings=plain_settings(settings),
-        model=cloud.model,
         axis=cloud.axis,
         points=int(np.count_nonzero(cloud.mask)),
         depth_mm=(float(near), float(far)),
@@ -231,9 +232,7 @@ def cloud_record(
         raised=model.residuals_over_noise(cloud.axis) if isinstance(model, SplinedModel) else 1.0,
         masked=masked_share(model, phase, region),
         frame=frame_of(store, cloud.model),
-        scale=describe_scale(store, cloud.model),
-        scales={cloud.model: scale_factor(store, cloud.model)},
-        inputs=store.input_hashes(settings.capture, *calibrations),
+        **describe_calibration(store, cloud.model, [settings.capture]),
     )
     return Found(settings.capture, record, known)
 
@@ -254,7 +253,7 @@ def segment_board(
     return board_mask(board, detection, texture.shape[:2])
 
 
-def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None = None) -> float | None:
+def masked_share(model: Model, phase: PhaseMap, region: np.ndarray | None) -> float | None:
     """Share of the pixels (of ``region`` (h, w) bool, or of all) that could be measured and are
     masked, because they look through parts of camera or projector that no target pose illuminated;
     None for models that mask none.
@@ -343,7 +342,16 @@ def verify(
         )
         if store.is_writable and (best := preferred_model(store)) in models:
             # by its own best axis, as reconstruct
-            yield _reconstruct_best(store, load_model(store, best), each, settings)
+            shot, axis, accepts = each.capture, settings.axis, settings.accept_rejected
+            fitted = load_model(store, best)
+            texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
+            cloud = capture_cloud(
+                store, fitted, shot, each.phases, axis=axis, texture=texture,
+                accept_rejected=accepts,
+            )  # fmt: skip
+            how = ReconstructSettings(name, axis=axis, accept_rejected=accepts)
+            region = None if each.found.is_searched else each.found.region
+            yield cloud_record(store, how, fitted, cloud, each.phases[cloud.axis], region)
 
 
 def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCapture]:
@@ -358,48 +366,225 @@ def compare_captures(job: Job, settings: VerifySettings) -> Iterator[ComparedCap
         decode_captures(store, names, job.warn, check=settings.check)
     ):
         job.progress(i / len(names), f"measuring {shot.name}")
-        clouds: dict[str, Cloud] = {}
-        axis = settings.axis  # of the first, so that all can be compared pixel by pixel
-        accepts = settings.accept_rejected
+        # the axis is that of the first, so that all can be compared pixel by pixel
+        clouds, axis, accepts = dict[str, Cloud](), settings.axis, settings.accept_rejected
         for model, fitted in chosen.items():
             clouds[model] = capture_cloud(
                 store, fitted, shot, phases, axis=axis, accept_rejected=accepts, warn=job.warn
             )
             axis = axis or clouds[model].axis
         assert axis is not None
-        phase = phases[axis]
-        region: np.ndarray | None = None
+        phase, region = phases[axis], None
         if settings.shape == "plane" and shot.role == "calibration":
             region = segment_board(store, shot, capture_texture(shot, frames), job.warn)
         try:
             found = fit_clouds(
-                settings.shape,
-                clouds,
-                phase.illuminated,
-                region=region,
-                depth_range=depths,
+                settings.shape, clouds, phase.illuminated, region=region, depth_range=depths,
                 radius=settings.radius,
-            )
+            )  # fmt: skip
         except InputError as error:
             raise InputError(f"{shot.name}: {error}") from error
         for message in found.warnings:
             job.warn(f"{shot.name}: {message}")
-        shares = {name: masked_share(each, phase, found.region) for name, each in chosen.items()}
-        masked = {name: share for name, share in shares.items() if share is not None}
+        masked = {
+            name: share
+            for name, each in chosen.items()
+            if (share := masked_share(each, phase, found.region)) is not None
+        }
         yield ComparedCapture(shot, frames, phases, found, masked)
     job.progress(1.0, "measured")
 
 
-def _reconstruct_best(
-    store: Session, model: Model, each: ComparedCapture, settings: VerifySettings
-) -> Found[Reconstruction]:
-    """Return the cloud of a capture as `reconstruct` stores it."""
-    shot, found = each.capture, each.found
-    texture = capture_texture(shot, each.frames, stretch=shot.role == "calibration")
-    axis, accepts = settings.axis, settings.accept_rejected
-    cloud = capture_cloud(
-        store, model, shot, each.phases, axis=axis, texture=texture, accept_rejected=accepts
+def check_capture_sizes(store: Session, names: Iterable[str]) -> None:
+    """Raise InputError where a capture's camera or projector has not the size that the session's
+    calibration has: before anything is decoded, which would fail for reasons that follow from
+    it."""
+    rig = load_stereo(store).rig
+    for capture in (store.load_capture(name) for name in names):
+        check_sizes(capture.name, capture.size, capture.sequence.projector_size, rig)
+
+
+def capture_cloud(
+    store: Session,
+    model: Model,
+    capture: Capture,
+    phases: Mapping[Axis, PhaseMap],
+    *,
+    axis: Axis | None = None,
+    texture: np.ndarray | None = None,
+    accept_rejected: bool = False,
+    warn: Warn = ignore_warnings,
+) -> Cloud:
+    """Reconstruct the organised cloud of a decoded capture, with the scale of its calibration
+    applied.
+
+    Raises InputError where capture and calibration do not belong together: by their sizes, or by
+    how far the axes of the capture miss each other, which is a warning if ``accept_rejected``.
+    Where they miss each other by more than noise explains, the cloud's sigmas are raised by that
+    factor, with a warning.
+    """
+    stereo = load_stereo(store)
+    check_sizes(capture.name, capture.size, capture.sequence.projector_size, stereo.rig)
+    calibration = model if isinstance(model, SplinedModel) else stereo
+    check = check_phases(capture.name, phases, calibration, stereo.depth_range_mm, accept_rejected)
+    for message in check.warnings:
+        warn(message)
+    cloud = scale_cloud(
+        reconstruct_cloud(model, phases, axis=axis, texture=texture),
+        scale_factor(store, model.name),
     )
-    region = None if found.is_searched else found.region
-    as_reconstructed = ReconstructSettings(shot.name, axis=axis, accept_rejected=accepts)
-    return cloud_record(store, as_reconstructed, model, cloud, each.phases[cloud.axis], region)
+    if check.excess_px is not None:  # by tiles of the image, in addition to the noise
+        noise_px, known = phases[cloud.axis].sigma_px, cloud.sigma_edges
+        excess = cv2.resize(check.excess_px, noise_px.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        error = cloud.sigma_z * excess / np.maximum(noise_px, np.float32(1e-9))
+        return replace(cloud, sigma_edges=error if known is None else np.hypot(known, error))
+    factor, sigma = np.float32(check.sigma_factor), cloud.sigma_calibration
+    return replace(
+        cloud,
+        sigma_z=cloud.sigma_z * factor,
+        sigma_calibration=None if sigma is None else sigma * factor,
+    )
+
+
+def absolute_phases(
+    store: Session,
+    name: str,
+    phases: Mapping[Axis, PhaseMap],
+    depth_range: tuple[float, float] | None = None,
+    warn: Warn = ignore_warnings,
+) -> dict[Axis, PhaseMap]:
+    """Return a capture's phases, ambiguous ones made absolute by the depth range (near, far) mm of
+    the scene; by default the calibrated one. An axis that more than one depth fits is solved by the
+    other axis, with a warning.
+
+    Raises InputError where no axis is unique in the range, and where no range is known.
+    """
+    if not any(phase.is_relative for phase in phases.values()):
+        if depth_range is not None:
+            warn(
+                f"{name}: its phase is absolute, and the depth range is not needed: it was not used"
+            )
+        return dict(phases)
+    stereo = load_stereo(store)
+    near_far = depth_range or stereo.depth_range_mm
+    whose = "" if depth_range else ", the calibrated depths"
+    if near_far is None:
+        raise InputError(
+            f"{name}: its phase is not absolute, and the calibration knows no depths: state those"
+            " of the scene with --depth-range NEAR FAR, mm"
+        )
+    absolute, refusals = dict[Axis, PhaseMap](), list[str]()
+    for axis, phase in phases.items():
+        if not phase.is_relative:
+            absolute[axis] = phase
+            continue
+        try:
+            resolved = resolve_phase(stereo.rig, phase, near_far)
+        except InputError as error:
+            refusals.append(str(error))
+            continue
+        absolute[axis] = resolved.phase
+        warn(
+            f"{name}: the phase of axis {axis} repeats every {phase.unambiguous_px:g} px, and each"
+            f" pixel was given its one depth between {near_far[0]:.0f} and {near_far[1]:.0f}"
+            f" mm{whose}; {100 * resolved.outside:.1f} % of the decoded pixels have none and are"
+            " masked. A surface outside of this range would be measured about"
+            f" {resolved.spacing_mm:.0f} mm from its place: change it with --depth-range"
+        )
+    if not absolute:
+        raise InputError(
+            f"{name}: {'; '.join(refusals)} (--depth-range NEAR"
+            f" FAR{whose and '; by default' + whose[1:]})"
+        )
+    for refusal in refusals:
+        warn(f"{name}: {refusal}; this axis was not used")
+    return absolute
+
+
+def reconstruct_captures(
+    job: Job,
+    model: Model,
+    names: Sequence[str],
+    doing: str = "reconstructing",
+    *,
+    accept_rejected: bool = False,
+    examine: bool = True,
+) -> Iterator[tuple[Capture, np.ndarray, Cloud]]:
+    """Yield captures, in order, with their frames and their textured clouds. ``doing``: how the
+    progress calls that; ``examine``: warn of what is wrong with the frames.
+
+    Raises InputError like `check_capture_sizes` and `capture_cloud`.
+    """
+    store = job.store
+    check_capture_sizes(store, names)
+    decoded = decode_captures(store, names, job.warn if examine else ignore_warnings)
+    for i, (capture, frames, phases) in enumerate(decoded):
+        job.progress(i / len(names), f"{doing} {capture.name}")
+        texture = capture_texture(capture, frames, stretch=False)
+        cloud = capture_cloud(
+            store, model, capture, phases, texture=texture, accept_rejected=accept_rejected,
+            warn=job.warn,
+        )  # fmt: skip
+        yield capture, frames, cloud
+
+
+def scan_cloud(
+    job: Job, name: str, model: str | None = None, accept_rejected: bool = False, roi: str = ""
+) -> Cloud:
+    """A capture's cloud: the stored one where it is up to date and of the requested model, else
+    reconstructed; without what was deleted from it, and what lies outside of the region ``roi``, as
+    `resolve_region` reads it.
+    """
+    store, stored = job.store, f"clouds/{name}"
+    region = resolve_region(store, roi)
+    meta = store.load_result(stored, only=())[0] if is_up_to_date(store, stored) else {}
+    if meta and model in (None, "", meta["model"]):
+        names = {"points", "sigma_z", "texture", "sigma_calibration", "sigma_edges"}
+        arrays = store.load_result(stored, only=names & set(meta["arrays"]))[1]
+        cloud = Cloud(axis=meta["axis"], model=meta["model"], **arrays)
+    else:
+        fitted, accepts = load_model(store, model), accept_rejected
+        *_, cloud = next(reconstruct_captures(job, fitted, [name], accept_rejected=accepts))
+    return restrict_cloud(store, name, cloud, region)
+
+
+def merge_name(store: Session, name: str) -> str:
+    """The merge of that number, or the last one where none is named; raises InputError where it
+    does not exist."""
+    there = numbered_names(store, "merge")
+    if not there:
+        raise InputError("there is no merge yet: merge scans first")
+    if name and name not in there:
+        raise InputError(f"there is no merge {name!r}: the merges are {', '.join(there)}")
+    return name or there[-1]
+
+
+def read_merge(store: Session, result: str, warn: Warn, roi: str = "") -> tuple[Merge, Ply]:
+    """The record and the points of a merge that the session stores as ``merge/<number>``; warns of
+    a stale one. Raises UsageError where a region ``roi`` was stated: its scans were cut when it was
+    made."""
+    if roi:
+        raise UsageError(
+            f"{result} was cut by the region when its scans were merged: merge them again with"
+            f" --roi {roi}"
+        )
+    if not is_up_to_date(store, result):
+        warn(f"{result} came from scans or a calibration that have changed since: merge again")
+    merge = load_record(store, Merge, result.removeprefix(f"{Merge.kind}/"))
+    return merge, read_ply(store.exports / merge.ply)
+
+
+def points_with_normals(merged: Ply) -> PointSet:
+    """Return the points of a merge whose normals are known, to make a mesh of; InputError for a
+    merge without any."""
+    if merged.normals is None:
+        raise InputError("the merged cloud has no normals: merge the scans again")
+    known, sigma = np.isfinite(merged.normals).all(axis=1), merged.scalars.get("sigma")
+    if sigma is not None and not np.isfinite(sigma[known]).all():
+        sigma = None
+    return PointSet(
+        merged.points[known],
+        merged.normals[known],
+        None if merged.colours is None else merged.colours[known],
+        None if sigma is None else sigma[known],
+    )

@@ -1,4 +1,5 @@
-"""Rigs: from what the operator chose to devices, choices by name, and recorded captures as a rig.
+"""Rigs: from what the operator chose to devices, choices by name, recorded captures as a rig, and
+what there is to choose from.
 
 A choice is a plain mapping, as the session keeps it: ``{"driver": "simulated", "scale": 0.5,
 "seed": 0}`` for a rig that one driver makes, or ``{"name": "bench", "camera": {"driver": …},
@@ -13,6 +14,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import cycle
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,12 @@ import msgspec
 import numpy as np
 
 from slviewer.devices.browser import PAGE_ROLES, PageChannels, PageRole
-from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, driver, drivers
+from slviewer.devices.drivers import DRIVER_PLUGINS, Driver, available, driver, drivers
 from slviewer.devices.protocols import Rig, Turntable
 from slviewer.devices.replay import Recording, recording_rig
 from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld, Thing
-from slviewer.errors import InputError
+from slviewer.errors import InputError, SlviewerError
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.feedback import ignore_warnings
 from slviewer.pipeline.import_captures import check_imported_capture, find_captures
@@ -58,8 +60,8 @@ class Reel:
     def __init__(self, recorded: Sequence[Recorded]) -> None:
         """Play these captures in order."""
         self.names = [each.name for each in recorded]
-        self._recorded, self._at = recorded, 0
-        self._recording = Recording(*_read_shot(recorded[0]))
+        self._following = cycle(recorded)
+        self._recording = Recording(*_read_shot(next(self._following)))
         self.rig: Rig = recording_rig(self._recording)
 
     @property
@@ -75,9 +77,8 @@ class Reel:
     def advance(self) -> None:
         """Play the next capture; the first after the last. Raises InputError where it is not of the
         same rig."""
-        self._at = (self._at + 1) % len(self.names)
         if len(self.names) > 1:
-            self._recording.play(*_read_shot(self._recorded[self._at]))
+            self._recording.play(*_read_shot(next(self._following)))
 
 
 def _read_shot(recorded: Recorded) -> tuple[np.ndarray, PatternSequence]:
@@ -140,77 +141,70 @@ def set_up(choice: Choice, board: Board | None, *, pages: PageChannels | None = 
 
     Raises InputError for an invalid choice, DeviceError for a driver that cannot be used here.
     """
-    bench = _set_up_devices(choice, board, pages)
-    if "turntable" in choice:
-        table = _set_up_turntable(choice["turntable"], bench.world)
-        bench = replace(bench, rig=replace(bench.rig, turntable=table))
-    return bench
-
-
-def _set_up_turntable(choice: Choice, world: SimulatedWorld | None) -> Turntable:
-    """The turntable of a choice, not opened yet; a simulated one turns the thing in `world`."""
-    options = dict(choice)
     try:
-        chosen = driver(str(options.pop("driver")))
-        if chosen.turntable is None:
-            raise InputError(f"the driver {chosen.name} offers no turntable: choose another")
-        if chosen.name != "simulated":
-            return chosen.turntable(**options)
-        if world is None:
-            raise InputError(
-                "a simulated turntable turns only what is before the simulated rig: choose another"
-            )
-        return chosen.turntable(world, **options)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"the turntable {dict(choice)} cannot be set up ({error}): choose it again"
-        ) from error
-
-
-def _set_up_devices(choice: Choice, board: Board | None, pages: PageChannels | None) -> RigSetup:
-    """Camera and projector of a choice, as `set_up` returns them."""
-    options = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
-    focal, settle_ms = choice.get("focal_px"), float(choice.get("settle_ms", 0.0))
-    try:
-        if choice.get("driver") == "simulated":
-            bench = _simulated_setup(board, **options)
-            return replace(bench, rig=replace(bench.rig, settle_ms=settle_ms))
-        if choice.get("driver") == "replay":
-            played = reel(**options)
-            return RigSetup(played.rig, focal_px=focal, reel=played)
         if "driver" in choice:
-            chosen = driver(str(choice["driver"]))
-            if chosen.rig is None:
-                raise InputError(
-                    f"the driver {choice['driver']} offers no whole rig: choose a camera and a"
-                    " projector"
-                )
-            rig = chosen.rig(**options)
-            rig = replace(rig, settle_ms=settle_ms or rig.settle_ms)
+            made = _make_device("rig", _options_of_rig(choice), board=board)
         else:
-            devices: list[Any] = []
-            for part in ("camera", "projector"):
-                given = dict(options.pop(part))
-                chosen = driver(given.pop("driver"))
-                make = getattr(chosen, part)
-                if make is None:
-                    raise InputError("one of the drivers offers no such device: choose others")
-                if chosen.page:
-                    given["page"] = pages and getattr(pages, part)
-                devices.append(make(**given))
-            rig = Rig(str(choice.get("name", "rig")), devices[0], devices[1], settle_ms)
-        return RigSetup(rig, focal_px=focal)
+            devices = {
+                part: _make_device(part, choice[part], page=pages and getattr(pages, part))
+                for part in PAGE_ROLES
+            }
+            made = Rig(str(choice.get("name", "rig")), **devices)
+        if isinstance(made, Reel):
+            made = RigSetup(made.rig, reel=made)
+        bench = made if isinstance(made, RigSetup) else RigSetup(made)
+        table: Turntable | None = bench.rig.turntable
+        if (turning := choice.get("turntable")) is not None:
+            if dict(turning)["driver"] == "simulated" and bench.world is None:
+                raise InputError(
+                    "a simulated turntable turns only what is before the simulated rig: choose"
+                    " another"
+                )
+            table = _make_device("turntable", turning, world=bench.world)
+        settle_ms = float(choice.get("settle_ms", 0.0)) or bench.rig.settle_ms
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"the rig {dict(choice)} cannot be set up ({error}): choose it again"
         ) from error
+    return replace(
+        bench,
+        rig=replace(bench.rig, settle_ms=settle_ms, turntable=table),
+        focal_px=bench.focal_px or choice.get("focal_px"),
+    )
+
+
+def _make_device(part: str, chosen: Choice, **provided: Any) -> Any:
+    """Return a device (camera, projector, turntable, or a whole rig) of a driver and its options,
+    with those of the ``provided`` arguments that the driver takes from the program."""
+    options = dict(chosen)
+    named = driver(str(options.pop("driver")))
+    make = driver_factory(named, part)
+    if make is None:
+        raise InputError(f"the driver {named.name} offers no {part}: choose another")
+    taken = _list_provided(named) & inspect.signature(make).parameters.keys() & provided.keys()
+    return make(**options, **{name: provided[name] for name in taken})
+
+
+def _list_provided(named: Driver) -> set[str]:
+    """Return the names of a driver's arguments that the program supplies; they are not entries of a
+    file."""
+    return {"board", "world", "timing"} | ({"page"} if named.page else set())
+
+
+def _options_of_rig(choice: Choice) -> Choice:
+    """Return the driver and its options of a choice without the keys that all rigs may have."""
+    return {key: value for key, value in choice.items() if key not in COMMON_KEYS}
 
 
 def list_needed_pages(choice: Choice) -> tuple[PageRole, ...]:
     """Return which of a choice's devices are pages in a browser."""
-    parts = {role: part for role in PAGE_ROLES if isinstance(part := choice.get(role), Mapping)}
-    named = {role: drivers().get(str(part.get("driver"))) for role, part in parts.items()}
-    return tuple(role for role, named_driver in named.items() if named_driver and named_driver.page)
+    return tuple(
+        role
+        for role in PAGE_ROLES
+        if isinstance(part := choice.get(role), Mapping)
+        and (named := drivers().get(str(part.get("driver"))))
+        and named.page
+    )
 
 
 def driver_factory(driver: Driver, part: str) -> Callable[..., Any] | None:
@@ -333,13 +327,13 @@ def check_choice(choice: Choice, where: str) -> None:
     if "turntable" in choice:
         _check_device(choice, "turntable", where)
     if "driver" in choice:
-        given = {key: value for key, value in choice.items() if key not in (*COMMON_KEYS, "driver")}
+        given = _options_of_rig(choice)
         if {"camera", "projector"} & set(given):
             raise InputError(
                 f"{where} names a driver of a whole rig and a camera or a projector: remove one of"
                 " both"
             )
-        _check_options(str(choice["driver"]), "rig", given, where)
+        _check_options(given, "rig", where)
         return
     unknown = sorted(set(choice) - {*COMMON_KEYS, "camera", "projector"})
     if unknown:
@@ -358,8 +352,7 @@ def _check_device(choice: Choice, part: str, where: str) -> None:
     if not isinstance(device, Mapping) or "driver" not in device:
         rather = "" if part == "turntable" else ", or a driver of a rig"
         raise InputError(f'{where} names no {part}: add [{part}] with driver = "…"{rather}')
-    options = {key: value for key, value in device.items() if key != "driver"}
-    _check_options(str(device["driver"]), part, options, f"{where}, {part}")
+    _check_options(device, part, f"{where}, {part}")
 
 
 def _read_preset(name: str, path: Path) -> Preset:
@@ -372,8 +365,11 @@ def _read_preset(name: str, path: Path) -> Preset:
     return Preset(name, what, choice, path)
 
 
-def _check_options(name: str, part: str, options: Mapping[str, Any], where: str) -> None:
-    """Raise InputError unless the driver exists, offers the part, and accepts the options."""
+def _check_options(chosen: Choice, part: str, where: str) -> None:
+    """Raise InputError unless the driver of a choice exists, offers the part, and accepts the
+    options."""
+    options = dict(chosen)
+    name = str(options.pop("driver"))
     if name not in drivers():
         offering = sorted(d.name for d in drivers().values() if driver_factory(d, part))
         why = DRIVER_PLUGINS.explain_missing(name)
@@ -383,12 +379,11 @@ def _check_options(name: str, part: str, options: Mapping[str, Any], where: str)
     make = driver_factory(drivers()[name], part)
     if make is None:
         raise InputError(f"{where}: the driver {name} offers no {part}: choose another")
-    parameters = inspect.signature(make, eval_str=True).parameters.values()
-    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+    parameters = inspect.signature(make, eval_str=True).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
         return
-    # the program supplies these; they are not entries of a file
-    provided = ("board", "world", "timing", *(("page",) if drivers()[name].page else ()))
-    known = {each.name: each for each in parameters if each.name not in provided}
+    provided = _list_provided(drivers()[name])
+    known = {key: each for key, each in parameters.items() if key not in provided}
     if unknown := sorted(options.keys() - known.keys()):
         use = f"use {', '.join(known)}" if known else "it takes none"
         raise InputError(f"{where}: the driver {name} has no option {unknown[0]!r}: {use}")
@@ -416,3 +411,27 @@ def _driver_names(choice: Choice) -> list[str]:
     of a turntable."""
     parts = [choice, *(choice.get(part, {}) for part in ("camera", "projector", "turntable"))]
     return [str(part["driver"]) for part in parts if "driver" in part]
+
+
+def devices() -> str:
+    """List the drivers: which can be used here, what is connected, what each needs, and the rigs to
+    choose from."""
+    blocks = []
+    for each in available():  # those that can be used here first
+        parts = ("camera", "projector", "turntable", "rig")
+        offers = ", ".join(part for part in parts if getattr(each, part) is not None)
+        lines = [
+            f"{each.name} ({offers}): {each.what}",
+            f"  cannot be used here, {each.missing}" if each.missing else "  can be used",
+        ]
+        if each.needs:
+            lines.append(f"  needs {each.needs}")
+        if each.list_connected is not None and not each.missing:
+            try:
+                connected = each.list_connected() or ["no device"]
+                lines += [f"  connected: {line}" for line in connected]
+            except Exception as error:  # a broken library of a maker must not hide other devices
+                kind = "" if isinstance(error, SlviewerError) else f" ({type(error).__name__})"
+                lines.append(f"  could not look for what is connected: {error}{kind}")
+        blocks.append("\n".join(lines))
+    return "\n".join([*blocks, rigs()])

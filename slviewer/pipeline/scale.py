@@ -1,6 +1,7 @@
 """A scale that an acceptance test measured and the operator applied: what later clouds are
 multiplied by."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -8,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.evaluation.acceptance import Acceptance
 from slviewer.reconstruction.cloud import Cloud
+from slviewer.records.acceptance import AcceptanceTest
 from slviewer.session.store import Session
 
 LARGEST_FACTOR = 1.25
@@ -42,6 +43,17 @@ def describe_scale(store: Session, model: str) -> str:
     return f"scale corrected by {ppm} ppm, by certificate {applied['certificate']}"
 
 
+def describe_calibration(store: Session, model: str, captures: Iterable[str]) -> dict[str, Any]:
+    """Return what a record of clouds of captures states of their calibration, and its inputs."""
+    calibrations = dict.fromkeys(("calibration/stereo", f"calibration/{model}"))
+    return {
+        "model": model,
+        "scale": describe_scale(store, model),
+        "scales": {model: scale_factor(store, model)},
+        "inputs": store.input_hashes(*captures, *calibrations),
+    }
+
+
 def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
     """Return the cloud enlarged by a factor, with its noise."""
     if factor == 1.0:
@@ -51,7 +63,7 @@ def scale_cloud(cloud: Cloud, factor: float) -> Cloud:
     return replace(cloud, **{name: values * np.float32(factor) for name, values in known.items()})
 
 
-def record_scale(store: Session, acceptance: Acceptance) -> float:
+def record_scale(store: Session, acceptance: AcceptanceTest) -> float:
     """Record that the calibration's clouds are to be corrected by a test's scale; returns the new
     factor.
 

@@ -21,7 +21,7 @@ C = TypeVar("C", bound=Cloud)
 _EXAMPLE = "such as --roi=-50,50,-40,40,300,500"
 
 
-def resolve_region(store: Session, roi: str = "") -> RegionOfInterest | None:
+def resolve_region(store: Session, roi: str) -> RegionOfInterest | None:
     """Return the region that an option ``--roi`` states; empty: the session's, ``off``: None."""
     if not roi:
         return load_region(store)
@@ -51,44 +51,15 @@ def parse_region(roi: str) -> RegionOfInterest:
     return RegionOfInterest.between(low, high)
 
 
-def refuse_region(merge: str, roi: str) -> None:
-    """Raise UsageError where a region was stated for a merge, whose scans were cut when it was
-    made."""
-    if roi:
-        raise UsageError(
-            f"{merge} was cut by the region when its scans were merged: merge them again with --roi"
-            f" {roi}"
-        )
-
-
 def restrict_cloud(store: Session, scan: str, cloud: C, region: RegionOfInterest | None) -> C:
     """Return a scan's cloud with NaN for what was deleted from it and what lies outside of the
     region.
 
     InputError, with the numbers, where nothing remains.
     """
-    kept = restriction_mask(store, scan, cloud.points, region)
-    if kept is None:
-        return cloud
-    nan = np.float32(np.nan)
-    return replace(
-        cloud,
-        points=np.where(kept[..., None], cloud.points, nan),
-        sigma_z=np.where(kept, cloud.sigma_z, nan),
-    )
-
-
-def restriction_mask(
-    store: Session, scan: str, points: np.ndarray, region: RegionOfInterest | None
-) -> np.ndarray | None:
-    """Mask (h, w) of the points (h, w, 3) mm of a scan that edits and region keep; None where there
-    are neither.
-
-    InputError where nothing remains of what was measured.
-    """
-    history = load_edits(store, scan)
+    points, history = cloud.points, load_edits(store, scan)
     if region is None and not history.active:
-        return None
+        return cloud
     kept = history.keep_mask(points)
     measured = int(np.count_nonzero(np.isfinite(points).all(axis=-1)))
     if measured and not kept.any():
@@ -98,7 +69,12 @@ def restriction_mask(
         )
     if region is not None:
         kept &= crop_mask(scan, np.where(kept[..., None], points, np.nan), region)
-    return kept
+    nan = np.float32(np.nan)
+    return replace(
+        cloud,
+        points=np.where(kept[..., None], points, nan),
+        sigma_z=np.where(kept, cloud.sigma_z, nan),
+    )
 
 
 def restriction_notes(

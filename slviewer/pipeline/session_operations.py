@@ -1,22 +1,18 @@
 """A session whose methods are the operations: what `slviewer.Session` is."""
 
 from slviewer.pipeline import (
-    accept,
-    align,
     calibrate,
-    check,
     compare,
     inspect_parts,
     measure,
-    merge,
-    validate,
 )
+from slviewer.pipeline.accept import accept, check, validate
 from slviewer.pipeline.edit import edit_scan, set_region
 from slviewer.pipeline.export import export
-from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.merge import align, merge
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.reconstruct import reconstruct, verify
-from slviewer.pipeline.report import report
+from slviewer.pipeline.report import inspect, report
 from slviewer.pipeline.stored_records import load_arrays
 from slviewer.session.store import Session
 
@@ -32,22 +28,22 @@ class SessionOperations(Session):
             session.reconstruct("object").only.points
     """
 
-    accept = accept.accept
-    align = align.align
+    accept = accept
+    align = align
     calibrate = calibrate.calibrate
-    check = check.check
+    check = check
     compare = compare.compare
     edit_scan = edit_scan
     export = export
     inspect = inspect
     load_arrays = load_arrays
     measure = measure.measure
-    merge = merge.merge
+    merge = merge
     mesh = mesh
     plan = inspect_parts.plan
     reconstruct = reconstruct
     report = report
     run_plan = inspect_parts.run_plan
     set_region = set_region
-    validate = validate.validate
+    validate = validate
     verify = verify

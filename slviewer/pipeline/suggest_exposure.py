@@ -30,6 +30,7 @@ Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 STATES = ("unlit", "measured", "saturated", "dark")
 """States of a pixel, by their numbers in `ExposureSuggestion.state`."""
+_UNLIT, _MEASURED, _SATURATED, _DARK = range(len(STATES))
 
 _PIXELS = 150_000
 _STOP = 4.0  # between exposures of the bracket
@@ -141,18 +142,19 @@ def apply_suggestion(rig: Rig, suggestion: ExposureSuggestion) -> list[float]:
     return exposures if len(exposures) > 1 else []
 
 
+@dataclass(eq=False)
 class _Bracket:
     """Looks at the fringes of a scene in several exposures, and the choice among them."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        sequence: PatternSequence,
-        region: Region | None,
-        budget_s: float,
-        progress: Progress,
-    ) -> None:
-        self._rig, self._budget_s, self._progress, self._grabs = rig, budget_s, progress, 0
+    rig: Rig
+    sequence: PatternSequence
+    region: Region | None
+    budget_s: float
+    progress: Progress
+
+    def __post_init__(self) -> None:
+        rig, sequence = self.rig, self.sequence
+        self._grabs = 0
         self._frames = len(sequence.frames)
         layout = axis_layout(sequence, sequence.axes[0])
         self._indices, self._is_fringe = _select_steps(layout)
@@ -161,7 +163,7 @@ class _Bracket:
         self._frame = np.empty((height, width), rig.camera.dtype)
         self._largest = 0
         self._stride = max(1, math.ceil(math.sqrt(width * height / _PIXELS)))
-        x, y, across, down = region or (0, 0, width, height)
+        x, y, across, down = self.region or (0, 0, width, height)
         if not (0 <= x < width and 0 <= y < height and across > 0 and down > 0):
             raise InputError(
                 f"the region {x} {y} {across} {down} is outside of the image of {width}x{height}"
@@ -177,14 +179,14 @@ class _Bracket:
     def choose(self, current_ms: Sequence[float | None], gain: float | None) -> ExposureSuggestion:
         """Look, choose, try, and correct what saturates after all."""
         if gain is not None and gain > 1:
-            gain = self._rig.camera.apply(CameraSettings(gain=1.0)).gain
+            gain = self.rig.camera.apply(CameraSettings(gain=1.0)).gain
         low, high, lit = self._examine(current_ms)
         # of the gain, where time does not allow for the exposures that are needed
         for _ in range(_MAX_DOUBLINGS):
             late = np.count_nonzero(low[lit] > self._longest_ms())
             if gain is None or late <= _LATE * np.count_nonzero(lit):
                 break
-            brighter = self._rig.camera.apply(CameraSettings(gain=2 * gain)).gain
+            brighter = self.rig.camera.apply(CameraSettings(gain=2 * gain)).gain
             if brighter is None or brighter <= gain:
                 break
             gain, self._looks = brighter, {}
@@ -197,7 +199,7 @@ class _Bracket:
         chosen = self._choose(low[lit], high[lit])
         if not chosen:
             raise DeviceError(
-                f"no capture of {self._frames} frames fits into {self._budget_s:g} s: allow more"
+                f"no capture of {self._frames} frames fits into {self.budget_s:g} s: allow more"
                 " time, or choose patterns with fewer frames"
             )
         for _ in range(_CORRECTIONS):
@@ -212,7 +214,7 @@ class _Bracket:
             self._classify(each, lit) for each in (chosen, self._applied(current_ms))
         )
         share, share_before = (
-            float(np.mean(each[lit] == STATES.index("measured"))) for each in (state, state_before)
+            float(np.mean(each[lit] == _MEASURED)) for each in (state, state_before)
         )
         return ExposureSuggestion(
             chosen,
@@ -240,7 +242,7 @@ class _Bracket:
     @property
     def _full(self) -> float:
         """Grey level at which the camera clips."""
-        return find_full_scale(self._rig.camera, self._largest)
+        return find_full_scale(self.rig.camera, self._largest)
 
     @property
     def _clip(self) -> float:
@@ -254,24 +256,24 @@ class _Bracket:
     def _look(self, exposure_ms: float | None) -> _Look:
         """Capture the fringes in the exposure that the camera has nearest to this one, unless that
         was done."""
-        with report_driver_faults(self._rig.camera):
-            set_ms = self._rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
+        with report_driver_faults(self.rig.camera):
+            set_ms = self.rig.camera.apply(CameraSettings(exposure_ms)).exposure_ms
         if set_ms is None:
             raise DeviceError(
-                f"{self._rig.camera.name} does not report its exposure: set it by hand, at the"
+                f"{self.rig.camera.name} does not report its exposure: set it by hand, at the"
                 " camera"
             )
         if set_ms in self._looks:
             return self._looks[set_ms]
         self._grabs += 1
-        self._progress(min(0.95, self._grabs / (2 * _MAX_LOOKS)), f"fringes at {set_ms:g} ms")
+        self.progress(min(0.95, self._grabs / (2 * _MAX_LOOKS)), f"fringes at {set_ms:g} ms")
         begun, images = time.monotonic(), []
         for index in (*self._indices, self._indices[-1]):
-            with report_driver_faults(self._rig.projector):
-                self._rig.projector.show(index)
-            settle(self._rig)
-            with report_driver_faults(self._rig.camera):
-                self._rig.camera.grab(self._frame)
+            with report_driver_faults(self.rig.projector):
+                self.rig.projector.show(index)
+            settle(self.rig)
+            with report_driver_faults(self.rig.camera):
+                self.rig.camera.grab(self._frame)
             image = self._frame[:: self._stride, :: self._stride]
             self._largest = max(self._largest, int(image.max()))
             images.append(image.astype(np.float32))
@@ -289,7 +291,7 @@ class _Bracket:
 
     def _longest_ms(self) -> float:
         """The longest exposure that a capture has time for."""
-        return 1e3 * self._budget_s / self._frames - self._overhead_ms
+        return 1e3 * self.budget_s / self._frames - self._overhead_ms
 
     def _examine(self, current_ms: Sequence[float | None]) -> tuple[Values, Values, Mask]:
         """Look at the present exposures, at shorter ones until nothing is saturated, and at longer
@@ -362,19 +364,20 @@ class _Bracket:
         if most <= first:
             return ()
         grid = np.unique([_round(each) for each in np.geomspace(first, most, _CANDIDATES)])
-        values, counts = _tabulate_values(grid, low, high)
+        values = _tabulate_values(grid, low, high)
         best: list[tuple[float, Exposures]] = []
         for count in range(1, MAX_SUGGESTED + 1):
             sets = np.array(list(combinations(range(len(grid)), count))).reshape(-1, count)
             times = grid[sets]
-            fits = self._duration_ms(times) <= 1e3 * self._budget_s
+            fits = self._duration_ms(times) <= 1e3 * self.budget_s
             sets = sets[fits & (times[:, 1:] >= _APART * times[:, :-1]).all(1)]
             if not len(sets):
                 break
             following = np.concatenate([sets[:, 1:], np.full((len(sets), 1), len(grid))], axis=1)
-            chosen = int(values[sets, following].sum(1).argmax())
-            measured = float(counts[sets[chosen], following[chosen]].sum())
-            best.append((measured, tuple(grid[sets[chosen]].tolist())))
+            chosen = grid[sets[values[sets, following].sum(1).argmax()]]
+            used = np.searchsorted(chosen, high, side="right") - 1  # the longest of each pixel
+            measured = float(np.count_nonzero((used >= 0) & (low <= chosen[used])))
+            best.append((measured, tuple(chosen.tolist())))
         largest = max((measured for measured, _ in best), default=0.0)
         good = (each for measured, each in best if measured >= largest - _WORTH * low.size)
         return next(good, ())
@@ -383,12 +386,12 @@ class _Bracket:
         """State (h, w) of each pixel if it is used from the longest of these exposures that does
         not saturate it."""
         variance = self._noise()
-        state = np.full(lit.shape, STATES.index("saturated"), np.uint8)
+        state = np.full(lit.shape, _SATURATED, np.uint8)
         for look in (self._looks[exposure] for exposure in exposures_ms):
             is_measured = self._required_factor(look, variance) <= 1
-            reached = np.where(is_measured, STATES.index("measured"), STATES.index("dark"))
+            reached = np.where(is_measured, _MEASURED, _DARK)
             state = np.where(look.peak < self._clip, reached, state).astype(np.uint8)
-        state[~lit] = STATES.index("unlit")
+        state[~lit] = _UNLIT
         return state
 
     def _required_factor(self, look: _Look, variance: tuple[float, float]) -> Values:
@@ -419,19 +422,18 @@ def _select_steps(layout: Layout) -> tuple[tuple[int, ...], bool]:
     return (layout.white, layout.black), False
 
 
-def _tabulate_values(grid: Values, low: Values, high: Values) -> tuple[Values, Values]:
-    """Value and number (n, n + 1) of the pixels that exposure i of the grid measures where exposure
-    j, the next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is
-    weakly modulated."""
+def _tabulate_values(grid: Values, low: Values, high: Values) -> Values:
+    """Value (n, n + 1) of the pixels that exposure i of the grid measures where exposure j, the
+    next one, saturates them; j = n: none follows. A pixel's value is 1, less where it is weakly
+    modulated."""
     n = len(grid)
     saturated_by = np.searchsorted(grid, high, side="right")
-    values, counts = np.zeros((n, n + 1)), np.zeros((n, n + 1))
+    values = np.zeros((n, n + 1))
     for i, exposure in enumerate(grid):
         measured = (low <= exposure) & (high >= exposure)
         value = 1 - _WEAK_COST * np.square(low[measured] / exposure)
         values[i] = np.cumsum(np.bincount(saturated_by[measured], value, n + 1))
-        counts[i] = np.cumsum(np.bincount(saturated_by[measured], minlength=n + 1))
-    return values, counts
+    return values
 
 
 def _round(exposure_ms: float) -> float:

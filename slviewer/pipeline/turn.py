@@ -7,19 +7,13 @@ before it stay, and the missing steps can be captured later.
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from slviewer.devices.capture import capture_with_texture
 from slviewer.devices.protocols import Rig, Turntable
-from slviewer.errors import (
-    Cancelled,
-    DeviceError,
-    InputError,
-    SlviewerError,
-    TurntableError,
-    UsageError,
-)
+from slviewer.errors import Cancelled, InputError, SlviewerError, UsageError
 from slviewer.fringe.sequence import one_axis
 from slviewer.pipeline.capture import (
     RigSettings,
@@ -31,14 +25,12 @@ from slviewer.pipeline.capture import (
     warn_of_captured,
 )
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
-from slviewer.pipeline.merge import MergeSettings
-from slviewer.pipeline.merge import merge as merge_operation
-from slviewer.pipeline.mesh import MeshResult
-from slviewer.pipeline.mesh import mesh as mesh_merge
+from slviewer.pipeline.merge import MergeSettings, merge
+from slviewer.pipeline.mesh import MeshResult, mesh
 from slviewer.pipeline.models import ModelName, check_accepted, load_model, load_stereo_if_complete
-from slviewer.pipeline.open_session import opened_or_made
 from slviewer.pipeline.operation import Findings, takes_settings
 from slviewer.pipeline.rig_choice import RigLike, RigSetup, load_rig
+from slviewer.pipeline.stored_records import opened_or_made
 from slviewer.records.merge import Merge
 from slviewer.registration.multiway import MOST_SCANS
 from slviewer.registration.refusal import Refused
@@ -176,7 +168,7 @@ def turn(settings: TurnSettings) -> Turn:
         merging = MergeSettings(names, names[0], model=model, accept_rejected=accepts)
         merged = merge_turn(store, merging, part(progress, 0.5, 0.8), warn)
         out = settings.mesh or store.exports / f"{turn_name}_mesh.ply"
-        meshed = mesh_merge(
+        meshed = mesh(
             store, [f"merge/{next(iter(merged))}"], out, plan=WATERTIGHT, model=model,
             accept_rejected=accepts, progress=part(progress, 0.8, 1.0), warn=warn,
         )  # fmt: skip
@@ -217,16 +209,13 @@ def plan_turn(name: str, steps: int = STEPS, range_deg: float = FULL_TURN_DEG) -
 def next_turn(store: Session) -> str:
     """Return the next unused name of a turn: turn1, turn2 and so on."""
     taken = {name.rpartition("_")[0] for name in store.taken_names()}
-    number = 1
-    while f"turn{number}" in taken:
-        number += 1
-    return f"turn{number}"
+    return next(name for number in count(1) if (name := f"turn{number}") not in taken)
 
 
 def recorded_steps(store: Session, name: str) -> list[TurnStep]:
     """List the captured steps of a turn, in their order."""
-    steps = [capture.turn_step for capture in store.captures("scan")]
-    turned = [step for step in steps if step is not None and step.turn == name]
+    steps = (capture.turn_step for capture in store.captures("scan"))
+    turned = (step for step in steps if step is not None and step.turn == name)
     return sorted(turned, key=lambda step: step.step)
 
 
@@ -294,9 +283,7 @@ def capture_turn(
                 raise
             except SlviewerError as error:
                 saved = len(recorded) + k
-                kinds = (TurntableError, DeviceError, InputError, SlviewerError)
-                kind = next(each for each in kinds if isinstance(error, each))
-                raise kind(
+                raise type(error)(
                     f"{label}, at {step.deg:g} degrees: {error}. {saved}"
                     f" scan{'s are' if saved != 1 else ' is'} saved: correct the cause, then resume"
                     " the turn"
@@ -315,13 +302,13 @@ def merge_turn(
     switched off.
     """
     try:
-        return merge_operation.run(store, replace(settings, start="turntable"), progress, warn)
+        return merge.run(store, replace(settings, start="turntable"), progress, warn)
     except (Refused, InputError) as error:
         warn(
             "the angles of the turntable do not align the scans, they are aligned by features"
             f" instead: {error}"
         )
-    return merge_operation.run(store, replace(settings, start="features"), progress, warn)
+    return merge.run(store, replace(settings, start="features"), progress, warn)
 
 
 def _origin(table: Turntable, recorded: Sequence[TurnStep], warn: Warn) -> float:

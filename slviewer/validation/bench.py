@@ -28,9 +28,9 @@ from slviewer.fringe.threshold import fringe_mean
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, ignore_progress, part
 from slviewer.pipeline.models import load_model, load_stereo
-from slviewer.pipeline.open_session import opened
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.simulate import TARGET, simulate
+from slviewer.pipeline.stored_records import opened
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.reconstruction.onepass import OnePass
 from slviewer.records.plain import to_plain

@@ -30,8 +30,7 @@ from slviewer.calibration.splined.volume import (
     working_volume,
 )
 from slviewer.errors import InputError
-from slviewer.evaluation.compare import Comparison, fit_clouds
-from slviewer.evaluation.fit import ShapeResult, ShapeSearch
+from slviewer.evaluation.fit import Comparison, ShapeResult, ShapeSearch, fit_clouds
 from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM
 from slviewer.evaluation.render import Row
 from slviewer.fringe.phase import PhaseMap

@@ -15,7 +15,7 @@ from slviewer.calibration.pixelwise import PixelwiseModel
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError, UsageError
 from slviewer.evaluation import letter
-from slviewer.evaluation.compare import Comparison
+from slviewer.evaluation.fit import Comparison
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.merge import MergedScans, MergeSettings, merge_scans

@@ -11,7 +11,7 @@ import numpy as np
 from slviewer.devices.world import Thing
 from slviewer.errors import Cancelled, SlviewerError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measured_surface import MeasuredSurface, Place
+from slviewer.pipeline.measure import MeasuredSurface, Place
 from slviewer.simulation.boards import BoardScene
 from slviewer.simulation.mesh import MeshScene
 from slviewer.simulation.plans import objects, planes, spheres

@@ -17,7 +17,7 @@ from slviewer.fringe.presets import short
 from slviewer.fringe.sequence import PatternSequence
 from slviewer.pipeline.capture import check_space, depth_axis, save_frames
 from slviewer.pipeline.feedback import Progress, part
-from slviewer.pipeline.import_captures import Role, describe_import, import_captures
+from slviewer.pipeline.import_captures import describe_import, import_captures
 from slviewer.pipeline.turn import (
     FULL_TURN_DEG,
     STEPS,
@@ -30,7 +30,7 @@ from slviewer.pipeline.turn import (
     require_turntable,
 )
 from slviewer.session import atomic
-from slviewer.session.capture import TurnStep
+from slviewer.session.capture import Role, TurnStep
 from slviewer.session.importers.archive import unpack, unpacked_size
 from slviewer.session.names import new_name
 from slviewer.session.reading import expand_user

@@ -14,7 +14,9 @@ from slviewer.inspection.regions import Region
 from slviewer.pipeline.compare import CompareSettings, compare
 from slviewer.pipeline.inspect_parts import TOLERANCE_MM, RunPlanSettings, make_plan, run_plan
 from slviewer.pipeline.measure import (
+    MeasuredSurface,
     MeasureSettings,
+    Place,
     RelateSettings,
     What,
     export_measurements,
@@ -24,7 +26,6 @@ from slviewer.pipeline.measure import (
     restore_measurement,
     trash_measurement,
 )
-from slviewer.pipeline.measured_surface import MeasuredSurface, Place
 from slviewer.pipeline.operation import Job
 from slviewer.records.measurement import MeasuredRegion
 from slviewer.records.plain import from_plain, to_plain

@@ -6,14 +6,22 @@ from functools import partial
 from typing import Any
 
 from slviewer.errors import Cancelled, InputError, SlviewerError
-from slviewer.pipeline.align import FOLDER as PLACEMENTS
-from slviewer.pipeline.align import AlignSettings, align, remove_placement
+from slviewer.pipeline.accept import ValidateSettings, validate
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.edit import SUPPORT, Selection, delete_points, step_history
 from slviewer.pipeline.export import What, check_export, default_file_name, export, formats
 from slviewer.pipeline.feedback import Progress, Warn, part
-from slviewer.pipeline.measured_surface import MERGED
-from slviewer.pipeline.merge import MergeSettings, Picked, StartKind, merge
+from slviewer.pipeline.measure import MERGED
+from slviewer.pipeline.merge import (
+    PLACEMENTS,
+    AlignSettings,
+    MergeSettings,
+    Picked,
+    StartKind,
+    align,
+    merge,
+    remove_placement,
+)
 from slviewer.pipeline.mesh import mesh
 from slviewer.pipeline.models import (
     ModelName,
@@ -26,7 +34,6 @@ from slviewer.pipeline.operation import Findings
 from slviewer.pipeline.operations import OPERATIONS
 from slviewer.pipeline.reconstruct import ReconstructSettings, VerifySettings, reconstruct, verify
 from slviewer.pipeline.turn import WATERTIGHT, merge_turn
-from slviewer.pipeline.validate import ValidateSettings, validate
 from slviewer.records.merge import Merge
 from slviewer.records.verification import Shape
 from slviewer.registration.refusal import Refused

@@ -12,7 +12,7 @@ from slviewer.errors import InputError
 from slviewer.fringe.hdr import radiance, toned
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
-from slviewer.pipeline.align import AlignedScans, view_aligned
+from slviewer.pipeline.merge import AlignedScans, load_placements, view_places
 from slviewer.pipeline.models import load_model, load_stereo
 from slviewer.pipeline.poses import load_observations
 from slviewer.pipeline.report import curve_at
@@ -96,7 +96,7 @@ def whole_cloud(session: Session, name: str) -> ScanCloud:
 
 def aligned_scans(session: Session) -> AlignedScans:
     """Load the scans in place, thinned, with the number of scans that see each point."""
-    return view_aligned(session)
+    return view_places(load_placements(session), {}, session)
 
 
 def merged_cloud(session: Session, name: str) -> Ply:

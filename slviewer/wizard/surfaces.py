@@ -8,7 +8,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measured_surface import (
+from slviewer.pipeline.measure import (
     MERGED,
     MeasuredSurface,
     Place,

@@ -24,7 +24,7 @@ from slviewer.cli import COMMANDS, main
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import multifrequency
 from slviewer.fringe.sequence import PatternSequence, one_axis
-from slviewer.pipeline.import_calibration import import_opencv_calibration
+from slviewer.pipeline.import_captures import import_opencv_calibration
 from slviewer.session.exporters import write_calibration
 from slviewer.session.store import Session
 from slviewer.session.toml import describe_sequence

@@ -9,8 +9,7 @@ from planted import board_before_a_wall, cloud, plane_depth, rectangle, sphere_d
 
 from slviewer.errors import InputError
 from slviewer.evaluation import letter
-from slviewer.evaluation.compare import Comparison, fit_clouds
-from slviewer.evaluation.incidence import incidence
+from slviewer.evaluation.fit import Comparison, fit_clouds, incidence
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.records.plain import to_plain
 from slviewer.records.table import render_text

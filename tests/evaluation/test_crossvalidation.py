@@ -10,16 +10,16 @@ from facts import missing_facts, raises
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
-from slviewer.evaluation.crossvalidation import (
+from slviewer.fringe.phase import PhaseMap
+from slviewer.geometry.lens import Lens
+from slviewer.geometry.polynomial import fit_polynomial
+from slviewer.geometry.rig import StereoRig
+from slviewer.pipeline.accept import (
     LEAST_POSES,
     gather_results,
     measure_held_out,
     split_folds,
 )
-from slviewer.fringe.phase import PhaseMap
-from slviewer.geometry.lens import Lens
-from slviewer.geometry.polynomial import fit_polynomial
-from slviewer.geometry.rig import StereoRig
 from slviewer.pipeline.stored_records import read_record
 from slviewer.records.model_comparison import HeldOutPose, ModelComparison
 from slviewer.records.plain import to_plain
@@ -146,11 +146,11 @@ def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
     names = ("stereo", "pixelwise", "splined")
 
     def recommended(*errors: float) -> str:
-        fold = {
-            f"p{k}": {name: held(e) for name, e in zip(names, errors, strict=True)}
-            for k in range(4)
+        poses = ("p0", "p1", "p2", "p3")
+        measured = {
+            name: dict.fromkeys(poses, held(e)) for name, e in zip(names, errors, strict=True)
         }
-        return gather_results(names, [fold], (("p0", "p1", "p2", "p3"),), {}).recommended
+        return gather_results(measured, (poses,), {}).recommended
 
     assert recommended(0.3, 0.2, 0.1) == "splined"
     assert recommended(0.3, 0.2, 0.199) == "pixelwise"
@@ -158,10 +158,8 @@ def test_the_best_is_recommended_and_of_equals_the_simpler() -> None:
 
 
 def test_it_survives_saving_and_says_what_failed() -> None:
-    fold = {"p0": {"stereo": held(0.2)}, "p1": {"stereo": held(0.4)}}
-    found = gather_results(
-        ("stereo", "pixelwise"), [fold], (("p0",), ("p1",)), {"pixelwise": "3 usable poses"}
-    )
+    measured = {"stereo": {"p0": held(0.2), "p1": held(0.4)}, "pixelwise": {}}
+    found = gather_results(measured, (("p0",), ("p1",)), {"pixelwise": "3 usable poses"})
     assert found.models["stereo"].board_mm == pytest.approx(np.sqrt(0.1))
     assert found.recommended == "stereo"
     (table,) = ModelComparison.tables({"1": found})
@@ -171,4 +169,4 @@ def test_it_survives_saving_and_says_what_failed() -> None:
     )
     assert read_record(ModelComparison, json.loads(json.dumps(to_plain(found)))) == found
     with raises(InputError, "stereo", "why"):
-        gather_results(("stereo",), [], (), {"stereo": "why"})
+        gather_results({"stereo": {}}, (), {"stereo": "why"})

@@ -30,13 +30,13 @@ from wizard_page import (
     wait_until_still,
 )
 
-from slviewer.evaluation.crossvalidation import gather_results
 from slviewer.gui.app import App
 from slviewer.gui.panel import Painter, display_name
 from slviewer.gui.steps.calibrate import named_poses, verdict_html
 from slviewer.gui.steps.scan import paint_cloud, point_html, sort_scans, uncertainty
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import colour_range, records_html
+from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.calibrate import save_verdict
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import Measurement
@@ -460,14 +460,10 @@ def test_no_label_is_cut_beside_results(measured: tuple[Page, Operator, list[str
 
 def test_comparison_and_verdict_as_html() -> None:
     measured = {
-        "pose_1": {
-            m: HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)
-            for m, p in (("stereo", 0.2), ("splined", 0.02))
-        }
+        m: {"pose_1": HeldOutPose(p, 2 * p, 9.0, p, p, 100, 600.0)}
+        for m, p in (("stereo", 0.2), ("splined", 0.02))
     }
-    compared = gather_results(
-        ("stereo", "splined"), [measured], (("pose_1",),), {"pixelwise": "too <few> poses"}
-    )
+    compared = gather_results(measured, (("pose_1",),), {"pixelwise": "too <few> poses"})
     html = records_html([Stored("1", "1", compared)])
     assert (
         re.search(r"font-weight:600\">0&#46;020", html)

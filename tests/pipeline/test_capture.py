@@ -17,8 +17,7 @@ from slviewer.fringe.decode import decode
 from slviewer.fringe.presets import p18
 from slviewer.pipeline.capture import RigSettings, capture, set_camera
 from slviewer.pipeline.capture_phases import capture_texture
-from slviewer.pipeline.devices import devices
-from slviewer.pipeline.rig_choice import RigSetup, set_up
+from slviewer.pipeline.rig_choice import RigSetup, devices, set_up
 from slviewer.session.store import Session
 from slviewer.session.toml import to_toml
 from slviewer.target.board import Board
@@ -273,10 +272,10 @@ def test_a_capture_that_is_saved_outlives_the_look_at_its_frames(
     def refused(*_: object) -> list[str]:
         raise SessionError("the disk is full: free some space")
 
-    monkeypatch.setattr(module, "save_examination", interrupted)
+    monkeypatch.setattr(module, "load_or_save_examination", interrupted)
     with raises(KeyboardInterrupt):
         capture(tmp_path / "fresh", "a", {"driver": "simulated", "scale": 0.1})
-    monkeypatch.setattr(module, "save_examination", refused)
+    monkeypatch.setattr(module, "load_or_save_examination", refused)
     said: list[str] = []
     capture(tmp_path / "fresh", "b", {"driver": "simulated", "scale": 0.1}, warn=said.append)
     assert len(said) == 1 and not missing_facts(

@@ -18,8 +18,7 @@ from slviewer.fringe.sequence import one_axis
 from slviewer.inspection.regions import Region
 from slviewer.pipeline.certificate import ReportCheck, certify_page, read_certificate, verify_report
 from slviewer.pipeline.inspect_parts import run_plan
-from slviewer.pipeline.measure import relate
-from slviewer.pipeline.measured_surface import load_surface
+from slviewer.pipeline.measure import load_surface, relate
 from slviewer.pipeline.operation import Job
 from slviewer.pipeline.report import report
 from slviewer.pipeline.simulate import save_true_stereo
@@ -117,8 +116,7 @@ def test_the_figures_of_a_report_follow_from_the_frames(
     assert sorted(path.name for path in folder.rglob("*")) == before
     certificate = read_certificate(page)[1]
     assert all(
-        len(c["frames"]) in (26, 52) and len(set(c["frames"])) > 20
-        for c in certificate.captures.values()
+        len(c.frames) in (26, 52) and len(set(c.frames)) > 20 for c in certificate.captures.values()
     )
     assert "verify-report" in page.read_text() and "<script" not in page.read_text()
 

@@ -14,8 +14,7 @@ from sound_checks import save_sound_checks
 from slviewer.errors import InputError
 from slviewer.fringe.presets import complementary, p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.accept import accept
-from slviewer.pipeline.check import REFERENCE, check, load_drift_history
+from slviewer.pipeline.accept import REFERENCE, accept, check, load_drift_history
 from slviewer.pipeline.models import load_stereo
 from slviewer.pipeline.scale import scale_factor
 from slviewer.pipeline.simulate import save_true_stereo

@@ -16,7 +16,7 @@ from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray_bits, phase_steps
 from slviewer.fringe.sequence import Frame, PatternSequence
-from slviewer.pipeline.conformance import (
+from slviewer.plugins import (
     check_board,
     check_camera,
     check_exporter,

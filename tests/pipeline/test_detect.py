@@ -90,7 +90,7 @@ def test_corners_that_are_seen_of_a_charuco_board_keep_their_numbers(tmp_path: P
     view = View(size=(400, 300), supersample=4, fill=0.6, hide=(-30, -30, 30, 90))
     cv2.imwrite(str(tmp_path / "part.png"), view.render(board))
     result = detect_board([tmp_path / "part.png"], str(board), out=tmp_path / "part_overlay.png")
-    detection = result.images[0].detection
-    assert detection is not None and 8 <= len(detection.ids) < len(board.points)
-    assert not missing_facts(result.text(), f"{len(detection.ids)} of 24 corners")
-    assert [row[1] for row in result.rows()] == detection.ids.tolist()
+    found = result.images[0]
+    assert found.detected and 8 <= len(found.index) < len(board.points)
+    assert not missing_facts(result.text(), f"{len(found.index)} of 24 corners")
+    assert [row[1] for row in result.rows()] == found.index

@@ -9,11 +9,15 @@ import trimesh
 from facts import missing_facts, raises
 
 from slviewer.errors import InputError
-from slviewer.evaluation.capability import process_capability
 from slviewer.geometry.rigid import move_points, transform_from_rvec
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.inspect_parts import FILES, inspect_surfaces, write_inspection
-from slviewer.pipeline.measured_surface import MeasuredSurface
+from slviewer.pipeline.inspect_parts import (
+    FILES,
+    inspect_surfaces,
+    process_capability,
+    write_inspection,
+)
+from slviewer.pipeline.measure import MeasuredSurface
 from slviewer.records.inspection import Characteristic, Inspection
 from slviewer.session.inspection_plan import (
     Alignment,

@@ -8,9 +8,13 @@ from facts import missing_facts, raises
 
 from slviewer.cli import main
 from slviewer.errors import InputError
-from slviewer.evaluation import rig_plan
-from slviewer.evaluation.rig_plan import PlannedLight, predict_rig
-from slviewer.pipeline.plan_rig import _read_camera, _read_projector, plan_rig
+from slviewer.pipeline.plan_rig import (
+    PlannedLight,
+    _read_camera,
+    _read_projector,
+    plan_rig,
+    predict_rig,
+)
 
 BUDGETS = (
     ("webcam-1080p", "pocket-720p", 500.0),
@@ -44,7 +48,7 @@ def test_the_simulation_measures_what_is_predicted(camera, projector, distance, 
 def predict(*given):
     """The plan, its usable range looked for at the distance alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rig_plan, "_DEPTHS", np.ones(1))
+        patch.setattr("slviewer.pipeline.plan_rig._DEPTHS", np.ones(1))
         return predict_rig(*given)
 
 

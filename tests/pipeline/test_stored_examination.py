@@ -12,7 +12,7 @@ from slviewer.devices.simulated import simulated_rig
 from slviewer.devices.world import SimulatedWorld
 from slviewer.fringe.presets import complementary, gray, multifrequency, p18
 from slviewer.fringe.sequence import one_axis
-from slviewer.pipeline.examination import examine_frames, load_examination, save_examination
+from slviewer.pipeline.examination import examine_frames, load_examination, load_or_save_examination
 from slviewer.records.plain import from_plain, to_plain
 from slviewer.records.verdict import Examination
 from slviewer.session.store import Session
@@ -129,7 +129,7 @@ def test_a_saved_examination_is_read_until_the_checks_change(tmp_path):
     with Session.create(tmp_path / "session") as session:
         session.save_capture("part", "scan", sequence, stack, source="a test")
         assert load_examination(session, "part") is None
-        saved = save_examination(session, session.load_capture("part"))
+        saved = load_or_save_examination(session, session.load_capture("part"))
         assert load_examination(session, "part") == saved
         assert saved.findings[0].cause == "frame-lag" and len(saved.warnings()) <= 4
         meta, _ = session.load_result("trust/part")

@@ -19,7 +19,6 @@ from slviewer.pipeline.rig_choice import Choice, RigSetup, set_up
 from slviewer.pipeline.simulate import save_true_stereo
 from slviewer.pipeline.turn import (
     capture_turn,
-    merge_operation,
     merge_turn,
     missing_steps,
     next_turn,
@@ -240,7 +239,7 @@ def test_angles_that_do_not_fit_the_scans_are_not_insisted_on(
             raise Refused("overlap", "they do not overlap")
         return settings.start
 
-    monkeypatch.setattr(merge_operation, "run", attempt)
+    monkeypatch.setattr(merge, "run", attempt)
     with Session.create(tmp_path / "session") as store:
         settings = MergeSettings(["two"], "one")
         merged = merge_turn(store, settings, ignore_progress, warnings.append)

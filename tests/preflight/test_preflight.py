@@ -89,7 +89,7 @@ def test_a_sound_rig_is_left_in_peace(seed, looked, compiled):
     assert found.seconds > 0 and process_time() - before < 10
     assert len(said) == len(found.checks) == 10 and done == sorted(done) and done[-1] == 1.0
     assert all(check.sentence.endswith(".") for check in found.checks)
-    assert found.to_dict()["checks"][0]["name"] == "screen"
+    assert found.to_json()["checks"][0]["name"] == "screen"
     table = np.array(found.levels)
     assert np.abs(table - np.arange(256)).max() <= 2
 

@@ -11,7 +11,7 @@ from facts import missing_facts
 from made_up import MODELS, planes, reproduction_data, session_data, spheres
 
 from slviewer.calibration.stereo import StereoModel
-from slviewer.evaluation.crossvalidation import gather_results
+from slviewer.pipeline.accept import gather_results
 from slviewer.pipeline.stored_records import read_record
 from slviewer.records.acceptance import AcceptanceTest
 from slviewer.records.calibration import ModelCalibration, SplinedFit, VolumeSigma
@@ -260,9 +260,9 @@ def test_how_good_a_calibration_is() -> None:
     )
     held = {"stereo": 0.2, "splined": 0.02}
     measured = {
-        "pose_01": {m: HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0) for m, mm in held.items()}
+        m: {"pose_01": HeldOutPose(mm, mm, 100 * mm, mm, mm, 900, 550.0)} for m, mm in held.items()
     }
-    compared = gather_results(tuple(held), [measured], (("pose_01",),), {})
+    compared = gather_results(measured, (("pose_01",),), {})
     splined = SplinedFit(
         steps=6,
         residuals_over_noise={"x": 1.0, "y": 1.1},

@@ -12,7 +12,7 @@ from slviewer.errors import CalibrationRejected, DamagedError, InputError, Sessi
 from slviewer.pipeline import poses
 from slviewer.pipeline.calibrate import CalibrateSettings, calibrate
 from slviewer.pipeline.examination import load_or_save_examination
-from slviewer.pipeline.inspect import inspect
+from slviewer.pipeline.report import inspect
 from slviewer.session.store import Session
 
 DAMAGE = {

@@ -195,7 +195,7 @@ def run_guarded(
             marks=pytest.mark.slow,
         ),
         (
-            "capture_clouds.reconstruct_cloud",
+            "reconstruct.reconstruct_cloud",
             run_guarded(reconstruct, ReconstructSettings("scan_01")),
         ),
         pytest.param(

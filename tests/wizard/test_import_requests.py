@@ -13,7 +13,7 @@ from wizard_events import HANG_S, list_texts
 
 from slviewer.fringe.patterns import render_pattern
 from slviewer.fringe.presets import gray
-from slviewer.pipeline.import_calibration import import_opencv_calibration
+from slviewer.pipeline.import_captures import import_opencv_calibration
 from slviewer.session.exporters import write_calibration
 from slviewer.wizard.operator import Operator
 from slviewer.wizard.snapshot import Level

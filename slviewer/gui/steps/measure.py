@@ -12,8 +12,7 @@ from slviewer.gui.scene import Click
 from slviewer.gui.widgets import Html, Text, to_html
 from slviewer.inspection.features import KINDS
 from slviewer.inspection.regions import Region
-from slviewer.pipeline.measure import What
-from slviewer.pipeline.measured_surface import Place
+from slviewer.pipeline.measure import Place, What
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.measurement import Measurement
 from slviewer.report.canvas import round_up

@@ -1,4 +1,5 @@
-"""Any folder of images, with a TOML that says what each of them shows.
+"""Any folder of images, with a TOML that says what each of them shows; and that TOML of images that
+nobody described, as they themselves suggest it.
 
 ```toml
 projector = "912x1140"   # width x height, px; not needed where only the phase is wanted
@@ -73,8 +74,9 @@ from typing import Annotated, Any, get_args
 import msgspec
 
 from slviewer.errors import InputError
+from slviewer.examination.guess import Guess, guess_sequence
 from slviewer.fringe.sequence import SEQUENCE_KEYS, Axis, Frame, Kind, PatternSequence, parse_size
-from slviewer.session.importers.images import Channel
+from slviewer.session.importers.images import DEFAULT_CHANNEL, Channel, read_frames
 from slviewer.session.importers.imported import (
     FolderLayout,
     ImportableRecording,
@@ -82,11 +84,13 @@ from slviewer.session.importers.imported import (
     collect_captures,
     has_wildcard,
     images_by_name,
+    list_folders,
     match_files,
     unknown_files_warning,
 )
 from slviewer.session.names import join_names
 from slviewer.session.reading import read_toml
+from slviewer.session.toml import format_value, table_lines
 
 _KEYS = {*SEQUENCE_KEYS, "frames", "order", "channel"}
 
@@ -437,15 +441,14 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
             f"{len(unstated)} of {len(frames)} images state no exposure_ms: add it to all, or to"
             " none"
         )
-    wanted = [frame for frame, exposure in frames if exposure == exposures[0]]
-    order: list[int] = []
-    for each in exposures:
-        there = {frame: index for index, (frame, exposure) in enumerate(frames) if exposure == each}
-        count = sum(exposure == each for _, exposure in frames)
-        if set(there) != set(wanted) or count != len(wanted):
+    shown = [[i for i, (_, ms) in enumerate(frames) if ms == exposure] for exposure in exposures]
+    wanted, order = [frames[i][0] for i in shown[0]], list[int]()
+    for exposure, indices in zip(exposures, shown, strict=True):
+        there = {frames[i][0]: i for i in indices}
+        if set(there) != set(wanted) or len(indices) != len(wanted):
             raise InputError(
-                f"the exposures of {exposures[0]:g} and {each:g} ms show other frames: describe the"
-                " whole sequence, each frame once, in every exposure"
+                f"the exposures of {exposures[0]:g} and {exposure:g} ms show other frames: describe"
+                " the whole sequence, each frame once, in every exposure"
             )
         order += [there[frame] for frame in wanted]
     return exposures, order
@@ -454,3 +457,94 @@ def _list_exposures(groups: Sequence[FrameGroup]) -> tuple[tuple[float, ...], li
 LAYOUT = FolderLayout(
     "frames", "images and a TOML that describes them", _read, lambda folder: False
 )
+
+
+@dataclass(frozen=True)
+class GuessedDescription:
+    """``toml``: the text, whose comments say what supports each entry. ``doubts``: what stays open;
+    empty where the description is sure."""
+
+    toml: str
+    doubts: tuple[str, ...]
+
+
+def guess_description(
+    folder: Path, projector: str | None, channel: Channel | None
+) -> GuessedDescription:
+    """Guess the pattern sequence of a folder's images, in natural order of their names, as a TOML
+    with doubts; nothing is saved. ``projector``: width x height, px, where it is known.
+
+    Of a folder of captures, the first is read. Raises InputError where there are no images, or they
+    cannot belong to one capture (other sizes, damaged).
+    """
+    source, files = folder, list[Path]()
+    for folder in list_folders(source):
+        if len(files := images_by_name(folder)) >= 3:
+            break
+    else:
+        raise InputError(
+            f"{source} and the folders in it hold fewer than three images: give the folder of a"
+            " capture"
+        )
+    images = read_frames(files, channel=channel or DEFAULT_CHANNEL)
+    size = None if projector is None else parse_size(projector)
+    guess = guess_sequence(images.stack, size)
+    names = [file.name for file in files]
+    shown = (channel or DEFAULT_CHANNEL) if images.in_colour else channel
+    other = "; the green of these colour images was read: try --channel red, blue or max"
+    hint = other if images.in_colour and channel is None and not any(guess.frames) else ""
+    doubts = tuple(
+        f"{_format_span(names, indices)}: {text}{hint}" for indices, text in guess.doubts
+    )
+    return GuessedDescription(_format_toml(folder, names, guess, shown, size, doubts), doubts)
+
+
+def _format_span(names: list[str], indices: tuple[int, ...]) -> str:
+    """Format the names at some indices: "first to last" where they are consecutive, else a list."""
+    whole = len(indices) > 1 and indices == tuple(range(indices[0], indices[-1] + 1))
+    return (
+        f"{names[indices[0]]} to {names[indices[-1]]}"
+        if whole
+        else join_names([names[i] for i in indices])
+    )
+
+
+def _format_toml(
+    folder: Path,
+    names: list[str],
+    guess: Guess,
+    channel: Channel | None,
+    projector: tuple[int, int] | None,
+    doubts: tuple[str, ...],
+) -> str:
+    """Return the text of the guessed TOML, with comments for its evidence and doubts."""
+    described = guess.sequence.to_dict() if guess.sequence else {}
+    lines = [f"# Guessed from the {len(names)} images of {folder.name}."]
+    lines += [f"# UNSURE: {doubt}" for doubt in doubts]
+    lines += [f"# {note}" for note in guess.notes]
+    if projector is None:
+        lines.append('# projector = "1280x800"  # unknown: needed to calibrate and to reconstruct')
+    else:
+        lines.append(f'projector = "{projector[0]}x{projector[1]}"')
+    lines.append('order = "name"  # all images of a folder in natural order of their names')
+    if channel is not None:
+        lines.append(f"channel = {format_value(channel)}")
+    # Without gray_origin the import estimates it from the images.
+    keys = ("phase_sign", "phase_offset", "gray_cell_px", "relative")
+    lines += table_lines({key: described[key] for key in keys if key in described})
+    evidence: dict[int, list[str]] = {}
+    for image, text in guess.evidence:
+        evidence.setdefault(image, []).append(text)
+    doubtful = {
+        image: text for images, text in guess.doubts if len(images) < len(names) for image in images
+    }
+    for index, (name, frame) in enumerate(zip(names, guess.frames, strict=True)):
+        lines += ["", *(f"# {text}" for text in evidence.get(index, []))]
+        if index in doubtful:
+            lines.append(f"# UNSURE: {doubtful[index]}")
+        if frame is None:
+            lines.append(f"# [[frame]] of {name}: add its kind")
+            continue
+        lines.append(f"[[frame]]  # {name}")
+        lines += table_lines(frame.to_dict())
+    return "\n".join(lines) + "\n"

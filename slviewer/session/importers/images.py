@@ -3,7 +3,6 @@ without a word."""
 
 import io
 import re
-import struct
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +30,8 @@ _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 Image.MAX_IMAGE_PIXELS = None
 warnings.filterwarnings("ignore", module=r"PIL\.")
 _PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8"
+_CHECKED = (_PNG, b"\xff\xd8", b"BM")
+"""Beginnings of PNG, JPEG and BMP files, which OpenCV may decode as far as they go."""
 _NETPBM = re.compile(
     rb"P[1-7]" + 2 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"(?:(?:\s|#[^\n]*\n)+(\d{1,5})\s)?"
 )
@@ -78,7 +78,17 @@ def read_frames(
     def read(index: int) -> None:
         """Read image ``index`` into the stack, and the texture if it is the colour frame."""
         image = first if index == 0 else read_image(paths[index])
-        _check_alike(image, first, paths[index], paths[0])
+        mine, firsts = _short_path(paths[index]), _short_path(paths[0])
+        if image.shape[:2] != first.shape[:2]:
+            raise InputError(
+                f"{mine} is {_format_size(image)} px, {firsts} is {_format_size(first)}: all"
+                " frames of a capture must have one size"
+            )
+        if image.dtype != first.dtype:
+            raise InputError(
+                f"{mine} has {8 * image.itemsize} bits, {firsts} has {8 * first.itemsize}: all"
+                " frames of a capture must have one bit depth"
+            )
         if image.ndim == 2:
             stack[index] = image
             return
@@ -135,87 +145,39 @@ def reduce_channels(
 def read_image(path: Path) -> np.ndarray:
     """(h, w) or (h, w, 3) BGR, uint8 or uint16. Raises InputError for anything that is not wholly
     an image."""
-    data = read_input(path, MAX_IMAGE_BYTES, "check the file")
-    if fault := _describe_fault(data):
-        raise InputError(f"{_short_path(path)} is {fault}: copy or record it again")
+    data, name = read_input(path, MAX_IMAGE_BYTES, "check the file"), _short_path(path)
+    if not data:
+        raise InputError(f"{name} is empty: copy or record it again")
     width = height = 0
     try:
-        with Image.open(io.BytesIO(data), formats=_FORMATS) as header:
-            width, height = header.size
-            if data.startswith(_PNG):
-                header.verify()
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+            width, height = image.size
+            if width * height <= MAX_PIXELS and data.startswith(_CHECKED):
+                (image.verify if data.startswith(_PNG) else image.load)()
     except Exception as error:  # a malformed file may make Pillow fail in any way
-        if data.startswith(_PNG):  # OpenCV decodes what is there of others, or nothing
+        if data.startswith(_CHECKED):
             raise InputError(
-                f"{_short_path(path)} is damaged or cut short ({error}): copy or record it again"
+                f"{name} is damaged or cut short ({error}): copy or record it again"
             ) from error
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{_short_path(path)} is {width}x{height} px, and images of up to"
+            f"{name} is {width}x{height} px, and images of up to"
             f" {MAX_PIXELS / 1e6:.0f} megapixels are read: crop it, or record it at a lower"
             " resolution"
         )
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError):
-        image = None
-    if image is None:
-        raise InputError(f"{_short_path(path)} is not a readable image: copy or record it again")
-    if image.dtype not in (np.uint8, np.uint16):
+        pixels = None
+    if pixels is None:
+        raise InputError(f"{name} is not a readable image: copy or record it again")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{name} has pixels of type {pixels.dtype}: save frames with 8 or 16 bits")
+    if pixels.ndim == 3 and pixels.shape[2] != 3:
         raise InputError(
-            f"{_short_path(path)} has pixels of type {image.dtype}: save frames with 8 or 16 bits"
+            f"{name} has {pixels.shape[2]} channels: save frames in grey or RGB, without alpha"
         )
-    if image.ndim == 3 and image.shape[2] != 3:
-        raise InputError(
-            f"{_short_path(path)} has {image.shape[2]} channels: save frames in grey or RGB,"
-            " without alpha"
-        )
-    return image
-
-
-def _check_alike(image: np.ndarray, first: np.ndarray, path: Path, first_path: Path) -> None:
-    """Raise InputError unless an image has the size, bit depth and channels of the first one."""
-    if image.shape[:2] != first.shape[:2]:
-        raise InputError(
-            f"{_short_path(path)} is {_format_size(image)} px, {_short_path(first_path)} is"
-            f" {_format_size(first)}: all frames of a capture must have one size"
-        )
-    if image.dtype != first.dtype:
-        raise InputError(
-            f"{_short_path(path)} has {8 * image.itemsize} bits, {_short_path(first_path)} has"
-            f" {8 * first.itemsize}: all frames of a capture must have one bit depth"
-        )
-
-
-def _describe_fault(data: bytes) -> str | None:
-    """Describe a fault of the file as a whole that the decoder would not report."""
-    if not data:
-        return "empty"
-    if data.startswith(_JPEG):
-        return None if _jpeg_ends(data) else "cut short (its end-of-image marker is missing)"
-    if data.startswith(b"BM") and len(data) >= 54:
-        start, width, height, bits, packed = struct.unpack_from("<I4xii2xHI", data, 10)
-        row = (abs(width) * bits + 31) // 32 * 4
-        if packed in (0, 3) and len(data) < start + row * abs(height):
-            return "cut short"
-    return None
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    """Return whether an end-of-image marker follows the scan; one inside a thumbnail, which comes
-    before, does not count."""
-    at = 2
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            return False
-        marker, (length,) = data[at + 1], struct.unpack_from(">H", data, at + 2)
-        if marker == 0xFF:  # padding
-            at += 1
-        elif marker == 0xDA:  # start of scan: from here on only a true marker follows 0xFF
-            return data.rfind(b"\xff\xd9", at) > 0
-        else:
-            at += 2 + length
-    return False
+    return pixels
 
 
 def _format_size(image: np.ndarray) -> str:

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import translate
@@ -72,9 +73,8 @@ class Imports:
 
     recordings: Sequence[ImportableRecording]
     warnings: Sequence[str]  # files and folders that were not used
-    skipped: Sequence[
-        Skipped
-    ] = ()  # captures whose files are missing, double or contradict the layout
+    # captures whose files are missing, double or contradict the layout
+    skipped: Sequence[Skipped] = ()
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -134,10 +134,7 @@ def define_layout(
         given."""
         size = projector or default
         if size is None and needs_projector:
-            raise InputError(
-                f"{needs_projector} depend on the projector's size: give it with --projector"
-                " 1280x800"
-            )
+            raise missing_projector(needs_projector)
         return collect_captures(
             Path(source),
             prefix,
@@ -147,6 +144,11 @@ def define_layout(
         )
 
     return FolderLayout(name, holds, read, is_capture, default)
+
+
+def missing_projector(what: str) -> InputError:
+    """Return the error that the projector's size, on which ``what`` depends, is not known."""
+    return InputError(f"{what} depend on the projector's size: give it with --projector 1280x800")
 
 
 def has_wildcard(name: str) -> bool:
@@ -206,13 +208,15 @@ def check_complete(
         )
     end = first + count if count else max(images)[0] + 1
     if missing := [number for number in range(first, end) if (number,) not in images]:
-        written = [
-            run
-            for (n,), file in images.items()
-            for run in re.findall(r"\d+", file.stem)
-            if int(run) == n
-        ]
-        digits = min(map(len, written), default=2)
+        digits = min(
+            (
+                len(run)
+                for (number,), file in images.items()
+                for run in re.findall(r"\d+", file.stem)
+                if int(run) == number
+            ),
+            default=2,
+        )
         raise InputError(
             f"it lacks {stem}{join_names([f'{n:0{digits}d}' for n in missing])}: copy or record"
             " them again"
@@ -262,7 +266,8 @@ def collect_captures(
             )
     for folder in captures:
         try:
-            recording, more = describe(folder, capture_name(folder, prefix))
+            name = f"{prefix}_{folder.name}" if prefix else folder.name
+            recording, more = describe(folder, new_name(name))
         except InputError as error:
             skipped.append(Skipped(folder.name, str(error)))
         except Exception as error:  # a plugin's own fault
@@ -283,9 +288,9 @@ def none_usable(skipped: Sequence[Skipped]) -> InputError:
     """Return the error that states why each capture of a source was skipped; each reason once."""
     if len(skipped) == 1:
         return InputError(str(skipped[0]))
-    reasons: dict[str, list[str]] = {}
+    reasons = defaultdict[str, list[str]](list)
     for each in skipped:
-        reasons.setdefault(each.reason.removeprefix(f"{each.name}: "), []).append(each.name)
+        reasons[each.reason.removeprefix(f"{each.name}: ")].append(each.name)
     shown = [
         f"{join_names(names, 3)}: {reason}"
         for reason, names in list(reasons.items())[:_MOST_REASONS]
@@ -307,12 +312,6 @@ def list_folders(source: Path) -> list[Path]:
     return [source, *sorted(inner, key=lambda entry: natural_key(entry.name))]
 
 
-def capture_name(folder: Path, prefix: str | None) -> str:
-    """The folder's name, behind `prefix_` if there is one; InputError where that cannot be a
-    capture's name."""
-    return new_name(f"{prefix}_{folder.name}" if prefix else folder.name)
-
-
 def visible(folder: Path) -> list[Path]:
     """Return the entries of a folder without hidden files; InputError where it cannot be listed."""
     try:
@@ -326,9 +325,7 @@ def unknown_files_warning(folder: Path, files: Sequence[Path]) -> list[str]:
     if not files:
         return []
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
-    shown = join_names(
-        [file.name for file in (*images, *(file for file in files if file not in images))]
-    )
+    shown = join_names([file.name for file in dict.fromkeys((*images, *files))])
     return [f"{folder.parent.name}/{folder.name}: {shown} left aside: not part of the layout"]
 
 

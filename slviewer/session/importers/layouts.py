@@ -45,7 +45,7 @@ from slviewer.entry_points import IMPORTERS, PluginGroup
 from slviewer.errors import InputError
 from slviewer.fringe.presets import AXES, gray, gray_bits, phase_steps
 from slviewer.fringe.sequence import Axis, Frame, PatternSequence, PerAxis
-from slviewer.session.importers import frames as described_frames
+from slviewer.session.importers.frames import LAYOUT as FRAMES
 from slviewer.session.importers.images import read_frames, read_image
 from slviewer.session.importers.imported import (
     FolderLayout,
@@ -59,6 +59,7 @@ from slviewer.session.importers.imported import (
     list_folders,
     match_files,
     match_images,
+    missing_projector,
     unknown_files_warning,
     visible,
 )
@@ -87,10 +88,7 @@ def _read_graycode(
     A capture is skipped where the number of its images contradicts the projector's size.
     """
     if projector is None:
-        raise InputError(
-            "the Gray code of OpenCV depends on the projector's size: give it with --projector"
-            " 1280x800"
-        )
+        raise missing_projector("the images of OpenCV's Gray code")
     sequence = gray(projector)
 
     def select(folder: Path) -> list[Path]:
@@ -105,12 +103,11 @@ def _read_graycode(
             raise InputError(
                 f'it holds images named {shown}: choose one with --files "{min(kinds)}*"'
             )
-        shown_sequence = _fit_sequence(sequence, len(files))
+        shown_sequence = _fit_sequence(sequence, len(files), optional=2)
         files = _order_shadow_images(files, shown_sequence)
+        unknown = [file for file in images_by_name(folder) if file not in files]
         recording = ImportableRecording(name, shown_sequence, tuple(files), folder)
-        return recording, unknown_files_warning(
-            folder, [file for file in images_by_name(folder) if file not in files]
-        )
+        return recording, unknown_files_warning(folder, unknown)
 
     def looks_so(folder: Path) -> bool:
         """Return whether a folder holds more than half of the images of a capture."""
@@ -169,18 +166,18 @@ def _order_shadow_images(files: list[Path], sequence: PatternSequence) -> list[P
     return files if brighter > 0.5 else [*files[:-2], files[-1], files[-2]]
 
 
-def _fit_sequence(sequence: PatternSequence, images: int) -> PatternSequence:
-    """Return the sequence of so many images: with or without white and black at its end."""
+def _fit_sequence(sequence: PatternSequence, images: int, optional: int = 0) -> PatternSequence:
+    """Return the sequence of so many images: with or without the ``optional`` ones at its end."""
     needed = len(sequence.frames)
     if images == needed:
         return sequence
-    if images == needed - 2:
-        return PatternSequence(sequence.projector, sequence.frames[:-2])
+    if optional and images == needed - optional:
+        return PatternSequence(sequence.projector, sequence.frames[:-optional])
     width, height = sequence.projector
+    without = f", or {needed - optional} without white and black" if optional else ""
     raise InputError(
         f"it holds {images} images, and the Gray code of a {width}x{height} projector takes"
-        f" {needed}, or {needed - 2} without white and black: images are missing or too many, or"
-        " the projector has another size"
+        f" {needed}{without}: images are missing or too many, or the projector has another size"
     )
 
 
@@ -301,16 +298,8 @@ def _order_procam(
 ) -> tuple[PatternSequence, Iterable[Path]]:
     """Return the sequence, and the files in its order. The projector's size determines the numbers
     of bits and of images."""
-    sequence = gray(projector)
     check_complete(images, "graycode_")
-    missing = len(sequence.frames) - len(images)
-    if missing:
-        fault = "images are missing" if missing > 0 else "there are images too many"
-        raise InputError(
-            f"it holds {len(images)} images, and the Gray code of a {projector[0]}x{projector[1]}"
-            f" projector takes {len(sequence.frames)}: {fault}, or the projector has another size"
-        )
-    return sequence, images.values()
+    return _fit_sequence(gray(projector), len(images)), images.values()
 
 
 def _order_sltk(
@@ -350,44 +339,37 @@ def _order_slstudio(
     determines it, where that is enough; ``axis`` is the one that a codec along a single axis
     showed.
 
-    Raises InputError where the frames are not those of the codec.
+    Raises InputError where the frames are not those of the codec, or of several.
     """
     check_complete(images, "frameSeq_")
-    return _identify_sequence(projector, len(images), codec, axis), images.values()
-
-
-def _identify_sequence(
-    projector: tuple[int, int], images: int, codec: Codec | None, axis: Axis
-) -> PatternSequence:
-    """Return the sequence that explains the number of images; InputError where none or several
-    do."""
-    if codec is None and images in _OTHERS:
+    count = len(images)
+    if codec is None and count in _OTHERS:
         raise InputError(
-            f"{images} frames may also be those of {_OTHERS[images]}, which cannot be imported: say"
+            f"{count} frames may also be those of {_OTHERS[count]}, which cannot be imported: say"
             " with --codec what was shown"
         )
     candidates = [
         (each, axes)
         for each in get_args(Codec)
         for axes in ([(axis,)] if each in _SINGLE_AXIS else [(axis,), AXES])
-        if codec in (None, each) and len(_list_frames(each, projector, axes)) == images
+        if codec in (None, each) and len(_list_frames(each, projector, axes)) == count
     ]
     if not candidates:
         what = f"codec {codec}" if codec else "any codec"
         raise InputError(
-            f"it holds {images} frames, which {what} does not show: choose another --codec, or use"
+            f"it holds {count} frames, which {what} does not show: choose another --codec, or use"
             " a TOML"
         )
     if len(candidates) > 1:
-        shown = join_names([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
-        raise InputError(f"{images} frames may be {shown}: choose with --codec")
-    sequence, axes = candidates[0]
+        several = join_names([f"{each} along {' and '.join(axes)}" for each, axes in candidates])
+        raise InputError(f"{count} frames may be {several}: choose with --codec")
+    ((shown, axes),) = candidates
     cells: PerAxis[float | None] | None = (
-        PerAxis(*(_gray_cell(each, projector) for each in AXES)) if sequence == "gray" else None
+        PerAxis(*(_gray_cell(each, projector) for each in AXES)) if shown == "gray" else None
     )
-    return PatternSequence(
-        projector, _list_frames(sequence, projector, axes), phase_sign=-1, gray_cell_px=cells
-    )
+    frames = _list_frames(shown, projector, axes)
+    sequence = PatternSequence(projector, frames, phase_sign=-1, gray_cell_px=cells)
+    return sequence, images.values()
 
 
 def _list_frames(
@@ -448,7 +430,7 @@ BUILT_IN = {
     layout.name: layout
     for layout in (
         *(P18, PROCAM_CALIBRATION, SLSTUDIO, SLTK),
-        *(OPENCV_GRAYCODE, described_frames.LAYOUT),
+        *(OPENCV_GRAYCODE, FRAMES),
     )
 }
 LAYOUT_PLUGINS = PluginGroup(IMPORTERS, FolderLayout, lambda: BUILT_IN)
