@@ -259,20 +259,20 @@ def _fill_rows(state, points, frame, pixels, weights, at, rows):
     ``weights``: of a feature and of a sample; ``at``: indices at which height, offsets, rig, camera
     field and projector field start in a row.
     """
-    work, cells = allocate_workspace(), np.zeros(4, np.int64)
+    work = allocate_workspace()
     columns = dense_columns(at)
     columns[:POSE] = np.arange(POSE)
     for n in range(points.shape[0]):
-        u, _, ci, cj = feature_row(state, 0, points, frame, n, work)
+        u, _ = feature_row(state, 0, points, frame, n, work)
         if np.isfinite(u):
-            set_feature_columns(columns, state.rig, n, ci, cj, at)
+            set_feature_columns(columns, state.rig, n, work.cells, at)
             fill_feature_fields(work)
             _scatter_row(work.row, columns, weights[0], rows[2 * n : 2 * n + 2])
     samples = rows[2 * points.shape[0] :]
     for n in range(pixels.shape[0]):
-        u, _, cells[0], cells[1], cells[2], cells[3] = sample_row(state, 0, frame, pixels[n], work)
+        u, _ = sample_row(state, 0, frame, pixels[n], work)
         if np.isfinite(u):
-            set_sample_columns(columns, state.rig, cells, at)
+            set_sample_columns(columns, state.rig, work.cells, at)
             fill_sample_fields(work)
             _scatter_row(work.row, columns, weights[1], samples[2 * n : 2 * n + 2])
 

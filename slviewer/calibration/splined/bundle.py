@@ -185,16 +185,16 @@ def _fill_rows(plane, axis, pixels, depths, at, values, columns):
     Each point is seen on a ``plane`` that faces the camera. Its depth changes so that the
     projector's coordinate stays what was measured.
     """
-    work, frame, cells = allocate_workspace(), np.array([0.0, 0.0, 1.0, 1.0]), np.zeros(4, np.int64)
+    work, frame = allocate_workspace(), np.array([0.0, 0.0, 1.0, 1.0])
     all_columns = dense_columns(at)
     for n in range(depths.shape[0]):
         z = plane.t_board[0, 2] = depths[n]
-        u, _, cells[0], cells[1], cells[2], cells[3] = sample_row(plane, 0, frame, pixels[n], work)
+        u, _ = sample_row(plane, 0, frame, pixels[n], work)
         if not np.isfinite(u):
             values[n] = np.nan
             continue
         fill_sample_fields(work)
-        set_sample_columns(all_columns, plane.rig, cells, at)
+        set_sample_columns(all_columns, plane.rig, work.cells, at)
         columns[n] = all_columns[CAMERA:]
         x, y = work.local[0] / z, work.local[1] / z
         row = work.row[axis]

@@ -18,6 +18,7 @@ from scipy.ndimage import binary_erosion
 from slviewer.calibration.splined.correction_grid import evaluate
 from slviewer.calibration.splined.fields import project_point, undistort, undistort_pixel
 from slviewer.calibration.splined.unknowns import Arrangement
+from slviewer.calibration.splined.volume import in_illuminated_cells, in_image
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.polynomial import grid_points
@@ -111,11 +112,15 @@ def compile_axis(
     )
     step = max(2, -(-width // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
-    grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
+    grid, projected = np.full(shape, np.nan, np.float32), np.full((*shape, 2), np.nan)
     _split_rows(
-        shape[0],
-        lambda rows: _tabulate(rig, row, centre, near, far, step, *illuminated, rows, grid, known),
+        shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, rows, grid, projected)
     )
+    nodes = step * grid_points(np.arange(shape[1]), np.arange(shape[0]))
+    at_camera = in_illuminated_cells(rig.camera, nodes, illuminated[0]).reshape(*shape[:2], 1)
+    lit = projected.reshape(-1, 2)
+    lit = in_image(rig.projector, lit) & in_illuminated_cells(rig.projector, lit, illuminated[1])
+    known = np.isfinite(grid) & at_camera & lit.reshape(shape)
     # a pixel needs its eight nodes: dilating the known nodes by one gives each pixel about its own
     # support
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
@@ -221,22 +226,9 @@ def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
 
 
 @kernel()
-def _is_in_illuminated_cell(illuminated, u, v, size):
-    """Return whether the cell of pixel (u, v) was illuminated; False outside the image."""
-    if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
-        return False
-    column = min(int((u + 0.5) / size[0] * illuminated.shape[1]), illuminated.shape[1] - 1)
-    return illuminated[
-        min(int((v + 0.5) / size[1] * illuminated.shape[0]), illuminated.shape[0] - 1), column
-    ]
-
-
-@kernel()
-def _tabulate(
-    rig, row, centre, near, far, step, camera_illuminated, projector_illuminated, rows, grid, known
-):
-    """Fill ``grid`` with exact depth minus rational function at its nodes; ``known``: whether poses
-    support them."""
+def _tabulate(rig, row, centre, near, far, step, rows, grid, projected):
+    """Fill ``grid`` with exact depth minus rational function at its nodes, and ``projected`` (nv,
+    nu, nz, 2) with their projector pixels."""
     basis = np.zeros((4, 4))
     for j in rows:
         for i in range(grid.shape[1]):
@@ -247,11 +239,6 @@ def _tabulate(
             )
             if np.isnan(c0):
                 continue
-            # the last nodes may be outside the image, where the edge pixel's support applies
-            edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            camera_supported = _is_in_illuminated_cell(
-                camera_illuminated, edge_u, edge_v, rig.camera.size
-            )
             for k in range(grid.shape[2]):
                 target = near + (far - near) * k / (grid.shape[2] - 1.0)
                 z = min(max(target, first), last)
@@ -268,6 +255,4 @@ def _tabulate(
                 settled = abs(change) < 1e-3 or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    known[j, i, k] = camera_supported and _is_in_illuminated_cell(
-                        projector_illuminated, pu, pv, rig.projector.size
-                    )
+                    projected[j, i, k] = pu, pv

@@ -135,14 +135,26 @@ def distort_to_pixel(device, x, y, basis):
 
 
 @kernel()
+def dot_row(R, k, v):
+    """Return the scalar product of row ``k`` of R (3, 3) and v (3,), summed in order."""
+    return R[k, 0] * v[0] + R[k, 1] * v[1] + R[k, 2] * v[2]
+
+
+@kernel()
+def dot_column(R, k, v):
+    """Return the scalar product of column ``k`` of R (3, 3) and v (3,), summed in order."""
+    return R[0, k] * v[0] + R[1, k] * v[1] + R[2, k] * v[2]
+
+
+@kernel()
 def project_point(rig, x, y, z, basis):
     """Return the projector's pixel of the point (x z, y z, z) mm in the camera's frame; NaN behind
     the projector."""
-    X0 = z * (rig.R[0, 0] * x + rig.R[0, 1] * y + rig.R[0, 2]) + rig.t[0]
-    X1 = z * (rig.R[1, 0] * x + rig.R[1, 1] * y + rig.R[1, 2]) + rig.t[1]
-    X2 = z * (rig.R[2, 0] * x + rig.R[2, 1] * y + rig.R[2, 2]) + rig.t[2]
+    ray = x, y, 1.0
+    X2 = z * dot_row(rig.R, 2, ray) + rig.t[2]
     if not X2 > 0.0:
         return np.nan, np.nan
+    X0, X1 = z * dot_row(rig.R, 0, ray) + rig.t[0], z * dot_row(rig.R, 1, ray) + rig.t[1]
     return distort_to_pixel(rig.projector, X0 / X2, X1 / X2, basis)
 
 

@@ -174,11 +174,9 @@ def _predict(state, data, poses, features, samples):
     work = allocate_workspace()
     for i in poses:
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
-            u, v, _, _ = feature_row(state, i, data.points, data.frame, data.feature[n], work)
-            features[n, 0], features[n, 1] = u, v
+            features[n] = feature_row(state, i, data.points, data.frame, data.feature[n], work)
         for n in range(data.sample_from[i], data.sample_from[i + 1]):
-            u, v, _, _, _, _ = sample_row(state, i, data.frame, data.sample_px[n], work)
-            samples[n, 0], samples[n, 1] = u, v
+            samples[n] = sample_row(state, i, data.frame, data.sample_px[n], work)
 
 
 @kernel()
@@ -208,9 +206,9 @@ def _add_features(state, pose, data, residuals, weights, work, sums):
     for n in range(data.feature_from[pose], data.feature_from[pose + 1]):
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
             f = data.feature[n]
-            _, _, i, j = feature_row(state, pose, data.points, data.frame, f, work)
-            set_feature_columns(sums.columns, state.rig, f, i, j, sums.at)
+            feature_row(state, pose, data.points, data.frame, f, work)
             fill_feature_fields(work)
+            set_feature_columns(sums.columns, state.rig, f, work.cells, sums.at)
             _set_rows(sums, 0, work.row, weights[n], residuals[n])
             _add_rows(sums, PROJECTOR_FIELD)
             _move_sums(sums, PROJECTOR_FIELD)
@@ -219,16 +217,16 @@ def _add_features(state, pose, data, residuals, weights, work, sums):
 @kernel()
 def _add_samples(state, pose, data, part, residuals, weights, work, sums):
     """Add the samples of one ``pose``, whose indices are ``part`` (k,)."""
-    cells = np.full(4, -1)
+    cells = np.full((2, 2), -1)
     first = 0
     for n in part:
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
-            _, _, ci, cj, pi, pj = sample_row(state, pose, data.frame, data.sample_px[n], work)
-            if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
+            sample_row(state, pose, data.frame, data.sample_px[n], work)
+            if not np.array_equal(work.cells, cells):
                 _add_rows(sums, ROW)
                 _move_sums(sums, ROW)
                 first = 0
-                cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
+                cells[:] = work.cells
                 set_sample_columns(sums.columns, state.rig, cells, sums.at)
             fill_sample_fields(work)
             _set_rows(sums, first, work.row, weights[n], residuals[n])
@@ -255,32 +253,31 @@ def dense_columns(at):
 
 
 @kernel()
-def set_feature_columns(columns, rig, feature, i, j, at):
-    """Fill in the columns of a feature's offset, and of the camera's field in the cell (i, j)."""
+def set_feature_columns(columns, rig, feature, cells, at):
+    """Fill in the columns of a feature's offset, and of the camera's field in the first of the
+    ``cells``."""
     columns[OFFSET], columns[OFFSET + 1] = at[1] + 2 * feature, at[1] + 2 * feature + 1
-    _set_field_columns(columns, CAMERA_FIELD, rig.camera, i, j, at[3])
+    _set_field_columns(columns, CAMERA_FIELD, rig.camera, cells[0], at[3])
 
 
 @kernel()
 def set_sample_columns(columns, rig, cells, at):
-    """Fill in the columns of the fields in their ``cells`` (i, j of the camera, i, j of the
-    projector)."""
-    columns[OFFSET], columns[OFFSET + 1] = at[1], at[1] + 1  # a sample's row has zeros there
-    _set_field_columns(columns, CAMERA_FIELD, rig.camera, cells[0], cells[1], at[3])
-    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, cells[2], cells[3], at[4])
+    """Fill in the columns of both fields in their ``cells`` (2, 2)."""
+    set_feature_columns(columns, rig, 0, cells, at)  # a sample's row has zeros at the offset
+    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, cells[1], at[4])
 
 
 @kernel()
-def _set_field_columns(columns, first, device, i, j, start):
-    """Fill in the columns of the coefficients of both components that reach the cell (i, j) of a
-    device's field."""
+def _set_field_columns(columns, first, device, cell, start):
+    """Fill in the columns of the coefficients of both components that reach a ``cell`` (column,
+    row) of a device's field."""
     stride = device.coefficients.shape[2]
     knots = stride * device.coefficients.shape[1]
     for k in range(2):
         for m in range(4):
             for n in range(4):
                 columns[first + k * FIELD + 4 * m + n] = (
-                    start + k * knots + (j + m) * stride + i + n
+                    start + k * knots + (cell[1] + m) * stride + cell[0] + n
                 )
 
 

@@ -78,9 +78,8 @@ def select_visible(rig: Arrangement, pixels: Floats, z: Floats) -> Volume:
     projector's image."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
     points, projector = view_pixels(rig, pixels, z)
-    # False for NaN
-    in_view = ((projector >= -0.5) & (projector <= rig.projector.size - 0.5)).all(axis=1)
-    return Volume(pixels, z, points, projector).select(np.flatnonzero(in_view))
+    visible = np.flatnonzero(in_image(rig.projector, projector))
+    return Volume(pixels, z, points, projector).select(visible)
 
 
 def view_pixels(rig: Arrangement, pixels: Floats, z: Floats) -> tuple[Floats, Floats]:
@@ -93,6 +92,11 @@ def view_pixels(rig: Arrangement, pixels: Floats, z: Floats) -> tuple[Floats, Fl
     points, projector = np.empty((len(z), 3)), np.empty((len(z), 2))
     _view_all(rig, pixels, z, points, projector)
     return points, projector
+
+
+def in_image(device: Device, pixels: Floats) -> Mask:
+    """(n,) bool: whether ``pixels`` (n, 2) are in a device's image; False for NaN."""
+    return np.asarray(((pixels >= -0.5) & (pixels <= device.size - 0.5)).all(axis=1))
 
 
 def in_illuminated_cells(device: Device, pixels: Floats, illuminated: Mask) -> Mask:
