@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
-from slviewer.calibration.drift.check import DriftReference, build_reference, check_drift
-from slviewer.calibration.drift.view import DriftView
+from slviewer.calibration.drift import DriftReference, DriftView, build_reference, check_drift
 from slviewer.calibration.observe import observe
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import InputError
