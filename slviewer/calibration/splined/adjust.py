@@ -18,11 +18,11 @@ from slviewer.calibration.splined.half_turns import (
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
+    Prior,
     factorize,
     normal_equations,
     predict_observations,
 )
-from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.residual_noise import (
     Noise,
     estimate_noise,
@@ -107,8 +107,9 @@ def adjust_bundle(
     other.
     """
     names, data, sample_sigma = gather_data(observations, stereo)
-    state = State.from_stereo(stereo, names, len(data.points), cells_across)
-    layout, prior = state.layout, Prior.build(state, data)
+    T = np.array([stereo.poses[name] for name in names])
+    state = State.from_rig(stereo.rig, T, len(data.points), cells_across)
+    layout, prior = state.layout, Prior.build(state, data.points)
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array(

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.fields import Device
-from slviewer.calibration.stereo import StereoModel
 from slviewer.geometry.brown import fold_radius_squared
 from slviewer.geometry.lens import Lens
+from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.rigid import Floats
 
 LENS = 9
@@ -71,19 +71,18 @@ class State(NamedTuple):
     offsets: Floats
 
     @classmethod
-    def from_stereo(
-        cls, stereo: StereoModel, poses: list[str], features: int, cells_across: int | None = None
+    def from_rig(
+        cls, rig: StereoRig, T: Floats, features: int, cells_across: int | None = None
     ) -> "State":
-        """Return the initial state from a stereo calibration: no displacement, a flat board.
+        """Return the initial state of a rig and poses ``T`` (p, 4, 4), board to camera: no
+        displacement, a flat board.
 
         ``cells_across``: cells of each displacement field across its image; by default
         ``fields.CELLS_ACROSS``.
         """
-        rig = stereo.rig
         camera, projector = (
             Device.from_lens(lens, cells_across) for lens in (rig.camera, rig.projector)
         )
-        T = np.array([stereo.poses[name] for name in poses])
         return cls(
             Arrangement(camera, projector, rig.R.copy(), rig.t.copy()),
             np.ascontiguousarray(T[:, :3, :3]),
