@@ -60,13 +60,6 @@ class Samples:
     projector: Floats
     sigma: Floats
 
-    def __post_init__(self) -> None:
-        shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
-        if len(shapes) != 1 or self.camera.ndim != 2 or self.camera.shape[1] != 2:
-            raise InputError(
-                f"samples of shapes {sorted(shapes)} do not match: give three arrays (n, 2)"
-            )
-
 
 def block_samples(
     phases: Mapping[Axis, PhaseMap],

@@ -58,6 +58,12 @@ class _Binarisation:
     blobs: Blobs
     lattices: list[Lattice]
 
+    @property
+    def largest(self) -> Lattice:
+        """The lattice of most nodes; an empty one if there is none."""
+        empty = Lattice(np.empty((0, 2), int), np.empty(0, int))
+        return max(self.lattices, key=len, default=empty)
+
 
 @dataclass(frozen=True)
 class _Grid:
@@ -94,23 +100,18 @@ def detect_circles(board: Board, image: BoardImage) -> tuple[Floats, float, bool
         ]
         if grids:
             return _measure(board, image, _select_board(board, grids))
-    most = max(tried, key=_size_of_largest, default=None)
-    if most is not None and _size_of_largest(most) > CLUTTER_FREE_SHARE * len(board.points):
+    most = max(tried, key=lambda attempt: len(attempt.largest), default=None)
+    if most is not None and len(most.largest) > CLUTTER_FREE_SHARE * len(board.points):
         # what one binarisation lacks, another may have: reflections and shadows cover parts of the
         # board
         inverted = most.blobs.inverted
         pool = _pool_blobs(
             most.blobs, [attempt.blobs for attempt in tried if attempt.blobs.inverted == inverted]
         )
-        grid = _match_board(board, complete_lattice(max(most.lattices, key=len), pool), pool, image)
+        grid = _match_board(board, complete_lattice(most.largest, pool), pool, image)
         if grid:
             return _measure(board, image, grid)
     raise DetectionError(_failure_message(board, image, most))
-
-
-def _size_of_largest(attempt: _Binarisation) -> int:
-    """Return the number of nodes of the largest lattice; 0 without one."""
-    return max(map(len, attempt.lattices), default=0)
 
 
 def _binarise_all(board: Board, grey: np.ndarray) -> Iterator[_Binarisation]:
@@ -285,12 +286,10 @@ def _pool_blobs(first: Blobs, others: list[Blobs]) -> Blobs:
 
 def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None) -> str:
     """Return the error message: number of detected circles, other blobs, and what to do."""
-    total = len(board.points)
-    if most is None or _size_of_largest(most) < 6:
+    total, detected = len(board.points), len(most.largest) if most else 0
+    if most is None or detected < 6:
         return f"no grid of circles detected where {board} has {total}: {light_advice(image.grey)}"
-    lattice = max(most.lattices, key=len)
-    detected = len(lattice)
-    longer, shorter = lattice.extent
+    longer, shorter = most.largest.extent
     others = len(most.blobs.centres) - detected
     if detected >= total:
         return (
@@ -300,7 +299,7 @@ def _failure_message(board: Board, image: BoardImage, most: _Binarisation | None
     facts = [f"{detected} of {total} circles of {board} detected"]
     if others:
         facts.append(f"among {others} other round blobs")
-    centres = most.blobs.centres[lattice.blobs]
+    centres = most.blobs.centres[most.largest.blobs]
     spacing = np.sqrt(max(np.ptp(centres, axis=0).prod(), 1.0) / ((longer - 1) * (shorter - 1)))
     left, upper = centres.min(0)
     right, lower = np.array(image.grey.shape[::-1]) - 1 - centres.max(0)

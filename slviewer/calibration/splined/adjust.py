@@ -168,8 +168,7 @@ def adjust_bundle(
                 f" {fits[name].projector_trust:.2f} in the projector): was the board moved during"
                 " the capture?"
             )
-            for name, out in zip(names, is_excluded, strict=True)
-            if out
+            for name in np.array(names)[is_excluded].tolist()
         }
         pose, _ = data.poses
         z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
@@ -189,9 +188,7 @@ def adjust_bundle(
             projector_poses=projector_poses,
             packed_factor=rig_factor[np.tri(len(rig_factor), dtype=bool)].astype(np.float32),
             steps=step,
-            half_turned_poses=tuple(
-                name for name, flag in zip(names, half_turned, strict=True) if flag
-            ),
+            half_turned_poses=tuple(np.array(names)[half_turned].tolist()),
         )
 
 

@@ -33,6 +33,7 @@ monotonic in depth."""
 MIN_SLOPE = 0.005
 """Smallest change of the coordinate with depth, px per mm; below it, the depth noise would be many
 mm."""
+_UNSEEN = (np.nan,) * 5
 MARGIN = 0.25
 """Distance beyond the projector's image, over its size, up to which rays are evaluated."""
 
@@ -188,13 +189,12 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     """Return (c0, c1, c2, first depth, last depth) of the ray (x, y, 1); NaN without a rational
     function."""
     first, last = near, far
-    none = np.nan, np.nan, np.nan, np.nan, np.nan
     if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(
         _project_depth(rig, x, y, far, basis)[0]
     ):
         first, last = _depth_interval(rig, x, y, near, far, basis)
         if not last - first > 1e-3 * (far - near):
-            return none
+            return _UNSEEN
     # nodes of Chebyshev's polynomial in 1/z, in which the coordinate is nearly linear
     middle, half = 0.5 * (1.0 / last + 1.0 / first), 0.433 * (1.0 / first - 1.0 / last)
     z0, z1, z2 = 1.0 / (middle - half), 1.0 / middle, 1.0 / (middle + half)
@@ -206,7 +206,7 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0
     determinant = m00 * m11 - m01 * m10
     if not (abs(determinant) > 0.0 and abs(s2 - s0) > MIN_SLOPE * abs(z2 - z0)):
-        return none
+        return _UNSEEN
     c1 = (r0 * m11 - m01 * r1) / determinant
     c2 = (m00 * r1 - r0 * m10) / determinant
     return z0 - c1 * s0 + c2 * s0 * z0, c1, c2, first, last
