@@ -65,7 +65,7 @@ class BoardPlane:
         """Fit the homography for a range of distortions, refined twice, and return the plane with
         the smallest RMS."""
         bends, step = np.linspace(-0.5, 0.3, 9), 0.1
-        best: tuple[float, BoardPlane] | None = None
+        fits: list[tuple[float, BoardPlane]] = []
         normalised = (camera - centre) / radius
         squares = np.sum(normalised**2, axis=1, keepdims=True)
         for _ in range(3):
@@ -76,15 +76,14 @@ class BoardPlane:
                     continue
                 plane = cls(H, float(bend), centre, radius, np.zeros(2))
                 residuals = plane.predict(camera[:, 0], camera[:, 1]) - projector
-                error = rms(residuals)
-                if best is None or error < best[0]:
-                    reach = MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(residuals).max(0)
-                    best = error, replace(plane, reach=reach)
-            if best is None:
+                reach = MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(residuals).max(0)
+                fits.append((rms(residuals), replace(plane, reach=reach)))
+            if not fits:
                 return None
-            bends = best[1].bend + np.linspace(-step, step, 7)
+            _, best = min(fits, key=lambda fit: fit[0])
+            bends = best.bend + np.linspace(-step, step, 7)
             step /= 3
-        return best[1] if best else None
+        return best
 
     def predict(self, u: np.ndarray, v: np.ndarray) -> Floats:
         """Return the plane's projector coordinates (..., 2) px at camera pixels (u, v), which

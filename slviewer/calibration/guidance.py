@@ -306,24 +306,22 @@ def suggest_poses(
     rows = information_rows(model, np.reshape(poses, (-1, 4, 4)))
     information = RigInformation.from_rows(model, rows, jacobian)
 
-    def compute_gains(indices: list[int]) -> dict[int, float]:
-        """Return the gain of each of these candidates by its index."""
-        return {
-            i: information.gain(rows)
-            for i, rows in zip(indices, information_rows(model, candidates[indices]), strict=True)
-        }
+    gains = np.full(len(candidates), -np.inf)  # of those that are not tried
 
-    gains = compute_gains(
-        np.random.default_rng(len(poses)).permutation(len(candidates))[:trials].tolist()
-    )
-    best = candidates[max(gains, key=lambda i: gains[i])]
+    def try_candidates(indices: np.ndarray) -> None:
+        """Fill in the gains of candidates."""
+        for i, rows in zip(indices, information_rows(model, candidates[indices]), strict=True):
+            gains[i] = information.gain(rows)
+
+    try_candidates(np.random.default_rng(len(poses)).permutation(len(candidates))[:trials])
+    best = candidates[gains.argmax()]
     # shifts over 0.1 depth, plus turns over 15 degrees
     apart = lengths(best[:3, 3] - candidates[:, :3, 3]) / (0.1 * best[2, 3])
     apart += rotation_angle(best[:3, :3].T @ candidates[:, :3, :3]) / np.radians(15)
     nearest = np.argsort(apart)[: trials // 5]
-    gains |= compute_gains([i for i in nearest.tolist() if i not in gains])
-    order = sorted(gains, key=lambda i: -gains[i])
-    next_variance = max(float(information.variances.mean()) - gains[order[0]], 0.0)
+    try_candidates(nearest[np.isinf(gains[nearest])])
+    order = np.argsort(-gains)[: np.isfinite(gains).sum()]
+    next_variance = max(float(information.variances.mean()) - gains.max(), 0.0)
     return Guidance(candidates[order], information.sigma_mm, float(np.sqrt(next_variance)))
 
 

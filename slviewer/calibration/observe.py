@@ -190,8 +190,11 @@ class Observation:
     def from_arrays(cls, name: str, arrays: Mapping[str, np.ndarray]) -> "Observation":
         """Return the observation that ``to_arrays`` saved."""
         surfaces: dict[Axis, SplineSurface | Polynomial2D] = {}
-        captured: list[Axis] = [axis for axis in AXES if f"{axis}_trend" in arrays]
-        for axis in captured:
+        periods: dict[Axis, float] = {}
+        for axis in AXES:
+            if f"{axis}_trend" not in arrays:
+                continue
+            periods[axis] = float(arrays[f"{axis}_period_px"])
             trend = Polynomial2D(arrays[f"{axis}_trend"], tuple(arrays[f"{axis}_extent"].tolist()))
             spline = arrays.get(f"{axis}_spline")
             surfaces[axis] = trend if spline is None else SplineSurface(trend, spline)
@@ -204,7 +207,7 @@ class Observation:
             arrays["camera"],
             arrays["projector"],
             surfaces,
-            {axis: float(arrays[f"{axis}_period_px"]) for axis in captured},
+            periods,
             tuple(arrays["size"].tolist()),
             tuple(arrays["box"].tolist()),
             arrays["region"],

@@ -102,16 +102,12 @@ def _measure_centroids(first, last, image, centres, covariances, gaps, inverted,
             continue
         ground = _fit_paper_level(place, level, ring, _quantile(level[core], 0.5))
         light = _fit_plane(place, level, core) if inverted else ground
-        total, moment_u, moment_v = 0.0, 0.0, 0.0
-        for i in range(size):
-            if within[i]:
-                paper, own = _plane_at(ground, place, i), max(_plane_at(light, place, i), 1.0)
-                ink = (level[i] - paper) / own if inverted else 1 - level[i] / own
-                total += ink
-                moment_u += ink * place[0, i]
-                moment_v += ink * place[1, i]
+        paper, own = _plane_at(ground, place), np.maximum(_plane_at(light, place), 1.0)
+        ink = ((level - paper) / own if inverted else 1 - level / own)[within]
+        total = ink.sum()
         if total > 0.0:
-            out[k, 0], out[k, 1] = u + moment_u / total, v + moment_v / total
+            out[k, 0] = u + (ink * place[0][within]).sum() / total
+            out[k, 1] = v + (ink * place[1][within]).sum() / total
 
 
 @kernel()
@@ -127,7 +123,7 @@ def _fit_paper_level(place, level, ring, ink):
     levels = level[ring]
     ground = _quantile(levels, 0.75 if ink < _quantile(levels, 0.5) else 0.25)
     contrast = abs(ground - ink)
-    off = _distances(plane, place, level)
+    off = np.abs(level - _plane_at(plane, place))
     if off[ring].max() < FLATNESS * contrast:
         return plane
     near = ring & (np.abs(level - ground) < INITIAL_GATE * contrast)
@@ -135,7 +131,7 @@ def _fit_paper_level(place, level, ring, ink):
         if np.count_nonzero(near) < MIN_RING_PIXELS:
             return plane
         plane = _fit_plane(place, level, near)
-        off = _distances(plane, place, level)
+        off = np.abs(level - _plane_at(plane, place))
         near = ring & (
             off < max(GATE_SIGMAS * 1.4826 * _quantile(off[near], 0.5), FLATNESS * contrast)
         )
@@ -155,23 +151,11 @@ def _fit_plane(place, level, where):
 
     Its slopes are 0 where the pixels are on one line.
     """
-    count, mean_u, mean_v, mean = 0, 0.0, 0.0, 0.0
-    for i in range(len(level)):
-        if where[i]:
-            count += 1
-            mean_u += place[0, i]
-            mean_v += place[1, i]
-            mean += level[i]
-    mean_u, mean_v, mean = mean_u / count, mean_v / count, mean / count
-    uu, uv, vv, ul, vl = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(len(level)):
-        if where[i]:
-            du, dv, dl = place[0, i] - mean_u, place[1, i] - mean_v, level[i] - mean
-            uu += du * du
-            uv += du * dv
-            vv += dv * dv
-            ul += du * dl
-            vl += dv * dl
+    u, v, brightness = place[0][where], place[1][where], level[where]
+    mean_u, mean_v, mean = u.mean(), v.mean(), brightness.mean()
+    du, dv, dl = u - mean_u, v - mean_v, brightness - mean
+    uu, uv, vv = (du * du).sum(), (du * dv).sum(), (dv * dv).sum()
+    ul, vl = (du * dl).sum(), (dv * dl).sum()
     determinant = uu * vv - uv * uv
     if not determinant > 1e-9 * uu * vv:
         return mean, 0.0, 0.0, mean_u, mean_v
@@ -180,15 +164,6 @@ def _fit_plane(place, level, where):
 
 
 @kernel()
-def _plane_at(plane, place, i):
-    """Return the level of a plane at pixel ``i``."""
-    return plane[0] + plane[1] * (place[0, i] - plane[3]) + plane[2] * (place[1, i] - plane[4])
-
-
-@kernel()
-def _distances(plane, place, level):
-    """Return the distances (n,) of the levels from a plane."""
-    off = np.empty(len(level))
-    for i in range(len(level)):
-        off[i] = abs(level[i] - _plane_at(plane, place, i))
-    return off
+def _plane_at(plane, place):
+    """Return the levels (n,) of a plane at pixels ``place`` (2, n)."""
+    return plane[0] + plane[1] * (place[0] - plane[3]) + plane[2] * (place[1] - plane[4])
