@@ -34,12 +34,12 @@ from slviewer.calibration.splined.residuals import (
     feature_row,
     sample_row,
 )
-from slviewer.calibration.splined.unknowns import State, UnknownLayout
-from slviewer.calibration.splined.volume import (
+from slviewer.calibration.splined.uncertainty import (
     remove_rigid_motion,
     select_depth_axis,
     working_volume,
 )
+from slviewer.calibration.splined.unknowns import State, UnknownLayout
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points

@@ -14,8 +14,9 @@ import scipy.sparse as sp
 from slviewer.geometry.brown import distort_to_px, undistort_point
 from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import Floats
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.splines import bending_energy
+from slviewer.geometry.vectors import finite_rows
 
 CELLS_ACROSS = 26
 """Of any image: half a wavelength of the finest distortion that matters holds two or three
@@ -55,6 +56,24 @@ def undistort(device: Device, pixels: Floats) -> Floats:
     rays = np.empty((len(pixels), 2))
     run_rows(_undistort_all, len(pixels), device, np.ascontiguousarray(pixels, np.float64), rays)
     return rays
+
+
+def in_image(device: Device, pixels: Floats) -> Mask:
+    """(n,) bool: whether ``pixels`` (n, 2) are in a device's image; False for NaN."""
+    return np.asarray(((pixels >= -0.5) & (pixels <= device.size - 0.5)).all(axis=1))
+
+
+def in_illuminated_cells(device: Device, pixels: Floats, illuminated: Mask) -> Mask:
+    """(n,) bool: whether ``pixels`` (n, 2) are in cells (rows, columns) bool that target poses
+    illuminated.
+
+    Pixels outside the image count to the cell at its edge; False for NaN.
+    """
+    shape = np.array(illuminated.shape[::-1])
+    known = finite_rows(pixels)
+    place = np.where(known[:, None], (pixels + 0.5) / device.size * shape, 0.0)
+    cells = np.clip(place, 0, shape - 1).astype(int)
+    return illuminated[cells[:, 1], cells[:, 0]] & known
 
 
 @kernel()

@@ -13,19 +13,16 @@ from slviewer.calibration.splined.adjust import adjust_bundle
 from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.compiled import CompiledAxis, compile_axis, pixel_rays
-from slviewer.calibration.splined.fields import Device, undistort
+from slviewer.calibration.splined.fields import Device, in_illuminated_cells, undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX, Noise
 from slviewer.calibration.splined.uncertainty import (
     SigmaMap,
     compute_sigma_map,
-    summarise_volume_sigma,
-)
-from slviewer.calibration.splined.unknowns import Arrangement, State, pinhole_lens
-from slviewer.calibration.splined.volume import (
-    in_illuminated_cells,
     select_depth_axis,
+    summarise_volume_sigma,
     working_volume,
 )
+from slviewer.calibration.splined.unknowns import Arrangement, State, pinhole_lens
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
