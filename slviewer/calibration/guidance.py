@@ -16,9 +16,7 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 from scipy.spatial.transform import Rotation
 
 from slviewer.calibration.next_pose import depth_range, place_board
-from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import compute_point_jacobian
-from slviewer.calibration.splined.fields import CELLS_ACROSS, RIDGE
 from slviewer.calibration.splined.normal import (
     Prior,
     dense_columns,
@@ -39,7 +37,13 @@ from slviewer.calibration.splined.uncertainty import (
     select_depth_axis,
     working_volume,
 )
-from slviewer.calibration.splined.unknowns import State, UnknownLayout
+from slviewer.calibration.splined.unknowns import (
+    CELLS_ACROSS,
+    RIDGE,
+    State,
+    UnknownLayout,
+    board_frame,
+)
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points
@@ -58,7 +62,7 @@ from slviewer.target.board import Board
 
 COARSE_CELLS = 10
 """Cells of the displacement fields across an image; the joint adjustment has more
-(``fields.CELLS_ACROSS``)."""
+(``unknowns.CELLS_ACROSS``)."""
 FEATURES, SAMPLES = (5, 4), (9, 7)
 """Points (across, down) that represent all features of a board, and all its bright pixels."""
 BOARD_SAMPLES = 4000

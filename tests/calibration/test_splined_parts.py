@@ -8,14 +8,6 @@ import pytest
 from splined_rig import BOARD, CELLS, aligned_error, observation, phase_map, poses, rig, surface
 
 from slviewer.calibration.splined.adjust import adjust_bundle, gather_data
-from slviewer.calibration.splined.fields import (
-    Device,
-    displacement,
-    distort_to_pixel,
-    remove_displacement,
-    roughness,
-    undistort_pixel,
-)
 from slviewer.calibration.splined.model import SplinedModel
 from slviewer.calibration.splined.normal import (
     BlockFactor,
@@ -23,7 +15,16 @@ from slviewer.calibration.splined.normal import (
     normal_equations,
     predict_observations,
 )
-from slviewer.calibration.splined.unknowns import State, pinhole_lens
+from slviewer.calibration.splined.unknowns import (
+    Device,
+    State,
+    displacement,
+    distort_to_pixel,
+    pinhole_lens,
+    remove_displacement,
+    roughness,
+    undistort_pixel,
+)
 from slviewer.calibration.stereo import calibrate_stereo
 
 

@@ -6,7 +6,6 @@ import pytest
 from facts import missing_facts
 from splined_rig import BOARD, CELLS, observation, phase_map, poses, rig
 
-from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.splined.uncertainty import (
     BestMotion,
@@ -20,6 +19,7 @@ from slviewer.calibration.splined.uncertainty import (
     summarise_volume_sigma,
     working_volume,
 )
+from slviewer.calibration.splined.unknowns import Device
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.inspection.features import distance

@@ -8,7 +8,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import (
     detect_half_turns,
@@ -31,7 +30,7 @@ from slviewer.calibration.splined.residual_noise import (
     robust_weights,
 )
 from slviewer.calibration.splined.residuals import PoseData
-from slviewer.calibration.splined.unknowns import State
+from slviewer.calibration.splined.unknowns import State, board_frame
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.geometry.rigid import Floats
@@ -102,7 +101,7 @@ def adjust_bundle(
     used.
 
     ``cells_across``: cells of each displacement field across its image; by default
-    ``fields.CELLS_ACROSS``. Raises InputError as ``gather_data`` does, and CalibrationRejected
+    ``unknowns.CELLS_ACROSS``. Raises InputError as ``gather_data`` does, and CalibrationRejected
     where the adjustment does not converge, is undetermined, or where too few poses agree with each
     other.
     """

@@ -10,7 +10,6 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
-from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.normal import (
     dense_columns,
     fill_sample_fields,
@@ -26,7 +25,7 @@ from slviewer.calibration.splined.residuals import (
     allocate_workspace,
     sample_row,
 )
-from slviewer.calibration.splined.unknowns import LENS, State
+from slviewer.calibration.splined.unknowns import HEIGHT_TERMS, LENS, State
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, Floats32, Mask

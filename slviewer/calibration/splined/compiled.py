@@ -16,14 +16,14 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from slviewer.calibration.splined.correction_grid import evaluate
-from slviewer.calibration.splined.fields import (
+from slviewer.calibration.splined.unknowns import (
+    Arrangement,
     in_illuminated_cells,
     in_image,
     project_point,
     undistort,
     undistort_pixel,
 )
-from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.polynomial import grid_points

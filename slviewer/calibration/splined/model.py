@@ -10,10 +10,8 @@ import numpy as np
 
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.adjust import adjust_bundle
-from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.compiled import CompiledAxis, compile_axis, pixel_rays
-from slviewer.calibration.splined.fields import Device, in_illuminated_cells, undistort
 from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX, Noise
 from slviewer.calibration.splined.uncertainty import (
     SigmaMap,
@@ -22,7 +20,16 @@ from slviewer.calibration.splined.uncertainty import (
     summarise_volume_sigma,
     working_volume,
 )
-from slviewer.calibration.splined.unknowns import Arrangement, State, pinhole_lens
+from slviewer.calibration.splined.unknowns import (
+    Arrangement,
+    Device,
+    State,
+    board_frame,
+    board_heights,
+    in_illuminated_cells,
+    pinhole_lens,
+    undistort,
+)
 from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
@@ -284,7 +291,7 @@ def calibrate_splined(
     """Calibrate the splined model from the poses that the stereo calibration used.
 
     ``cells_across``: cells of each displacement field across its image; by default
-    ``fields.CELLS_ACROSS``. Raises InputError where poses lack an axis, and CalibrationRejected
+    ``unknowns.CELLS_ACROSS``. Raises InputError where poses lack an axis, and CalibrationRejected
     where they contradict each other.
     """
     return SplinedModel(adjust_bundle(observations, stereo, progress, cells_across=cells_across))

@@ -10,14 +10,6 @@ import numba
 import numpy as np
 from scipy.linalg import blas, cho_solve, lapack, solve_triangular
 
-from slviewer.calibration.splined.board_shape import (
-    GAUGE_MM,
-    HEIGHT_SIGMA_MM,
-    HEIGHT_TERMS,
-    OFFSET_SIGMA_MM,
-    offset_gauge,
-)
-from slviewer.calibration.splined.fields import roughness
 from slviewer.calibration.splined.residuals import (
     CAMERA,
     CAMERA_FIELD,
@@ -31,7 +23,17 @@ from slviewer.calibration.splined.residuals import (
     feature_row,
     sample_row,
 )
-from slviewer.calibration.splined.unknowns import RIG, State, UnknownLayout
+from slviewer.calibration.splined.unknowns import (
+    GAUGE_MM,
+    HEIGHT_SIGMA_MM,
+    HEIGHT_TERMS,
+    OFFSET_SIGMA_MM,
+    RIG,
+    State,
+    UnknownLayout,
+    offset_gauge,
+    roughness,
+)
 from slviewer.errors import CalibrationRejected
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slviewer.calibration.splined.board_shape import HEIGHT_TERMS, height_at
-from slviewer.calibration.splined.fields import (
+from slviewer.calibration.splined.unknowns import (
+    HEIGHT_TERMS,
     displacement,
     dot_column,
     dot_row,
+    height_at,
     remove_displacement,
 )
 from slviewer.geometry.brown import distort_point, undistort_point

@@ -16,14 +16,14 @@ from numba import prange
 from scipy.ndimage import binary_erosion, distance_transform_edt, minimum_filter, uniform_filter
 
 from slviewer.calibration.splined.bundle import Bundle
-from slviewer.calibration.splined.fields import (
+from slviewer.calibration.splined.unknowns import (
+    Arrangement,
     Device,
     in_illuminated_cells,
     in_image,
     project_point,
     undistort_pixel,
 )
-from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
