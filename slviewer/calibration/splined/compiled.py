@@ -7,10 +7,7 @@ errors of some hundredths of a millimetre. They vary slowly, and a grid over (u,
 them.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from os import cpu_count
 
 import numpy as np
 from scipy.ndimage import binary_erosion
@@ -25,7 +22,7 @@ from slviewer.calibration.splined.unknowns import (
     undistort_pixel,
 )
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import Floats, Floats32, Mask
 
@@ -113,15 +110,12 @@ def compile_axis(
     width, height = (int(n) for n in rig.camera.size)
     centre = (float(rig.projector.size[row]) - 1) / 2
     coefficients = np.empty((3, height, width), np.float32)
-    _split_rows(
-        height, lambda rows: _fit_rational(rig, row, centre, near, far, rays, rows, coefficients)
-    )
+    ray = rig, row, centre, near, far
+    run_rows(_fit_rational, height, *ray, rays, coefficients)
     step = max(2, -(-width // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
     grid, projected = np.full(shape, np.nan, np.float32), np.full((*shape, 2), np.nan)
-    _split_rows(
-        shape[0], lambda rows: _tabulate(rig, row, centre, near, far, step, rows, grid, projected)
-    )
+    run_rows(_tabulate, shape[0], *ray, step, grid, projected)
     nodes = step * grid_points(np.arange(shape[1]), np.arange(shape[0]))
     at_camera = in_illuminated_cells(rig.camera, nodes, illuminated[0]).reshape(*shape[:2], 1)
     lit = projected.reshape(-1, 2)
@@ -132,13 +126,6 @@ def compile_axis(
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
     supported_grid = np.where(unknown, np.float32(np.nan), grid)
     return CompiledAxis(coefficients, centre, grid, supported_grid, step, near, far)
-
-
-def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
-    """Run ``work`` on interleaved image rows in parallel threads."""
-    lanes = max(1, min(cpu_count() or 1, rows))
-    with ThreadPoolExecutor(lanes) as threads:
-        list(threads.map(lambda lane: work(np.arange(lane, rows, lanes)), range(lanes)))
 
 
 @kernel()
@@ -218,11 +205,11 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
 
 
 @kernel()
-def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
-    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in some ``rows``;
-    NaN without one."""
+def _fit_rational(start, stop, rig, row, centre, near, far, rays, coefficients):
+    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in rows ``start``
+    to ``stop``; NaN without one."""
     basis = np.zeros((4, 4))
-    for v in rows:
+    for v in range(start, stop):
         for u in range(rays.shape[2]):
             c0, c1, c2, _, _ = _interpolate_rational(
                 rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis
@@ -231,11 +218,11 @@ def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
 
 
 @kernel()
-def _tabulate(rig, row, centre, near, far, step, rows, grid, projected):
-    """Fill ``grid`` with exact depth minus rational function at its nodes, and ``projected`` (nv,
-    nu, nz, 2) with their projector pixels."""
+def _tabulate(start, stop, rig, row, centre, near, far, step, grid, projected):
+    """Fill rows ``start`` to ``stop`` of ``grid`` with exact depth minus rational function at its
+    nodes, and ``projected`` (nv, nu, nz, 2) with their projector pixels."""
     basis = np.zeros((4, 4))
-    for j in rows:
+    for j in range(start, stop):
         for i in range(grid.shape[1]):
             u, v = float(i * step), float(j * step)
             x, y = undistort_pixel(rig.camera, u, v, basis)

@@ -35,7 +35,7 @@ from slviewer.calibration.splined.unknowns import (
     roughness,
 )
 from slviewer.errors import CalibrationRejected
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats
 
 MAX_LANES = 4
@@ -79,9 +79,7 @@ def predict_observations(state: State, data: PoseData) -> ObservedValues:
     """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where
     not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
-    shares = _split_poses(state.layout.poses)
-    with ThreadPoolExecutor(len(shares)) as threads:
-        list(threads.map(lambda poses: _predict(state, data, poses, features, samples), shares))
+    run_rows(_predict, state.layout.poses, state, data, features, samples)
     return features, samples
 
 
@@ -94,7 +92,9 @@ def normal_equations(
     NaN.
     """
     layout = state.layout
-    shares = _split_poses(layout.poses)
+    # a kernel's parallel loops take no structures
+    lanes = max(1, min(MAX_LANES, numba.get_num_threads(), layout.poses))
+    shares = [np.arange(lane, layout.poses, lanes) for lane in range(lanes)]
     matrices = [np.zeros((layout.size, layout.size)) for _ in shares]
     right = np.zeros((len(shares), layout.size))
     observed = data, residuals, weights, _sort_by_cell(state, data)
@@ -262,17 +262,12 @@ def _sort_by_cell(state: State, data: PoseData) -> np.ndarray:
     return np.lexsort([*keys, data.poses[1]])
 
 
-def _split_poses(poses: int) -> list[np.ndarray]:
-    """The poses of each thread: a kernel's parallel loops take no structures."""
-    lanes = max(1, min(MAX_LANES, numba.get_num_threads(), poses))
-    return [np.arange(lane, poses, lanes) for lane in range(lanes)]
-
-
 @kernel()
-def _predict(state, data, poses, features, samples):
-    """Fill the predicted ``features`` (n, 2) and ``samples`` (m, 2) px of some poses."""
+def _predict(first, last, state, data, features, samples):
+    """Fill the predicted ``features`` (n, 2) and ``samples`` (m, 2) px of poses ``first`` to
+    ``last``."""
     work = allocate_workspace()
-    for i in poses:
+    for i in range(first, last):
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
             features[n] = feature_row(state, i, data.points, data.frame, data.feature[n], work)
         for n in range(data.sample_from[i], data.sample_from[i + 1]):
