@@ -119,8 +119,9 @@ class _Profile:
     """Radial profile of a dot.
 
     ``paper``: grey level of the paper around it, and ``difference``: that less the level of its
-    middle; ``contrast``: the difference over the larger, negative for bright dots. ``off``: distance of its centroid from the
-    predicted position, and ``size``: its radius at half contrast, both over its nominal radius.
+    middle; ``contrast``: the difference over the larger, negative for bright dots. ``off``:
+    distance of its centroid from the predicted position, and ``size``: its radius at half contrast,
+    both over its nominal radius.
     ``is_alone``: whether there is paper on all sides.
     """
 
