@@ -319,8 +319,9 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
     sigmas = np.full(len(KINDS), 0.05)
     weights = [_compute_weights(e, sigmas) for e in equations]
     for _ in range(3):
-        parts = [_reduce_normal_equations(e, w) for e, w in zip(equations, weights, strict=True)]
-        total, right = sum((N for N, _ in parts), prior), sum(b for _, b in parts)
+        parts = list(map(_reduce_normal_equations, equations, weights))
+        normals, rights = zip(*parts, strict=True)
+        total, right = sum(normals, prior), sum(rights)
         factor = cho_factor(total)
         shared = cho_solve(factor, right)
         # after the shared unknowns and the best board poses
