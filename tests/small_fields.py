@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from slviewer.calibration.splined import fields
+from slviewer.calibration.splined import unknowns
 
 
 @contextmanager
@@ -13,5 +13,5 @@ def fit_few_cells() -> Iterator[None]:
     """Fit displacement fields of fewer cells: a hundredth of the time to solve, and as good for the
     simulated rigs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fields, "CELLS_ACROSS", 12)
+        patch.setattr(unknowns, "CELLS_ACROSS", 12)
         yield

@@ -46,15 +46,16 @@ def intersect_board(T: Floats, rays: Floats) -> Floats:
 def solve_device(
     device: str, points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, list[Floats], tuple[float, float]]:
-    """Solve a pinhole and Brown lens from points (n, 3) mm and pixels (n, 2) of each pose, float32.
+    """Solve a pinhole and Brown lens from points (n, 3) mm and pixels (n, 2) of each pose.
 
     Returns K (3, 3), D (5,), T_device_board (4, 4) mm of each pose, and the standard deviations of
     fx and fy in px. ``device``: for the message of CalibrationRejected, which is raised where
     OpenCV finds no solution.
     """
+    objects, images = ([each.astype(np.float32) for each in arrays] for arrays in (points, pixels))
     try:
         _, K, D, rvecs, tvecs, deviations, _, _ = cv2.calibrateCameraExtended(
-            points, pixels, size, np.zeros((3, 3)), np.zeros(5), criteria=CRITERIA
+            objects, images, size, np.zeros((3, 3)), np.zeros(5), criteria=CRITERIA
         )
     except cv2.error as error:
         raise CalibrationRejected(

@@ -127,8 +127,7 @@ def _solve_camera(
     Returns the lens, T_camera_board (4, 4) mm of each picture, and the standard deviations of fx
     and fy in px.
     """
-    objects, images = ([each.astype(np.float32) for each in arrays] for arrays in (points, pixels))
-    K, D, poses, sigma = solve_device("camera", objects, images, size)
+    K, D, poses, sigma = solve_device("camera", points, pixels, size)
     return Lens(K, D, size), poses, sigma
 
 

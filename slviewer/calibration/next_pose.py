@@ -120,10 +120,10 @@ def depth_range(board: Board, lens: Lens) -> tuple[float, float]:
 
 def count_coverage(board: Board, lens: Lens, poses: Sequence[Floats]) -> Coverage:
     """Count how often `poses`, T_camera_board (4, 4) mm each, cover the cells, depths and tilts."""
-    span = depth_range(board, lens)
-    covered, thirds, tilts = _classify(board, lens, np.reshape(poses, (-1, 4, 4)), span)
+    covered, thirds, tilts = _classify(board, lens, np.reshape(poses, (-1, 4, 4)))
     depths = np.bincount(thirds, minlength=len(THIRDS))
-    return Coverage(covered.sum(axis=0), depths, np.bincount(tilts, minlength=len(TILTS)), span)
+    tilts = np.bincount(tilts, minlength=len(TILTS))
+    return Coverage(covered.sum(axis=0), depths, tilts, depth_range(board, lens))
 
 
 def place_board(board: Board, lens: Lens, R: Floats, depths: Floats, pixels: Floats) -> Floats:
@@ -158,26 +158,24 @@ def suggest(
     board.
     """
     current = count_coverage(board, lens, poses)
-    candidates = _list_candidates(board, lens, current.range_mm, len(poses), illuminated)
+    candidates = _list_candidates(board, lens, len(poses), illuminated)
     if not len(candidates):
         raise InputError(
             f"the board {board} cannot be held so that the camera sees all of it: take a smaller"
             " board"
         )
-    covered, thirds, tilts = _classify(board, lens, candidates, current.range_mm)
+    covered, thirds, tilts = _classify(board, lens, candidates)
     gain = (
         (covered * np.maximum(CELL_GOAL - current.cells, 0)).sum(axis=(1, 2))
         / (CELL_GOAL * current.cells.size)
         + np.maximum(GOAL_POSES - current.depths[thirds], 0) / GOAL_POSES
         + np.maximum(GOAL_POSES - current.tilts[tilts], 0) / GOAL_POSES
     )
-    distance = 1.0
-    if len(poses):
-        new, existing = (
-            _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm)
-            for each in (candidates, poses)
-        )
-        distance = lengths(new[:, None] - existing).min(axis=1)
+    new, existing = (
+        _describe_numerically(np.reshape(each, (-1, 4, 4)), board, current.range_mm)
+        for each in (candidates, poses)
+    )
+    distance = lengths(new[:, None] - existing).min(axis=1) if len(poses) else 1.0
     order = np.argsort(-(gain + 0.2 * distance), kind="stable")
     return describe_suggestion(board, lens, candidates[order[skip % len(order)]])
 
@@ -185,7 +183,7 @@ def suggest(
 def describe_suggestion(board: Board, lens: Lens, T_camera_board: Floats) -> Suggestion:
     """Return a suggestion for a given pose, with its outline and instruction."""
     corners = outline_px(board, lens, T_camera_board)
-    _, thirds, tilts = _classify(board, lens, T_camera_board[None], depth_range(board, lens))
+    _, thirds, tilts = _classify(board, lens, T_camera_board[None])
     across, down = corners.mean(0) / np.array(lens.size) - 0.5
     offsets = {"top": -down, "bottom": down, "left": -across, "right": across}
     where = " ".join(word for word, offset in offsets.items() if offset > 0.06)
@@ -206,9 +204,12 @@ def projector_reach(points: Floats, pixels: Floats, size: tuple[int, int]) -> Il
     if len(points) < 12:
         return None
     middle, scale = points.mean(0), points.std()
-    unit = np.array(size, float)
-    X = np.column_stack([(points - middle) / scale, np.ones(len(points))])
-    u = pixels / unit - 0.5
+
+    def homogeneous(points: Floats) -> Floats:
+        """Return normalised homogeneous coordinates (k, 4) of points (k, 3) mm."""
+        return np.column_stack([(points - middle) / scale, np.ones(len(points))])
+
+    X, u = homogeneous(points), pixels / np.array(size, float) - 0.5
     none = np.zeros_like(X)
     rows = np.concatenate(
         [np.hstack([X, none, -u[:, :1] * X]), np.hstack([none, X, -u[:, 1:] * X])]
@@ -220,26 +221,22 @@ def projector_reach(points: Floats, pixels: Floats, size: tuple[int, int]) -> Il
 
     def reaches(points: Floats) -> np.ndarray:
         """(k,) bool: whether points (k, 3) mm project into the projector's image less a margin."""
-        h = np.column_stack([(points - middle) / scale, np.ones(len(points))]) @ P.T
+        h = homogeneous(points) @ P.T
         return (np.abs(h[:, :2] / h[:, 2:]) < 0.5 - _REACH_MARGIN).all(1)
 
     return reaches if reaches(points).mean() > 0.8 else None
 
 
 def _list_candidates(
-    board: Board,
-    lens: Lens,
-    span: tuple[float, float],
-    count: int,
-    illuminated: Illumination | None,
+    board: Board, lens: Lens, count: int, illuminated: Illumination | None
 ) -> Floats:
     """Return poses (k, 4, 4) at every depth, tilt and direction, each as far off-centre as the
     whole board is visible.
 
-    `span`: (near, far) mm; `count`: number of poses so far, which selects the tilt angle.
+    `count`: number of poses so far, which selects the tilt angle.
     """
     angle = np.radians((18.0, 25.0, 14.0)[count % 3])
-    near, far = span
+    near, far = depth_range(board, lens)
     # Before two poses have shown the projector's field of view, the middle of the image is most
     # likely inside it.
     places = np.array(list(product((-1, 0, 1), repeat=2)) if illuminated is not None else [(0, 0)])
@@ -265,15 +262,11 @@ def _is_visible(board: Board, lens: Lens, T: Floats, illuminated: Illumination |
         lens.contains(lens.project(corners), _FREE * lens.size[0] + 0.5).all(axis=1)
     )
     if illuminated is not None:
-        inside[inside] = (
-            illuminated(corners[inside].reshape(-1, 3)).reshape(-1, corners.shape[1]).all(axis=1)
-        )
+        inside[inside] = illuminated(corners[inside].reshape(-1, 3)).reshape(-1, 4).all(axis=1)
     return inside
 
 
-def _classify(
-    board: Board, lens: Lens, T: Floats, span: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _classify(board: Board, lens: Lens, T: Floats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the covered cells (n, 3, 4) bool, third of the depths (n,), index in `TILTS` (n,) of
     poses (n, 4, 4)."""
     samples = grid_points(
@@ -285,7 +278,7 @@ def _classify(
     turns = sides[..., 0] * away[..., 1] - sides[..., 1] * away[..., 0]
     inside = (turns > 0).all(-1) | (turns < 0).all(-1)  # not for corners of NaN
     cells = inside.reshape(-1, ROWS, _FINE, COLUMNS, _FINE).mean((2, 4)) >= _CELL_SHARE
-    near, far = span
+    near, far = depth_range(board, lens)
     thirds = np.clip(3 * (_board_middle(T, board)[:, 2] - near) / (far - near), 0, 2).astype(int)
     normal = T[:, :3, 2] * np.where(T[:, 2, 2] >= 0, 1, -1)[:, None]
     # the side towards which depth grows: dz/dx = -n_x/n_z, dz/dy = -n_y/n_z, and up in the image is

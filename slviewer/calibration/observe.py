@@ -2,19 +2,25 @@
 (Letter step 2).
 
 An observation is small whatever the image size, so any number of poses fits in memory; frames and
-phase maps are released.
+phase maps are released. The board's pixels count where their phase is undisturbed: bright ones,
+clear of the contrast edges, that agree with the board's plane.
+
+The camera's lens and pixels mix bright and dark across an edge, and the phase of a bright pixel
+there is that of a point farther inside the bright part: by half a blur's sigma at the edge, a tenth
+at 1.3 sigma, a fortieth at 2 and a hundredth at 2.5, whatever the blur (measured on rendered boards
+of known truth). The errors of opposite sides of a circle cancel, so that the error of a feature or
+a smoothed surface is smallest where 2 sigma are excluded; with more, the loss of pixels adds more
+noise.
 """
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
-from slviewer.calibration.board_plane import BoardPlane
-from slviewer.calibration.edges import bright_pixels
 from slviewer.calibration.local_fit import fit_local_values
 from slviewer.errors import DetectionError, InputError
 from slviewer.fringe.phase import PhaseMap
@@ -22,7 +28,7 @@ from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import Polynomial2D, fit_polynomial
 from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.splines import SplineSurface, fit_spline
-from slviewer.geometry.vectors import lengths
+from slviewer.geometry.vectors import finite_rows, lengths, rms
 from slviewer.target.board import Board
 from slviewer.target.detect import Detection, board_mask
 
@@ -36,8 +42,27 @@ SAMPLES = 30_000
 AXES: tuple[Axis, ...] = ("x", "y")
 CELLS_PER_WIDTH = 14
 """Spline cells across the image: half the wavelength of the finest relevant lens distortion."""
-
-
+CLEARANCE_SIGMAS = 2.0
+"""Distance from an edge, in standard deviations of its blur, beyond which a bright pixel's phase is
+undisturbed."""
+MIN_CLEARANCE_PX = 1.0
+"""Smallest clearance: the uncertainty of a mask's edge."""
+MIN_CLEAR_SHARE = 0.25
+"""Share of the bright pixels within half a pitch that must be clear of edges; otherwise the
+clearance is reduced."""
+SHARPEST_PX = 12**-0.5
+"""Blur of an edge by the pixel area alone."""
+EDGE_BAND = 0.25
+"""Pixels whose brightness differs by this share of the contrast from dark and from bright belong to
+an edge; with a Gaussian blur they are within 0.6745 sigma of it."""
+MIN_FEATURES = 12
+"""Nine unknowns, and some features more."""
+OUTLIER_SIGMAS = 6.0
+"""Features with a larger residual, in robust sigma, are outliers."""
+MIN_TOLERANCE_PX = 1.0
+TOLERANCE_RATIO = 4.0
+"""Tolerance of a pixel's coordinate: 1 px plus four times the largest residual of a feature. Beyond
+the outermost features, lens distortion is several times as large as between them."""
 COUNT = 4000
 """Number of blocks sampled from one pose; more resolve no finer distortion and slow the joint
 adjustment down."""
@@ -45,6 +70,96 @@ MAX_BLOCK_PX = 5
 """Largest side of a block; over more pixels, the phase of a tilted board is not linear."""
 MIN_FILL_SHARE = 0.5
 """Share of a block's pixels that must be bright."""
+
+
+@dataclass(frozen=True)
+class BoardPlane:
+    """A homography from camera to projector, with the division model x / (1 + bend r^2) of the
+    camera's distortion.
+
+    ``centre`` px and ``radius`` px normalise camera pixels; ``reach`` (2,) px: tolerance of the
+    projector's x and y coordinate at a pixel of the board.
+    """
+
+    H: np.ndarray
+    bend: float
+    centre: Floats
+    radius: float
+    reach: Floats
+
+    @classmethod
+    def fit(cls, camera: Floats, projector: Floats, size: tuple[int, int]) -> "BoardPlane | None":
+        """Fit the plane robustly to features at ``camera`` and ``projector`` pixels (n, 2), NaN
+        where unknown.
+
+        ``size``: (width, height) px of the camera. None where fewer than MIN_FEATURES inliers
+        remain.
+        """
+        centre, radius = (np.array(size) - 1) / 2, float(np.hypot(*size)) / 2
+        inlier = finite_rows(projector, camera)
+        plane = None
+        for _ in range(5):
+            if np.count_nonzero(inlier) < MIN_FEATURES:
+                return None
+            plane = cls._fit_inliers(camera[inlier], projector[inlier], centre, radius)
+            if plane is None:
+                return None
+            residual = lengths(plane.predict(camera[:, 0], camera[:, 1]) - projector)
+            before, typical = inlier, np.median(residual[inlier])
+            inlier = residual < np.maximum(OUTLIER_SIGMAS * typical / 1.1774, 0.5)
+            if np.array_equal(inlier, before):
+                break
+        return plane
+
+    @classmethod
+    def _fit_inliers(
+        cls, camera: Floats, projector: Floats, centre: Floats, radius: float
+    ) -> "BoardPlane | None":
+        """Fit the homography for a range of distortions, refined twice, and return the plane with
+        the smallest RMS."""
+        bends, step = np.linspace(-0.5, 0.3, 9), 0.1
+        fits: list[tuple[float, BoardPlane]] = []
+        normalised = (camera - centre) / radius
+        squares = np.sum(normalised**2, axis=1, keepdims=True)
+        for _ in range(3):
+            for bend in bends:
+                # undistorted by the division model
+                H, _ = cv2.findHomography(normalised / (1 + bend * squares), projector)
+                if H is None:
+                    continue
+                plane = cls(H, float(bend), centre, radius, np.zeros(2))
+                residuals = plane.predict(camera[:, 0], camera[:, 1]) - projector
+                reach = MIN_TOLERANCE_PX + TOLERANCE_RATIO * np.abs(residuals).max(0)
+                fits.append((rms(residuals), replace(plane, reach=reach)))
+            if not fits:
+                return None
+            _, best = min(fits, key=lambda fit: fit[0])
+            bends = best.bend + np.linspace(-step, step, 7)
+            step /= 3
+        return best
+
+    def predict(self, u: np.ndarray, v: np.ndarray) -> Floats:
+        """Return the plane's projector coordinates (..., 2) px at camera pixels (u, v), which
+        broadcast."""
+        x, y = (u - self.centre[0]) / self.radius, (v - self.centre[1]) / self.radius
+        scale = 1 + self.bend * (x * x + y * y)
+        a, b, w = (h[0] * x + h[1] * y + h[2] * scale for h in self.H)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.stack([a / w, b / w], axis=-1)
+
+    def contains(self, coordinate: np.ndarray, along: int, origin: tuple[int, int]) -> Mask:
+        """(h', w') bool: projector coordinates (h', w') px within the tolerance of the plane; False
+        for NaN.
+
+        ``along``: 0 for columns, 1 for rows; ``origin``: camera pixel (u0, v0) of the first
+        coordinate.
+        """
+        height, width = coordinate.shape
+        expected = self.predict(
+            np.arange(width)[None] + origin[0], np.arange(height)[:, None] + origin[1]
+        )
+        with np.errstate(invalid="ignore"):
+            return np.abs(coordinate - expected[..., along]) < self.reach[along]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +174,6 @@ class Samples:
     camera: Floats
     projector: Floats
     sigma: Floats
-
-    def __post_init__(self) -> None:
-        shapes = {a.shape for a in (self.camera, self.projector, self.sigma)}
-        if len(shapes) != 1 or self.camera.ndim != 2 or self.camera.shape[1] != 2:
-            raise InputError(
-                f"samples of shapes {sorted(shapes)} do not match: give three arrays (n, 2)"
-            )
 
 
 def block_samples(
@@ -197,8 +305,11 @@ class Observation:
     def from_arrays(cls, name: str, arrays: Mapping[str, np.ndarray]) -> "Observation":
         """Return the observation that ``to_arrays`` saved."""
         surfaces: dict[Axis, SplineSurface | Polynomial2D] = {}
-        captured: list[Axis] = [axis for axis in AXES if f"{axis}_trend" in arrays]
-        for axis in captured:
+        periods: dict[Axis, float] = {}
+        for axis in AXES:
+            if f"{axis}_trend" not in arrays:
+                continue
+            periods[axis] = float(arrays[f"{axis}_period_px"])
             trend = Polynomial2D(arrays[f"{axis}_trend"], tuple(arrays[f"{axis}_extent"].tolist()))
             spline = arrays.get(f"{axis}_spline")
             surfaces[axis] = trend if spline is None else SplineSurface(trend, spline)
@@ -211,7 +322,7 @@ class Observation:
             arrays["camera"],
             arrays["projector"],
             surfaces,
-            {axis: float(arrays[f"{axis}_period_px"]) for axis in captured},
+            periods,
             tuple(arrays["size"].tolist()),
             tuple(arrays["box"].tolist()),
             arrays["region"],
@@ -372,3 +483,66 @@ def _bounding_box(mask: Mask) -> tuple[int, int, int, int]:
     if not width:
         raise DetectionError("the board's outline is outside the image: move the board into view")
     return u0, v0, u0 + width, v0 + height
+
+
+def bright_pixels(phase: PhaseMap, inside: Mask, pitch: float) -> Mask:
+    """Select the valid pixels (h, w) bool of the board's bright parts at a distance from contrast
+    edges.
+
+    ``inside`` (h, w) bool: the board's pixels; ``pitch``: px. Bright pixels have more than half of
+    the largest modulation within a pitch. The distance is 2 sigma of the edges' blur, less where
+    few pixels would remain, as between the squares and markers of a ChArUco board.
+    """
+    modulation = np.where(inside & phase.mask, phase.modulation, 0).astype(np.float32)
+    crest = _local_extreme(cv2.dilate, modulation, pitch)
+    bright = (modulation > 0.5 * crest) & (modulation > 0)
+    # a lone pixel lost to noise is not an edge
+    dark = cv2.morphologyEx((~bright).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    sigma = edge_blur_px(phase, inside, pitch)
+    # px from the edge, half a px before the first dark pixel's middle
+    apart = cv2.distanceTransform(1 - dark, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
+    clear = np.zeros_like(bright)
+    window = (2 * int(pitch / 2) + 1,) * 2
+    around = cv2.blur(bright.astype(np.float32), window)
+    for share in (1.0, 0.8, 0.6, 0.3):
+        few = cv2.blur(clear.astype(np.float32), window) < MIN_CLEAR_SHARE * around
+        clear |= few & bright & (apart > max(share * CLEARANCE_SIGMAS * sigma, MIN_CLEARANCE_PX))
+    return clear
+
+
+def edge_blur_px(phase: PhaseMap, inside: Mask, pitch: float) -> float:
+    """Estimate the blur of the board's contrast edges by lens and pixels, standard deviation in px.
+
+    It is proportional to the area of intermediate pixels over the length of the edges.
+    """
+    modulation = np.asarray(phase.modulation, np.float32)
+    crest, trough = (_local_extreme(of, modulation, pitch) for of in (cv2.dilate, cv2.erode))
+    contrast = crest - trough
+    # the board's outline is not an edge
+    edged = cv2.erode(inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    edged &= contrast > 0.4 * crest
+    level = np.clip((modulation - trough) / np.maximum(contrast, 1e-6), 0, 1)
+    area = np.count_nonzero(edged & (level > EDGE_BAND) & (level < 1 - EDGE_BAND))
+    across, down = cv2.Sobel(level, cv2.CV_32F, 1, 0), cv2.Sobel(level, cv2.CV_32F, 0, 1)
+    steep = np.maximum(np.hypot(across, down), 1e-6)
+    high = level > 0.5
+    # an edge of length L with its normal at (n_u, n_v) crosses L n_u rows and L n_v columns
+    rows = (high[:, 1:] != high[:, :-1]) & edged[:, 1:] & edged[:, :-1]
+    columns = (high[1:] != high[:-1]) & edged[1:] & edged[:-1]
+    across, down = np.abs(across) / steep, np.abs(down) / steep
+    length = float(across[:, 1:][rows].sum() + down[1:][columns].sum())
+    if length < pitch:
+        return SHARPEST_PX
+    return float(np.clip(area / length / (2 * 0.6745), SHARPEST_PX, pitch / 8))
+
+
+def _local_extreme(
+    of: Callable[..., np.ndarray], modulation: np.ndarray, pitch: float
+) -> np.ndarray:
+    """(h, w): the largest or smallest modulation within a pitch, by ``cv2.dilate`` or
+    ``cv2.erode``."""
+    shrink = max(1, int(pitch // 12))
+    small = cv2.blur(modulation, (shrink, shrink))[::shrink, ::shrink] if shrink > 1 else modulation
+    reach = 2 * int(np.ceil(0.7 * pitch / shrink)) + 1
+    extreme = of(small, np.ones((reach, reach), np.uint8))
+    return cv2.resize(extreme, modulation.shape[::-1], interpolation=cv2.INTER_LINEAR)

@@ -7,10 +7,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from slviewer.calibration.pixelwise import PixelwiseModel
-from slviewer.calibration.splined.fields import Device, undistort
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.calibration.splined.unknowns import pinhole_lens
-from slviewer.calibration.splined.volume import in_illuminated_cells
+from slviewer.calibration.splined.unknowns import (
+    Device,
+    in_illuminated_cells,
+    pinhole_lens,
+    undistort,
+)
 from slviewer.errors import InputError
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.polynomial import grid_points

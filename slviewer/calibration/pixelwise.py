@@ -36,6 +36,7 @@ BAND_BYTES = 2**27
 there are."""
 MIN_POSES = 4
 """One pose more than coefficients, so that the fit's RMS is meaningful."""
+_UNSOLVED = (np.nan,) * 5
 MAX_EXTRAPOLATION = 1.5
 """Largest extrapolation beyond a pixel's calibrated phase range, in lengths of that range."""
 
@@ -397,14 +398,11 @@ def _evaluate(phase, ratio, c, phase_min, phase_max, out):  # type: ignore[no-un
             denominator = 1.0 + c[2, v, u] * p
             z = (c[0, v, u] + c[1, v, u] * p) / denominator
             inside = p >= phase_min[v, u] - margin and p <= phase_max[v, u] + margin
-            if inside and z > 0.0:
-                out[v, u, 0] = c[3, v, u] * z
-                out[v, u, 1] = c[4, v, u] * z
-                out[v, u, 2] = z
-            else:
-                out[v, u, 0] = np.nan
-                out[v, u, 1] = np.nan
-                out[v, u, 2] = np.nan
+            if not (inside and z > 0.0):
+                z = np.nan
+            out[v, u, 0] = c[3, v, u] * z
+            out[v, u, 1] = c[4, v, u] * z
+            out[v, u, 2] = z
 
 
 @kernel(parallel=True)
@@ -497,20 +495,19 @@ def _solve_moments(a):
     Returns the three unknowns, the sum of squares that they explain, and the condition; NaN without
     a solution.
     """
-    none = np.nan
     if a[0] <= 0 or a[3] <= 0 or a[5] <= 0:
-        return none, none, none, none, none
+        return _UNSOLVED
     d0, d1, d2 = 1 / np.sqrt(a[0]), 1 / np.sqrt(a[3]), 1 / np.sqrt(a[5])
     m01, m02, m12 = a[1] * d0 * d1, a[2] * d0 * d2, a[4] * d1 * d2
     y0, b1, b2 = a[6] * d0, a[7] * d1, a[8] * d2
     l11s = 1 - m01 * m01
     if not l11s > 1e-12:
-        return none, none, none, none, none
+        return _UNSOLVED
     l11 = np.sqrt(l11s)
     l21 = (m12 - m01 * m02) / l11
     l22s = 1 - m02 * m02 - l21 * l21
     if not l22s > 1e-12:
-        return none, none, none, none, none
+        return _UNSOLVED
     l22 = np.sqrt(l22s)
     y1 = (b1 - m01 * y0) / l11
     y2 = (b2 - m02 * y0 - l21 * y1) / l22

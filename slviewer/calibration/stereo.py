@@ -186,10 +186,11 @@ def calibrate_stereo(
         check_handedness(used)
         check_tilts(used)
 
-    for _ in range(4):
-        solution = _Solution.fit(used, inliers, projector_size, strict)
-        outliers = _detect_outliers(solution, used, inliers)
-        if not (outliers and strict):  # a diagnosis keeps all features
+    for remaining in range(4, -1, -1):
+        model = _solve(used, inliers, projector_size, strict)
+        # a diagnosis keeps all features
+        outliers = _detect_outliers(model) if strict and remaining else {}
+        if not outliers:
             break
         for name, is_outlier in outliers.items():
             inliers[name] = inliers[name] & ~is_outlier
@@ -200,122 +201,93 @@ def calibrate_stereo(
                 )
                 used = [o for o in used if o.name != name]
         check_pose_count(len(used), excluded)
-    else:  # the last round excluded features or poses too
-        solution = _Solution.fit(used, inliers, projector_size, strict)
-    model = solution.to_model(used, inliers, board, excluded)
     if strict:
         _check_agreement(model)
-    return model
+    return replace(model, board=board, excluded=excluded)
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Result of ``cv2.stereoCalibrate``: the rig, T_camera_board (4, 4) mm of each pose, focal
-    sigmas by device."""
+def _solve(
+    used: Sequence[Observation],
+    inliers: Mapping[str, Mask],
+    projector_size: tuple[int, int],
+    strict: bool,
+) -> StereoModel:
+    """Solve each device by itself, then both together with their relative pose, from the inlier
+    features.
 
-    rig: StereoRig
-    poses: dict[str, Floats]
-    focal_sigma_px: dict[str, float]
-
-    @classmethod
-    def fit(
-        cls,
-        used: Sequence[Observation],
-        inliers: Mapping[str, Mask],
-        projector_size: tuple[int, int],
-        strict: bool,
-    ) -> "_Solution":
-        """Solve each device by itself, then both together with their relative pose, from the inlier
-        features.
-
-        Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive,
-        and if ``strict`` where one is too uncertain.
-        """
-        objects, cameras, projectors = (
-            [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
-            for name in ("points", "camera", "projector")
-        )
-        sizes = used[0].size, projector_size
-        sigma: dict[str, float] = {}
-        intrinsics = []
-        for device, images, size in zip(DEVICES, (cameras, projectors), sizes, strict=True):
-            K, D, _, sigmas = solve_device(device, objects, images, size)
-            sigma[device] = max(sigmas)
-            relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
-            if strict and not relative < MAX_FOCAL_SIGMA:
-                raise CalibrationRejected(
-                    f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f}"
-                    " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
-                    " distance"
-                )
-            intrinsics += [K, D]
-        K_c, D_c, K_p, D_p = intrinsics
-        alone = [np.diag(K).copy() for K in (K_c, K_p)]  # OpenCV overwrites both
-        _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
-            objects,
-            cameras,
-            projectors,
-            K_c,
-            D_c,
-            K_p,
-            D_p,
-            sizes[0],
-            np.eye(3),
-            np.zeros((3, 1)),
-            flags=cv2.CALIB_USE_INTRINSIC_GUESS,
-            criteria=CRITERIA,
-        )
-        for device, K in zip(DEVICES, (K_c, K_p), strict=True):
-            if not min(K[0, 0], K[1, 1]) > 0:
-                raise CalibrationRejected(
-                    f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px,"
-                    " as no lens has: check the target's notation, the projector's size, the"
-                    " fringe period, and that x and y are not exchanged"
-                )
-        for device, f, K in zip(DEVICES, alone, (K_c, K_p), strict=True):
-            # systematic errors, which the standard deviations lack, change the two fits differently
-            change = np.abs(f / np.diag(K) - 1).max()
-            sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
-        camera = Lens(K_c, np.ravel(D_c)[:5], sizes[0])
-        projector = Lens(K_p, np.ravel(D_p)[:5], sizes[1])
-        poses = {
-            o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)
-        }
-        return cls(StereoRig(camera, projector, R, T), poses, sigma)
-
-    def residuals(self, observation: Observation) -> Floats:
-        """Return the camera and projector residuals (n, 4) px of every feature of one pose."""
-        X = move_points(self.poses[observation.name], observation.points)
-        measured = np.hstack([observation.camera, observation.projector])
-        return measured - np.hstack([self.rig.camera.project(X), self.rig.project(X)])
-
-    def to_model(
-        self,
-        used: Sequence[Observation],
-        inliers: Mapping[str, Mask],
-        board: str,
-        excluded: Mapping[str, str],
-    ) -> StereoModel:
-        """Return the calibrated model with the reprojection errors of the inlier features."""
-        residuals = {
-            o.name: np.where(inliers[o.name][:, None], self.residuals(o), np.nan) for o in used
-        }
-        z = np.concatenate([move_points(self.poses[o.name], o.points)[:, 2] for o in used])
-        camera, projector = _device_rms(np.concatenate([*residuals.values()]))
-        stereo = float(np.sqrt((camera**2 + projector**2) / 2))
-        return StereoModel(
-            rig=self.rig,
-            board=board,
-            axes=("x", "y"),
-            reprojection_rms_px={"camera": camera, "projector": projector, "stereo": stereo},
-            poses=self.poses,
-            pose_rms_px={name: _device_rms(each) for name, each in residuals.items()},
-            excluded=excluded,
-            depth_range_mm=(float(z.min()), float(z.max())),
-            focal_sigma_px=self.focal_sigma_px,
-            features_excluded=int(sum((~inliers[name]).sum() for name in residuals)),
-            residuals_px=residuals,
-        )
+    Raises CalibrationRejected where OpenCV finds no solution or a focal length is not positive,
+    and if ``strict`` where one is too uncertain.
+    """
+    objects, cameras, projectors = (
+        [getattr(o, name)[inliers[o.name]].astype(np.float32) for o in used]
+        for name in ("points", "camera", "projector")
+    )
+    sizes = used[0].size, projector_size
+    sigma: dict[str, float] = {}
+    intrinsics = []
+    for device, images, size in zip(DEVICES, (cameras, projectors), sizes, strict=True):
+        K, D, _, sigmas = solve_device(device, objects, images, size)
+        sigma[device] = max(sigmas)
+        relative = sigma[device] / float(min(K[0, 0], K[1, 1]))
+        if strict and not relative < MAX_FOCAL_SIGMA:
+            raise CalibrationRejected(
+                f"the poses leave the {device}'s focal length uncertain by {100 * relative:.0f}"
+                " %: tilt the board by 15 to 30 degrees in different directions, and vary its"
+                " distance"
+            )
+        intrinsics += [K, D]
+    K_c, D_c, K_p, D_p = intrinsics
+    alone = [np.diag(K).copy() for K in (K_c, K_p)]  # OpenCV overwrites both
+    _, K_c, D_c, K_p, D_p, R, T, _, _, rvecs, tvecs, _ = cv2.stereoCalibrateExtended(
+        objects,
+        cameras,
+        projectors,
+        K_c,
+        D_c,
+        K_p,
+        D_p,
+        sizes[0],
+        np.eye(3),
+        np.zeros((3, 1)),
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+        criteria=CRITERIA,
+    )
+    for device, f, K in zip(DEVICES, alone, (K_c, K_p), strict=True):
+        if not min(K[0, 0], K[1, 1]) > 0:
+            raise CalibrationRejected(
+                f"the poses give the {device} focal lengths of {K[0, 0]:.0f}, {K[1, 1]:.0f} px,"
+                " as no lens has: check the target's notation, the projector's size, the"
+                " fringe period, and that x and y are not exchanged"
+            )
+        # systematic errors, which the standard deviations lack, change the two fits differently
+        change = np.abs(f / np.diag(K) - 1).max()
+        sigma[device] = max(sigma[device], float(change * min(K[0, 0], K[1, 1])))
+    camera, projector = Lens(K_c, D_c, sizes[0]), Lens(K_p, D_p, sizes[1])
+    rig = StereoRig(camera, projector, R, T)
+    poses = {o.name: transform_from_rvec(r, t) for o, r, t in zip(used, rvecs, tvecs, strict=True)}
+    residuals, depths = {}, []
+    for o in used:
+        X = move_points(poses[o.name], o.points)
+        measured = np.hstack([o.camera, o.projector])
+        errors = measured - np.hstack([camera.project(X), rig.project(X)])
+        residuals[o.name] = np.where(inliers[o.name][:, None], errors, np.nan)
+        depths.append(X[:, 2])
+    z = np.concatenate(depths)
+    rms = dict(zip(DEVICES, _device_rms(np.concatenate([*residuals.values()])), strict=True))
+    rms["stereo"] = float(np.sqrt((rms["camera"] ** 2 + rms["projector"] ** 2) / 2))
+    return StereoModel(
+        rig=rig,
+        board="",
+        axes=("x", "y"),
+        reprojection_rms_px=rms,
+        poses=poses,
+        pose_rms_px={name: _device_rms(each) for name, each in residuals.items()},
+        excluded={},
+        depth_range_mm=(float(z.min()), float(z.max())),
+        focal_sigma_px=sigma,
+        features_excluded=int(sum((~inliers[name]).sum() for name in residuals)),
+        residuals_px=residuals,
+    )
 
 
 def _device_rms(residuals: Floats) -> tuple[float, float]:
@@ -340,19 +312,17 @@ def _check_agreement(model: StereoModel) -> None:
         )
 
 
-def _detect_outliers(
-    solution: _Solution, used: Sequence[Observation], inliers: Mapping[str, Mask]
-) -> dict[str, Mask]:
+def _detect_outliers(model: StereoModel) -> dict[str, Mask]:
     """Return the outliers (n,) bool among the inliers so far, of each pose that has some.
 
     An outlier's residual exceeds ROBUST_SIGMAS times the robust sigma of all features, in either
     device.
     """
     # in the camera and projector
-    errors = {o.name: lengths(solution.residuals(o).reshape(-1, 2, 2)) for o in used}
-    typical = np.median(np.concatenate([errors[o.name][inliers[o.name]] for o in used]), axis=0)
+    errors = {name: lengths(r.reshape(-1, 2, 2)) for name, r in model.residuals_px.items()}
+    typical = np.nanmedian(np.concatenate([*errors.values()]), axis=0)
     limit = np.maximum(ROBUST_SIGMAS * typical / 1.1774, 0.05)  # Rayleigh
-    outliers = {o.name: inliers[o.name] & (errors[o.name] > limit).any(1) for o in used}
+    outliers = {name: (each > limit).any(1) for name, each in errors.items()}
     return {name: is_outlier for name, is_outlier in outliers.items() if is_outlier.any()}
 
 

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slviewer.calibration.splined.bundle import Bundle
-from slviewer.calibration.splined.uncertainty import extrapolation_factor
-from slviewer.calibration.splined.volume import BestMotion, Volume, view_pixels, working_volume
+from slviewer.calibration.splined.uncertainty import (
+    BestMotion,
+    Volume,
+    extrapolation_factor,
+    view_pixels,
+    working_volume,
+)
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.vectors import finite_rows, occupied_cubes

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from slviewer.calibration.centres import move_to_centres
-from slviewer.calibration.drift.check import DriftReference, build_reference, check_drift
-from slviewer.calibration.drift.view import DriftView
+from slviewer.calibration.drift import DriftReference, DriftView, build_reference, check_drift
 from slviewer.calibration.observe import Observation, observe
 from slviewer.calibration.pixelwise import best_axis, calibrate_pixelwise
 from slviewer.calibration.splined.model import calibrate_splined

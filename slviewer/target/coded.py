@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import lengths
-from slviewer.target.drawing import Drawing
+from slviewer.target.sheet import Drawing
 
 DICTIONARIES = ("DICT_APRILTAG_36h11", "DICT_5X5_250", "DICT_6X6_250")
 """Those that are searched for, in this order, until one is seen; the sheets have the first."""

@@ -59,30 +59,29 @@ def detect_charuco(board: Board, image: BoardImage) -> tuple[Floats, np.ndarray]
     few corners."""
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     first = min(1.0, SEARCH_PX / max(image.grey.shape))
-    best: tuple[Floats, np.ndarray] | None = None
+    pixels, ids = np.empty((0, 2)), np.empty(0, int)
     markers = 0
     for factor in dict.fromkeys((first / 2, first, 1.0)):
         small = resize_image(image.grey, factor)
-        corners, ids, _, marker_ids = detector.detectBoard(small)
+        corners, numbers, _, marker_ids = detector.detectBoard(small)
         markers = max(markers, 0 if marker_ids is None else len(marker_ids))
-        if ids is not None and len(ids) and (best is None or len(ids) > len(best[1])):
-            best = to_full_image(np.reshape(corners, (-1, 2)), factor), np.ravel(ids).astype(int)
-        if best is not None and len(best[1]) >= SUFFICIENT_SHARE * len(board.points):
+        if numbers is not None and len(numbers) > len(ids):
+            pixels = to_full_image(np.reshape(corners, (-1, 2)), factor)
+            ids = np.ravel(numbers).astype(int)
+        if len(ids) >= SUFFICIENT_SHARE * len(board.points):
             break
-    if best is not None and len(best[1]) >= MIN_CORNERS:
-        pixels, ids = best
+    if len(ids) >= MIN_CORNERS:
         points = board.points[ids][:, :2]
         pixels, good = refine_corners(image.deep, pixels, points, board.pitch_mm, board.marker_mm)
-        best = pixels[good], ids[good]
-    detected = 0 if best is None else len(best[1])
-    if best is None or detected < MIN_CORNERS:
+        pixels, ids = pixels[good], ids[good]
+    if len(ids) < MIN_CORNERS:
         total_markers = board.columns * board.rows // 2
         raise DetectionError(
-            f"{detected} of {len(board.points)} corners and {markers} of {total_markers} markers of"
+            f"{len(ids)} of {len(board.points)} corners and {markers} of {total_markers} markers of"
             f" {board} detected, and a pose needs {MIN_CORNERS}: {light_advice(image.grey)}"
         )
-    check_grid(board, *best, "corners")
-    return best
+    check_grid(board, pixels, ids, "corners")
+    return pixels, ids
 
 
 def detect_chessboard(board: Board, image: BoardImage) -> Floats:
@@ -195,12 +194,11 @@ def _is_first_square_dark(image: np.ndarray, grid: Floats) -> bool:
     Raises DetectionError where dark and bright squares do not alternate.
     """
     colours = corner_polarity(image, grid, np.gradient(grid, axis=1), np.gradient(grid, axis=0))
-    rows, columns = colours.shape
     colours = colours * np.where(np.indices(colours.shape).sum(0) % 2, -1, 1)
     good = max(np.count_nonzero(colours > 0), np.count_nonzero(colours < 0))
-    if good < rows * columns:
+    if good < colours.size:
         raise DetectionError(
-            f"at {rows * columns - good} of {rows * columns} corners no dark and bright squares"
+            f"at {colours.size - good} of {colours.size} corners no dark and bright squares"
             " alternate: move the board so that all of it is in view, uncovered and without"
             " reflections"
         )
@@ -230,15 +228,17 @@ def _list_numberings(order: np.ndarray, first_is_dark: bool) -> list[np.ndarray]
     """Return the flattened rotations of the corners' ``order`` (rows, columns) that the squares'
     colours allow."""
     rows, columns = order.shape
-    dark: list[np.ndarray] = []
-    bright: list[np.ndarray] = []
-    for turns in range(0, 4, 1 if rows == columns else 2):
-        # the square outside the first corner, after the rotation, was the one outside another
-        # corner of the grid
-        i, j = ((0, 0), (0, columns), (rows, columns), (rows, 0))[turns]
-        group = dark if first_is_dark == ((i + j) % 2 == 0) else bright
-        group.append(np.rot90(order, turns).ravel())
-    return dark or bright
+    turns = range(0, 4, 1 if rows == columns else 2)
+    numberings = [np.rot90(order, turn).ravel() for turn in turns]
+    # the square outside the first corner, after the rotation, was the one outside another corner
+    # of the grid
+    squares = [(0, columns, rows + columns, rows)[turn] for turn in turns]
+    dark = [
+        numbering
+        for numbering, square in zip(numberings, squares, strict=True)
+        if first_is_dark == (square % 2 == 0)
+    ]
+    return dark or numberings
 
 
 def corner_polarity(image: np.ndarray, corners: Floats, across: Floats, down: Floats) -> np.ndarray:

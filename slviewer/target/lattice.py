@@ -76,9 +76,7 @@ def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
     free = np.ones(len(blobs.centres), bool)
     seeds = (seed for seed in _list_seeds(tree, blobs) if free[seed[0]])
     for seed in islice(seeds, SEEDS):
-        lattice = _grow(tree, blobs, free, *seed)
-        free[lattice.blobs] = False
-        yield lattice
+        yield _grow(tree, blobs, free, *seed)
 
 
 def complete_lattice(lattice: Lattice, blobs: Blobs) -> Lattice:
@@ -173,10 +171,8 @@ def _list_seeds(tree: cKDTree, blobs: Blobs) -> list[tuple[int, Floats, Floats]]
         if len(across):
             k = across[0]
             score = regular[blob, a[0], b[0]] + regular[blob, a[k], b[k]]
-            seeds.append((score, int(blob), axes[0], axes[k] * np.sign(cross[k])))
-    return [
-        (blob, first, second) for _, blob, first, second in sorted(seeds, key=lambda seed: seed[0])
-    ]
+            seeds.append((score, (int(blob), axes[0], axes[k] * np.sign(cross[k]))))
+    return [seed for _, seed in sorted(seeds, key=lambda scored: scored[0])]
 
 
 def _grow(
@@ -186,12 +182,12 @@ def _grow(
     two directions.
 
     Each node's four neighbours are searched among the ``free`` (n,) bool blobs where the known
-    nodes predict them.
+    nodes predict them; those of the lattice are not free any more.
     """
     centres, areas = blobs.centres, blobs.areas
     at = {(0, 0): seed}
     steps = {(0, 0): (first, second)}
-    used = {seed}
+    free[seed] = False
     queue = [(0, 0)]
     for node in queue:
         i, j = node
@@ -213,18 +209,13 @@ def _grow(
                         step = centres[diagonal] - centres[lateral]
             reach = PREDICTION_RADIUS * float(np.hypot(*step))
             near = tree.query(here + step, k=3, distance_upper_bound=reach)[1]
-            ratios = {
-                k: areas[k] / areas[at[node]]
-                for k in near[near < len(areas)].tolist()
-                if free[k] and k not in used
-            }
-            neighbour = next(
-                (k for k, ratio in ratios.items() if 1 / AREA_RATIO < ratio < AREA_RATIO), None
-            )
-            if neighbour is None:
+            near = near[near < len(areas)]
+            ratios = areas[near] / areas[at[node]]
+            near = near[free[near] & (ratios > 1 / AREA_RATIO) & (ratios < AREA_RATIO)]
+            if not len(near):
                 continue
-            at[ahead] = neighbour
-            used.add(neighbour)
+            neighbour = at[ahead] = int(near[0])
+            free[neighbour] = False
             measured = sign * (centres[neighbour] - here)
             steps[ahead] = (measured, steps[node][1]) if axis == 0 else (steps[node][0], measured)
             queue.append(ahead)

@@ -107,7 +107,7 @@ def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: Floats) -> 
     circle = _measure_profile(image, H, points[0], 2 * mark.radius)
     if dot is None or circle is None or abs(circle.contrast) < 0.05:
         return 0.0, False
-    same_paper = abs(dot.paper - circle.paper) < MAX_PAPER_CHANGE * abs(circle.paper - circle.ink)
+    same_paper = abs(dot.paper - circle.paper) < MAX_PAPER_CHANGE * abs(circle.difference)
     is_mark = (
         dot.off < MAX_OFFSET and SIZES[0] < dot.size < SIZES[1] and same_paper and dot.is_alone
     )
@@ -118,14 +118,15 @@ def _detect_dot(board: Board, mark: Mark, image: np.ndarray, pixels: Floats) -> 
 class _Profile:
     """Radial profile of a dot.
 
-    ``ink`` and ``paper``: grey levels of its middle and of the paper around it; ``contrast``: their
-    difference over the larger, negative for bright dots. ``off``: distance of its centroid from the
-    predicted position, and ``size``: its radius at half contrast, both over its nominal radius.
+    ``paper``: grey level of the paper around it, and ``difference``: that less the level of its
+    middle; ``contrast``: the difference over the larger, negative for bright dots. ``off``:
+    distance of its centroid from the predicted position, and ``size``: its radius at half contrast,
+    both over its nominal radius.
     ``is_alone``: whether there is paper on all sides.
     """
 
-    ink: float
     paper: float
+    difference: float
     contrast: float
     off: float
     size: float
@@ -136,7 +137,7 @@ def _measure_profile(
     image: np.ndarray, H: Floats, centre: Floats, radius: float
 ) -> _Profile | None:
     """Measure the profile around a point ``centre`` (2,) mm of the board, out to 2.2 radii; None
-    where cut off.
+    where cut off, and without contrast.
 
     The paper's level is the quantile of the outer rings that differs least from the dot, so that an
     edge is not a dot.
@@ -156,7 +157,7 @@ def _measure_profile(
     paper = float(np.quantile(flat, 0.2 if own < np.median(flat) else 0.8))
     difference = paper - own
     if abs(difference) < 1e-3:
-        return _Profile(own, paper, 0.0, np.inf, np.inf, False)
+        return None
     share = np.nan_to_num((paper - levels) / difference, nan=0.0)
     middle = float(np.median(ring))
     is_alone = bool(np.abs(ring - middle).max() < 0.5 * abs(difference))
@@ -167,4 +168,4 @@ def _measure_profile(
     below = np.nonzero(means < 0.5)[0]
     size = float(_RADII[below[0]]) if len(below) else np.inf
     contrast = difference / max(paper, own, 1.0)
-    return _Profile(own, paper, contrast, float(lengths(centroid)), size, is_alone)
+    return _Profile(paper, difference, contrast, float(lengths(centroid)), size, is_alone)

@@ -139,16 +139,15 @@ def check_grid(board: Board, pixels: Floats, ids: np.ndarray, what: str) -> None
     """
     advice = "keep the board flat and in focus, without reflections, and take the pose again"
     points = board.points[ids][:, :2] / board.pitch_mm
-    H = fit_homography(points, pixels)
-    areas = np.linalg.det(jacobians(H, points))
+    fitted = fit_grid_map(points, pixels)
+    areas = np.linalg.det(jacobians(fitted.H, points))
     if areas.max() <= 0:
         raise DetectionError(
             f"the {what} appear mirrored: point the camera at the board, not at a mirror"
         )
     pitch = np.sqrt(np.maximum(areas, 1e-9))
-    if (lengths(pixels - to_image(H, points)) > MAX_BEND * pitch).any():
+    if (lengths(pixels - to_image(fitted.H, points)) > MAX_BEND * pitch).any():
         raise DetectionError(f"the {what} detected do not lie on a flat grid: {advice}")
-    fitted = fit_grid_map(points, pixels)
     off = lengths(fitted.residuals)
     limit = MAX_GRID_OFFSET_SIGMAS * fitted.sigma_px
     wrong = off > np.clip(

@@ -19,16 +19,16 @@ import numpy as np
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.pixelwise import calibrate_pixelwise
 from slviewer.calibration.splined.model import SplinedModel
-from slviewer.calibration.splined.uncertainty import volume_sigmas
-from slviewer.calibration.splined.unknowns import Arrangement
-from slviewer.calibration.splined.volume import (
+from slviewer.calibration.splined.uncertainty import (
     Volume,
     remove_rigid_motion,
     select_depth_axis,
     sigma_3d,
     view_pixels,
+    volume_sigmas,
     working_volume,
 )
+from slviewer.calibration.splined.unknowns import Arrangement
 from slviewer.errors import InputError
 from slviewer.evaluation.fit import Comparison, ShapeResult, ShapeSearch, fit_clouds
 from slviewer.evaluation.letter import DEPTH_RANGE_MM, SPHERE_RADIUS_MM

@@ -14,7 +14,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from slviewer.calibration.guidance import pose_selection
+from slviewer.calibration import guidance
 from slviewer.calibration.observe import Observation, Smoothing
 from slviewer.errors import DamagedError, InputError, SessionError, SlviewerError
 from slviewer.pipeline.capture import Space, measure_space, warn_of_captured
@@ -68,7 +68,7 @@ class Timing:
 
     retry_s: float = acquisition.RETRY_S
     previews_per_s: float = acquisition.PREVIEWS_PER_S
-    trials: int = pose_selection.TRIALS
+    trials: int = guidance.TRIALS
     hold_s: float = preview_watcher.HOLD_S
     count_s: float = preview_watcher.COUNT_S
 

@@ -10,9 +10,14 @@ from functools import cached_property
 
 import numpy as np
 
-from slviewer.calibration.guidance.coarse_rig import MIN_POSES as MIN_POSES_FOR_RIG
-from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
-from slviewer.calibration.guidance.pose_selection import TRIALS, suggest_poses
+from slviewer.calibration.guidance import MIN_POSES as MIN_POSES_FOR_RIG
+from slviewer.calibration.guidance import (
+    TRIALS,
+    ExpectedNoise,
+    GuidanceModel,
+    estimate_rig,
+    suggest_poses,
+)
 from slviewer.calibration.next_pose import (
     Coverage,
     Suggestion,

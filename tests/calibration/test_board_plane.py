@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slviewer.calibration.board_plane import BoardPlane
-from slviewer.calibration.edges import bright_pixels
+from slviewer.calibration.observe import BoardPlane, bright_pixels
 from slviewer.fringe.phase import PhaseMap
 
 SIZE = (400, 300)

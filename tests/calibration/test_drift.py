@@ -9,8 +9,13 @@ import pytest
 from facts import missing_facts, raises
 from simulated_views import BOARD, moved, poses, seen
 
-from slviewer.calibration.drift.check import MIN_POSES, DriftReference, build_reference, check_drift
-from slviewer.calibration.drift.view import DriftView
+from slviewer.calibration.drift import (
+    MIN_POSES,
+    DriftReference,
+    DriftView,
+    build_reference,
+    check_drift,
+)
 from slviewer.calibration.stereo import calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.records.drift import Drift

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slviewer.calibration.edges import (
+from slviewer.calibration.observe import (
     CLEARANCE_SIGMAS,
     MIN_CLEARANCE_PX,
     bright_pixels,

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 from splined_rig import BOARD, poses, rig
 
-from slviewer.calibration.guidance.coarse_rig import ExpectedNoise, GuidanceModel, estimate_rig
-from slviewer.calibration.guidance.pose_selection import (
+from slviewer.calibration.guidance import (
+    ExpectedNoise,
+    GuidanceModel,
     RigInformation,
-    VolumeSensitivity,
+    estimate_rig,
     information_rows,
     suggest_poses,
+    volume_jacobian,
 )
 from slviewer.calibration.next_pose import depth_range
 from slviewer.geometry.rig import StereoRig
@@ -65,7 +67,7 @@ def test_few_poses_tell_where_things_will_be_seen(true, seen, known) -> None:
 @pytest.mark.computes
 @pytest.mark.slow
 def test_the_gain_of_a_pose_is_what_it_will_bring(bench, known) -> None:
-    sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
+    sensitivity = volume_jacobian(bench, depth_range(BOARD, bench.stereo.camera))
     rows = information_rows(bench, np.array(known[1]))
     before, after = (RigInformation.from_rows(bench, rows[:n], sensitivity) for n in (5, 6))
     gain = before.gain(rows[5])
@@ -92,7 +94,7 @@ def test_guided_poses_are_seen_and_know_more_than_others(true, bench, known) -> 
             (true.project(X), true.projector),
         ):
             assert ((pixels > -1) & (pixels < np.array(device.size))).all()
-    sensitivity = VolumeSensitivity.from_model(bench, depth_range(BOARD, bench.stereo.camera))
+    sensitivity = volume_jacobian(bench, depth_range(BOARD, bench.stereo.camera))
     reached, by_design = (
         RigInformation.from_rows(
             bench, information_rows(bench, np.array(poses)), sensitivity

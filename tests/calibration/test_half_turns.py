@@ -70,8 +70,8 @@ def test_turned_poses_are_found_and_change_nothing(seen, mixed, true) -> None:
         assert (
             np.sqrt(np.mean(aligned_error(*(cloud[known][::11] for cloud in clouds)) ** 2)) < 0.002
         )
-    again = type(found.bundle).from_arrays(found.bundle.to_dict(), found.bundle.to_arrays())
-    assert again.half_turned_poses == found.bundle.half_turned_poses
+    again = SplinedModel.from_arrays(found.to_dict(), found.to_arrays())
+    assert again.bundle.half_turned_poses == found.bundle.half_turned_poses
 
 
 @pytest.mark.slow

@@ -1,10 +1,8 @@
 """Blocks of bright pixels: where they are, what they say, and how sure."""
 
 import numpy as np
-import pytest
 
-from slviewer.calibration.observe import Samples, block_samples
-from slviewer.errors import InputError
+from slviewer.calibration.observe import block_samples
 from slviewer.fringe.phase import PhaseMap
 
 SHAPE = (240, 320)
@@ -36,8 +34,3 @@ def test_blocks_average_position_and_coordinate_alike_and_know_their_noise() -> 
     assert np.median(samples.sigma[:, 0]) < 0.3 * np.median(x.sigma_phase) * 18 / (2 * np.pi)
     quarters = np.histogram2d(*samples.camera.T, bins=4, range=[[0, 320], [0, 240]])[0]
     assert quarters.min() > 0.8 * quarters.mean()
-
-
-def test_arrays_that_do_not_belong_together_are_refused() -> None:
-    with pytest.raises(InputError):
-        Samples(np.zeros((3, 2)), np.zeros((4, 2)), np.zeros((3, 2)))

@@ -20,8 +20,8 @@ from splined_rig import (
 
 from slviewer.calibration.observe import Observation
 from slviewer.calibration.splined.adjust import adjust_bundle
-from slviewer.calibration.splined.board_shape import board_frame, board_heights
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
+from slviewer.calibration.splined.unknowns import board_frame, board_heights
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.simulation.boards import BoardShape, printed_board

@@ -6,22 +6,20 @@ import pytest
 from facts import missing_facts
 from splined_rig import BOARD, CELLS, observation, phase_map, poses, rig
 
-from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.model import SplinedModel, calibrate_splined
 from slviewer.calibration.splined.uncertainty import (
+    BestMotion,
     compute_sigma_map,
     extrapolation_factor,
     persistence_ratio,
-    summarise_volume_sigma,
-)
-from slviewer.calibration.splined.volume import (
-    BestMotion,
     remove_rigid_motion,
     select_depth_axis,
     select_visible,
     sigma_3d,
+    summarise_volume_sigma,
     working_volume,
 )
+from slviewer.calibration.splined.unknowns import Device
 from slviewer.calibration.stereo import StereoModel, calibrate_stereo
 from slviewer.errors import InputError
 from slviewer.inspection.features import distance

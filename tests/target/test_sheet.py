@@ -13,9 +13,8 @@ from facts import missing_facts, raises
 from slviewer.errors import InputError
 from slviewer.target.board import Board
 from slviewer.target.detect import detect
-from slviewer.target.drawing import Drawing
 from slviewer.target.mark import mark_geometry
-from slviewer.target.sheet import draw_board, write_sheet
+from slviewer.target.sheet import Drawing, draw_board, write_sheet
 
 NOTATIONS = ["circles:5x4:9", "acircles:4x5:20", "chessboard:6x5:12.345", "charuco:6x5:20"]
 SVG = "{http://www.w3.org/2000/svg}"

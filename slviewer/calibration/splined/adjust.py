@@ -8,7 +8,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from slviewer.calibration.observe import Observation
-from slviewer.calibration.splined.board_shape import board_frame
 from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.half_turns import (
     detect_half_turns,
@@ -18,11 +17,11 @@ from slviewer.calibration.splined.half_turns import (
 from slviewer.calibration.splined.normal import (
     BlockFactor,
     ObservedValues,
+    Prior,
     factorize,
     normal_equations,
     predict_observations,
 )
-from slviewer.calibration.splined.prior import Prior
 from slviewer.calibration.splined.residual_noise import (
     Noise,
     estimate_noise,
@@ -31,7 +30,7 @@ from slviewer.calibration.splined.residual_noise import (
     robust_weights,
 )
 from slviewer.calibration.splined.residuals import PoseData
-from slviewer.calibration.splined.unknowns import State
+from slviewer.calibration.splined.unknowns import State, board_frame
 from slviewer.calibration.stereo import StereoModel
 from slviewer.errors import CalibrationRejected, InputError
 from slviewer.geometry.rigid import Floats
@@ -102,13 +101,14 @@ def adjust_bundle(
     used.
 
     ``cells_across``: cells of each displacement field across its image; by default
-    ``fields.CELLS_ACROSS``. Raises InputError as ``gather_data`` does, and CalibrationRejected
+    ``unknowns.CELLS_ACROSS``. Raises InputError as ``gather_data`` does, and CalibrationRejected
     where the adjustment does not converge, is undetermined, or where too few poses agree with each
     other.
     """
     names, data, sample_sigma = gather_data(observations, stereo)
-    state = State.from_stereo(stereo, names, len(data.points), cells_across)
-    layout, prior = state.layout, Prior.build(state, data)
+    T = np.array([stereo.poses[name] for name in names])
+    state = State.from_rig(stereo.rig, T, len(data.points), cells_across)
+    layout, prior = state.layout, Prior.build(state, data.points)
     is_excluded = np.zeros(len(names), bool)
     marked = {o.name for o in observations if o.marked}
     certain = np.array(
@@ -167,8 +167,7 @@ def adjust_bundle(
                 f" {fits[name].projector_trust:.2f} in the projector): was the board moved during"
                 " the capture?"
             )
-            for name, out in zip(names, is_excluded, strict=True)
-            if out
+            for name in np.array(names)[is_excluded].tolist()
         }
         pose, _ = data.poses
         z = np.einsum("ni,ni->n", state.R_board[pose, 2], data.points[data.feature])
@@ -188,9 +187,7 @@ def adjust_bundle(
             projector_poses=projector_poses,
             packed_factor=rig_factor[np.tri(len(rig_factor), dtype=bool)].astype(np.float32),
             steps=step,
-            half_turned_poses=tuple(
-                name for name, flag in zip(names, half_turned, strict=True) if flag
-            ),
+            half_turned_poses=tuple(np.array(names)[half_turned].tolist()),
         )
 
 

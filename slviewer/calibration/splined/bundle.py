@@ -5,14 +5,11 @@ cloud's."""
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
-from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
-from slviewer.calibration.splined.fields import Device
 from slviewer.calibration.splined.normal import (
     dense_columns,
     fill_sample_fields,
@@ -28,15 +25,10 @@ from slviewer.calibration.splined.residuals import (
     allocate_workspace,
     sample_row,
 )
-from slviewer.calibration.splined.unknowns import LENS, Arrangement, State
-from slviewer.errors import InputError
+from slviewer.calibration.splined.unknowns import HEIGHT_TERMS, LENS, State
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats, Floats32, Mask
-from slviewer.records.plain import from_plain, to_plain
-
-_STATE_ARRAYS = ("R_board", "t_board", "heights", "offsets")
-_OWN_ARRAYS = ("points", "camera_poses", "projector_poses")
 
 
 @dataclass(frozen=True)
@@ -112,67 +104,14 @@ class Bundle:
         right = np.asarray(dense, self.factor.dtype).T
         return solve_triangular(self.factor, right, lower=True, check_finite=False)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields that are not arrays, as JSON types."""
-        keys = ("poses", "noise", "strengths", "fits", "depth_range_mm", "steps")
-        data: dict[str, Any] = to_plain(
-            {key: getattr(self, key) for key in keys}
-            | {"turned": self.half_turned_poses, "left_out": self.excluded}
-        )
-        return data
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return named arrays for saving; the factor packed, in float32."""
-        rig = self.state.rig
-        arrays = {
-            f"{name}_{key}": value
-            for name, device in zip(("camera", "projector"), rig[:2], strict=True)
-            for key, value in device._asdict().items()
-        }
-        arrays |= {name: getattr(self.state, name) for name in _STATE_ARRAYS}
-        arrays |= {name: getattr(self, name) for name in _OWN_ARRAYS}
-        return arrays | {"R": rig.R, "t": rig.t, "factor": self.packed_factor}
-
-    @classmethod
-    def from_arrays(cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Bundle":
-        """Return the bundle that ``to_dict`` and ``to_arrays`` saved."""
-        a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-        camera, projector = (
-            Device(*(a[f"{name}_{key}"] for key in Device._fields))
-            for name in ("camera", "projector")
-        )
-        rig = Arrangement(camera, projector, a["R"], a["t"])
-        state = State(rig, *(a[name] for name in _STATE_ARRAYS))
-        return cls(
-            state=state,
-            poses=tuple(data["poses"]),
-            **{name: a[name] for name in _OWN_ARRAYS},
-            noise=from_plain(data["noise"], Noise),
-            strengths=tuple(data["strengths"]),
-            fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
-            excluded=data["left_out"],
-            depth_range_mm=tuple(data["depth_range_mm"]),
-            packed_factor=a["factor"],
-            steps=data["steps"],
-            half_turned_poses=tuple(data.get("turned", ())),
-        )
-
 
 def compute_point_jacobian(state: State, axis: Axis, pixels: Floats, z: Floats) -> sp.csr_matrix:
     """Compute the Jacobian (3 n, unknowns) described in ``Bundle.point_jacobian``."""
     pixels, z = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(z, np.float64)
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or z.shape != pixels.shape[:1]:
-        raise InputError(
-            f"pixels {pixels.shape} and depths {z.shape} were given: (n, 2) and (n,) are needed"
-        )
-    if axis not in ("x", "y"):
-        raise InputError(
-            f"the axis {axis!r} was given: it must be 'x' (projector columns) or 'y' (rows)"
-        )
     at, entries = state.layout, ROW - CAMERA
     values, columns = np.zeros((len(z), 3, entries)), np.zeros((len(z), entries), np.int64)
     plane = State(state.rig, np.eye(3)[None], np.zeros((1, 3)), np.zeros(HEIGHT_TERMS), z[:0, None])
-    _fill_rows(plane, 0 if axis == "x" else 1, pixels, z, at.starts - at.rig, values, columns)
+    _fill_rows(plane, "xy".index(axis), pixels, z, at.starts - at.rig, values, columns)
     indices = np.repeat(columns, 3, axis=0).ravel()
     pointers = np.arange(0, 3 * len(z) + 1) * entries
     return sp.csr_matrix((values.ravel(), indices, pointers), (3 * len(z), at.size - at.rig))
@@ -185,16 +124,16 @@ def _fill_rows(plane, axis, pixels, depths, at, values, columns):
     Each point is seen on a ``plane`` that faces the camera. Its depth changes so that the
     projector's coordinate stays what was measured.
     """
-    work, frame, cells = allocate_workspace(), np.array([0.0, 0.0, 1.0, 1.0]), np.zeros(4, np.int64)
+    work, frame = allocate_workspace(), np.array([0.0, 0.0, 1.0, 1.0])
     all_columns = dense_columns(at)
     for n in range(depths.shape[0]):
         z = plane.t_board[0, 2] = depths[n]
-        u, _, cells[0], cells[1], cells[2], cells[3] = sample_row(plane, 0, frame, pixels[n], work)
+        u, _ = sample_row(plane, 0, frame, pixels[n], work)
         if not np.isfinite(u):
             values[n] = np.nan
             continue
         fill_sample_fields(work)
-        set_sample_columns(all_columns, plane.rig, cells, at)
+        set_sample_columns(all_columns, plane.rig, work.cells, at)
         columns[n] = all_columns[CAMERA:]
         x, y = work.local[0] / z, work.local[1] / z
         row = work.row[axis]

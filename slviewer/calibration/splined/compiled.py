@@ -7,19 +7,22 @@ errors of some hundredths of a millimetre. They vary slowly, and a grid over (u,
 them.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from os import cpu_count
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
 from slviewer.calibration.splined.correction_grid import evaluate
-from slviewer.calibration.splined.fields import project_point, undistort, undistort_pixel
-from slviewer.calibration.splined.unknowns import Arrangement
+from slviewer.calibration.splined.unknowns import (
+    Arrangement,
+    in_illuminated_cells,
+    in_image,
+    project_point,
+    undistort,
+    undistort_pixel,
+)
 from slviewer.fringe.sequence import Axis
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.polynomial import grid_points
 from slviewer.geometry.rigid import Floats, Floats32, Mask
 
@@ -32,6 +35,7 @@ monotonic in depth."""
 MIN_SLOPE = 0.005
 """Smallest change of the coordinate with depth, px per mm; below it, the depth noise would be many
 mm."""
+_UNSEEN = (np.nan,) * 5
 MARGIN = 0.25
 """Distance beyond the projector's image, over its size, up to which rays are evaluated."""
 
@@ -106,28 +110,22 @@ def compile_axis(
     width, height = (int(n) for n in rig.camera.size)
     centre = (float(rig.projector.size[row]) - 1) / 2
     coefficients = np.empty((3, height, width), np.float32)
-    _split_rows(
-        height, lambda rows: _fit_rational(rig, row, centre, near, far, rays, rows, coefficients)
-    )
+    ray = rig, row, centre, near, far
+    run_rows(_fit_rational, height, *ray, rays, coefficients)
     step = max(2, -(-width // GRID_CELLS_ACROSS))
     shape = (height - 1) // step + 2, (width - 1) // step + 2, DEPTHS
-    grid, known = np.full(shape, np.nan, np.float32), np.zeros(shape, np.bool_)
-    _split_rows(
-        shape[0],
-        lambda rows: _tabulate(rig, row, centre, near, far, step, *illuminated, rows, grid, known),
-    )
+    grid, projected = np.full(shape, np.nan, np.float32), np.full((*shape, 2), np.nan)
+    run_rows(_tabulate, shape[0], *ray, step, grid, projected)
+    nodes = step * grid_points(np.arange(shape[1]), np.arange(shape[0]))
+    at_camera = in_illuminated_cells(rig.camera, nodes, illuminated[0]).reshape(*shape[:2], 1)
+    lit = projected.reshape(-1, 2)
+    lit = in_image(rig.projector, lit) & in_illuminated_cells(rig.projector, lit, illuminated[1])
+    known = np.isfinite(grid) & at_camera & lit.reshape(shape)
     # a pixel needs its eight nodes: dilating the known nodes by one gives each pixel about its own
     # support
     unknown = binary_erosion(~known, np.ones((3, 3, 3), bool), border_value=1)
     supported_grid = np.where(unknown, np.float32(np.nan), grid)
     return CompiledAxis(coefficients, centre, grid, supported_grid, step, near, far)
-
-
-def _split_rows(rows: int, work: Callable[[np.ndarray], None]) -> None:
-    """Run ``work`` on interleaved image rows in parallel threads."""
-    lanes = max(1, min(cpu_count() or 1, rows))
-    with ThreadPoolExecutor(lanes) as threads:
-        list(threads.map(lambda lane: work(np.arange(lane, rows, lanes)), range(lanes)))
 
 
 @kernel()
@@ -183,13 +181,12 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     """Return (c0, c1, c2, first depth, last depth) of the ray (x, y, 1); NaN without a rational
     function."""
     first, last = near, far
-    none = np.nan, np.nan, np.nan, np.nan, np.nan
     if np.isnan(_project_depth(rig, x, y, near, basis)[0]) or np.isnan(
         _project_depth(rig, x, y, far, basis)[0]
     ):
         first, last = _depth_interval(rig, x, y, near, far, basis)
         if not last - first > 1e-3 * (far - near):
-            return none
+            return _UNSEEN
     # nodes of Chebyshev's polynomial in 1/z, in which the coordinate is nearly linear
     middle, half = 0.5 * (1.0 / last + 1.0 / first), 0.433 * (1.0 / first - 1.0 / last)
     z0, z1, z2 = 1.0 / (middle - half), 1.0 / middle, 1.0 / (middle + half)
@@ -201,18 +198,18 @@ def _interpolate_rational(rig, row, centre, x, y, near, far, basis):
     m10, m11, r1 = s2 - s0, s0 * z0 - s2 * z2, z2 - z0
     determinant = m00 * m11 - m01 * m10
     if not (abs(determinant) > 0.0 and abs(s2 - s0) > MIN_SLOPE * abs(z2 - z0)):
-        return none
+        return _UNSEEN
     c1 = (r0 * m11 - m01 * r1) / determinant
     c2 = (m00 * r1 - r0 * m10) / determinant
     return z0 - c1 * s0 + c2 * s0 * z0, c1, c2, first, last
 
 
 @kernel()
-def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
-    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in some ``rows``;
-    NaN without one."""
+def _fit_rational(start, stop, rig, row, centre, near, far, rays, coefficients):
+    """Fill the ``coefficients`` (3, h, w) of the rational functions of the pixels in rows ``start``
+    to ``stop``; NaN without one."""
     basis = np.zeros((4, 4))
-    for v in rows:
+    for v in range(start, stop):
         for u in range(rays.shape[2]):
             c0, c1, c2, _, _ = _interpolate_rational(
                 rig, row, centre, rays[0, v, u], rays[1, v, u], near, far, basis
@@ -221,24 +218,11 @@ def _fit_rational(rig, row, centre, near, far, rays, rows, coefficients):
 
 
 @kernel()
-def _is_in_illuminated_cell(illuminated, u, v, size):
-    """Return whether the cell of pixel (u, v) was illuminated; False outside the image."""
-    if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
-        return False
-    column = min(int((u + 0.5) / size[0] * illuminated.shape[1]), illuminated.shape[1] - 1)
-    return illuminated[
-        min(int((v + 0.5) / size[1] * illuminated.shape[0]), illuminated.shape[0] - 1), column
-    ]
-
-
-@kernel()
-def _tabulate(
-    rig, row, centre, near, far, step, camera_illuminated, projector_illuminated, rows, grid, known
-):
-    """Fill ``grid`` with exact depth minus rational function at its nodes; ``known``: whether poses
-    support them."""
+def _tabulate(start, stop, rig, row, centre, near, far, step, grid, projected):
+    """Fill rows ``start`` to ``stop`` of ``grid`` with exact depth minus rational function at its
+    nodes, and ``projected`` (nv, nu, nz, 2) with their projector pixels."""
     basis = np.zeros((4, 4))
-    for j in rows:
+    for j in range(start, stop):
         for i in range(grid.shape[1]):
             u, v = float(i * step), float(j * step)
             x, y = undistort_pixel(rig.camera, u, v, basis)
@@ -247,11 +231,6 @@ def _tabulate(
             )
             if np.isnan(c0):
                 continue
-            # the last nodes may be outside the image, where the edge pixel's support applies
-            edge_u, edge_v = min(u, rig.camera.size[0] - 1.0), min(v, rig.camera.size[1] - 1.0)
-            camera_supported = _is_in_illuminated_cell(
-                camera_illuminated, edge_u, edge_v, rig.camera.size
-            )
             for k in range(grid.shape[2]):
                 target = near + (far - near) * k / (grid.shape[2] - 1.0)
                 z = min(max(target, first), last)
@@ -268,6 +247,4 @@ def _tabulate(
                 settled = abs(change) < 1e-3 or z in (first, last)
                 if settled and abs(correction) < MAX_CORRECTION * (last - first):
                     grid[j, i, k] = correction
-                    known[j, i, k] = camera_supported and _is_in_illuminated_cell(
-                        projector_illuminated, pu, pv, rig.projector.size
-                    )
+                    projected[j, i, k] = pu, pv

@@ -2,7 +2,7 @@
 uncertainty."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -10,23 +10,27 @@ import numpy as np
 
 from slviewer.calibration.observe import AXES, Observation
 from slviewer.calibration.splined.adjust import adjust_bundle
-from slviewer.calibration.splined.board_shape import board_frame, board_heights
-from slviewer.calibration.splined.bundle import Bundle
+from slviewer.calibration.splined.bundle import Bundle, PoseFit
 from slviewer.calibration.splined.compiled import CompiledAxis, compile_axis, pixel_rays
-from slviewer.calibration.splined.fields import undistort
-from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX
+from slviewer.calibration.splined.residual_noise import MIN_SIGMA_PX, Noise
 from slviewer.calibration.splined.uncertainty import (
     SigmaMap,
     compute_sigma_map,
-    summarise_volume_sigma,
-)
-from slviewer.calibration.splined.unknowns import Arrangement, pinhole_lens
-from slviewer.calibration.splined.volume import (
-    in_illuminated_cells,
     select_depth_axis,
+    summarise_volume_sigma,
     working_volume,
 )
-from slviewer.calibration.stereo import StereoModel
+from slviewer.calibration.splined.unknowns import (
+    Arrangement,
+    Device,
+    State,
+    board_frame,
+    board_heights,
+    in_illuminated_cells,
+    pinhole_lens,
+    undistort,
+)
+from slviewer.calibration.stereo import DEVICES, StereoModel
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
@@ -34,9 +38,9 @@ from slviewer.geometry.rigid import Mask
 from slviewer.geometry.triangulation import check_map
 from slviewer.geometry.vectors import rms
 from slviewer.records.calibration import SplinedFit, VolumeSigma
+from slviewer.records.plain import from_plain, to_plain
 
-_COMPILED_ARRAYS = ("coefficients", "grid", "supported_grid")
-_COMPILED_NUMBERS = ("centre", "step", "near", "far")
+_BUNDLE_ARRAYS = ("points", "camera_poses", "projector_poses")
 NEAR, FAR = 0.7, 1.4
 """Of the nearest and the farthest calibrated depth: between them points are measured."""
 
@@ -126,17 +130,17 @@ class SplinedModel:
         """Compile the axis along which depth is measured, and its uncertainty; `restore_compiled`
         takes the result."""
         axis = select_depth_axis(self.rig, working_volume(self.rig, self.bundle.depth_range_mm))
-        fast = self.fast_axis(axis)
-        arrays = {name: getattr(fast, name) for name in _COMPILED_ARRAYS}
-        data = {"axis": axis} | {name: getattr(fast, name) for name in _COMPILED_NUMBERS}
-        return data, arrays | {"sigma": self.sigma_map(axis).nodes, "rays": self.single_rays}
+        arrays = {"sigma": self.sigma_map(axis).nodes, "rays": self.single_rays}
+        data: dict[str, Any] = {"axis": axis}
+        for name, value in vars(self.fast_axis(axis)).items():
+            (arrays if isinstance(value, np.ndarray) else data)[name] = value
+        return data, arrays
 
     def restore_compiled(self, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Take what `compile_depth` of the same calibration returned, which takes seconds to
         compute."""
-        axis, fields = data["axis"], {name: data[name] for name in _COMPILED_NUMBERS}
-        fields |= {name: arrays[name] for name in _COMPILED_ARRAYS}
-        self._compiled[axis] = CompiledAxis(**fields)
+        axis, values = data["axis"], {**data, **arrays}
+        self._compiled[axis] = CompiledAxis(*(values[field.name] for field in fields(CompiledAxis)))
         self._sigma_maps[axis] = SigmaMap(arrays["sigma"], data["near"], data["far"])
         vars(self)["single_rays"] = arrays["rays"]
 
@@ -209,17 +213,17 @@ class SplinedModel:
     def describe(self) -> SplinedFit:
         """Return the figures of the adjustment."""
         bundle, noise = self.bundle, self.bundle.noise
-        camera, projector = (rms(device.coefficients[:, 1:-1, 1:-1]) for device in self.rig[:2])
+        local = [rms(device.coefficients[:, 1:-1, 1:-1]) for device in self.rig[:2]]
         lit = [float(np.mean(cells)) for cells in bundle.illuminated]
         height = board_heights(bundle.points, board_frame(bundle.points), bundle.state.heights)
         return SplinedFit(
             steps=bundle.steps,
             residuals_over_noise=dict(zip(AXES, noise.ratio, strict=True)),
             noise_px={"camera": noise.camera_px, **dict(zip(AXES, noise.sample_px, strict=True))},
-            local_distortion_rms_px={"camera": camera, "projector": projector},
+            local_distortion_rms_px=dict(zip(DEVICES, local, strict=True)),
             board_height_mm=(float(height.min()), float(height.max())),
             board_offsets_rms_mm=rms(bundle.state.offsets),
-            cells_lit={"camera": lit[0], "projector": lit[1]},
+            cells_lit=dict(zip(DEVICES, lit, strict=True)),
             sigma_volume_mm=self.sigma_volume,
             weights={
                 name: (fit.camera_trust, fit.projector_trust) for name, fit in bundle.fits.items()
@@ -229,19 +233,52 @@ class SplinedModel:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """What is not an array, JSON-able."""
-        return self.bundle.to_dict()
+        """Return the fields that are not arrays, as JSON types."""
+        bundle = self.bundle
+        keys = ("poses", "noise", "strengths", "fits", "depth_range_mm", "steps")
+        data: dict[str, Any] = to_plain(
+            {key: getattr(bundle, key) for key in keys}
+            | {"turned": bundle.half_turned_poses, "left_out": bundle.excluded}
+        )
+        return data
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Flat named arrays, for saving."""
-        return self.bundle.to_arrays()
+        """Return named arrays for saving; the factor packed, in float32."""
+        bundle = self.bundle
+        rig, *own = bundle.state
+        arrays = {
+            f"{name}_{key}": value
+            for name, device in zip(DEVICES, rig[:2], strict=True)
+            for key, value in device._asdict().items()
+        }
+        arrays |= dict(zip(State._fields[1:], own, strict=True))
+        arrays |= {name: getattr(bundle, name) for name in _BUNDLE_ARRAYS}
+        return arrays | {"R": rig.R, "t": rig.t, "factor": bundle.packed_factor}
 
     @classmethod
     def from_arrays(
         cls, data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
     ) -> "SplinedModel":
-        """The inverse of ``to_dict`` and ``to_arrays``."""
-        return cls(Bundle.from_arrays(data, arrays))
+        """Return the model that ``to_dict`` and ``to_arrays`` saved."""
+        a = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+        camera, projector = (
+            Device(*(a[f"{name}_{key}"] for key in Device._fields)) for name in DEVICES
+        )
+        rig = Arrangement(camera, projector, a["R"], a["t"])
+        bundle = Bundle(
+            state=State(rig, *(a[name] for name in State._fields[1:])),
+            poses=tuple(data["poses"]),
+            **{name: a[name] for name in _BUNDLE_ARRAYS},
+            noise=from_plain(data["noise"], Noise),
+            strengths=tuple(data["strengths"]),
+            fits={name: PoseFit(**fit) for name, fit in data["fits"].items()},
+            excluded=data["left_out"],
+            depth_range_mm=tuple(data["depth_range_mm"]),
+            packed_factor=a["factor"],
+            steps=data["steps"],
+            half_turned_poses=tuple(data.get("turned", ())),
+        )
+        return cls(bundle)
 
 
 def calibrate_splined(
@@ -254,7 +291,7 @@ def calibrate_splined(
     """Calibrate the splined model from the poses that the stereo calibration used.
 
     ``cells_across``: cells of each displacement field across its image; by default
-    ``fields.CELLS_ACROSS``. Raises InputError where poses lack an axis, and CalibrationRejected
+    ``unknowns.CELLS_ACROSS``. Raises InputError where poses lack an axis, and CalibrationRejected
     where they contradict each other.
     """
     return SplinedModel(adjust_bundle(observations, stereo, progress, cells_across=cells_across))

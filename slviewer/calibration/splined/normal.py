@@ -1,13 +1,15 @@
-"""The normal equations, summed pose by pose from rows that are never stored, and their factor."""
+"""The normal equations, summed pose by pose from rows that are never stored, the prior of the
+unknowns, normal distributions that regularise the adjustment, and the equations' factor."""
 
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from scipy.linalg import blas, cho_solve, lapack, solve_triangular
 
-from slviewer.calibration.splined.board_shape import HEIGHT_TERMS
 from slviewer.calibration.splined.residuals import (
     CAMERA,
     CAMERA_FIELD,
@@ -21,14 +23,32 @@ from slviewer.calibration.splined.residuals import (
     feature_row,
     sample_row,
 )
-from slviewer.calibration.splined.unknowns import RIG, State, UnknownLayout
+from slviewer.calibration.splined.unknowns import (
+    GAUGE_MM,
+    HEIGHT_SIGMA_MM,
+    HEIGHT_TERMS,
+    OFFSET_SIGMA_MM,
+    RIG,
+    State,
+    UnknownLayout,
+    offset_gauge,
+    roughness,
+)
 from slviewer.errors import CalibrationRejected
-from slviewer.geometry.jit import kernel
+from slviewer.geometry.jit import kernel, run_rows
 from slviewer.geometry.rigid import Floats
 
 MAX_LANES = 4
 """Largest number of matrices that threads fill in parallel; each has the size of the whole."""
 _ROWS_ADDED = 128  # of two matrices at a time
+POSE_SIGMA = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
+"""rad and mm: holds a pose that was excluded as a whole."""
+FIRST_STRENGTH = 10.0
+"""Initial strength of the fields' priors in 1/px^2: displacements of some tenths of a pixel."""
+PROBES = 24
+"""Random vectors that estimate a trace: to a percent of it."""
+STRENGTH_BOUNDS = (1e-1, 1e6)
+"""Bounds of a prior's strength, 1/px^2: a field of px and no prior, or no field."""
 
 
 ObservedValues = tuple[Floats, Floats]
@@ -59,9 +79,7 @@ def predict_observations(state: State, data: PoseData) -> ObservedValues:
     """Predict the features (n, 2) px and the samples' projector coordinates (m, 2) px; NaN where
     not visible."""
     features, samples = np.empty_like(data.feature_px), np.empty_like(data.sample_px)
-    shares = _split_poses(state.layout.poses)
-    with ThreadPoolExecutor(len(shares)) as threads:
-        list(threads.map(lambda poses: _predict(state, data, poses, features, samples), shares))
+    run_rows(_predict, state.layout.poses, state, data, features, samples)
     return features, samples
 
 
@@ -74,7 +92,9 @@ def normal_equations(
     NaN.
     """
     layout = state.layout
-    shares = _split_poses(layout.poses)
+    # a kernel's parallel loops take no structures
+    lanes = max(1, min(MAX_LANES, numba.get_num_threads(), layout.poses))
+    shares = [np.arange(lane, layout.poses, lanes) for lane in range(lanes)]
     matrices = [np.zeros((layout.size, layout.size)) for _ in shares]
     right = np.zeros((len(shares), layout.size))
     observed = data, residuals, weights, _sort_by_cell(state, data)
@@ -90,6 +110,86 @@ def normal_equations(
         for other in matrices[1:]:
             matrices[0][upper] += other[upper]
     return matrices[0], right.sum(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Normal distributions: of the fields' coefficients by their roughness (``forms``, times
+    ``strengths``), of the board's height and offsets by what boards are like, and of the poses
+    widely.
+
+    ``features_per_point``: how many of the board's features each offset of the state represents.
+    """
+
+    forms: tuple[Floats, Floats]
+    gauge: Floats
+    strengths: tuple[float, float] = (FIRST_STRENGTH, FIRST_STRENGTH)
+    features_per_point: float = 1.0
+
+    @classmethod
+    def build(cls, state: State, points: Floats) -> "Prior":
+        """Build the prior for the fields' knots and the board's features at ``points`` (f, 3)
+        mm."""
+        camera, projector = (roughness(device.coefficients) for device in state.rig[:2])
+        return cls((camera, projector), offset_gauge(points))
+
+    def add(self, A: Floats, b: Floats, state: State) -> None:
+        """Add to the upper triangle and the right-hand side."""
+        at, diagonal = state.layout, np.arange(len(b))
+        pose = np.tile(POSE_SIGMA**-2.0, at.poses)
+        A[diagonal[: at.height], diagonal[: at.height]] += pose
+        height, offsets = diagonal[at.height : at.offsets], slice(at.offsets, at.rig)
+        A[height, height] += HEIGHT_SIGMA_MM**-2.0
+        b[height] -= state.heights / HEIGHT_SIGMA_MM**2
+        form = (
+            np.eye(at.rig - at.offsets) * self.features_per_point / OFFSET_SIGMA_MM**2
+            + self.gauge.T @ self.gauge / GAUGE_MM**2
+        )
+        A[offsets, offsets] += form
+        b[offsets] -= form @ state.offsets.ravel()
+        for first, field, form, strength in self._fields(state):
+            n = len(form)
+            for k in range(2):
+                block = slice(first + k * n, first + (k + 1) * n)
+                A[block, block] += strength * form
+                b[block] -= strength * (form @ field[k])
+
+    def cost(self, state: State) -> float:
+        """Half the prior's chi square at a state."""
+        offsets = state.offsets.ravel()
+        total = (
+            np.sum((state.heights / HEIGHT_SIGMA_MM) ** 2) + np.sum(offsets**2) / OFFSET_SIGMA_MM**2
+        )
+        for _, field, form, strength in self._fields(state):
+            total += strength * float(np.sum(field * (field @ form)))
+        return 0.5 * float(total)
+
+    def update_strengths(self, state: State, solve: Callable[[Floats], Floats]) -> "Prior":
+        """Return the prior with its strengths updated by MacKay's fixed point, which maximises the
+        evidence.
+
+        The prior is exp(-strength/2 c'Fc) for each component c of a field, F its form; ``solve``
+        applies the inverse of the normal matrix.
+        """
+        updated = []
+        for first, field, form, strength in self._fields(state):
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (*field.shape, PROBES))
+            right = np.zeros((state.layout.size, PROBES))
+            part = slice(first, first + field.size)
+            right[part] = signs.reshape(-1, PROBES)
+            spread = solve(right)[part].reshape(signs.shape)
+            trace = float(np.sum(spread * (form @ signs))) / PROBES
+            determined = max(field.size - strength * trace, 1.0)
+            energy = float(np.sum(field * (field @ form)))
+            updated.append(float(np.clip(determined / max(energy, 1e-12), *STRENGTH_BOUNDS)))
+        return replace(self, strengths=(updated[0], updated[1]))
+
+    def _fields(self, state: State) -> Iterator[tuple[int, Floats, Floats, float]]:
+        """Iterate over both fields: first unknown, coefficients (2, n), quadratic form (n, n), and
+        strength."""
+        firsts = state.layout.camera_field, state.layout.projector_field
+        fields = [device.coefficients.reshape(2, -1) for device in state.rig[:2]]
+        return zip(firsts, fields, self.forms, self.strengths, strict=True)
 
 
 class BlockFactor:
@@ -162,23 +262,16 @@ def _sort_by_cell(state: State, data: PoseData) -> np.ndarray:
     return np.lexsort([*keys, data.poses[1]])
 
 
-def _split_poses(poses: int) -> list[np.ndarray]:
-    """The poses of each thread: a kernel's parallel loops take no structures."""
-    lanes = max(1, min(MAX_LANES, numba.get_num_threads(), poses))
-    return [np.arange(lane, poses, lanes) for lane in range(lanes)]
-
-
 @kernel()
-def _predict(state, data, poses, features, samples):
-    """Fill the predicted ``features`` (n, 2) and ``samples`` (m, 2) px of some poses."""
+def _predict(first, last, state, data, features, samples):
+    """Fill the predicted ``features`` (n, 2) and ``samples`` (m, 2) px of poses ``first`` to
+    ``last``."""
     work = allocate_workspace()
-    for i in poses:
+    for i in range(first, last):
         for n in range(data.feature_from[i], data.feature_from[i + 1]):
-            u, v, _, _ = feature_row(state, i, data.points, data.frame, data.feature[n], work)
-            features[n, 0], features[n, 1] = u, v
+            features[n] = feature_row(state, i, data.points, data.frame, data.feature[n], work)
         for n in range(data.sample_from[i], data.sample_from[i + 1]):
-            u, v, _, _, _, _ = sample_row(state, i, data.frame, data.sample_px[n], work)
-            samples[n, 0], samples[n, 1] = u, v
+            samples[n] = sample_row(state, i, data.frame, data.sample_px[n], work)
 
 
 @kernel()
@@ -208,9 +301,9 @@ def _add_features(state, pose, data, residuals, weights, work, sums):
     for n in range(data.feature_from[pose], data.feature_from[pose + 1]):
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
             f = data.feature[n]
-            _, _, i, j = feature_row(state, pose, data.points, data.frame, f, work)
-            set_feature_columns(sums.columns, state.rig, f, i, j, sums.at)
+            feature_row(state, pose, data.points, data.frame, f, work)
             fill_feature_fields(work)
+            set_feature_columns(sums.columns, state.rig, f, work.cells, sums.at)
             _set_rows(sums, 0, work.row, weights[n], residuals[n])
             _add_rows(sums, PROJECTOR_FIELD)
             _move_sums(sums, PROJECTOR_FIELD)
@@ -219,16 +312,16 @@ def _add_features(state, pose, data, residuals, weights, work, sums):
 @kernel()
 def _add_samples(state, pose, data, part, residuals, weights, work, sums):
     """Add the samples of one ``pose``, whose indices are ``part`` (k,)."""
-    cells = np.full(4, -1)
+    cells = np.full((2, 2), -1)
     first = 0
     for n in part:
         if weights[n, 0] > 0.0 or weights[n, 1] > 0.0:
-            _, _, ci, cj, pi, pj = sample_row(state, pose, data.frame, data.sample_px[n], work)
-            if ci != cells[0] or cj != cells[1] or pi != cells[2] or pj != cells[3]:
+            sample_row(state, pose, data.frame, data.sample_px[n], work)
+            if not np.array_equal(work.cells, cells):
                 _add_rows(sums, ROW)
                 _move_sums(sums, ROW)
                 first = 0
-                cells[0], cells[1], cells[2], cells[3] = ci, cj, pi, pj
+                cells[:] = work.cells
                 set_sample_columns(sums.columns, state.rig, cells, sums.at)
             fill_sample_fields(work)
             _set_rows(sums, first, work.row, weights[n], residuals[n])
@@ -255,32 +348,31 @@ def dense_columns(at):
 
 
 @kernel()
-def set_feature_columns(columns, rig, feature, i, j, at):
-    """Fill in the columns of a feature's offset, and of the camera's field in the cell (i, j)."""
+def set_feature_columns(columns, rig, feature, cells, at):
+    """Fill in the columns of a feature's offset, and of the camera's field in the first of the
+    ``cells``."""
     columns[OFFSET], columns[OFFSET + 1] = at[1] + 2 * feature, at[1] + 2 * feature + 1
-    _set_field_columns(columns, CAMERA_FIELD, rig.camera, i, j, at[3])
+    _set_field_columns(columns, CAMERA_FIELD, rig.camera, cells[0], at[3])
 
 
 @kernel()
 def set_sample_columns(columns, rig, cells, at):
-    """Fill in the columns of the fields in their ``cells`` (i, j of the camera, i, j of the
-    projector)."""
-    columns[OFFSET], columns[OFFSET + 1] = at[1], at[1] + 1  # a sample's row has zeros there
-    _set_field_columns(columns, CAMERA_FIELD, rig.camera, cells[0], cells[1], at[3])
-    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, cells[2], cells[3], at[4])
+    """Fill in the columns of both fields in their ``cells`` (2, 2)."""
+    set_feature_columns(columns, rig, 0, cells, at)  # a sample's row has zeros at the offset
+    _set_field_columns(columns, PROJECTOR_FIELD, rig.projector, cells[1], at[4])
 
 
 @kernel()
-def _set_field_columns(columns, first, device, i, j, start):
-    """Fill in the columns of the coefficients of both components that reach the cell (i, j) of a
-    device's field."""
+def _set_field_columns(columns, first, device, cell, start):
+    """Fill in the columns of the coefficients of both components that reach a ``cell`` (column,
+    row) of a device's field."""
     stride = device.coefficients.shape[2]
     knots = stride * device.coefficients.shape[1]
     for k in range(2):
         for m in range(4):
             for n in range(4):
                 columns[first + k * FIELD + 4 * m + n] = (
-                    start + k * knots + (j + m) * stride + i + n
+                    start + k * knots + (cell[1] + m) * stride + cell[0] + n
                 )
 
 

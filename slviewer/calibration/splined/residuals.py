@@ -10,8 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slviewer.calibration.splined.board_shape import HEIGHT_TERMS, height_at
-from slviewer.calibration.splined.fields import displacement, remove_displacement
+from slviewer.calibration.splined.unknowns import (
+    HEIGHT_TERMS,
+    displacement,
+    dot_column,
+    dot_row,
+    height_at,
+    remove_displacement,
+)
 from slviewer.geometry.brown import distort_point, undistort_point
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.rigid import Floats
@@ -63,11 +69,12 @@ class PoseData(NamedTuple):
 
 class Workspace(NamedTuple):
     """Buffers of one thread for the kernels: ``row`` (2, ROW) holds the derivatives of an
-    observation, ``by_field`` (2, 2) those of a sample by the camera's displacement."""
+    observation, ``by_field`` (2, 2) those of a sample by the camera's displacement, and ``cells``
+    (2, 2) int the first column and row of the camera's and of the projector's field."""
 
     row: Floats
     by_field: Floats
-
+    cells: np.ndarray
     camera_basis: Floats
     projector_basis: Floats
     by_point: Floats
@@ -79,15 +86,17 @@ class Workspace(NamedTuple):
     point: Floats
     turned: Floats
     normal: Floats
+    by_pixel: Floats
 
 
 @kernel()
 def allocate_workspace():
     """Return a workspace of zeros."""
     return Workspace(
-        np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)),
-        np.zeros((2, 9)), np.zeros((2, 9)), np.zeros((2, 2)),
-        np.zeros((3, HEIGHT_TERMS)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+        np.zeros((2, ROW)), np.zeros((2, 2)), np.zeros((2, 2), np.int64),
+        np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((2, 3)),
+        np.zeros((2, 9)), np.zeros((2, 9)), np.zeros((2, 2)), np.zeros((3, HEIGHT_TERMS)),
+        np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
     )  # fmt: skip
 
 
@@ -118,20 +127,20 @@ def fill_cross(a, b, scale, out):
 
 
 @kernel()
-def project_to_device(device, X, basis, by_point, by_lens):
-    """(u, v, first column, first row of the field's cell) of a point X (3,) in the device's frame.
+def project_to_device(device, X, basis, by_point, by_lens, cell):
+    """Return the pixel (u, v) of a point X (3,) in the device's frame.
 
-    Fills ``by_point`` (2, 3) and ``by_lens`` (2, 9); the derivative by the field's coefficients is
-    ``basis``'s product.
+    Fills ``by_point`` (2, 3), ``by_lens`` (2, 9) and the field's ``cell`` (2,); the derivative by
+    the field's coefficients is ``basis``'s product.
     """
     k = device.numbers
     inverse = 1.0 / X[2]
     x, y = X[0] * inverse, X[1] * inverse
     if not (X[2] > 0.0 and x * x + y * y < k[9]):
-        return np.nan, np.nan, 0, 0
+        return np.nan, np.nan
     xd, yd, dxx, dxy, dyy = distort_point(x, y, k)
     u, v = k[0] * xd + k[2], k[1] * yd + k[3]
-    du, dv, duu, duv, dvu, dvv, i, j = displacement(device, u, v, basis)
+    du, dv, duu, duv, dvu, dvv, cell[0], cell[1] = displacement(device, u, v, basis)
     _fill_pixel_by_lens(x, y, xd, yd, k, by_lens)
     # d(u, v before displacement) by x, y
     ux, uy, vx, vy = k[0] * dxx, k[0] * dxy, k[1] * dxy, k[1] * dyy
@@ -144,23 +153,24 @@ def project_to_device(device, X, basis, by_point, by_lens):
             a, b = row[0, c], row[1, c]
             row[0, c] = (1.0 + duu) * a + duv * b
             row[1, c] = dvu * a + (1.0 + dvv) * b
-    return u + du, v + dv, i, j
+    return u + du, v + dv
 
 
 @kernel()
-def undistort_ray(device, u, v, basis, by_lens, by_field):
-    """(x, y, first column, first row): the undistorted normalised point that a camera pixel sees.
+def undistort_ray(device, u, v, basis, by_lens, by_field, cell):
+    """Return the undistorted normalised point (x, y) that a camera pixel sees.
 
-    Fills ``by_lens`` (2, 9), and ``by_field`` (2, 2): by a displacement along u and v where the
-    field is evaluated.
+    Fills ``by_lens`` (2, 9), ``by_field`` (2, 2), by a displacement along u and v where the field
+    is evaluated, and the field's ``cell`` (2,).
     """
+
     k = device.numbers
     qu, qv = remove_displacement(device, u, v, basis)
     xd, yd = (qu - k[2]) / k[0], (qv - k[3]) / k[1]
     x, y = undistort_point(xd, yd, k)
     if not np.isfinite(x):
-        return np.nan, np.nan, 0, 0
-    _, _, duu, duv, dvu, dvv, i, j = displacement(device, qu, qv, basis)
+        return np.nan, np.nan
+    _, _, duu, duv, dvu, dvv, cell[0], cell[1] = displacement(device, qu, qv, basis)
     _, _, dxx, dxy, dyy = distort_point(x, y, k)
     determinant = dxx * dyy - dxy * dxy
     ixx, ixy, iyy = dyy / determinant, -dxy / determinant, dxx / determinant
@@ -177,102 +187,102 @@ def undistort_ray(device, u, v, basis, by_lens, by_field):
         b = (qvu if c == 0 else qvv) / k[1]
         by_field[0, c] = ixx * a + ixy * b
         by_field[1, c] = ixy * a + iyy * b
-    return x, y, i, j
+    return x, y
 
 
 @kernel()
 def feature_row(state, pose, points, frame, f, work):
-    """(u, v, first column, first row): where the camera sees feature ``f`` of the board at a pose.
+    """Return the pixel (u, v) where the camera sees feature ``f`` of the board at a pose.
 
-    Fills ``work.row`` but for the fields' part, and in ``work.camera_basis`` the splines.
+    Fills ``work.row`` but for the fields' part, and the camera's basis and cell.
     """
     R, t = state.R_board[pose], state.t_board[pose]
     x, y = points[f, 0] + state.offsets[f, 0], points[f, 1] + state.offsets[f, 1]
     z, zx, zy = height_at(x, y, frame, state.heights, work.terms)
     L, X, row = work.local, work.point, work.row
     for a in range(3):
-        L[a] = R[a, 0] * x + R[a, 1] * y + R[a, 2] * z
+        L[a] = dot_row(R, a, (x, y, z))
         X[a] = L[a] + t[a]
-    u, v, i, j = project_to_device(
-        state.rig.camera, X, work.camera_basis, work.by_point, work.by_lens
+    u, v = project_to_device(
+        state.rig.camera, X, work.camera_basis, work.by_point, work.by_lens, work.cells[0]
     )
     row[:] = 0.0
     if not np.isfinite(u):
-        return u, v, i, j
+        return u, v
     for k in range(2):
-        m0, m1, m2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
+        by_point = work.by_point[k]
         # a turn w moves the point by w x L
-        fill_cross(L, work.by_point[k], 1.0, row[k, POSE : POSE + 3])
-        row[k, POSE + 3], row[k, POSE + 4], row[k, POSE + 5] = m0, m1, m2
-        along = m0 * R[0, 2] + m1 * R[1, 2] + m2 * R[2, 2]
+        fill_cross(L, by_point, 1.0, row[k, POSE : POSE + 3])
+        for a in range(3):
+            row[k, POSE + 3 + a] = by_point[a]
+        along = dot_column(R, 2, by_point)
         for c in range(HEIGHT_TERMS):
             row[k, HEIGHT + c] = along * work.terms[0, c]
-        row[k, OFFSET] = m0 * R[0, 0] + m1 * R[1, 0] + m2 * R[2, 0] + along * zx
-        row[k, OFFSET + 1] = m0 * R[0, 1] + m1 * R[1, 1] + m2 * R[2, 1] + along * zy
+        row[k, OFFSET] = dot_column(R, 0, by_point) + along * zx
+        row[k, OFFSET + 1] = dot_column(R, 1, by_point) + along * zy
         for c in range(9):
             row[k, CAMERA + c] = work.by_lens[k, c]
-    return u, v, i, j
+    return u, v
 
 
 @kernel()
 def sample_row(state, pose, frame, pixel, work):
-    """(u_p, v_p, then first column and row in the camera's field, and in the projector's): where
-    the projector lights what a camera ``pixel`` (2,) sees of the board at a pose.
+    """Return the pixel (u_p, v_p) where the projector lights what a camera ``pixel`` (2,) sees of
+    the board at a pose.
 
-    Fills ``work.row`` but for the fields' part, ``work.by_field``, and both bases.
+    Fills ``work.row`` but for the fields' part, ``work.by_field``, and both bases and cells.
     """
     rig, R, t = state.rig, state.R_board[pose], state.t_board[pose]
-    row, by_field = work.row, work.by_field
+    row, M, N = work.row, work.by_pixel, work.normal
     row[:] = 0.0
-    x, y, ci, cj = undistort_ray(
-        rig.camera, pixel[0], pixel[1], work.camera_basis, work.ray_by_lens, work.ray_by_field
-    )
-    facing = R[0, 2] * x + R[1, 2] * y + R[2, 2]
+    x, y = undistort_ray(
+        rig.camera, pixel[0], pixel[1], work.camera_basis, work.ray_by_lens, work.ray_by_field,
+        work.cells[0],
+    )  # fmt: skip
+    ray = x, y, 1.0
+    facing = dot_column(R, 2, ray)
     if not (np.isfinite(x) and facing != 0.0):
-        return np.nan, np.nan, ci, cj, 0, 0
-    s = (R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2]) / facing
-    Y, N = work.local, work.normal
+        return np.nan, np.nan
+    s = dot_column(R, 2, t) / facing
+    X, V, Y = work.point, work.turned, work.local
     # onto the bent surface: the bow is a thousandth of the distance, so this squares fast
     for _ in range(4):
         Y[0], Y[1], Y[2] = s * x - t[0], s * y - t[1], s - t[2]
-        bx = R[0, 0] * Y[0] + R[1, 0] * Y[1] + R[2, 0] * Y[2]
-        by = R[0, 1] * Y[0] + R[1, 1] * Y[1] + R[2, 1] * Y[2]
-        bz = R[0, 2] * Y[0] + R[1, 2] * Y[1] + R[2, 2] * Y[2]
-        z, zx, zy = height_at(bx, by, frame, state.heights, work.terms)
+        z, zx, zy = height_at(
+            dot_column(R, 0, Y), dot_column(R, 1, Y), frame, state.heights, work.terms
+        )
         for a in range(3):
             N[a] = R[a, 2] - R[a, 0] * zx - R[a, 1] * zy
-        facing = N[0] * x + N[1] * y + N[2]
-        error = bz - z
+        facing = N[0] * ray[0] + N[1] * ray[1] + N[2]
+        error = dot_column(R, 2, Y) - z
         s -= error / facing
         if abs(error) < 1e-10:
             break
     # point s (x, y, 1), moved along the ray by the surface's motion, and across it by the ray's
-    X, V = work.point, work.turned
     for a in range(3):
-        V[a] = s * (rig.R[a, 0] * x + rig.R[a, 1] * y + rig.R[a, 2])
+        V[a] = s * dot_row(rig.R, a, ray)
         X[a] = V[a] + rig.t[a]
-    pu, pv, pi, pj = project_to_device(
-        rig.projector, X, work.projector_basis, work.by_point, work.by_lens
+    pu, pv = project_to_device(
+        rig.projector, X, work.projector_basis, work.by_point, work.by_lens, work.cells[1]
     )
     if not np.isfinite(pu):
-        return np.nan, np.nan, ci, cj, pi, pj
+        return np.nan, np.nan
     for k in range(2):
-        p0, p1, p2 = work.by_point[k, 0], work.by_point[k, 1], work.by_point[k, 2]
-        fill_cross(V, work.by_point[k], 1.0, row[k, TURN : TURN + 3])
-        row[k, SHIFT], row[k, SHIFT + 1], row[k, SHIFT + 2] = p0, p1, p2
-        m0 = p0 * rig.R[0, 0] + p1 * rig.R[1, 0] + p2 * rig.R[2, 0]
-        m1 = p0 * rig.R[0, 1] + p1 * rig.R[1, 1] + p2 * rig.R[2, 1]
-        m2 = p0 * rig.R[0, 2] + p1 * rig.R[1, 2] + p2 * rig.R[2, 2]
-        along = (m0 * x + m1 * y + m2) / facing
+        by_point = work.by_point[k]
+        fill_cross(V, by_point, 1.0, row[k, TURN:SHIFT])
+        for a in range(3):
+            row[k, SHIFT + a] = by_point[a]
+            M[a] = dot_column(rig.R, a, by_point)
+        along = (M[0] * x + M[1] * y + M[2]) / facing
         fill_cross(Y, N, along, row[k, POSE : POSE + 3])
         for a in range(3):
             row[k, POSE + 3 + a] = along * N[a]
         for c in range(HEIGHT_TERMS):
             row[k, HEIGHT + c] = along * work.terms[0, c]
-        ex, ey = s * (m0 - along * N[0]), s * (m1 - along * N[1])
+        ex, ey = s * (M[0] - along * N[0]), s * (M[1] - along * N[1])
         for c in range(9):
             row[k, CAMERA + c] = ex * work.ray_by_lens[0, c] + ey * work.ray_by_lens[1, c]
             row[k, PROJECTOR + c] = work.by_lens[k, c]
         for c in range(2):
-            by_field[k, c] = ex * work.ray_by_field[0, c] + ey * work.ray_by_field[1, c]
-    return pu, pv, ci, cj, pi, pj
+            work.by_field[k, c] = ex * work.ray_by_field[0, c] + ey * work.ray_by_field[1, c]
+    return pu, pv

@@ -9,30 +9,33 @@ How precisely one view determines the projector's pose is known from the calibra
 Lens distortion beyond Brown's model is estimated from all of them together, as displacement fields.
 Then each pose, with the fields of the others alone, gives an apparent motion of the projector. Its
 true motion is zero: these apparent motions are the noise floor of every later check.
+
+A view is a calibration pose or a later capture of the same board: its features in the camera, and
+the projector's coordinates at a grid of the board's pixels. It is linearised in the board's pose,
+the projector's pose and the lens errors: all unknowns are small (tenths of a pixel), so that one
+linearisation at the calibration and at the board's pose by the camera is sufficient.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.special import fdtrc, fdtri
 
-from slviewer.calibration.drift.view import (
-    KINDS,
-    DisplacementField,
-    DriftView,
-    LinearView,
-    linearise_view,
-)
+from slviewer.calibration.board_pose import intersect_board, solve_pose
+from slviewer.calibration.observe import AXES, Observation
 from slviewer.errors import InputError
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.rig import StereoRig
-from slviewer.geometry.rigid import Floats, Mask
+from slviewer.geometry.rigid import Floats, Mask, move_points, rigid_transform
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import rms, unit_vectors
+from slviewer.geometry.splines import basis_matrix, second_differences
+from slviewer.geometry.vectors import finite_rows, rms, unit_vectors
 from slviewer.records.drift import Drift
 from slviewer.records.record import to_vector
 
@@ -63,6 +66,182 @@ UNSUPPORTED_PX = 0.1
 """Largest sigma of the lens error at pixels that are used."""
 RIG_SIGMAS = np.array([3e-3] * 3 + [3.0] * 3)
 """Prior sigma of the error of the calibration's own relative pose, rad and mm."""
+SAMPLES = 1000
+"""Number of pixels of the board at which the projector's coordinates are compared."""
+CELLS_PER_WIDTH = 16
+"""Spline cells across an image of the lens errors beyond Brown's model."""
+KINDS = ("camera", "x", "y")
+"""Kinds of observations: features in the camera, projector columns, projector rows."""
+STEPS = np.array([1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.05])
+"""Half steps of the numerical derivatives, rad and mm: pixels move by about a tenth."""
+
+
+@dataclass(frozen=True, eq=False)
+class DriftView:
+    """``camera`` (n, 2) px of board ``points`` (n, 3) mm; ``pixels`` (m, 2) px of the board in the
+    camera, and the ``projector`` coordinates (m, 2) px there, a column of NaN for an axis that was
+    not captured."""
+
+    name: str
+    points: Floats
+    camera: Floats
+    pixels: Floats
+    projector: Floats
+
+    @classmethod
+    def from_observation(cls, observation: Observation) -> "DriftView":
+        """Sample an observation of the board. Raises InputError where its region is empty."""
+        u0, v0, _, _ = observation.box
+        v, u = np.nonzero(observation.region)
+        if not len(v):
+            raise InputError(
+                f"{observation.name}: no pixel of the board carries a readable pattern: illuminate"
+                " the board"
+            )
+        step = max(1, int(np.sqrt(len(v) / SAMPLES)))
+        on_grid = (u % step == 0) & (v % step == 0)
+        pixels = np.stack([u[on_grid] + u0, v[on_grid] + v0], 1).astype(float)
+        projector = np.full((len(pixels), 2), np.nan)
+        for axis in observation.surfaces:
+            projector[:, AXES.index(axis)] = observation.coordinate(axis, *pixels.T)
+        return cls(observation.name, observation.points, observation.camera, pixels, projector)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes with known projector coordinates."""
+        return tuple(axis for i, axis in enumerate(AXES) if np.isfinite(self.projector[:, i]).any())
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementField:
+    """A cubic B-spline displacement field over an image of ``size`` px: ``cells`` (across,
+    down)."""
+
+    size: tuple[int, int]
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Cells (across, down): square ones."""
+        return CELLS_PER_WIDTH, max(1, round(CELLS_PER_WIDTH * self.size[1] / self.size[0]))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of coefficients of one of the two components."""
+        return (self.cells[0] + 3) * (self.cells[1] + 3)
+
+    def basis(self, pixels: Floats) -> sp.csr_array:
+        """Return the spline basis (n, unknowns) at pixels (n, 2): displacement by coefficients."""
+        across, down = (
+            basis_matrix(np.clip(pixels[:, k], -0.5, size - 0.5), -0.5, size - 0.5, cells)
+            for k, (size, cells) in enumerate(zip(self.size, self.cells, strict=True))
+        )
+        return sp.csr_array((down[:, :, None] * across[:, None]).reshape(-1, self.unknowns))
+
+    @cached_property
+    def roughness(self) -> sp.csr_array:
+        """Quadratic form (unknowns, unknowns) of the squared second differences of one component's
+        coefficients."""
+        across, down = (n + 3 for n in self.cells)
+        u = sp.kron(sp.eye(down), second_differences(across))
+        v = sp.kron(second_differences(down), sp.eye(across))
+        return sp.csr_array(u.T @ u + v.T @ v)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearView:
+    """A view's linear equations ``residuals = pose a + change b + shared c``, one row per observed
+    coordinate (px).
+
+    ``kinds`` (k,): index into KINDS of each row; ``usable`` (k,) bool: the rows that were measured.
+    Derivatives: ``pose`` (k, 6) by the board's pose; ``change`` (k, 6) by the projector's rotation
+    about its own centre and axes (rad) and its translation (mm); ``scale`` (k,) by the board's
+    relative growth; ``shared`` (k, unknowns) by what all views share: the change again, as the
+    calibration's own error, then the lens errors, u and v components of the camera's field, then of
+    the projector's. ``across`` (k,): weight of each projector coordinate in the offset across the
+    epipolar lines.
+    """
+
+    kinds: np.ndarray
+    residuals: Floats
+    usable: Mask
+    pose: Floats
+    change: Floats
+    scale: Floats
+    shared: sp.csr_array
+    across: Floats
+
+
+def linearise_view(rig: StereoRig, view: DriftView) -> LinearView:
+    """Linearise a view at the board's pose by the camera alone.
+
+    Raises InputError where that pose cannot be solved.
+    """
+    T = solve_pose(view.points, rig.camera.undistort(view.camera), np.eye(3), np.zeros(5))
+    if T is None:
+        raise InputError(
+            f"{view.name}: no pose of the board fits its features: is it the calibration's board?"
+        )
+    middle = view.points.mean(0)
+
+    def model(at: Floats, moved: Floats | float = 0.0) -> tuple[Floats, Floats]:
+        """Predict features (n, 2) and samples (m, 2) px at changes ``at`` (13,) of board pose,
+        projector, scale."""
+        moved_T = rigid_transform(cv2.Rodrigues(at[:3])[0] @ T[:3, :3], T[:3, 3] + at[3:6])
+        on_board = intersect_board(moved_T, rig.camera.undistort(view.pixels + moved))
+        in_projector = rig.to_projector(on_board) @ cv2.Rodrigues(at[6:9])[0].T + at[9:12]
+        points = middle + (view.points - middle) * (1 + at[12])
+        features = rig.camera.project(move_points(moved_T, points))
+        return features, rig.projector.project(in_projector)
+
+    derivatives = np.column_stack(
+        [
+            _flatten(*(a - b for a, b in zip(model(step), model(-step), strict=True)))
+            / (2 * step.sum())
+            for step in np.diag(np.r_[STEPS, STEPS, 1e-4])
+        ]
+    )
+    features, samples = model(np.zeros(13))
+    residuals = _flatten(view.camera - features, view.projector - samples)
+    usable = finite_rows(residuals[:, None], derivatives[:, 6:12])
+    derivatives = np.nan_to_num(derivatives)
+    pose, change, scale = derivatives[:, :6], derivatives[:, 6:12], derivatives[:, 12]
+    # (m, 2, 2): how the sample in the projector moves with the pixel in the camera
+    moved = [
+        (model(np.zeros(13), 0.1 * unit)[1] - model(np.zeros(13), -0.1 * unit)[1]) / 0.2
+        for unit in np.eye(2)
+    ]
+    J = np.nan_to_num(np.stack(moved, axis=2))
+    camera, projector = DisplacementField(rig.camera.size), DisplacementField(rig.projector.size)
+    on_features, at_pixels = camera.basis(view.camera), camera.basis(view.pixels)
+    on_samples = projector.basis(np.nan_to_num(samples))
+    interleaved = [sp.kron(on_features, unit[:, None]) for unit in np.eye(2)]
+    columns, rows = ([-sp.diags(J[:, row, k]) @ at_pixels for k in (0, 1)] for row in (0, 1))
+    lens_errors = sp.block_array(
+        [
+            [*interleaved, None, None],
+            [*columns, on_samples, None],
+            [*rows, None, on_samples],
+        ]
+    )
+    n, m = len(view.camera), len(view.pixels)
+    by_shift = (derivatives[2 * n :, 3:6] @ T[:3, 2]).reshape(2, m)  # along the board's normal
+    towards = unit_vectors(by_shift.T)
+    return LinearView(
+        np.repeat([0, 1, 2], [2 * n, m, m]),
+        np.where(usable, residuals, 0.0),
+        usable,
+        pose,
+        change,
+        scale,
+        sp.csr_array(sp.hstack([sp.csr_array(change), lens_errors])),
+        np.concatenate([np.zeros(2 * n), -towards[:, 1], towards[:, 0]]),
+    )
+
+
+def _flatten(camera: Floats, projector: Floats) -> Floats:
+    """Flatten values of features (n, 2) and of samples (m, 2) in the order of KINDS, (2 n + 2
+    m,)."""
+    return np.concatenate([camera.ravel(), *projector.T])
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +250,15 @@ class PoseChange:
     of ``LinearView``.
 
     ``spreads`` (3, 6, 6): covariance of the change by kind of observation, for errors of 1 px;
-    ``by_growth`` (6,): change per relative growth of the board. ``scale``: apparent relative growth
-    of the board; ``across_px``: mean offset across the epipolar lines, NaN with one axis;
-    ``misfit_px``: RMS residual that no change explains.
+    ``by_growth`` (6,): change per relative growth of the board. ``figures`` (3,): apparent relative
+    growth of the board, mean offset in px across the epipolar lines, NaN with one axis, and RMS
+    residual in px that no change explains.
     """
 
-    name: str
     change: Floats
     spreads: Floats
     by_growth: Floats
-    scale: float
-    across_px: float
-    misfit_px: float
+    figures: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,47 +267,37 @@ class DriftReference:
 
     ``shared``: corrections of the relative pose and coefficients of the lens errors, with their
     ``covariance``; ``sigmas`` (3,) px: standard deviation of one observation by kind, remaining
-    lens errors included; ``pose_changes``: apparent changes of the calibration's own poses, each
-    from the other poses' lens errors.
+    lens errors included. Of the calibration's own poses, one row each: ``names``, and apparent
+    ``changes`` from the other poses' lens errors with ``spreads``, ``by_growth`` and ``figures`` as
+    in `PoseChange`.
     """
 
     rig: StereoRig
     shared: Floats
     covariance: Floats
     sigmas: Floats
-    pose_changes: tuple[PoseChange, ...]
+    names: np.ndarray
+    changes: Floats
+    spreads: Floats
+    by_growth: Floats
+    figures: Floats
 
     def estimate_change(self, view: DriftView) -> PoseChange:
         """Estimate the projector's apparent change in a later view."""
         equations = linearise_view(self.rig, view)
         known = equations.shared
         variance = np.asarray(known.multiply(known @ self.covariance).sum(axis=1)).ravel()
-        return solve_change(equations, self.shared, self.sigmas, variance < UNSUPPORTED_PX**2)
+        supported = equations.usable & (variance < UNSUPPORTED_PX**2)
+        return solve_change(replace(equations, usable=supported), self.shared, self.sigmas)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return named arrays for saving."""
-        changes = self.pose_changes
-        return {
-            "shared": self.shared,
-            "covariance": self.covariance,
-            "sigmas": self.sigmas,
-            "names": np.array([a.name for a in changes]),
-            "changes": np.array([a.change for a in changes]),
-            "spreads": np.array([a.spreads for a in changes]),
-            "by_growth": np.array([a.by_growth for a in changes]),
-            "figures": np.array([(a.scale, a.across_px, a.misfit_px) for a in changes]),
-        }
+        return {name: values for name, values in vars(self).items() if name != "rig"}
 
     @classmethod
     def from_arrays(cls, rig: StereoRig, arrays: Mapping[str, np.ndarray]) -> "DriftReference":
         """Return the reference that ``to_arrays`` saved, of a calibration with this rig."""
-        each = (arrays[name] for name in ("names", "changes", "spreads", "by_growth", "figures"))
-        pose_changes = tuple(
-            PoseChange(str(name), change, spreads, growth, *figures.tolist())
-            for name, change, spreads, growth, figures in zip(*each, strict=True)
-        )
-        shared, covariance, sigmas = (arrays[name] for name in ("shared", "covariance", "sigmas"))
-        return cls(rig, shared, covariance, sigmas, pose_changes)
+        return cls(rig, *(arrays[field.name] for field in fields(cls)[1:]))
 
 
 def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReference:
@@ -151,10 +317,11 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
         blocks += [one, one]
     prior = sp.block_diag(blocks).toarray()
     sigmas = np.full(len(KINDS), 0.05)
-    weights = [_compute_weights(e, e.usable, sigmas) for e in equations]
+    weights = [_compute_weights(e, sigmas) for e in equations]
     for _ in range(3):
-        parts = [_reduce_normal_equations(e, w) for e, w in zip(equations, weights, strict=True)]
-        total, right = sum((N for N, _ in parts), prior), sum(b for _, b in parts)
+        parts = list(map(_reduce_normal_equations, equations, weights))
+        normals, rights = zip(*parts, strict=True)
+        total, right = sum(normals, prior), sum(rights)
         factor = cho_factor(total)
         shared = cho_solve(factor, right)
         # after the shared unknowns and the best board poses
@@ -165,32 +332,31 @@ def build_reference(rig: StereoRig, views: Sequence[DriftView]) -> DriftReferenc
         ]
         sigmas = _estimate_sigmas(equations, residuals, sigmas)
         weights = [
-            _compute_weights(e, e.usable, sigmas, r)
-            for e, r in zip(equations, residuals, strict=True)
+            _compute_weights(e, sigmas, r) for e, r in zip(equations, residuals, strict=True)
         ]
     others = [cho_solve(cho_factor(total - N), right - b) for N, b in parts]
     for _ in range(2):  # the weights depend on the sigmas, and the sigmas on the changes
-        pose_changes = tuple(
-            solve_change(e, g, sigmas, e.usable) for e, g in zip(equations, others, strict=True)
-        )
-        sigmas = _fit_sigmas(pose_changes, sigmas)
+        own = [solve_change(e, g, sigmas) for e, g in zip(equations, others, strict=True)]
+        # (views, 6), (views, kinds, 6, 6), (views, 6), (views, 3)
+        changes, spreads, *rest = map(np.array, zip(*(vars(a).values() for a in own), strict=True))
+        sigmas = _fit_sigmas(changes, spreads, sigmas)
     covariance = cho_solve(factor, np.eye(len(shared)))
-    return DriftReference(rig, shared, covariance, sigmas, pose_changes)
+    names = np.array([view.name for view in views])
+    return DriftReference(rig, shared, covariance, sigmas, names, changes, spreads, *rest)
 
 
-def solve_change(e: LinearView, shared: Floats, sigmas: Floats, supported: Mask) -> PoseChange:
+def solve_change(e: LinearView, shared: Floats, sigmas: Floats) -> PoseChange:
     """Estimate the projector's apparent change in one view by robust least squares, given the
     ``shared`` lens errors.
 
-    ``sigmas`` (3,) px by kind; ``supported`` (k,) bool: rows with certain lens errors.
+    ``sigmas`` (3,) px by kind.
     """
-    usable = e.usable & supported
-    residuals = np.where(usable, e.residuals, 0.0) - e.shared @ shared
+    residuals = np.where(e.usable, e.residuals, 0.0) - e.shared @ shared
     both = np.hstack([e.pose, e.change])
-    w = _compute_weights(e, usable, sigmas)
+    w = _compute_weights(e, sigmas)
     for _ in range(5):
         solution = _least_squares_gain(both, w) @ residuals
-        w = _compute_weights(e, usable, sigmas, residuals - both @ solution)
+        w = _compute_weights(e, sigmas, residuals - both @ solution)
     gain = _least_squares_gain(both, w)
     growth = _least_squares_gain(np.column_stack([e.pose, e.scale]), w)[6] @ residuals
     by_camera = _least_squares_gain(e.pose, np.where(e.kinds == 0, w, 0.0)) @ residuals
@@ -198,26 +364,23 @@ def solve_change(e: LinearView, shared: Floats, sigmas: Floats, supported: Mask)
     samples = across[e.kinds == 1] + across[e.kinds == 2]
     has_both_axes = (w[e.kinds == 1] > 0) & (w[e.kinds == 2] > 0)
     unexplained = (residuals - both @ (gain @ residuals))[w > 0]
+    offset = samples[has_both_axes].mean() if has_both_axes.any() else np.nan
+    by_kind = [gain[6:, e.kinds == k] for k in range(len(KINDS))]
     return PoseChange(
-        e.name,
         gain[6:] @ residuals,
-        np.array([part @ part.T for k in range(3) for part in [gain[6:, e.kinds == k]]]),
+        np.array([part @ part.T for part in by_kind]),
         gain[6:] @ e.scale,
-        float(growth),
-        float(samples[has_both_axes].mean()) if has_both_axes.any() else float("nan"),
-        rms(unexplained),
+        np.array([growth, offset, rms(unexplained)]),
     )
 
 
-def _compute_weights(
-    e: LinearView, usable: Mask, sigmas: Floats, residuals: Floats | None = None
-) -> Floats:
+def _compute_weights(e: LinearView, sigmas: Floats, residuals: Floats | None = None) -> Floats:
     """Return the weights (k,) 1/px^2, times Tukey's where ``residuals`` (k,) are given; 0 where not
     usable."""
-    w = usable / sigmas[e.kinds] ** 2
+    w = e.usable / sigmas[e.kinds] ** 2
     if residuals is not None:
         for kind in range(len(KINDS)):
-            these = usable & (e.kinds == kind)
+            these = e.usable & (e.kinds == kind)
             if these.any():
                 spread = max(robust_sigma(residuals[these]), 1e-9)
                 w[these] *= tukey_weights(residuals[these], spread)
@@ -258,20 +421,17 @@ def _estimate_sigmas(
     return sigmas
 
 
-def _fit_sigmas(pose_changes: Sequence[PoseChange], start: Floats) -> Floats:
-    """Fit the sigmas (3,) px by kind by maximum likelihood of the apparent changes, whose true
-    value is 0.
+def _fit_sigmas(changes: Floats, spreads: Floats, start: Floats) -> Floats:
+    """Fit the sigmas (3,) px by kind by maximum likelihood of the apparent ``changes`` (views, 6)
+    with ``spreads`` (views, 3, 6, 6), whose true value is 0.
 
     It exceeds the scatter of the residuals, as errors of neighbouring samples are correlated.
     """
-    # (views, kinds, 6, 6)
-    spreads = np.array([a.spreads for a in pose_changes])
-    changes = np.array([a.change for a in pose_changes])[..., None]
 
     def negative_log_likelihood(logs: Floats) -> float:
         """Return twice the negative log likelihood at the logarithms of the sigmas."""
         L = np.linalg.cholesky(np.tensordot(spreads, np.exp(2 * logs), (1, 0)))
-        whitened = np.linalg.solve(L, changes)
+        whitened = np.linalg.solve(L, changes[..., None])
         return float(2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum() + (whitened**2).sum())
 
     options = {"xatol": 0.02, "fatol": 0.01}
@@ -291,34 +451,33 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
             " board"
         )
     estimate = reference.estimate_change(view)
-    own = reference.pose_changes
     growth = BOARD_PPM * 1e-6
     C = np.tensordot(reference.sigmas**2, estimate.spreads, 1)
     C += growth**2 * np.outer(estimate.by_growth, estimate.by_growth)
     information = np.linalg.inv(C)
     squared_distance = float(estimate.change @ information @ estimate.change)
-    degrees = 6 * len(own) - 3  # the floor is itself an estimate, from so many numbers
+    degrees = reference.changes.size - 3  # the floor is itself an estimate, from so many numbers
     chance = float(fdtrc(6, degrees, squared_distance / 6))
     limit = 6 * float(fdtri(6, degrees, 1 - FALSE_ALARMS))
-    scale_sigma = float(np.hypot(rms([a.scale for a in own]), growth))
+    scale, offset, misfit = estimate.figures.tolist()
+    scales, offsets, misfits = reference.figures.T
+    scale_sigma = float(np.hypot(rms(scales), growth))
     across_px = across_sigma = None
-    if np.isfinite(estimate.across_px):
-        across_px = estimate.across_px
-        across_sigma = float(np.sqrt(np.nanmean([a.across_px**2 for a in own])))
+    if np.isfinite(offset):
+        across_px, across_sigma = offset, float(np.sqrt(np.nanmean(offsets**2)))
     along = np.concatenate([np.zeros(3), unit_vectors(reference.rig.t)])
     reasons = []
-    worst = max(a.misfit_px for a in own)
-    if estimate.misfit_px > MAX_MISFIT_RATIO * worst:
+    if misfit > MAX_MISFIT_RATIO * misfits.max():
         reasons.append(
-            f"residuals of {estimate.misfit_px:.3f} px RMS remain with any movement of the"
-            f" projector (at most {worst:.3f} px in the poses of the calibration): was a lens"
-            " refocused, the board moved, or is it another one?"
+            f"residuals of {misfit:.3f} px RMS remain with any movement of the"
+            f" projector (at most {misfits.max():.3f} px in the poses of the calibration): was a"
+            " lens refocused, the board moved, or is it another one?"
         )
     elif squared_distance > limit:
         reasons.append(_list_movements(estimate, information, squared_distance, along))
-        if abs(estimate.scale) > 3 * scale_sigma:
+        if abs(scale) > 3 * scale_sigma:
             reasons.append(
-                f"the board seems {1e6 * estimate.scale:+.0f} ppm larger than it is (+-"
+                f"the board seems {1e6 * scale:+.0f} ppm larger than it is (+-"
                 f" {1e6 * scale_sigma:.0f})"
             )
         if across_px and across_sigma and abs(across_px) > 4 * across_sigma:
@@ -339,13 +498,13 @@ def check_drift(reference: DriftReference, view: DriftView) -> Drift:
         shift_sigma_mm=to_vector(sigmas[3:]),
         baseline_mm=float(along @ estimate.change),
         baseline_sigma_mm=float(np.sqrt(along @ C @ along)),
-        scale_ppm=1e6 * estimate.scale,
+        scale_ppm=1e6 * scale,
         scale_sigma_ppm=1e6 * scale_sigma,
         across_px=across_px,
         across_sigma_px=across_sigma,
-        misfit_px=estimate.misfit_px,
+        misfit_px=misfit,
         chance=chance,
-        seen_alone=(*to_vector(seen_alone[:3]), *to_vector(seen_alone[3:])),
+        seen_alone=tuple(seen_alone.tolist()),
         unseen=(
             *_list_undetermined(seen_alone, view.axes),
             "common motion of both devices (harmless)",

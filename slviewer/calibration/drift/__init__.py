@@ -1,1 +1,0 @@
-"""Drift check of a saved calibration from one capture of its board."""
