@@ -19,9 +19,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points, turn_about
+from slviewer.geometry.rigid import Floats, Uncertainty, distance_jacobian, move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, occupied_cubes, rms_length
+from slviewer.geometry.vectors import diagonal, rms_length, subsample, sum_by_cube
 from slviewer.registration.markers import MarkerPose
 from slviewer.registration.scan import PreparedScan
 
@@ -53,7 +53,7 @@ class RefinedPose:
     ``gate_mm``: largest distance of a pair along its normal in the last iteration.
     """
 
-    T: np.ndarray
+    T: Floats
     gate_mm: float
     uncertainty: Uncertainty
 
@@ -76,11 +76,15 @@ def refine_pose(
     stride, least = (
         max(1, len(scan.fine_points) // points) for points in (_FIRST_POINTS, _MOST_POINTS)
     )
-    for _ in range(_STEPS):
+    steps_left = _STEPS
+    while True:
         pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
             return RefinedPose(T, gate, _UNKNOWN)
         e = _linearise(*pairs, T, markers)
+        if not steps_left:
+            return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], e))
+        steps_left -= 1
         gradient = e.gradients.sum(axis=0) + e.gradient_markers
         step = -np.linalg.lstsq(e.H + e.H_markers, gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], e.centre, step[3:]) @ T
@@ -88,14 +92,10 @@ def refine_pose(
         motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(pairs[0])
         if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
             if stride == least:
-                break
+                steps_left = 0
+                continue
             stride = least  # the last iterations use many more points
         gate = next_gate
-    pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
-    if pairs is None:
-        return RefinedPose(T, gate, _UNKNOWN)
-    equations = _linearise(*pairs, T, markers)
-    return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], equations))
 
 
 def _match_pairs(
@@ -105,7 +105,7 @@ def _match_pairs(
     gate: float,
     lateral: float,
     stride: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+) -> tuple[Floats, Floats, Floats] | None:
     """Match every ``stride``-th point of the scan, moved by ``T`` (4, 4), with the nearest point of
     the reference.
 
@@ -144,20 +144,20 @@ class _Equations:
     leaves bent is alike over a good part of the surface, and a plane would slide until it fits.
     """
 
-    centre: np.ndarray
+    centre: Floats
     sigma: float
-    H: np.ndarray
-    gradients: np.ndarray
+    H: Floats
+    gradients: Floats
     alike: float
-    H_markers: np.ndarray
-    gradient_markers: np.ndarray
+    H_markers: Floats
+    gradient_markers: Floats
 
 
 def _linearise(
-    points: np.ndarray,
-    normal: np.ndarray,
-    residual: np.ndarray,
-    T: np.ndarray,
+    points: Floats,
+    normal: Floats,
+    residual: Floats,
+    T: Floats,
     markers: MarkerPose | None,
 ) -> _Equations:
     """Return the normal equations of pairs, as of ``_match_pairs``, and of markers at a pose ``T``
@@ -173,7 +173,7 @@ def _linearise(
     return _Equations(centre, sigma, (J * weight[:, None]).T @ J, gradients, alike, *of_markers)
 
 
-def _estimate_uncertainty(points: np.ndarray, e: _Equations) -> Uncertainty:
+def _estimate_uncertainty(points: Floats, e: _Equations) -> Uncertainty:
     """Estimate the uncertainty of a pose by a cluster-robust covariance of the pairs' points (n,
     3), and from the standard deviations of markers."""
     arm = points - e.centre
@@ -181,7 +181,7 @@ def _estimate_uncertainty(points: np.ndarray, e: _Equations) -> Uncertainty:
     inverse = np.linalg.pinv(e.H + e.H_markers, rcond=1e-12, hermitian=True)
     covariances: list[np.ndarray] = []
     for share in _PATCHES:
-        patches = _sum_by_cube(e.gradients, arm, diameter / share)
+        patches = sum_by_cube(e.gradients, arm, diameter / share)
         if len(patches) < _LEAST_PATCHES and covariances:
             break
         meat = (
@@ -194,13 +194,6 @@ def _estimate_uncertainty(points: np.ndarray, e: _Equations) -> Uncertainty:
     return Uncertainty(_UNSEEN**2 * (largest + largest.T) / 2, e.centre)
 
 
-def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
-    """Return the sums (m, k) of ``values`` (n, k) over the m occupied cubes of ``side`` mm of
-    ``points`` (n, 3)."""
-    _, which = occupied_cubes(points, side)
-    return np.stack([np.bincount(which, column) for column in values.T], axis=1)
-
-
 @dataclass(frozen=True, eq=False)
 class Freedom:
     """Principal motions of a scan on its reference, and how well the shape determines each.
@@ -210,8 +203,8 @@ class Freedom:
     the overlap's radius.
     """
 
-    slack_mm: np.ndarray
-    motions: np.ndarray
+    slack_mm: Floats
+    motions: Floats
 
     @property
     def loosest_mm(self) -> float:
@@ -242,7 +235,7 @@ WORDS: dict[Shape, str] = {
 
 
 def estimate_freedom(
-    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, points: np.ndarray, rms: float
+    scan: PreparedScan, reference: PreparedScan, T: Floats, points: Floats, rms: float
 ) -> Freedom:
     """Estimate which motions of the scan the overlap leaves undetermined.
 
@@ -251,7 +244,7 @@ def estimate_freedom(
     """
     if len(points) < 6:
         return Freedom(np.full(6, np.inf), np.eye(6))
-    points = points[:: -(-len(points) // _FREEDOM_POINTS)]
+    points = subsample(points, _FREEDOM_POINTS)
     smooth_points, normals = reference.smooth
     reference_normals = normals[cKDTree(smooth_points).query(points)[1]]
     smooth_points, normals = scan.smooth
