@@ -139,8 +139,6 @@ def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
     """Return the axis with the lowest median sigma where both are valid, else the one with most
     valid pixels."""
     axes = list(measured)
-    if len(axes) == 1:
-        return axes[0]
     valid = {
         axis: np.isfinite(points[..., 2]) & np.isfinite(sigma)
         for axis, (points, sigma, _) in measured.items()
@@ -216,20 +214,19 @@ def triangulate_grid(points: np.ndarray, max_jump: float | None = None) -> np.nd
     if max_jump is None:
         max_jump = JUMP * float(np.median(z[valid])) if valid.any() else 0.0
     corners = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
-    z00, z01, z10, z11 = (z[corner] for corner in corners)
-    falling, rising = np.abs(z00 - z11), np.abs(z01 - z10)
+    depths, numbers = (np.stack([grid[corner] for corner in corners]) for grid in (z, index))
+    falling, rising = np.abs(depths[0] - depths[3]), np.abs(depths[1] - depths[2])
     # a diagonal with an invalid end has a NaN step: the other one is cut along
     along_rising = np.isfinite(rising) & ~(falling < rising)
     along_falling = np.isfinite(falling) & ~along_rising
     faces = []
-    for chosen, a, b, c in (
+    for chosen, *triangle in (
         (along_rising, 0, 2, 1),
         (along_rising, 1, 2, 3),
         (along_falling, 0, 2, 3),
         (along_falling, 0, 3, 1),
     ):
-        triangle = [corners[k] for k in (a, b, c)]
-        spread = np.ptp([z[corner] for corner in triangle], axis=0)
-        selected = chosen & (spread <= max_jump)  # False where a corner is NaN
-        faces.append(np.stack([index[corner][selected] for corner in triangle], axis=1))
-    return np.concatenate(faces)
+        # False where a corner is NaN
+        selected = chosen & (np.ptp(depths[triangle], axis=0) <= max_jump)
+        faces.append(numbers[triangle][:, selected])
+    return np.ascontiguousarray(np.concatenate(faces, axis=1).T)
