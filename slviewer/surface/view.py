@@ -36,22 +36,6 @@ LEAST_GROUP = 2e-4
 """Least share of a scan's pixels in a connected group."""
 
 
-@dataclass(frozen=True)
-class ExcludedPixels:
-    """Numbers of excluded pixels: ``edges`` (border and depth jumps), ``grazing`` or without a
-    normal, in small ``groups``, and in ``far`` clusters."""
-
-    edges: int
-    grazing: int
-    groups: int
-    far: int
-
-    @property
-    def total(self) -> int:
-        """Number of all excluded pixels."""
-        return self.edges + self.grazing + self.groups + self.far
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """A cleaned scan, cropped to its surface.
@@ -75,7 +59,7 @@ class View:
     colours: np.ndarray | None
     to_pixel: np.ndarray
     spacing: float
-    cleaned: ExcludedPixels
+    cleaned: dict[str, int]
 
     @property
     def mask(self) -> np.ndarray:
@@ -230,8 +214,10 @@ def _fit_pixel_map(name: str, points: np.ndarray, surface: np.ndarray) -> np.nda
     return np.concatenate([middle, half, coefficients.T.ravel()])
 
 
-def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels]:
-    """Select the pixels of a cloud on a surface, (h, w) bool, and count the excluded ones.
+def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, dict[str, int]]:
+    """Select the pixels of a cloud on a surface, (h, w) bool, and count the excluded ones: at
+    ``edges`` (border and depth jumps), ``grazing`` or without a normal, in small ``groups``, and in
+    ``far`` clusters.
 
     ``normals``: (h, w, 3), towards the camera, NaN where unknown.
     """
@@ -244,8 +230,9 @@ def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels
     facing = inside & (np.abs(viewing_cosines(cloud.points, normals)) > MIN_VIEWING_COSINE)
     grouped = _select_large_groups(facing)
     surface = grouped & ~detect_far_clusters(cloud.points, grouped)
-    counts = [np.count_nonzero(each) for each in (mask, inside, facing, grouped, surface)]
-    return surface, ExcludedPixels(*(int(a - b) for a, b in pairwise(counts)))
+    counts = [int(np.count_nonzero(each)) for each in (mask, inside, facing, grouped, surface)]
+    reasons = "edges", "grazing", "groups", "far"
+    return surface, {why: a - b for why, (a, b) in zip(reasons, pairwise(counts), strict=True)}
 
 
 def viewing_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
