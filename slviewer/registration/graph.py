@@ -125,10 +125,6 @@ def select_consistent_edges(
     ``Refused`` where that does not decide.
     """
     hypotheses = _list_hypotheses(nodes, edges, root)
-    gaps = {
-        dropped: {k: loop_gap(edges[k], poses) for k in dropped}
-        for dropped, poses in hypotheses.items()
-    }
     fewest = min(map(len, hypotheses))
     best = [dropped for dropped in hypotheses if len(dropped) == fewest]
     if len(best) > 1:
@@ -138,14 +134,18 @@ def select_consistent_edges(
             if all(is_good_fit(edges[k], hypotheses[dropped]) for k in dropped)
         ]
     if len(best) != 1:
-        worst = max(gap for each in gaps.values() for gap in each.values())
+        worst = max(
+            loop_gap(edges[k], poses) for dropped, poses in hypotheses.items() for k in dropped
+        )
         raise Refused(
             "ambiguous",
             f"Pairs of scans contradict one another by {worst.shift_mm:.1f} mm and"
             f" {worst.turn_deg:.1f} degrees, and nothing tells which is wrong: take scans that"
             " overlap more, pick point pairs, or give the turntable's angle.",
         )
-    return [k for k in range(len(edges)) if k not in best[0]], gaps[best[0]]
+    (dropped,) = best
+    gaps = {k: loop_gap(edges[k], hypotheses[dropped]) for k in dropped}
+    return [k for k in range(len(edges)) if k not in dropped], gaps
 
 
 def _list_hypotheses(nodes: int, edges: Sequence[Edge], root: int) -> dict[frozenset[int], Floats]:

@@ -85,8 +85,7 @@ def refine_pose(
         if not steps_left:
             return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], e))
         steps_left -= 1
-        gradient = e.gradients.sum(axis=0) + e.gradient_markers
-        step = -np.linalg.lstsq(e.H + e.H_markers, gradient, rcond=1e-10)[0]
+        step = -np.linalg.lstsq(e.H, e.gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], e.centre, step[3:]) @ T
         next_gate = min(gate, max(3.0 * e.sigma, narrowest))
         motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(pairs[0])
@@ -139,18 +138,16 @@ class _Equations:
     """Normal equations of pairs and markers, of a small rotation (rad) about ``centre`` (3,) mm and
     a translation (mm).
 
-    ``sigma``: noise of the residuals, mm; ``gradients`` (n, 6) of each pair, ``H`` (6, 6) of all;
-    ``alike``: how many pairs count as one measurement beside markers, because what a calibration
-    leaves bent is alike over a good part of the surface, and a plane would slide until it fits.
+    ``sigma``: noise of the residuals, mm; ``H`` (6, 6) and ``gradient`` (6,) of all; ``gradients``
+    (n, 6) of each pair; ``scatter`` (6, 6): covariance of the markers' gradient.
     """
 
     centre: Floats
     sigma: float
-    H: Floats
+    H: np.ndarray
+    gradient: Floats
     gradients: Floats
-    alike: float
-    H_markers: Floats
-    gradient_markers: Floats
+    scatter: Floats
 
 
 def _linearise(
@@ -165,12 +162,17 @@ def _linearise(
     centre = points.mean(axis=0)
     sigma = max(robust_sigma(residual, about=0.0), 1e-6)
     J, weight = distance_jacobian(points - centre, normal), tukey_weights(residual, sigma)
-    alike = max(1.0, len(points) / _INDEPENDENT)
-    of_markers = np.zeros((6, 6)), np.zeros(6)
-    if markers is not None:
-        of_markers = markers.normal_equations(T, centre, sigma * np.sqrt(alike))
     gradients = J * (weight * residual)[:, None]
-    return _Equations(centre, sigma, (J * weight[:, None]).T @ J, gradients, alike, *of_markers)
+    H, gradient = (J * weight[:, None]).T @ J, gradients.sum(axis=0)
+    scatter = np.zeros((6, 6))
+    if markers is not None:
+        # So many pairs count as one measurement: what a calibration leaves bent is alike over a
+        # good part of the surface, and a plane would slide until it fits.
+        alike = max(1.0, len(points) / _INDEPENDENT)
+        of_markers = markers.normal_equations(T, centre, sigma * np.sqrt(alike))
+        H, gradient = H + of_markers[0], gradient + of_markers[1]
+        scatter = alike * sigma**2 * of_markers[0]
+    return _Equations(centre, sigma, H, gradient, gradients, scatter)
 
 
 def _estimate_uncertainty(points: Floats, e: _Equations) -> Uncertainty:
@@ -178,16 +180,13 @@ def _estimate_uncertainty(points: Floats, e: _Equations) -> Uncertainty:
     3), and from the standard deviations of markers."""
     arm = points - e.centre
     diameter = 2.0 * rms_length(arm)
-    inverse = np.linalg.pinv(e.H + e.H_markers, rcond=1e-12, hermitian=True)
+    inverse = np.linalg.pinv(e.H, rcond=1e-12, hermitian=True)
     covariances: list[np.ndarray] = []
     for share in _PATCHES:
         patches = sum_by_cube(e.gradients, arm, diameter / share)
         if len(patches) < _LEAST_PATCHES and covariances:
             break
-        meat = (
-            patches.T @ patches * len(patches) / max(len(patches) - 6, 1)
-            + e.alike * e.sigma**2 * e.H_markers
-        )
+        meat = patches.T @ patches * len(patches) / max(len(patches) - 6, 1) + e.scatter
         covariances.append(inverse @ meat @ inverse)
     # errors that are correlated over more than one patch show in larger patches only
     largest = max(covariances, key=lambda covariance: float(np.trace(covariance[3:, 3:])))
