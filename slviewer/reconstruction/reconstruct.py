@@ -11,7 +11,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.vectors import finite_rows
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, Map, Points
 
 EDGE_SIGMAS = 10.0
 """Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel;
@@ -34,10 +34,10 @@ class Model(Protocol):
     def axes(self) -> tuple[Axis, ...]:
         """The axes it was calibrated for."""
 
-    def points(self, phase: PhaseMap) -> np.ndarray:
+    def points(self, phase: PhaseMap) -> Points:
         """(h, w, 3) float32 mm in the camera's frame, NaN where invalid."""
 
-    def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
+    def sigma_z(self, phase: PhaseMap, points: Points) -> Map:
         """(h, w) mm: predicted standard deviation of depth."""
 
 
@@ -48,7 +48,7 @@ class KnowsErrors(Protocol):
     def excess_px(self, axis: Axis) -> float:
         """Scatter of the phase beyond its predicted noise, in projector px (1 sigma)."""
 
-    def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
+    def sigma_calibration(self, axis: Axis, points: Points) -> Map:
         """(h, w) float32 mm: standard deviation of the depth of organised points due to the
         calibration."""
 
@@ -95,7 +95,7 @@ def reconstruct_cloud(
     return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
 
 
-def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
+def normals(points: Points, reach: int = 2) -> Points:
     """Unit normals (h, w, 3) float32 of an organised cloud, towards the camera; NaN where
     neighbours are missing.
 
@@ -199,7 +199,7 @@ def _normals(points, reach, out):
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = n0 / length, n1 / length, n2 / length
 
 
-def triangulate_grid(points: np.ndarray, max_jump: float | None = None) -> np.ndarray:
+def triangulate_grid(points: Points, max_jump: float | None = None) -> np.ndarray:
     """Faces (m, 3) int32 of an organised cloud (h, w, 3) mm, numbering its valid points row by row.
 
     (The vertices are ``points[np.isfinite(points).all(axis=-1)]``.) Each square of four

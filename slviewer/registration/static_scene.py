@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.geometry.rigid import Floats, Mask, move_points
 from slviewer.geometry.vectors import lengths
-from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.cloud import Cloud, Points, choose_pixels, keep_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.registration.pairwise import Progress
@@ -58,8 +58,8 @@ class SurfaceSamples:
     results of ``heights_above``.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
+    points: Points
+    normals: Points
     ray_tree: cKDTree
     ray_distance: np.ndarray
     point_tree: cKDTree
@@ -181,7 +181,7 @@ def _sample_clouds(clouds: Mapping[str, Cloud]) -> dict[str, SurfaceSamples]:
     return {name: sample_surface(_select_precise(cloud)) for name, cloud in clouds.items()}
 
 
-def _select_precise(cloud: Cloud) -> np.ndarray:
+def _select_precise(cloud: Cloud) -> Points:
     """Return the points (n, 3) mm of a cloud but the noisiest, which on dark print lie further off
     than the others."""
     mask = cloud.mask
@@ -234,7 +234,7 @@ def _detect_unmoved_points(
     return static
 
 
-def sample_surface(points: np.ndarray) -> SurfaceSamples:
+def sample_surface(points: Points) -> SurfaceSamples:
     """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are
     removed."""
     points = np.asarray(points, np.float64)

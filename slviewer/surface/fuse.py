@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points
+from slviewer.geometry.rigid import Mask, Uncertainty, distance_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import lengths, rms, unit_vectors
-from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.cloud import Cloud, Points, choose_pixels, keep_pixels
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes, measure_heights
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, prepare_view, viewing_cosines
@@ -137,9 +137,7 @@ def fuse(
     )
 
 
-def _detect_violations(
-    views: Views, pairs: Agreements, progress: Progress
-) -> dict[str, np.ndarray]:
+def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> dict[str, Mask]:
     """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that
     confirm them."""
     witnesses = {name: _select_witnesses(view) for name, view in views.items()}
@@ -162,7 +160,7 @@ def _detect_violations(
     return violations
 
 
-def _select_witnesses(view: View) -> np.ndarray:
+def _select_witnesses(view: View) -> Mask:
     """Select the pixels (h, w) bool whose free space is certain: inside the surface, and not at
     grazing angles."""
     inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
@@ -226,7 +224,7 @@ def _fuse_scan(
 
 
 def _average(
-    view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarray, coloured: bool
+    view: View, points: Points, normals: Points, sums: np.ndarray, coloured: bool
 ) -> PointSet:
     """Return the averages of a scan's points (n, 3) in the reference's frame from their ``sums``
     (n, FIELDS)."""

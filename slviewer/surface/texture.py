@@ -19,7 +19,7 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
 from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, Points
 from slviewer.registration.open3d_loader import open3d
 from slviewer.surface.fuse import Progress, Views, colour_gains, compare_views
 from slviewer.surface.shapes import Mesh, count_edges, face_areas, pick_attributes
@@ -150,7 +150,7 @@ def _unfold(mesh: Mesh, size: int) -> tuple[Any, np.ndarray, int]:
     return unfolded, unfolded.triangle.texture_uvs.numpy().astype(np.float64), int(charts)
 
 
-def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _bake_places(unfolded: Any, size: int) -> tuple[Points, Points]:
     """Return the place (h, w, 3) mm of each texel and the unit normal there; NaN outside of the
     charts."""
     unfolded.compute_vertex_normals()
@@ -162,8 +162,8 @@ def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blend(
-    places: np.ndarray,
-    normals: np.ndarray,
+    places: Points,
+    normals: Points,
     views: Views,
     gains: Mapping[str, float],
     light: np.ndarray | None,
@@ -183,7 +183,7 @@ def _blend(
 
 
 def _look(
-    places: np.ndarray, normals: np.ndarray, view: View, light: np.ndarray | None
+    places: Points, normals: Points, view: View, light: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a view shows of places (n, 3) with normals: colours (n, 3), and weights (n,), 0
     of what it misses."""
