@@ -341,10 +341,8 @@ def _residual_of(kind: Kind, points: Floats) -> float:
 def _residual_from_quadric(plane: Feature, points: Floats) -> float:
     """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed,
     noise remains."""
-    normal = plane.unit_direction
     offsets = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(offsets - (offsets @ normal)[:, None] * normal, full_matrices=False)
-    basis = monomials(offsets @ axes[:2].T, 2)
+    basis = monomials(offsets @ perpendicular_axes(plane.unit_direction).T, 2)
     heights = plane.distance(points)
 
     def solve(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

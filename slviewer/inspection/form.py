@@ -106,36 +106,30 @@ def smooth_deviations(
     ``coordinates`` (n, k): across the region, in about -1 to 1; ``unrolled`` (n, 1 or 2): others
     that are in proportion to its area, by default the same. Raises InputError for too few points.
     """
-    step = -(-len(deviations) // MAX_FITTED_POINTS)
-    d, points, normals = deviations[::step], points[::step], normals[::step]
-    unrolled = (coordinates if unrolled is None else unrolled)[::step]
-    coordinates, fitted = coordinates[::step], fitted[::step]
-    counted = np.ones(len(d), bool)
-    for _ in range(2):
-        removed, basis, degrees = _smooth_basis(coordinates[counted], fitted[counted])
-        n, r = basis.shape
-        if n < POINTS_PER_TERM * (r + removed.shape[1]):
+    unrolled = coordinates if unrolled is None else unrolled
+    arrays = deviations, points, normals, coordinates, fitted, unrolled
+    chosen = [subsample(each, MAX_FITTED_POINTS) for each in arrays]
+    rounding = 1e-9 * float(np.abs(chosen[1]).max())
+    for exclusions_left in (2, 1, 0):
+        d, points, normals, coordinates, fitted, unrolled = chosen
+        removed, basis, degrees = _smooth_basis(coordinates, fitted)
+        whole, residuals = _project_out(d, removed, basis)
+        n, columns = whole.shape
+        if exclusions_left and n < POINTS_PER_TERM * columns:
             raise InputError(
                 f"The region holds {n} measured points: its form needs"
-                f" {POINTS_PER_TERM * (r + removed.shape[1])}; select a wider region."
+                f" {POINTS_PER_TERM * columns}; select a wider region."
             )
-        whole, residuals = _project_out(d[counted], removed, basis)
-        reach = max(SPIKE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
-        within = np.abs(residuals) <= reach
-        if within.all():
+        is_near = np.abs(residuals) <= max(SPIKE_SIGMA * robust_sigma(residuals), rounding)
+        if is_near.all() or not exclusions_left:
             break
-        counted[np.flatnonzero(counted)[~within]] = False
-    d, points, normals, coordinates = (each[counted] for each in (d, points, normals, coordinates))
-    if len(d) < n:
-        removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
-        whole, residuals = _project_out(d, removed, basis)
-    n, columns = whole.shape
+        chosen = [each[is_near] for each in chosen]
     noise = float(np.sqrt(residuals @ residuals / (n - columns)))
     factor, unresolved = _patch_misfit(residuals, coordinates, noise, columns)
     sampled = np.arange(0, n, -(-n // MAX_SHARED_POINTS))
     answer = np.linalg.pinv(whole[sampled], rcond=1e-6)
     # the reference is that of even weight by area, whatever the density of the points
-    root = np.sqrt(_even_weights(unrolled[counted]))[:, None]
+    root = np.sqrt(_even_weights(unrolled))[:, None]
     reference = np.linalg.lstsq(root * removed, root * whole, rcond=1e-6)[0]
     smooth = whole - removed @ reference
     weights, noise = whole.T @ d, factor * noise
@@ -179,11 +173,11 @@ def zone_width(
         # leaves it unchanged
         change = 1e-3 * smooth.noise_mm + 1e-9
         by_field = np.zeros(len(field))
-        for k in (field.argmin(), field.argmax()):
-            sign = np.sign(field[k] - np.median(field))
-            step = np.zeros(len(field))
-            step[k] = sign * change
-            by_field[k] = (float(width((field + step)[:, None])[0]) - value) / change * sign
+        ends = [field.argmin(), field.argmax()]
+        signs = np.sign(field[ends] - np.median(field))
+        moved = np.repeat(field[:, None], 2, axis=1)
+        moved[ends, [0, 1]] += signs * change
+        by_field[ends] = (width(moved) - value) / change * signs
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
         effects = shared(smooth.points[places], answers[None, :, None] * smooth.normals[places])

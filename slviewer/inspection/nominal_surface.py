@@ -70,22 +70,17 @@ class NominalSurface:
         # the side of the surface follows from the normals of the vertices there
         at_side = (s < CORNER) | (t < CORNER) | (1 - s - t < CORNER)
         away = np.sum(normals * offsets, axis=1)
-        if at_side.any():
-            some = self._smooth[self._faces[face[at_side]]]
-            weights = np.stack([1 - s - t, s, t], axis=1)[at_side]
-            smooth = unit_vectors((some * weights[..., None]).sum(axis=1))
-            gaps = lengths(offsets[at_side])
-            above = np.sum(smooth * offsets[at_side], axis=1)
-            signs = np.where(above < 0, -1.0, 1.0)
-            away[at_side] = np.where(gaps > NEGLIGIBLE, signs * gaps, away[at_side])
-            at_rim = (self._at_rim[self._faces[face[at_side]]] | (weights < CORNER)).all(axis=1)
-            beyond = at_rim & (np.abs(above) < RIM * gaps) & (gaps > NEGLIGIBLE)
-            away[np.flatnonzero(at_side)[beyond]] = np.inf
-            normals = normals.copy()
-            clear = gaps > 10 * NEGLIGIBLE
-            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(gaps, 1e-300))[
-                clear, None
-            ] * offsets[at_side][clear]
+        weights, corners = np.stack([1 - s - t, s, t], axis=1), self._faces[face]
+        smooth = unit_vectors((self._smooth[corners] * weights[..., None]).sum(axis=1))
+        gaps, above = lengths(offsets), np.sum(smooth * offsets, axis=1)
+        signs = np.where(above < 0, -1.0, 1.0)
+        is_off = at_side & (gaps > NEGLIGIBLE)
+        away = np.where(is_off, signs * gaps, away)
+        at_rim = (self._at_rim[corners] | (weights < CORNER)).all(axis=1)
+        away[is_off & at_rim & (np.abs(above) < RIM * gaps)] = np.inf
+        towards = (signs / np.maximum(gaps, 1e-300))[:, None] * offsets
+        is_clear = at_side & (gaps > 10 * NEGLIGIBLE)
+        normals = np.where(is_clear[:, None], towards, normals)
         return away, normals
 
     def seen_from(self, places: Floats, facing: Floats, view: Floats, least: float) -> Mask:

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from slviewer.geometry.rigid import Floats, Uncertainty, distance_jacobian, move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, rms_length, subsample, sum_by_cube
+from slviewer.geometry.vectors import diagonal, rms_length, subsample, sum_by_cube, unit_vectors
 from slviewer.registration.markers import MarkerPose
 from slviewer.registration.scan import PreparedScan
 
@@ -122,8 +122,7 @@ def _match_pairs(
     scan_normals = scan.fine_normals[::stride][near] @ T[:3, :3].T
     is_pair = np.einsum("ij,ij->i", reference_normals, scan_normals) > _MIN_COSINE
     gap = points - reference.fine_points[nearest]
-    normal = reference_normals + scan_normals
-    normal /= np.maximum(np.sqrt(np.einsum("ij,ij->i", normal, normal)), 1e-9)[:, None]
+    normal = unit_vectors(reference_normals + scan_normals)
     residual = np.einsum("ij,ij->i", gap, normal)
     across = np.sqrt(np.maximum(np.einsum("ij,ij->i", gap, gap) - residual**2, 0.0))
     # beyond the rim the nearest point is far across

@@ -183,17 +183,16 @@ def measure_size(points: np.ndarray) -> float:
 def _make_cloud(points: Floats, normals: np.ndarray | None, voxel: float) -> Any:
     """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
     origin."""
-    if normals is not None:
-        # a NaN normal weighs nothing in a voxel's mean
-        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))
-        cloud = point_cloud(points, finite).voxel_down_sample(voxel)
+    # a NaN normal weighs nothing in a voxel's mean
+    finite = None if normals is None else np.nan_to_num(np.asarray(normals, dtype=np.float64))
+    cloud = point_cloud(points, finite).voxel_down_sample(voxel)
+    if normals is None:
+        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
+        cloud.orient_normals_towards_camera_location(np.zeros(3))
+    else:
         known = lengths(np.asarray(cloud.normals)) > 0.1
         cloud = cloud.select_by_index(np.flatnonzero(known))
         cloud.normalize_normals()
-    else:
-        cloud = point_cloud(points).voxel_down_sample(voxel)
-        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
-        cloud.orient_normals_towards_camera_location(np.zeros(3))
     seen = np.asarray(cloud.points)
     facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)
     return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

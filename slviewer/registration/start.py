@@ -135,11 +135,9 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     normal_products = np.einsum("ni,nj->nij", m, n).reshape(-1, 9)
     votes = np.empty(len(motions), dtype=np.int64)
     for chunk in np.array_split(np.arange(len(motions)), max(1, len(motions) * len(p) // 100_000)):
-        R, t = motions[chunk, :3, :3], motions[chunk, :3, 3]
-        gap = R.reshape(-1, 3) @ p.T
-        gap = gap.reshape(len(chunk), 3, len(p)) + (t[:, :, None] - q.T)
-        close = np.einsum("kin,kin->kn", gap, gap) < (1.5 * voxel) ** 2
-        alike = R.reshape(-1, 9) @ normal_products.T > 0.8
+        gap = move_points(motions[chunk], p) - q
+        close = np.einsum("kni,kni->kn", gap, gap) < (1.5 * voxel) ** 2
+        alike = motions[chunk, :3, :3].reshape(-1, 9) @ normal_products.T > 0.8
         votes[chunk] = np.count_nonzero(close & alike, axis=1)
 
     poses: list[np.ndarray] = []
