@@ -7,6 +7,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.robust import fit_reweighted
 from slviewer.geometry.vectors import finite_rows
 
@@ -22,17 +23,17 @@ class Polynomial2D:
     box.
     """
 
-    coefficients: np.ndarray
+    coefficients: Floats
     box: Box
 
-    def evaluate(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def evaluate(self, u: np.ndarray, v: np.ndarray) -> Floats:
         """Values at scattered pixels ``u``, ``v``, in their shape; NaN outside the box."""
         u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
         s, t = _normalise_pixels(u, v, self.box)
         values = chebyshev.chebval2d(t, s, self.coefficients)
         return np.where((np.abs(s) <= 1.0) & (np.abs(t) <= 1.0), values, np.nan)
 
-    def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Floats:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
         height, width = shape
         s, t = _normalise_pixels(
@@ -85,7 +86,7 @@ def fit_polynomial(
     return Polynomial2D(coefficients, box)
 
 
-def monomials(points: np.ndarray, degree: int) -> np.ndarray:
+def monomials(points: Floats, degree: int) -> Floats:
     """(n, m): x^i y^j of points (n, 2) for i from 0 and j from 0 while i + j <= ``degree``; j runs
     fastest."""
     # products, much faster than powers
@@ -95,7 +96,7 @@ def monomials(points: np.ndarray, degree: int) -> np.ndarray:
     )
 
 
-def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
+def fit_slopes(inputs: Floats, values: np.ndarray) -> Floats:
     """Return the slopes (k, m) of values (n, m) by ``inputs`` (n, k), by least squares with a
     constant.
 
@@ -106,13 +107,13 @@ def fit_slopes(inputs: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(design, values[known], rcond=None)[0][:-1]
 
 
-def grid_points(*coordinates: np.ndarray) -> np.ndarray:
+def grid_points(*coordinates: np.ndarray) -> Floats:
     """Return all combinations (n, k) of so many ``coordinates``, the first varying fastest in two
     dimensions."""
     return np.stack(np.meshgrid(*coordinates), axis=-1).reshape(-1, len(coordinates))
 
 
-def scale_to_unit_square(points: np.ndarray) -> np.ndarray:
+def scale_to_unit_square(points: Floats) -> Floats:
     """Scale points (n, 2) so that their extent along x and along y is -1 to 1."""
     low = points.min(0)
     return 2 * (points - low) / np.maximum(np.ptp(points, axis=0), 1e-9) - 1

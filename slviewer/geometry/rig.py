@@ -7,7 +7,6 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.geometry.jit import read_only
 from slviewer.geometry.lens import Lens
-from slviewer.geometry.rigid import rigid_transform
 
 LARGEST_BASELINE_MM = 1e6
 
@@ -49,11 +48,6 @@ class StereoRig:
                 f" in mm, {LARGEST_BASELINE_MM:g} at most."
             )
         vars(self).update(R=read_only(R), t=read_only(t))
-
-    @property
-    def T_projector_camera(self) -> np.ndarray:
-        """(4, 4): maps camera-frame points into the projector's frame."""
-        return rigid_transform(self.R, self.t)
 
     def to_projector(self, points: np.ndarray) -> np.ndarray:
         """Camera-frame points (..., 3) mm in the projector's frame, (..., 3) mm."""

@@ -5,26 +5,28 @@ from typing import TypeVar
 
 import numpy as np
 
+from slviewer.geometry.rigid import Floats
+
 Solution = TypeVar("Solution")
 
 
-def robust_sigma(residuals: np.ndarray, about: float | None = None) -> float:
+def robust_sigma(residuals: Floats, about: float | None = None) -> float:
     """1.4826 times the median absolute deviation from the median, or from ``about``: the standard
     deviation of normal residuals, robust to outliers."""
     centre = np.median(residuals) if about is None else about
     return float(1.4826 * np.median(np.abs(residuals - centre)))
 
 
-def tukey_weights(residuals: np.ndarray, sigma: float) -> np.ndarray:
+def tukey_weights(residuals: Floats, sigma: float) -> Floats:
     """Tukey's biweight at 4.685 sigma (95 % efficient on normal residuals): 0 beyond."""
     scaled = np.minimum(np.abs(residuals) / (4.685 * sigma), 1.0)
     return (1.0 - scaled**2) ** 2
 
 
 def fit_reweighted(
-    solve: Callable[[np.ndarray], tuple[Solution, np.ndarray]],
+    solve: Callable[[Floats], tuple[Solution, Floats]],
     values: np.ndarray,
-    weights: np.ndarray,
+    weights: Floats,
 ) -> Solution:
     """Iteratively reweighted least squares with Tukey's weights.
 

@@ -1,14 +1,16 @@
 """Planes and spheres: fitted to points by least squares of the orthogonal distances, and detected
 in a cluttered cloud by RANSAC, for initial values of these fits."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.vectors import diagonal, finite_rows, lengths, unit_vectors
 
 MIN_CAP_HEIGHT_RATIO = 4.0
@@ -21,7 +23,7 @@ class Plane:
     """n . x = d (Letter eq. 12): unit ``normal`` (3,) that points towards the camera (n_z < 0),
     ``offset`` d in mm."""
 
-    normal: np.ndarray
+    normal: Floats
     offset: float
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -33,12 +35,15 @@ class Plane:
 class Sphere:
     """``centre`` (3,) and ``radius``, mm."""
 
-    centre: np.ndarray
+    centre: Floats
     radius: float
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed radial distances (...) mm of points (..., 3), positive outside."""
         return _norms(np.asarray(points, dtype=np.float64) - self.centre) - self.radius
+
+
+AnyShape = TypeVar("AnyShape", Plane, Sphere)
 
 
 def fit_plane(points: np.ndarray) -> Plane:
@@ -82,11 +87,11 @@ def fit_sphere(points: np.ndarray, radius: float | None = None) -> Sphere:
         raise flat
     centre, start = _algebraic_sphere(points)
 
-    def distances(unknowns: np.ndarray) -> np.ndarray:
+    def distances(unknowns: Floats) -> Floats:
         """Return the radial distances (n,) mm of the points from the sphere of the unknowns."""
         return _norms(points - unknowns[:3]) - (unknowns[3] if radius is None else radius)
 
-    def jacobian(unknowns: np.ndarray) -> np.ndarray:
+    def jacobian(unknowns: Floats) -> Floats:
         """Return the derivatives (n, 3 or 4) of the radial distances by centre and radius."""
         offsets = points - unknowns[:3]
         derivatives = np.full((len(points), len(unknowns)), -1.0)
@@ -127,7 +132,7 @@ def _norms(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
 
 
-def _algebraic_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+def _algebraic_sphere(points: Floats) -> tuple[Floats, float]:
     """Centre and radius from |x|^2 = 2 c.x + (r^2 - c^2), linear in the unknowns; points about
     their centroid."""
     scale = np.sqrt((points**2).sum(axis=1).mean())
@@ -153,20 +158,15 @@ def ransac_plane(points: np.ndarray, tolerance: float) -> tuple[Plane, np.ndarra
     excluded. Raises InputError where no plane is detected.
     """
 
-    def hypotheses(triples: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return normals (k, 3) and offsets (k,) mm of the planes through point triples (k, 3,
-        3)."""
+    def hypotheses(triples: Floats) -> Iterable[Plane]:
+        """Return the planes through point triples (k, 3, 3), turned either way."""
         a, b, c = triples[:, 0], triples[:, 1], triples[:, 2]
         normals = np.cross(b - a, c - a)
         regular = lengths(normals) > 0
         normals = unit_vectors(normals[regular])
-        return normals, np.einsum("ij,ij->i", normals, a[regular])
+        return map(Plane, normals, np.einsum("ij,ij->i", normals, a[regular]))
 
-    def distances(sample: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Return the signed distances (k, n) mm of the sample (n, 3) from each plane."""
-        return normal @ sample.T - offset[:, None]
-
-    return _search(points, 3, tolerance, hypotheses, distances, fit_plane, "plane")
+    return _search(points, 3, tolerance, hypotheses, fit_plane, "plane")
 
 
 def ransac_sphere(
@@ -183,9 +183,8 @@ def ransac_sphere(
     extent = diagonal(finite) if len(finite) else 0.0
     low, high = (10.0 * tolerance, 0.5 * extent) if radius is None else (0.7 * radius, 1.4 * radius)
 
-    def hypotheses(quads: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return centres (k, 3) and radii (k,) mm of the spheres through four points each (k, 4,
-        3)."""
+    def hypotheses(quads: Floats) -> Iterable[Sphere]:
+        """Return the spheres through four points each (k, 4, 3)."""
         origin = quads[:, :1]
         edges = quads[:, 1:] - origin
         regular = np.abs(np.linalg.det(edges)) > 1e-12 * lengths(edges).prod(axis=1)
@@ -193,16 +192,9 @@ def ransac_sphere(
         offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=2)[..., None])[..., 0]
         radii = lengths(offset)
         sized = (radii >= low) & (radii <= high)
-        return (origin + offset)[sized], radii[sized]
+        return map(Sphere, (origin + offset)[sized], radii[sized])
 
-    def distances(sample: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """Return the signed radial distances (k, n) mm of the sample (n, 3) from each sphere."""
-        middle = sample.mean(axis=0)  # centred: the difference of squares loses no digits
-        x, c = sample - middle, centre - middle
-        squares = np.einsum("ij,ij->i", x, x) + np.einsum("ij,ij->i", c, c)[:, None] - 2.0 * c @ x.T
-        return np.sqrt(np.maximum(squares, 0.0)) - radii[:, None]
-
-    def fit(chosen: np.ndarray) -> Sphere:
+    def fit(chosen: Mask) -> Sphere:
         """Fit a sphere to the inliers (n, 3); InputError where its radius is outside the allowed
         range."""
         sphere = fit_sphere(chosen, radius)
@@ -213,23 +205,21 @@ def ransac_sphere(
             )
         return sphere
 
-    return _search(points, 4, tolerance, hypotheses, distances, fit, "sphere")
+    return _search(points, 4, tolerance, hypotheses, fit, "sphere")
 
 
 def _search(
     points: np.ndarray,
     needed: int,
     tolerance: float,
-    hypotheses: Callable[[np.ndarray], tuple[np.ndarray, ...]],
-    distances: Callable[..., np.ndarray],
-    fit: Callable,
+    hypotheses: Callable[[Floats], Iterable[AnyShape]],
+    fit: Callable[[np.ndarray], AnyShape],
     what: str,
-) -> tuple:
+) -> tuple[AnyShape, Mask]:
     """Hypotheses from neighbours at many scales, scored by truncated squares (MSAC); the best few
     refined."""
     points = np.asarray(points, dtype=np.float64)
-    finite = finite_rows(points)
-    valid = points[finite]
+    valid = points[finite_rows(points)]
     if len(valid) < 3 * needed:
         raise InputError(
             f"{len(valid)} points were measured, too few to detect a {what}: check the capture's"
@@ -237,20 +227,16 @@ def _search(
         )
     rng = np.random.default_rng(0)
     sample = valid[rng.choice(len(valid), min(SAMPLE_SIZE, len(valid)), replace=False)]
-    parameters = hypotheses(_minimal_sets(sample, needed, rng))
-    # score in slices, so that the table of distances stays small
-    scores = np.concatenate(
-        [
-            _score(distances(sample, *(p[i : i + 50] for p in parameters)), tolerance)
-            for i in range(0, len(parameters[0]), 50)
-        ]
-        or [np.empty(0)]
-    )
-    best, best_score = None, np.inf
-    for index in np.argsort(scores)[:REFINED_HYPOTHESES]:
-        chosen = (
-            np.abs(distances(sample, *(p[index : index + 1] for p in parameters))[0]) <= tolerance
-        )
+
+    def score(shape: AnyShape) -> float:
+        """Return the sum of squares truncated at the tolerance: fewer and larger residuals cost
+        more."""
+        return float(np.minimum((shape.distance(sample) / tolerance) ** 2, 1.0).sum())
+
+    refined = []
+    drawn = hypotheses(_minimal_sets(sample, needed, rng))
+    for shape in sorted(drawn, key=score)[:REFINED_HYPOTHESES]:
+        chosen = np.abs(shape.distance(sample)) <= tolerance
         try:
             for _ in range(5):
                 before, shape = chosen, fit(sample[chosen])
@@ -259,20 +245,18 @@ def _search(
                     break
         except InputError:  # too few, or flat: this hypothesis was chance
             continue
-        score = float(_score(shape.distance(sample), tolerance))
-        if score < best_score:
-            best, best_score = shape, score
-    if best is None:
+        refined.append(shape)
+    if not refined:
         raise InputError(
             f"No {what} was detected among {len(valid)} points to {tolerance:g} mm: "
             "check that it fills a good part of the view."
         )
-    inliers = np.abs(best.distance(points)) <= tolerance
-    shape = fit(points[inliers])
+    best = min(refined, key=score)
+    shape = fit(points[np.abs(best.distance(points)) <= tolerance])
     return shape, np.abs(shape.distance(points)) <= tolerance
 
 
-def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
+def _minimal_sets(sample: Floats, size: int, rng: np.random.Generator) -> Floats:
     """(HYPOTHESES, size, 3): each a random point and some of its nearest 1, 3, 10 or 25 % of the
     sample.
 
@@ -291,9 +275,3 @@ def _minimal_sets(sample: np.ndarray, size: int, rng: np.random.Generator) -> np
         sets[group, 0] = sample[seeds[group]]
         sets[group, 1:] = sample[np.take_along_axis(neighbours, picks, axis=1)]
     return sets
-
-
-def _score(residuals: np.ndarray, tolerance: float) -> np.ndarray:
-    """Sum of squares truncated at the tolerance, along the last axis: fewer and larger residuals
-    cost more."""
-    return np.minimum((residuals / tolerance) ** 2, 1.0).sum(axis=-1)

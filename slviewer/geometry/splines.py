@@ -21,6 +21,7 @@ from slviewer.geometry.polynomial import (
     parse_box,
     select_valid_samples,
 )
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.robust import fit_reweighted
 
 TREND_DEGREE = 3
@@ -40,7 +41,7 @@ class SplineSurface:
     """
 
     trend: Polynomial2D
-    coefficients: np.ndarray
+    coefficients: Floats
 
     @property
     def _spans(self) -> tuple[tuple[float, float, int], tuple[float, float, int]]:
@@ -49,7 +50,7 @@ class SplineSurface:
         u0, v0, u1, v1 = self.trend.box
         return (u0, u1, columns - 3), (v0, v1, rows - 3)
 
-    def evaluate(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def evaluate(self, u: np.ndarray, v: np.ndarray) -> Floats:
         """Values at scattered pixels ``u``, ``v``, in their shape; NaN outside the box."""
         u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
         values = self.trend.evaluate(u, v).ravel()
@@ -59,7 +60,7 @@ class SplineSurface:
         values[inside] += _spline_at(*bases, self.coefficients)
         return values.reshape(u.shape)
 
-    def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    def evaluate_grid(self, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Floats:
         """(h, w) float64 values of the pixels from ``origin`` (u, v) on; NaN outside the box."""
         along, down = (
             basis_matrix(first + np.arange(count, dtype=np.float64), *span)

@@ -40,6 +40,11 @@ def finite_rows(*arrays: np.ndarray) -> np.ndarray:
     return np.logical_and.reduce([np.isfinite(each).all(axis=-1) for each in arrays])
 
 
+def subsample(values: np.ndarray, most: int) -> np.ndarray:
+    """Return every k-th of values (n, ...), with the least k that leaves at most so many."""
+    return values[:: max(1, -(-len(values) // most))]
+
+
 def median_spacing(tree: cKDTree, samples: int) -> float:
     """Return the median distance of points of a search tree to their nearest other point, over some
     ``samples`` of them; infinite for a single point."""
@@ -64,3 +69,10 @@ def occupied_cubes(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndar
     shifts = np.array([2 * _BITS, _BITS, 0])
     keys, which = np.unique((cube << shifts).sum(axis=1), return_inverse=True)
     return keys[:, None] >> shifts & (1 << _BITS) - 1, which
+
+
+def sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
+    """Return the sums (m, k) of ``values`` (n, k) over the m occupied cubes of ``side`` mm of
+    ``points`` (n, 3)."""
+    _, which = occupied_cubes(points, side)
+    return np.stack([np.bincount(which, column) for column in values.T], axis=1)

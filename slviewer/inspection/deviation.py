@@ -1,20 +1,26 @@
 """Signed deviations of a scan from a nominal model after best-fit alignment: their statistics and
 colours, and whether they stay within a tolerance, as far as their uncertainty lets one say."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import move_points, turn_about
-from slviewer.geometry.vectors import rms
+from slviewer.geometry.rigid import (
+    Floats,
+    Mask,
+    Uncertainty,
+    distance_jacobian,
+    move_points,
+    turn_about,
+)
+from slviewer.geometry.vectors import rms, subsample
 from slviewer.inspection.nominal_surface import NominalSurface, search_start
-from slviewer.inspection.uncertainty import RigidSpread, scatter_covariance
+from slviewer.inspection.uncertainty import scatter_covariance
 from slviewer.records.acceptance import Decision, worst_decision
 from slviewer.records.measurement import ToleranceVerdict
-from slviewer.registration.pairwise import Registration
+from slviewer.registration.pairwise import Progress, Registration
 from slviewer.surface.shapes import Mesh
 
 REACH = 0.02
@@ -48,16 +54,16 @@ class Deviation:
 
     signed: np.ndarray
     normals: np.ndarray
-    T_nominal_scan: np.ndarray
+    T_nominal_scan: Floats
     reach_mm: float
     coverage: float
-    uncovered: np.ndarray
+    uncovered: Floats
     alignment_mm: float
     start: Registration | None = None
-    alignment_spread: RigidSpread | None = None
+    alignment_spread: Uncertainty | None = None
 
     @property
-    def counted(self) -> np.ndarray:
+    def counted(self) -> Mask:
         """(n,) bool: the points that belong to the nominal."""
         return np.isfinite(self.signed)
 
@@ -81,7 +87,7 @@ class Deviation:
             "left_out": int(self.signed.size - values.size),
         }
 
-    def histogram(self, bins: int = 81) -> tuple[np.ndarray, np.ndarray]:
+    def histogram(self, bins: int = 81) -> tuple[Floats, Floats]:
         """Edges (bins + 1,) mm, symmetric about 0, and counts (bins,); values beyond 99.8 % are
         excluded."""
         values = self.signed[self.counted]
@@ -94,11 +100,11 @@ def deviation(
     points: np.ndarray,
     nominal: Mesh,
     *,
-    normals: np.ndarray | None = None,
+    normals: Floats | None = None,
     sigma_mm: float | None = None,
     reach_mm: float | None = None,
-    initial: np.ndarray | None = None,
-    progress: Callable[[float], None] | None = None,
+    initial: Floats | None = None,
+    progress: Progress | None = None,
 ) -> Deviation:
     """Align scan points (n, 3) mm with a nominal model, and return the signed distance of each.
 
@@ -154,10 +160,10 @@ def deviation(
 
 
 def _signed_distances(
-    points: np.ndarray,
-    normals: np.ndarray | None,
+    points: Floats,
+    normals: Floats | None,
     surface: NominalSurface,
-    T: np.ndarray,
+    T: Floats,
     reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (n,) and the nominal's normals (n, 3), NaN where a point does not belong to
@@ -173,19 +179,18 @@ def _signed_distances(
 
 
 def _refine_best_fit(
-    points: np.ndarray,
-    normals: np.ndarray | None,
+    points: Floats,
+    normals: Floats | None,
     surface: NominalSurface,
     T: np.ndarray,
     reach: float,
-    report: Callable[[float], None],
-) -> tuple[np.ndarray, float, RigidSpread]:
+    report: Progress,
+) -> tuple[np.ndarray, float, Uncertainty]:
     """The pose of least squared distances of the points that belong to the nominal, by
     Gauss-Newton, the standard uncertainty, mm, that its own gives the points, and its
     covariance."""
-    step = -(-len(points) // MAX_ALIGNED_POINTS)
-    points = points[::step]
-    normals = None if normals is None else normals[::step]
+    points = subsample(points, MAX_ALIGNED_POINTS)
+    normals = None if normals is None else subsample(normals, MAX_ALIGNED_POINTS)
     T = np.array(T, np.float64)
     for turn in range(MAX_ITERATIONS):
         report(turn / MAX_ITERATIONS)
@@ -198,7 +203,7 @@ def _refine_best_fit(
             )
         moved = move_points(T, points[counted])
         middle = moved.mean(axis=0)
-        J = np.hstack([np.cross(moved - middle, towards[counted]), towards[counted]])
+        J = distance_jacobian(moved - middle, towards[counted])
         information = J.T @ J
         change = -np.linalg.lstsq(information, J.T @ away[counted], rcond=1e-10)[0]
         T = turn_about(change[:3], middle, change[3:]) @ T
@@ -208,24 +213,24 @@ def _refine_best_fit(
     return (
         T,
         float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).mean())),
-        RigidSpread(middle, covariance),
+        Uncertainty(covariance, middle),
     )
 
 
-def _measure_coverage(feet: np.ndarray, surface: NominalSurface) -> tuple[float, np.ndarray]:
+def _measure_coverage(feet: Floats, surface: NominalSurface) -> tuple[float, Floats]:
     """Share of the nominal's area that was measured, and places (k, 3) in its frame of the rest.
     ``feet`` (n, 3): where on the nominal the scan's points were measured."""
     places, _ = surface.sample(COVERAGE_SAMPLES, seed=1)
-    thin = feet[:: -(-len(feet) // MAX_FEET)]
+    thin = subsample(feet, MAX_FEET)
     tree = cKDTree(thin)
-    spacing, _ = tree.query(thin[:: -(-len(thin) // 2000)], k=2)
+    spacing, _ = tree.query(subsample(thin, 2000), k=2)
     away, _ = tree.query(places, workers=-1)
     measured = away <= SPACINGS * float(np.percentile(spacing[:, 1], 95))
     return float(measured.mean()), places[~measured]
 
 
 def judge_deviation(
-    deviation: Deviation, sigma_mm: np.ndarray, tolerance_mm: float
+    deviation: Deviation, sigma_mm: Floats, tolerance_mm: float
 ) -> ToleranceVerdict:
     """The verdict on a deviation; ``sigma_mm`` (n,): standard uncertainty of its points along the
     surface's normal."""

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import lengths, unit_vectors
 from slviewer.inspection.uncertainty import Spread, joint_covariance, propagate_covariance
 from slviewer.records.measurement import Quantity, Unit
@@ -29,8 +30,8 @@ class Feature:
     """
 
     kind: Kind
-    place: np.ndarray
-    direction: np.ndarray | None = None
+    place: Floats
+    direction: Floats | None = None
     radius: float | None = None
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -48,7 +49,7 @@ class Feature:
             return np.broadcast_to(self.unit_direction, offsets.shape)
         return unit_vectors(self._across(offsets))
 
-    def jacobian(self, points: np.ndarray) -> np.ndarray:
+    def jacobian(self, points: np.ndarray) -> Floats:
         """Return the derivatives (n, p) of ``distance`` of the points (n, 3) by the parameters."""
         offsets, normals = np.asarray(points, np.float64) - self.place, self.normals(points)
         minus = -np.ones((len(offsets), 1))
@@ -56,58 +57,58 @@ class Feature:
             return -normals
         if self.kind == "sphere":
             return np.hstack([-normals, minus])
-        e = self._tangents()
+        e = perpendicular_axes(self.unit_direction)
         if self.kind == "plane":
             return np.hstack([offsets @ e.T, minus])
         shifts = -normals @ e.T
         return np.hstack([(offsets @ self.unit_direction)[:, None] * shifts, shifts, minus])
 
-    def moved(self, step: np.ndarray) -> "Feature":
+    def moved(self, step: Floats) -> "Feature":
         """Return the feature with its parameters changed by a step (p,)."""
-        step = np.asarray(step, np.float64)
-        if self.kind in ("point", "sphere"):
-            radius = None if self.radius is None else self.radius + step[3]
-            return replace(self, place=self.place + step[:3], radius=radius)
-        e = self._tangents()
-        tilted = unit_vectors(self.unit_direction + step[:2] @ e)
-        if self.kind == "plane":
-            return replace(self, place=self.place + step[2] * self.unit_direction, direction=tilted)
-        assert self.radius is not None
-        return replace(
-            self, place=self.place + step[2:4] @ e, direction=tilted, radius=self.radius + step[4]
-        )
+        tilts, shifts, direction = self._tilts, self._shifts, self.direction
+        place = self.place + step[tilts : tilts + len(shifts)] @ shifts
+        if direction is not None:
+            direction = unit_vectors(direction + step[:2] @ perpendicular_axes(direction))
+        radius = None if self.radius is None else self.radius + step[-1]
+        return replace(self, place=place, direction=direction, radius=radius)
 
     @property
     def parameters(self) -> int:
         """Number of the feature's parameters."""
-        return {"point": 3, "plane": 3, "sphere": 4, "cylinder": 5}[self.kind]
+        return self._tilts + len(self._shifts) + (self.radius is not None)
 
     @property
-    def unit_direction(self) -> np.ndarray:
+    def _tilts(self) -> int:
+        """Number of the parameters that tilt the direction."""
+        return 0 if self.direction is None else 2
+
+    @property
+    def _shifts(self) -> Floats:
+        """Return the unit vectors (k, 3) along which the parameters shift the place."""
+        if self.direction is None:
+            return np.eye(3)
+        axis = self.direction
+        return axis[None] if self.kind == "plane" else perpendicular_axes(axis)
+
+    @property
+    def unit_direction(self) -> Floats:
         """Unit normal or axis (3,); InputError for a feature without one."""
         if self.direction is None:
             raise InputError(f"A {self.kind} has no direction: choose a plane or a cylinder.")
         return self.direction
 
-    def _across(self, offsets: np.ndarray) -> np.ndarray:
+    def _across(self, offsets: Floats) -> Floats:
         """Return the offsets (n, 3) from the feature's place, for a cylinder only their part across
         the axis."""
         if self.kind != "cylinder":
             return offsets
         return offsets - (offsets @ self.unit_direction)[..., None] * self.unit_direction
 
-    def _tangents(self) -> np.ndarray:
-        """Return two unit vectors (2, 3) perpendicular to the direction and to each other."""
-        least = np.eye(3)[np.argmin(np.abs(self.unit_direction))]
-        first = unit_vectors(_cross(self.unit_direction, least))
-        return np.stack([first, _cross(self.unit_direction, first)])
 
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross product (3,) of two vectors (3,); `numpy.cross` takes ten times as long for
-    so few."""
-    (x, y, z), (u, v, w) = a.tolist(), b.tolist()
-    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+def perpendicular_axes(direction: Floats) -> Floats:
+    """Return two unit vectors (2, 3) perpendicular to a unit direction (3,) and to each other."""
+    first = unit_vectors(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]))
+    return np.stack([first, np.cross(direction, first)])
 
 
 PARALLEL_DEG = 5.0
@@ -223,7 +224,7 @@ def relation(a: Feature, a_spread: Spread, b: Feature, b_spread: Spread) -> list
     def quantity(meaning: Meaning) -> Quantity:
         """Return the value of one quantity between both features, with its uncertainty."""
 
-        def moved(step: np.ndarray) -> float:
+        def moved(step: Floats) -> float:
             """Return the quantity after the features' parameters change by a step (p + q,)."""
             return meaning.of(a.moved(step[:p]), b.moved(step[p:]))
 

@@ -2,7 +2,7 @@
 where none fits; robust starts by the least median of squares over small samples; and the 3-2-1
 alignment of a part by three such features."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,18 +13,13 @@ from scipy.spatial import cKDTree
 from slviewer.errors import InputError
 from slviewer.evaluation.acceptance import narrowest_range
 from slviewer.evaluation.fit import MAX_SIGMA, fit_settled, within_sigmas
-from slviewer.geometry.rigid import move_points, rigid_transform
+from slviewer.geometry.polynomial import monomials
+from slviewer.geometry.rigid import Floats, Uncertainty, move_points, rigid_transform
 from slviewer.geometry.robust import fit_reweighted, robust_sigma
 from slviewer.geometry.shapes import fit_plane, fit_sphere
-from slviewer.geometry.vectors import diagonal, finite_rows, lengths, rms, unit_vectors
-from slviewer.inspection.features import Feature, Kind
-from slviewer.inspection.uncertainty import (
-    RigidSpread,
-    Shared,
-    Spread,
-    propagate_covariance,
-    scatter_covariance,
-)
+from slviewer.geometry.vectors import diagonal, finite_rows, lengths, rms, subsample, unit_vectors
+from slviewer.inspection.features import Feature, Kind, perpendicular_axes
+from slviewer.inspection.uncertainty import Shared, Spread, scatter_covariance
 from slviewer.records.measurement import Quantity
 from slviewer.records.verification import MAX_EXCLUDED
 
@@ -36,49 +31,43 @@ NEAR = 2.5
 """Robust standard deviations: what lies nearer belongs to a hypothesis."""
 
 
-def estimate_start(
-    kind: Kind, points: np.ndarray, fit: Callable[[np.ndarray, Feature | None], Feature]
-) -> Feature:
+def estimate_start(kind: Kind, points: Floats) -> Feature:
     """Estimate the shape that is closest to at least half of the points (n, 3); the same points
     give the same result.
 
-    ``fit``: least squares over points, from a start. Raises InputError, the last one's, where no
-    sample holds a shape.
+    Raises InputError, the last one's, where no sample holds a shape.
     """
     rng = np.random.default_rng(0)
     sample = points[rng.choice(len(points), min(SAMPLE, len(points)), replace=False)]
     normals = local_normals(sample, points) if kind == "cylinder" else None
     # samples of the whole region show its curvature; noise would hide it from neighbours
-    rated: list[tuple[float, int, Feature]] = []
-    for n in range(HYPOTHESES if kind != "plane" else HYPOTHESES // 4):
+    rated: list[tuple[float, Feature]] = []
+    for _ in range(HYPOTHESES if kind != "plane" else HYPOTHESES // 4):
         try:
             candidate = _fit_sample(kind, sample, normals, rng)
         except (InputError, np.linalg.LinAlgError):
             continue
-        if candidate is not None:
-            rated.append((_median_distance(candidate, sample), n, candidate))
-    refused: InputError | None = None
-    best: tuple[float, Feature] | None = None
-    for rating, _, candidate in sorted(rated, key=lambda each: each[:2])[:POLISHED]:
-        for _ in range(3):
-            chosen = np.abs(candidate.distance(sample)) <= NEAR * 1.4826 * rating + 1e-9
-            try:
-                candidate = fit(sample[chosen], candidate)
-            except InputError as error:
-                refused = error
-                break
-            rating = _median_distance(candidate, sample)
-        else:
-            if best is None or rating < best[0]:
-                best = rating, candidate
-    if best is None:
-        raise refused or InputError(
-            f"No {kind} passes through the {len(points)} points: select another region."
-        )
-    return best[1]
+        rated.append((_robust_distance(candidate, sample), candidate))
+    refused = InputError(
+        f"No {kind} passes through the {len(points)} points: select another region."
+    )
+    polished: list[tuple[float, Feature]] = []
+    for sigma, candidate in sorted(rated, key=lambda each: each[0])[:POLISHED]:
+        try:
+            for _ in range(3):
+                near = np.abs(candidate.distance(sample)) <= NEAR * sigma + 1e-9
+                candidate = least_squares(kind, sample[near], candidate)
+                sigma = _robust_distance(candidate, sample)
+        except InputError as error:
+            refused = error
+            continue
+        polished.append((sigma, candidate))
+    if not polished:
+        raise refused
+    return min(polished, key=lambda each: each[0])[1]
 
 
-def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
+def local_normals(sample: np.ndarray, points: np.ndarray) -> Floats:
     """(m, 3): unit normals at ``sample`` (m, 3), of either sign, from neighbours among ``points``
     (n, 3): about a tenth of the region across, so that the noise of a point does not tilt them."""
     thin = points[:: max(1, len(points) // 6000)]
@@ -90,58 +79,39 @@ def local_normals(sample: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _fit_sample(
-    kind: Kind, sample: np.ndarray, normals: np.ndarray | None, rng: np.random.Generator
-) -> Feature | None:
-    """Return the shape through a minimal sample of points; None where they do not determine it."""
-    if kind == "cylinder":
-        assert normals is not None
-        return _cylinder_through(sample, normals, rng)
-    some = sample[rng.integers(0, len(sample), 3 if kind == "plane" else 4)]
+    kind: Kind, sample: Floats, normals: Floats | None, rng: np.random.Generator
+) -> Feature:
+    """Return the shape through a minimal sample of points; LinAlgError where they do not determine
+    it.
+
+    The axis of a cylinder is perpendicular to two normals (Gauss map), and the circle through three
+    points, projected along it, gives the rest.
+    """
+    chosen = rng.integers(0, len(sample), 4 if kind == "sphere" else 3)
     if kind == "plane":
-        return fit_plane_feature(some)
-    offset = _offset_of_centre(some, 1e-9)
-    return (
-        None
-        if offset is None
-        else Feature("sphere", some[0] + offset, None, float(np.linalg.norm(offset)))
-    )
-
-
-def _cylinder_through(
-    sample: np.ndarray, normals: np.ndarray, rng: np.random.Generator
-) -> Feature | None:
-    """Return the cylinder through a sample of three points with normals: two normals give the axis
-    (Gauss map), and the circle through the points, projected along it, the rest."""
-    i, j, k = rng.integers(0, len(sample), 3)
-    axis = np.cross(normals[i], normals[j])
-    length = np.linalg.norm(axis)
-    if length < 0.05:
-        return None
-    axis /= length
-    u = unit_vectors(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
-    frame = np.stack([u, np.cross(axis, u)])
-    flat = sample[[i, j, k]] @ frame.T
-    offset = _offset_of_centre(flat, 1e-6)
-    if offset is None:
-        return None
-    return Feature("cylinder", (flat[0] + offset) @ frame, axis, float(np.linalg.norm(offset)))
-
-
-def _offset_of_centre(points: np.ndarray, flattest: float) -> np.ndarray | None:
-    """Return the centre (k,) of the sphere (circle) through points (k + 1, k), relative to the
-    first; None for points that are flatter than the share ``flattest``."""
+        return fit_plane_feature(sample[chosen])
+    frame, axis, flattest = np.eye(3), None, 1e-9
+    if normals is not None:
+        axis = np.cross(*normals[chosen[:2]])
+        length = np.linalg.norm(axis)
+        if length < 0.05:
+            raise np.linalg.LinAlgError("The normals are parallel.")
+        axis /= length
+        frame, flattest = perpendicular_axes(axis), 1e-6
+    points = sample[chosen] @ frame.T
     edges = points[1:] - points[0]
     if abs(np.linalg.det(edges)) <= flattest * lengths(edges).prod():
-        return None
-    return np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
+        raise np.linalg.LinAlgError("The points are flat.")
+    offset = np.linalg.solve(2.0 * edges, (edges**2).sum(axis=1))
+    return Feature(kind, (points[0] + offset) @ frame, axis, float(np.linalg.norm(offset)))
 
 
-def _median_distance(feature: Feature, points: np.ndarray) -> float:
-    """Return the median absolute distance in mm of points (n, 3) from a feature."""
-    return float(np.median(np.abs(feature.distance(points))))
+def _robust_distance(feature: Feature, points: Floats) -> float:
+    """Return the robust standard deviation in mm of points (n, 3) about a feature."""
+    return robust_sigma(feature.distance(points), about=0.0)
 
 
-def fit_plane_feature(points: np.ndarray) -> Feature:
+def fit_plane_feature(points: Floats) -> Feature:
     """Return the least-squares plane of points (n, 3); its place is their centroid."""
     plane = fit_plane(points)
     middle = points.mean(axis=0)
@@ -188,19 +158,21 @@ class FeatureFit:
     def quantities(self) -> list[Quantity]:
         """Return radius, diameter, form error and residuals of the feature, with uncertainties
         where known."""
-        f, covariance = self.feature, self.spread.covariance
-        known = self.spread.shared is not None
-        listed: list[Quantity] = []
-        if f.radius is not None:
-            sigma = propagate_covariance(
-                lambda step: float(f.moved(step).radius or 0.0), covariance
-            )
-            listed.append(Quantity("radius", f.radius, "mm", sigma, known))
-            listed.append(Quantity("diameter", 2 * f.radius, "mm", 2 * sigma, known))
-        listed.append(Quantity("form (95 %)", self.form, "mm"))
-        listed.append(Quantity("RMS", self.rms, "mm"))
-        listed.append(Quantity("farthest off", self.maximum, "mm"))
-        return listed
+        listed = [
+            Quantity("form (95 %)", self.form, "mm"),
+            Quantity("RMS", self.rms, "mm"),
+            Quantity("farthest off", self.maximum, "mm"),
+        ]
+        radius = self.feature.radius
+        if radius is None:
+            return listed
+        # of a fit with a radius the last parameter
+        sigma, known = float(self.spread.sigmas[-1]), self.spread.shared is not None
+        size = [
+            Quantity(name, times * radius, "mm", times * sigma, known)
+            for name, times in (("radius", 1), ("diameter", 2))
+        ]
+        return size + listed
 
 
 def fit_feature(
@@ -221,7 +193,7 @@ def fit_feature(
         )
     if kind == "point":
         raise InputError("A point is picked, not fitted: fit a plane, a sphere or a cylinder.")
-    looked_at = points[:: -(-len(points) // MAX_FITTED_POINTS)]
+    looked_at = subsample(points, MAX_FITTED_POINTS)
     try:
         feature, inliers = _fit_robustly(kind, looked_at)
     except InputError as error:
@@ -238,7 +210,12 @@ def fit_feature(
     basis = looked_at[inliers]
     _refuse_other(kind, feature, basis)
     spread = _estimate_spread(feature, basis, shared, calibration)
-    _refuse_uncertain_radius(kind, feature, spread)
+    sigma = spread.sigmas[-1]
+    if feature.radius is not None and not sigma <= MAX_RADIUS_SIGMA * feature.radius:
+        raise InputError(
+            f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the"
+            " region shows too little of its curve; select more of it."
+        )
     warnings = []
     if excluded_share > MAX_EXCLUDED:
         warnings.append(
@@ -252,7 +229,7 @@ def fit_feature(
     )
 
 
-def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feature:
+def least_squares(kind: Kind, points: Floats, start: Feature | None) -> Feature:
     """The shape of least squared distances from points (n, 3); a cylinder needs a ``start``."""
     if kind == "plane":
         return fit_plane_feature(points)
@@ -265,11 +242,10 @@ def least_squares(kind: Kind, points: np.ndarray, start: Feature | None) -> Feat
 
 def _fit_robustly(kind: Kind, points: np.ndarray) -> tuple[Feature, np.ndarray]:
     """The feature, and which of the points it was fitted to: repeated until the set is stable."""
-    fit = partial(least_squares, kind)
-    return fit_settled(fit, points, estimate_start(kind, points, fit))
+    return fit_settled(partial(least_squares, kind), points, estimate_start(kind, points))
 
 
-def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
+def _fit_cylinder(start: Feature, points: Floats) -> Feature:
     """The least-squares cylinder near a start; its place is next to the middle of the points.
     Raises InputError where the radius diverges: the points are flat."""
     solution = scipy.optimize.least_squares(
@@ -290,7 +266,7 @@ def _fit_cylinder(start: Feature, points: np.ndarray) -> Feature:
 
 
 def _estimate_spread(
-    feature: Feature, points: np.ndarray, shared: Shared | None, calibration: str
+    feature: Feature, points: Floats, shared: Shared | None, calibration: str
 ) -> Spread:
     """Estimate the covariance of a fitted feature: own scatter, and the errors shared through the
     calibration."""
@@ -298,7 +274,7 @@ def _estimate_spread(
     own = scatter_covariance(points, J, feature.distance(points))
     if shared is None:
         return Spread(own)
-    some = points[:: -(-len(points) // MAX_SHARED_POINTS)]
+    some = subsample(points, MAX_SHARED_POINTS)
     J = feature.jacobian(some)
     # a displacement of the points changes each distance by its part along the normal, and the fit
     # makes up for it
@@ -306,9 +282,9 @@ def _estimate_spread(
     return Spread(own, shared(some, answers), calibration)
 
 
-def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
+def _refuse_other(kind: Kind, feature: Feature, points: Floats) -> None:
     """Raise InputError where the region plainly holds something else than the requested shape."""
-    some = points[:: -(-len(points) // MAX_COMPARED_POINTS)]
+    some = subsample(points, MAX_COMPARED_POINTS)
     mine = robust_sigma(feature.distance(some))
     if kind == "plane":
         size = diagonal(some)
@@ -333,10 +309,10 @@ def _refuse_other(kind: Kind, feature: Feature, points: np.ndarray) -> None:
         )
 
 
-def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> InputError:
+def _describe_alternative(kind: Kind, points: Floats, error: InputError) -> InputError:
     """Describe which other shape the region holds where the requested one could not be fitted at
     all."""
-    other, rival, flat = _fit_rivals(kind, points[:: -(-len(points) // MAX_COMPARED_POINTS)])
+    other, rival, flat = _fit_rivals(kind, subsample(points, MAX_COMPARED_POINTS))
     best, residual = (other, rival) if rival * RIVAL_RATIO < flat else ("plane", flat)
     if not np.isfinite(residual):
         return error
@@ -346,14 +322,14 @@ def _describe_alternative(kind: Kind, points: np.ndarray, error: InputError) -> 
     )
 
 
-def _fit_rivals(kind: Kind, points: np.ndarray) -> tuple[Kind, float, float]:
+def _fit_rivals(kind: Kind, points: Floats) -> tuple[Kind, float, float]:
     """Return the other curved shape that points may have, and their `_residual_of` it and of a
     plane."""
     other: Kind = "cylinder" if kind == "sphere" else "sphere"
     return other, _residual_of(other, points), _residual_of("plane", points)
 
 
-def _residual_of(kind: Kind, points: np.ndarray) -> float:
+def _residual_of(kind: Kind, points: Floats) -> float:
     """Return the robust sigma in mm of the points' distances from another shape; infinite where it
     does not fit at all."""
     try:
@@ -362,14 +338,11 @@ def _residual_of(kind: Kind, points: np.ndarray) -> float:
         return float("inf")
 
 
-def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
+def _residual_from_quadric(plane: Feature, points: Floats) -> float:
     """Return the robust sigma in mm about the quadratic surface over a plane: curvature removed,
     noise remains."""
-    normal = plane.unit_direction
     offsets = points - points.mean(axis=0)
-    _, _, axes = np.linalg.svd(offsets - (offsets @ normal)[:, None] * normal, full_matrices=False)
-    u, v = offsets @ axes[0], offsets @ axes[1]
-    basis = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+    basis = monomials(offsets @ perpendicular_axes(plane.unit_direction).T, 2)
     heights = plane.distance(points)
 
     def solve(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -382,23 +355,11 @@ def _residual_from_quadric(plane: Feature, points: np.ndarray) -> float:
     return robust_sigma(heights - fit_reweighted(solve, heights, np.ones(len(heights))))
 
 
-def _refuse_uncertain_radius(kind: Kind, feature: Feature, spread: Spread) -> None:
-    """Raise InputError where the radius' standard deviation is too large a part of the radius."""
-    if feature.radius is None:
-        return
-    sigma = float(spread.sigmas[-1])
-    if not sigma <= MAX_RADIUS_SIGMA * feature.radius:
-        raise InputError(
-            f"The radius of the {kind} is only known as {feature.radius:.3g} ± {sigma:.2g} mm: the"
-            " region shows too little of its curve; select more of it."
-        )
-
-
 MIN_SINE = 0.17
 """Of the angle between directions that fix a frame: at 10 degrees they hardly do."""
 
 
-def datum_frame(features: Sequence[Feature]) -> np.ndarray:
+def datum_frame(features: Sequence[Feature]) -> Floats:
     """T_part_measured (4, 4) of three datums: the primary, a plane, is z = 0 with z along its
     normal.
 
@@ -438,7 +399,7 @@ def datum_frame(features: Sequence[Feature]) -> np.ndarray:
     return rigid_transform(R, -R @ origin)
 
 
-def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
+def datum_spread(fits: Sequence[FeatureFit], middle: Floats) -> Uncertainty:
     """Covariance of the part coordinates of `datum_frame`, about ``middle`` (3,) mm in part
     coordinates; the errors of the datums are taken as independent of each other."""
     features = [fit.feature for fit in fits]
@@ -458,10 +419,10 @@ def datum_spread(fits: Sequence[FeatureFit], middle: np.ndarray) -> RigidSpread:
             columns.append(np.concatenate([turn / 2, shift]) / step)
         J = np.array(columns).T
         covariance += J @ fit.spread.covariance @ J.T
-    return RigidSpread(middle, covariance)
+    return Uncertainty(covariance, middle)
 
 
-def face_towards(fit: FeatureFit, side: np.ndarray) -> FeatureFit:
+def face_towards(fit: FeatureFit, side: Floats) -> FeatureFit:
     """The fit with a plane's normal turned to the half-space of a direction ``side`` (3,); others
     unchanged."""
     f = fit.feature

@@ -19,19 +19,19 @@ from typing import Literal
 
 import numpy as np
 from scipy.ndimage import uniform_filter
-from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, Uncertainty
 from slviewer.geometry.robust import robust_sigma
-from slviewer.geometry.vectors import finite_rows, occupied_cubes, unit_vectors
-from slviewer.inspection.features import Feature
+from slviewer.geometry.vectors import finite_rows, subsample, sum_by_cube, unit_vectors
+from slviewer.inspection.features import Feature, perpendicular_axes
 from slviewer.inspection.fitting import MAX_FITTED_POINTS, MAX_SHARED_POINTS, FeatureFit
 from slviewer.inspection.uncertainty import (
     DRAWS,
     PATCHES,
-    RigidSpread,
     Shared,
+    draw_motions,
     draw_steps,
     joint_covariance,
 )
@@ -76,10 +76,10 @@ class SmoothDeviations:
     m) gives the weights by displacements of the ``sampled`` points (m,) along their normals.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
-    basis: np.ndarray
-    draws: np.ndarray
+    points: Floats
+    normals: Floats
+    basis: Floats
+    draws: Floats
     is_noise: bool
     noise_mm: float
     unresolved_mm: float
@@ -87,18 +87,18 @@ class SmoothDeviations:
     sampled: np.ndarray
 
     @property
-    def smooth(self) -> np.ndarray:
+    def smooth(self) -> Floats:
         """(n,) mm: the smooth part, the mean of its draws."""
         return self.basis @ self.draws.mean(axis=1)
 
 
 def smooth_deviations(
-    deviations: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    coordinates: np.ndarray,
-    fitted: np.ndarray,
-    unrolled: np.ndarray | None = None,
+    deviations: Floats,
+    points: Floats,
+    normals: Floats,
+    coordinates: Floats,
+    fitted: Floats,
+    unrolled: Floats | None = None,
 ) -> SmoothDeviations:
     """Separate deviations (n,) mm into a smooth part, without what the columns of ``fitted`` (n, p)
     explain, and noise.
@@ -106,36 +106,30 @@ def smooth_deviations(
     ``coordinates`` (n, k): across the region, in about -1 to 1; ``unrolled`` (n, 1 or 2): others
     that are in proportion to its area, by default the same. Raises InputError for too few points.
     """
-    step = -(-len(deviations) // MAX_FITTED_POINTS)
-    d, points, normals = deviations[::step], points[::step], normals[::step]
-    unrolled = (coordinates if unrolled is None else unrolled)[::step]
-    coordinates, fitted = coordinates[::step], fitted[::step]
-    counted = np.ones(len(d), bool)
-    for _ in range(2):
-        removed, basis, degrees = _smooth_basis(coordinates[counted], fitted[counted])
-        n, r = basis.shape
-        if n < POINTS_PER_TERM * (r + removed.shape[1]):
+    unrolled = coordinates if unrolled is None else unrolled
+    arrays = deviations, points, normals, coordinates, fitted, unrolled
+    chosen = [subsample(each, MAX_FITTED_POINTS) for each in arrays]
+    rounding = 1e-9 * float(np.abs(chosen[1]).max())
+    for exclusions_left in (2, 1, 0):
+        d, points, normals, coordinates, fitted, unrolled = chosen
+        removed, basis, degrees = _smooth_basis(coordinates, fitted)
+        whole, residuals = _project_out(d, removed, basis)
+        n, columns = whole.shape
+        if exclusions_left and n < POINTS_PER_TERM * columns:
             raise InputError(
                 f"The region holds {n} measured points: its form needs"
-                f" {POINTS_PER_TERM * (r + removed.shape[1])}; select a wider region."
+                f" {POINTS_PER_TERM * columns}; select a wider region."
             )
-        whole, residuals = _project_out(d[counted], removed, basis)
-        reach = max(SPIKE_SIGMA * robust_sigma(residuals), 1e-9 * float(np.abs(points).max()))
-        within = np.abs(residuals) <= reach
-        if within.all():
+        is_near = np.abs(residuals) <= max(SPIKE_SIGMA * robust_sigma(residuals), rounding)
+        if is_near.all() or not exclusions_left:
             break
-        counted[np.flatnonzero(counted)[~within]] = False
-    d, points, normals, coordinates = (each[counted] for each in (d, points, normals, coordinates))
-    if len(d) < n:
-        removed, basis, degrees = _smooth_basis(coordinates, fitted[counted])
-        whole, residuals = _project_out(d, removed, basis)
-    n, columns = whole.shape
+        chosen = [each[is_near] for each in chosen]
     noise = float(np.sqrt(residuals @ residuals / (n - columns)))
-    factor, unresolved = _patch_misfit(residuals, coordinates, noise, n, columns)
+    factor, unresolved = _patch_misfit(residuals, coordinates, noise, columns)
     sampled = np.arange(0, n, -(-n // MAX_SHARED_POINTS))
     answer = np.linalg.pinv(whole[sampled], rcond=1e-6)
     # the reference is that of even weight by area, whatever the density of the points
-    root = np.sqrt(_even_weights(unrolled[counted]))[:, None]
+    root = np.sqrt(_even_weights(unrolled))[:, None]
     reference = np.linalg.lstsq(root * removed, root * whole, rcond=1e-6)[0]
     smooth = whole - removed @ reference
     weights, noise = whole.T @ d, factor * noise
@@ -148,17 +142,22 @@ def smooth_deviations(
     )
 
 
+def _range(deviations: Floats) -> Floats:
+    """Return the range of deviations (n, draws) in each draw."""
+    return np.ptp(deviations, axis=0)
+
+
 def zone_width(
     name: str,
     smooth: SmoothDeviations,
-    width: Callable[[np.ndarray], np.ndarray],
-    shared: Shared | None = None,
-    displaced: Callable[[np.ndarray], np.ndarray] | None = None,
+    shared: Shared | None,
+    displaced: Callable[[Floats, Floats], Floats] | None = None,
+    width: Callable[[Floats], Floats] = _range,
 ) -> Quantity:
     """The width (mm) of a zone that holds the smooth part, with the spread of its draws in U.
 
     ``width``: of deviations (n, draws), for each draw; ``displaced``: draws of further deviations
-    (n, draws) at points (n, 3), as a datum's or an alignment's errors cause.
+    (n, draws) at points (n, 3) with normals (n, 3), as a datum's or an alignment's errors cause.
     """
     field = smooth.smooth
     chosen = np.unique(
@@ -166,7 +165,7 @@ def zone_width(
     )
     drawn = smooth.basis[chosen] @ smooth.draws
     if displaced is not None:
-        drawn = drawn + displaced(smooth.points[chosen])
+        drawn = drawn + displaced(smooth.points[chosen], smooth.normals[chosen])
     widths, value = width(drawn), float(width(field[:, None])[0])
     variance = float(widths.var()) + smooth.unresolved_mm**2
     if shared is not None:
@@ -174,11 +173,11 @@ def zone_width(
         # leaves it unchanged
         change = 1e-3 * smooth.noise_mm + 1e-9
         by_field = np.zeros(len(field))
-        for k in (int(field.argmin()), int(field.argmax())):
-            sign = np.sign(field[k] - np.median(field))
-            step = np.zeros(len(field))
-            step[k] = sign * change
-            by_field[k] = (float(width((field + step)[:, None])[0]) - value) / change * sign
+        ends = [field.argmin(), field.argmax()]
+        signs = np.sign(field[ends] - np.median(field))
+        moved = np.repeat(field[:, None], 2, axis=1)
+        moved[ends, [0, 1]] += signs * change
+        by_field[ends] = (width(moved) - value) / change * signs
         answers = (by_field @ smooth.basis) @ smooth.answer
         places = smooth.sampled
         effects = shared(smooth.points[places], answers[None, :, None] * smooth.normals[places])
@@ -192,7 +191,7 @@ def zone_width(
 
 
 def form_error(
-    kind: FormKind, fit: FeatureFit, points: np.ndarray, shared: Shared | None = None
+    kind: FormKind, fit: FeatureFit, points: Floats, shared: Shared | None = None
 ) -> Quantity:
     """Flatness of a plane, cylindricity of a cylinder, roundness of a section of a cylinder or a
     sphere, mm.
@@ -227,13 +226,13 @@ def form_error(
                 [np.arctan2(coordinates[:, 1], coordinates[:, 0]), coordinates[:, 2]]
             )
     smooth = smooth_deviations(f.distance(points), points, normals, coordinates, fitted, unrolled)
-    return zone_width(kind, smooth, lambda d: np.ptp(d, axis=0), shared)
+    return zone_width(kind, smooth, shared)
 
 
 def orientation_error(
     kind: OrientationKind,
     fit: FeatureFit,
-    points: np.ndarray,
+    points: Floats,
     datum: FeatureFit,
     shared: Shared | None = None,
 ) -> Quantity:
@@ -258,7 +257,7 @@ def orientation_error(
     if f.kind == "cylinder":
         return _axis_orientation(kind, fit, points, datum, along)
 
-    def zone_normal(datum_direction: np.ndarray) -> np.ndarray:
+    def zone_normal(datum_direction: Floats) -> Floats:
         """The unit normal (3,) of the zone's planes, for a direction of the datum."""
         direction = f.unit_direction
         if along:
@@ -278,15 +277,15 @@ def orientation_error(
     steps = draw_steps(datum.spread.covariance, np.random.default_rng(1))
     turned = np.stack([zone_normal(d.moved(step).unit_direction) for step in steps]) - normal
 
-    def displaced(places: np.ndarray) -> np.ndarray:
+    def displaced(places: Floats, _: Floats) -> Floats:
         """Changes of the heights (n, draws) by the draws of the datum."""
         return (places - f.place) @ turned.T
 
-    return zone_width(kind, smooth, lambda heights: np.ptp(heights, axis=0), shared, displaced)
+    return zone_width(kind, smooth, shared, displaced)
 
 
 def position_error(
-    fit: FeatureFit, points: np.ndarray, nominal: Feature, alignment: RigidSpread | None = None
+    fit: FeatureFit, points: Floats, nominal: Feature, alignment: Uncertainty | None = None
 ) -> Quantity:
     """Position, mm: the diameter of the zone about the ``nominal`` place that holds a sphere's
     centre or a cylinder's axis over its region, or the width of the zone that holds a plane.
@@ -305,14 +304,16 @@ def position_error(
         along = (points - f.place) @ f.direction
         reached = np.array([along.min(), along.max()])[:, None] * f.direction
     else:
-        reached = points[:: -(-len(points) // 200)] - f.place
+        reached = subsample(points, 200) - f.place
     rng = np.random.default_rng(2)
-    moves = None if alignment is None else alignment.draw(rng)
+    shifts = np.zeros((DRAWS, len(reached), 3))
+    if alignment is not None:
+        shifts = draw_motions(alignment, rng)(f.place + reached)
     steps = draw_steps(fit.spread.covariance, rng)
 
     place_or_axis = replace(nominal, radius=None)
 
-    def off(feature: Feature, moved: np.ndarray | float) -> float:
+    def off(feature: Feature, moved: Floats | float) -> float:
         """Twice how far a feature, moved by (k, 3), is off its nominal."""
         places = feature.place + reached + moved
         if f.kind == "cylinder":
@@ -322,16 +323,15 @@ def position_error(
             places = places - (reached @ feature.unit_direction)[:, None] * feature.unit_direction
         return 2 * float(np.abs(place_or_axis.distance(places)).max())
 
-    shifts = np.zeros((DRAWS, len(reached), 3)) if moves is None else moves(f.place + reached)
     drawn = np.array([off(f.moved(step), shift) for step, shift in zip(steps, shifts, strict=True)])
     return _correct_for_noise("position", off(f, 0.0), drawn, fit.spread.shared is not None)
 
 
 def profile_error(
-    points: np.ndarray,
-    deviations: np.ndarray,
-    normals: np.ndarray,
-    alignment: RigidSpread | None = None,
+    points: Floats,
+    deviations: Floats,
+    normals: Floats,
+    alignment: Uncertainty | None = None,
     shared: Shared | None = None,
 ) -> Quantity:
     """Profile of a surface, mm: twice the largest deviation (n,) mm of points (n, 3) from the
@@ -347,24 +347,23 @@ def profile_error(
     # on the nominal: without noise
     coordinates = _region_coordinates(points - deviations[:, None] * normals, axes=3)
     smooth = smooth_deviations(deviations, points, normals, coordinates, np.zeros((len(points), 0)))
-    moves = None if alignment is None else alignment.draw(np.random.default_rng(3))
+    if alignment is None:
+        return zone_width("profile", smooth, shared, width=_twice_largest)
+    moves = draw_motions(alignment, np.random.default_rng(3))
 
-    def displaced(places: np.ndarray) -> np.ndarray:
+    def displaced(places: Floats, towards: Floats) -> Floats:
         """Changes of the deviations (n, draws) by the draws of the alignment."""
-        assert moves is not None
-        nearest = cKDTree(smooth.points).query(places)[1]
-        return np.einsum("bni,ni->nb", moves(places), smooth.normals[nearest])
+        return np.einsum("bni,ni->nb", moves(places), towards)
 
-    return zone_width(
-        "profile",
-        smooth,
-        lambda d: 2 * np.abs(d).max(axis=0),
-        shared,
-        None if moves is None else displaced,
-    )
+    return zone_width("profile", smooth, shared, displaced, _twice_largest)
 
 
-def _correct_for_noise(name: str, value: float, drawn: np.ndarray, whole: bool) -> Quantity:
+def _twice_largest(deviations: Floats) -> Floats:
+    """Return twice the largest size of deviations (n, draws) in each draw."""
+    return 2 * np.abs(deviations).max(axis=0)
+
+
+def _correct_for_noise(name: str, value: float, drawn: Floats, whole: bool) -> Quantity:
     """Return a width (mm) less what noise adds to it, with that and the spread of the draws in U.
 
     The measured width holds noise once, the ``drawn`` ones (draws,) twice: they are extrapolated to
@@ -378,8 +377,8 @@ def _correct_for_noise(name: str, value: float, drawn: np.ndarray, whole: bool) 
 
 
 def _draw_weights(
-    weights: np.ndarray, degrees: np.ndarray, noise: float, rng: np.random.Generator
-) -> np.ndarray:
+    weights: Floats, degrees: np.ndarray, noise: float, rng: np.random.Generator
+) -> Floats:
     """Draw what weights (r,), measured with ``noise``, are without it: (r, DRAWS), by Gibbs
     sampling.
 
@@ -403,7 +402,7 @@ def _draw_weights(
 
 
 def _axis_orientation(
-    kind: OrientationKind, fit: FeatureFit, points: np.ndarray, datum: FeatureFit, along: bool
+    kind: OrientationKind, fit: FeatureFit, points: Floats, datum: FeatureFit, along: bool
 ) -> Quantity:
     """The orientation of a cylinder's axis over its region to a datum: the diameter of its zone
     where both directions should agree (``along``), else its width."""
@@ -432,23 +431,23 @@ def _smooth_basis(
     removed = _span(fitted / np.maximum(np.sqrt(np.mean(fitted**2, axis=0)), 1e-300))
     whole, degrees = removed, list[int]()
     for degree in range(DEGREE + 1):
-        powers = [
-            e for e in product(range(degree + 1), repeat=coordinates.shape[1]) if sum(e) == degree
-        ]
-        terms = np.stack([np.prod(coordinates ** np.array(e), axis=1) for e in powers], axis=1)
+        powers = product(range(degree + 1), repeat=coordinates.shape[1])
+        terms = np.stack(
+            [np.prod(coordinates**e, axis=1) for e in powers if sum(e) == degree], axis=1
+        )
         added = _span(terms, whole)
         whole = np.hstack([whole, added])
         degrees += [degree] * added.shape[1]
     return removed, whole[:, removed.shape[1] :], np.array(degrees)
 
 
-def _project_out(values: np.ndarray, *bases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _project_out(values: np.ndarray, *bases: np.ndarray) -> tuple[Floats, Floats]:
     """Return the columns (n, q + r) of orthonormal bases, and what they leave of values (n,)."""
     whole = np.hstack(bases)
     return whole, values - whole @ (whole.T @ values)
 
 
-def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
+def _span(columns: Floats, without: Floats | None = None) -> Floats:
     """Orthonormal columns (n, r) that span those given, ``without`` what other orthonormal ones (n,
     q) span, and without directions that rounding alone distinguishes."""
     if not columns.shape[1]:
@@ -461,7 +460,7 @@ def _span(columns: np.ndarray, without: np.ndarray | None = None) -> np.ndarray:
     return vectors[:, values > SPAN_RATIO]
 
 
-def _even_weights(unrolled: np.ndarray) -> np.ndarray:
+def _even_weights(unrolled: Floats) -> Floats:
     """Weights (n,) of points at coordinates (n, k) in proportion to area, so that equal areas weigh
     the same."""
     low, size = unrolled.min(axis=0), np.ptp(unrolled, axis=0)
@@ -481,32 +480,30 @@ def _even_weights(unrolled: np.ndarray) -> np.ndarray:
 
 
 def _patch_misfit(
-    residuals: np.ndarray, coordinates: np.ndarray, noise: float, n: int, columns: int
+    residuals: Floats, coordinates: Floats, noise: float, columns: int
 ) -> tuple[float, float]:
     """How many times larger than independent ones the patches' mean residuals are (at least 1), and
     by how much (mm) some lie off what noise explains."""
     low = coordinates.min(axis=0)
     side = max(float(np.ptp(coordinates, axis=0).max()) / PATCHES, 1e-12)
     padding = (0, 0), (0, 3 - coordinates.shape[1])
-    cubes, patch = occupied_cubes(np.pad(coordinates - low, padding), side)
-    counts = np.bincount(patch, minlength=len(cubes))
-    means = np.bincount(patch, residuals, len(cubes)) / np.maximum(counts, 1)
+    tallies = np.column_stack([np.ones(len(residuals)), residuals])
+    counts, sums = sum_by_cube(tallies, np.pad(coordinates - low, padding), side).T
+    means, expected = sums / counts, noise / np.sqrt(counts)
     large = counts >= POINTS_PER_TERM
-    expected = noise / np.sqrt(np.maximum(counts, 1))
     if not large.any() or not noise > 0:
         return 1.0, 0.0
     # the smooth part takes its share of the patches' freedom
-    freedom = max(1 - columns / max(int(large.sum()), 1), 0.25)
-    factor = float(
-        np.sqrt(max(float(np.mean((means[large] / expected[large]) ** 2)) / freedom, 1.0))
-    )
-    beyond = np.abs(means[large]) - PATCH_SIGMA * expected[large]
+    freedom = max(1 - columns / int(large.sum()), 0.25)
+    means, expected = np.abs(means[large]), expected[large]
+    factor = float(np.sqrt(max(float(np.mean((means / expected) ** 2)) / freedom, 1.0)))
+    beyond = means - PATCH_SIGMA * expected
     worst = int(np.argmax(beyond))
     # a defect seldom fills its patch
-    return factor, 2 * float(np.abs(means[large])[worst]) if beyond[worst] > 0 else 0.0
+    return factor, 2 * float(means[worst]) if beyond[worst] > 0 else 0.0
 
 
-def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
+def _region_coordinates(points: Floats, axes: int = 2) -> Floats:
     """Coordinates (n, axes) of points along their principal axes, each in -1 to 1; 0 along those in
     which the region is thinner than `THIN` of its length."""
     offsets = points - points.mean(axis=0)
@@ -518,7 +515,7 @@ def _region_coordinates(points: np.ndarray, axes: int = 2) -> np.ndarray:
     return np.where(size > THIN * size.max(), scaled, 0.0)
 
 
-def _cylinder_coordinates(f: Feature, points: np.ndarray) -> np.ndarray:
+def _cylinder_coordinates(f: Feature, points: Floats) -> Floats:
     """Cosine and sine of the angle about the axis, and the place along it in -1 to 1: (n, 3)."""
     normals, axis = f.normals(points), f.unit_direction
     first = np.linalg.svd(axis[None])[2][1]
@@ -529,7 +526,7 @@ def _cylinder_coordinates(f: Feature, points: np.ndarray) -> np.ndarray:
     )
 
 
-def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _section_points(f: Feature, points: Floats) -> tuple[Floats, Floats]:
     """The points of the section whose roundness is measured, and its normal (3,)."""
     if f.kind == "cylinder":
         axis = f.unit_direction
@@ -537,5 +534,5 @@ def _section_points(f: Feature, points: np.ndarray) -> tuple[np.ndarray, np.ndar
         middle, reach = (along.max() + along.min()) / 2, SECTION_SHARE * float(np.ptp(along)) / 2
         return points[np.abs(along - middle) <= reach], axis
     towards = points.mean(axis=0) - f.place
-    axis = unit_vectors(np.cross(towards, np.eye(3)[np.argmin(np.abs(towards))]))
+    axis = perpendicular_axes(towards)[0]
     return points[np.abs((points - f.place) @ axis) <= SECTION_SHARE * (f.radius or 0.0)], axis

@@ -1,6 +1,5 @@
 """A nominal model: signed distances of points from it, and initial alignment of a scan to it."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -8,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import InputError, SlviewerError
-from slviewer.geometry.vectors import box_middle, diagonal, lengths, unit_vectors
+from slviewer.geometry.rigid import Floats, Mask
+from slviewer.geometry.vectors import box_middle, diagonal, lengths, subsample, unit_vectors
 from slviewer.registration.open3d_loader import open3d, raycasting_scene
 from slviewer.registration.pairwise import (
     MOST_ATTEMPTS,
+    Progress,
     Registration,
     register_prepared,
     search_starts,
@@ -48,10 +49,13 @@ class NominalSurface:
         # (Bærentzen and Aanæs 2005)
         self._smooth = np.asarray(self._mesh.vertex_normals)
         self._faces = mesh.faces
-        self._at_rim = _rim_vertices(mesh.faces, len(vertices))
+        # the vertices at edges of one triangle alone
+        half, first, _, triangles = count_edges(mesh.faces)
+        self._at_rim = np.zeros(len(vertices), bool)
+        self._at_rim[half[first[triangles == 1]]] = True
         self._scene = raycasting_scene(vertices - self.middle, mesh.faces)
 
-    def signed(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def signed(self, points: Floats) -> tuple[Floats, Floats]:
         """Distances (n,) mm of places (n, 3), positive outside, infinite beyond the rim of an open
         mesh; and the surface's normals (n, 3) where each is nearest."""
         centred = points - self.middle
@@ -66,27 +70,20 @@ class NominalSurface:
         # the side of the surface follows from the normals of the vertices there
         at_side = (s < CORNER) | (t < CORNER) | (1 - s - t < CORNER)
         away = np.sum(normals * offsets, axis=1)
-        if at_side.any():
-            some = self._smooth[self._faces[face[at_side]]]
-            weights = np.stack([1 - s - t, s, t], axis=1)[at_side]
-            smooth = unit_vectors((some * weights[..., None]).sum(axis=1))
-            gaps = lengths(offsets[at_side])
-            above = np.sum(smooth * offsets[at_side], axis=1)
-            signs = np.where(above < 0, -1.0, 1.0)
-            away[at_side] = np.where(gaps > NEGLIGIBLE, signs * gaps, away[at_side])
-            at_rim = (self._at_rim[self._faces[face[at_side]]] | (weights < CORNER)).all(axis=1)
-            beyond = at_rim & (np.abs(above) < RIM * gaps) & (gaps > NEGLIGIBLE)
-            away[np.flatnonzero(at_side)[beyond]] = np.inf
-            normals = normals.copy()
-            clear = gaps > 10 * NEGLIGIBLE
-            normals[np.flatnonzero(at_side)[clear]] = (signs / np.maximum(gaps, 1e-300))[
-                clear, None
-            ] * offsets[at_side][clear]
+        weights, corners = np.stack([1 - s - t, s, t], axis=1), self._faces[face]
+        smooth = unit_vectors((self._smooth[corners] * weights[..., None]).sum(axis=1))
+        gaps, above = lengths(offsets), np.sum(smooth * offsets, axis=1)
+        signs = np.where(above < 0, -1.0, 1.0)
+        is_off = at_side & (gaps > NEGLIGIBLE)
+        away = np.where(is_off, signs * gaps, away)
+        at_rim = (self._at_rim[corners] | (weights < CORNER)).all(axis=1)
+        away[is_off & at_rim & (np.abs(above) < RIM * gaps)] = np.inf
+        towards = (signs / np.maximum(gaps, 1e-300))[:, None] * offsets
+        is_clear = at_side & (gaps > 10 * NEGLIGIBLE)
+        normals = np.where(is_clear[:, None], towards, normals)
         return away, normals
 
-    def seen_from(
-        self, places: np.ndarray, facing: np.ndarray, view: np.ndarray, least: float
-    ) -> np.ndarray:
+    def seen_from(self, places: Floats, facing: Floats, view: Floats, least: float) -> Mask:
         """Return which places (n, 3) on the surface, facing (n, 3), are visible from far away in
         the direction ``view`` (3,); ``least``: cosine between the two. Returns (n,) bool."""
         is_visible = facing @ view > least
@@ -98,20 +95,12 @@ class NominalSurface:
         is_visible[is_visible] = ~self._scene.test_occlusions(open3d().core.Tensor(rays)).numpy()
         return is_visible
 
-    def sample(self, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    def sample(self, count: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Places (count, 3) mm evenly over the area, and the unit normals (count, 3) there."""
         import trimesh
 
         places, face = trimesh.sample.sample_surface(self._mesh, count, seed=seed)
         return np.asarray(places) + self.middle, self._flat[face]
-
-
-def _rim_vertices(faces: np.ndarray, count: int) -> np.ndarray:
-    """Return the vertices (count,) bool at edges of one triangle alone."""
-    half, first, _, triangles = count_edges(faces)
-    is_rim = np.zeros(count, bool)
-    is_rim[half[first[triangles == 1]]] = True
-    return is_rim
 
 
 SAMPLES = 60_000
@@ -139,11 +128,11 @@ AWAY = 3.0
 
 
 def search_start(
-    points: np.ndarray,
-    normals: np.ndarray | None,
+    points: Floats,
+    normals: Floats | None,
     surface: NominalSurface,
     sigma_mm: float | None,
-    report: Callable[[float], None],
+    report: Progress,
 ) -> Registration:
     """The scan (n, 3) registered to the nominal.
 
@@ -152,10 +141,9 @@ def search_start(
     none is.
     """
     places, facing = surface.sample(SAMPLES)
-    step = -(-len(points) // MAX_POINTS)
-    scan = prepare_scan(
-        "scan", points[::step], None if normals is None else normals[::step], sigma_mm
-    )
+    if normals is not None:
+        normals = subsample(normals, MAX_POINTS)
+    scan = prepare_scan("scan", subsample(points, MAX_POINTS), normals, sigma_mm)
     good = max(GOOD_RMS * surface.diagonal, 3.0 * (sigma_mm or 0.0))
     refusal: SlviewerError | None = None
     best: Registration | None = None

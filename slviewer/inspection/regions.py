@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import finite_rows, lengths
 from slviewer.surface.region_of_interest import box_edges
 
@@ -23,9 +24,9 @@ class Region:
     """
 
     kind: Literal["ball", "box"]
-    centre: NDArray[np.float64]
-    size: NDArray[np.float64]
-    axes: NDArray[np.float64] | None = None
+    centre: Floats
+    size: Floats
+    axes: Floats | None = None
 
     def __post_init__(self) -> None:
         centre, size = np.asarray(self.centre, np.float64), np.asarray(self.size, np.float64)
@@ -48,7 +49,7 @@ class Region:
         return cls("ball", np.asarray(centre), np.array([radius]))
 
     @classmethod
-    def box(cls, low: ArrayLike, high: ArrayLike, axes: np.ndarray | None = None) -> "Region":
+    def box(cls, low: ArrayLike, high: ArrayLike, axes: Floats | None = None) -> "Region":
         """Return the region between two corners (3,) mm, given along ``axes`` where there are
         some."""
         a, b = np.asarray(low, np.float64), np.asarray(high, np.float64)
@@ -62,7 +63,7 @@ class Region:
         along = points @ axes.T
         return cls.box(along.min(axis=0) - MARGIN_MM, along.max(axis=0) + MARGIN_MM, axes)
 
-    def moved(self, T: np.ndarray) -> "Region":
+    def moved(self, T: Floats) -> "Region":
         """Return the region after a rigid motion (4, 4), in the digits of a file."""
         axes = (np.eye(3) if self.axes is None else self.axes) @ T[:3, :3].T
         is_turned = self.kind == "box" and not np.allclose(axes, np.eye(3))
@@ -78,7 +79,7 @@ class Region:
         offsets = offsets if self.axes is None else offsets @ self.axes.T
         return finite & (np.abs(offsets) <= self.size).all(axis=-1)
 
-    def edges(self) -> np.ndarray:
+    def edges(self) -> Floats:
         """(12, 2, 3) mm: the edges of a box."""
         return box_edges(self.centre, 2 * self.size, np.eye(3) if self.axes is None else self.axes)
 

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import finite_rows, lengths, median_spacing, unit_vectors
 from slviewer.records.measurement import Quantity
 from slviewer.registration.open3d_loader import open3d, point_cloud
@@ -19,12 +20,12 @@ class CutPlane:
     """``origin`` (3,) mm, and the two unit axes (3,) of the drawing: ``along`` to the right,
     ``up``."""
 
-    origin: np.ndarray
-    along: np.ndarray
-    up: np.ndarray
+    origin: Floats
+    along: Floats
+    up: Floats
 
     @classmethod
-    def through(cls, a: np.ndarray, b: np.ndarray, up: np.ndarray) -> "CutPlane":
+    def through(cls, a: Floats, b: Floats, up: Floats) -> "CutPlane":
         """Through two points (3,) mm, a at 0 and b to its right, with ``up`` (3,) in it as nearly
         as can be; for a scan that is towards the camera, (0, 0, -1). Raises InputError for points
         that are one, or lie above one another.
@@ -43,11 +44,11 @@ class CutPlane:
         return cls(a, along, unit_vectors(across))
 
     @property
-    def normal(self) -> np.ndarray:
+    def normal(self) -> Floats:
         """(3,): unit normal of the plane."""
         return np.cross(self.along, self.up)
 
-    def drawn(self, points: np.ndarray) -> np.ndarray:
+    def drawn(self, points: Floats) -> Floats:
         """Return points (n, 3) in the drawing, (n, 2) mm: along and up."""
         return (points - self.origin) @ np.stack([self.along, self.up]).T
 
@@ -81,7 +82,7 @@ def section(vertices: np.ndarray, faces: np.ndarray, plane: CutPlane) -> list[np
 
 
 def triangulate_near(
-    points: np.ndarray, normals: np.ndarray, plane: CutPlane
+    points: Floats, normals: Floats, plane: CutPlane
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and triangles (m, 3) between the points (k, 3) mm of a cloud near a
     plane, to cut them.
@@ -106,32 +107,29 @@ def triangulate_near(
 def _join_segments(segments: np.ndarray, count: int) -> list[list[int]]:
     """Segments (m, 2) of numbered places as lines of places that follow one another; open ones
     first."""
-    touching: list[list[int]] = [[] for _ in range(count)]
+    # by place: numbers of the segments that touch it, and their other ends
+    touching: list[list[tuple[int, int]]] = [[] for _ in range(count)]
     for number, (a, b) in enumerate(segments.tolist()):
-        touching[a].append(number)
-        touching[b].append(number)
-    ends, is_unused = segments.tolist(), [True] * len(segments)
+        touching[a].append((number, b))
+        touching[b].append((number, a))
+    unused = set(range(len(segments)))
     # where more than two triangles share a side, lines end
     starts = [place for place in range(count) if len(touching[place]) != 2]
     chains = []
     for place in [*starts, *range(count)]:
         for first in touching[place]:
-            if not is_unused[first]:
-                continue
-            chain, number = [place], first
-            while True:
-                is_unused[number] = False
-                a, b = ends[number]
-                chain.append(b if a == chain[-1] else a)
-                onwards = [n for n in touching[chain[-1]] if is_unused[n]]
-                if len(touching[chain[-1]]) != 2 or not onwards:
-                    break
-                number = onwards[0]
-            chains.append(chain)
+            chain, (number, end) = [place], first
+            while number in unused:
+                unused.remove(number)
+                chain.append(end)
+                if len(touching[end]) == 2:
+                    number, end = next((n for n in touching[end] if n[0] in unused), first)
+            if len(chain) > 1:
+                chains.append(chain)
     return chains
 
 
-def measure_cursors(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
+def measure_cursors(a: Floats, b: Floats) -> list[Quantity]:
     """Return the distance between two cursors (2,) mm on a section, along it and in height."""
     width, height = (float(value) for value in np.subtract(b, a))
     return [
@@ -141,28 +139,27 @@ def measure_cursors(a: np.ndarray, b: np.ndarray) -> list[Quantity]:
     ]
 
 
-def radius_through(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Quantity:
+def radius_through(a: Floats, b: Floats, c: Floats) -> Quantity:
     """Return the radius of the circle through three cursors (2,) mm. Raises InputError for cursors
     on a straight line."""
-    edges = np.stack([np.subtract(b, a), np.subtract(c, a)])
-    area = abs(float(np.linalg.det(edges)))
-    sides = [float(np.linalg.norm(v)) for v in (edges[0], edges[1], edges[1] - edges[0])]
-    if not area > 1e-6 * max(sides) ** 2:
+    edges = np.stack([np.subtract(b, a), np.subtract(c, a), np.subtract(c, b)])
+    area, sides = abs(float(np.linalg.det(edges[:2]))), lengths(edges)
+    if not area > 1e-6 * sides.max() ** 2:
         raise InputError("The three cursors lie on a straight line: put the middle one on a curve.")
-    return Quantity("radius", sides[0] * sides[1] * sides[2] / (2 * area), "mm")
+    return Quantity("radius", float(sides.prod()) / (2 * area), "mm")
 
 
-def nearest_on_section(lines: list[np.ndarray], x: float) -> np.ndarray:
+def nearest_on_section(lines: list[Floats], x: float) -> Floats:
     """(2,) mm: where a cursor at ``x`` meets the section, at the highest line; the nearest point
     drawn where no line passes x."""
-    met = []
-    for line in lines:
-        left, right = line[:-1], line[1:]
-        passes = (left[:, 0] - x) * (right[:, 0] - x) <= 0
-        passes &= left[:, 0] != right[:, 0]
-        share = (x - left[passes, 0]) / (right[passes, 0] - left[passes, 0])
-        met.append(left[passes, 1] + share * (right[passes, 1] - left[passes, 1]))
-    heights = np.concatenate(met)
+    left, right = (
+        np.concatenate([line[part] for line in lines]) for part in (np.s_[:-1], np.s_[1:])
+    )
+    passes = (left[:, 0] - x) * (right[:, 0] - x) <= 0
+    passes &= left[:, 0] != right[:, 0]
+    left, right = left[passes], right[passes]
+    share = (x - left[:, 0]) / (right[:, 0] - left[:, 0])
+    heights = left[:, 1] + share * (right[:, 1] - left[:, 1])
     if not heights.size:
         drawn = np.concatenate(lines)
         return drawn[np.argmin(np.abs(drawn[:, 0] - x))]

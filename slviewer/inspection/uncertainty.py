@@ -16,7 +16,8 @@ from slviewer.calibration.splined.uncertainty import (
 )
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.polynomial import grid_points
-from slviewer.geometry.vectors import finite_rows, occupied_cubes
+from slviewer.geometry.rigid import Floats, Uncertainty
+from slviewer.geometry.vectors import finite_rows, sum_by_cube
 
 Shared = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Called with points (m, 3) and how p parameters answer to their displacement (p, m, 3): (k, p),
@@ -37,38 +38,29 @@ class Spread:
     calibration's part, as ``Shared`` gives it; None where that is not known. ``calibration``: by
     whose errors; only one calibration's are the same."""
 
-    scatter: np.ndarray
-    shared: np.ndarray | None = None
+    scatter: Floats
+    shared: Floats | None = None
     calibration: str = ""
 
     @property
-    def covariance(self) -> np.ndarray:
+    def covariance(self) -> Floats:
         """(p, p): total covariance."""
         return self.scatter if self.shared is None else self.scatter + self.shared.T @ self.shared
 
     @property
-    def sigmas(self) -> np.ndarray:
+    def sigmas(self) -> Floats:
         """(p,): standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
 
-@dataclass(frozen=True, eq=False)
-class RigidSpread:
-    """Covariance (6, 6) of a rigid motion's rotation vector (rad) about ``middle`` (3,) mm, and its
-    shift (mm)."""
-
-    middle: np.ndarray
-    covariance: np.ndarray
-
-    def draw(self, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-        """Draw `DRAWS` motions; returns what displaces points (n, 3): (draws, n, 3) mm."""
-        steps = draw_steps(self.covariance, rng)
-        return lambda points: (
-            np.cross(steps[:, None, :3], points - self.middle) + steps[:, None, 3:]
-        )
+def draw_motions(motion: Uncertainty, rng: np.random.Generator) -> Callable[[Floats], Floats]:
+    """Draw `DRAWS` motions of an uncertain pose; returns what displaces points (n, 3): (draws, n,
+    3) mm."""
+    steps = draw_steps(motion.covariance, rng)
+    return lambda points: np.cross(steps[:, None, :3], points - motion.centre) + steps[:, None, 3:]
 
 
-def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
+def joint_covariance(a: Spread, b: Spread) -> Floats:
     """(p + q, p + q): the covariance of two features' parameters; errors of a calibration that both
     have, are one."""
     p = len(a.scatter)
@@ -80,13 +72,13 @@ def joint_covariance(a: Spread, b: Spread) -> np.ndarray:
     return whole
 
 
-def draw_steps(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def draw_steps(covariance: Floats, rng: np.random.Generator) -> Floats:
     """Draw `DRAWS` steps (draws, p) of parameters of a covariance (p, p)."""
     values, vectors = np.linalg.eigh(covariance)
     return rng.normal(size=(DRAWS, len(values))) * np.sqrt(np.maximum(values, 0)) @ vectors.T
 
 
-def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarray) -> float:
+def propagate_covariance(f: Callable[[Floats], float], covariance: Floats) -> float:
     """Return the standard deviation of f(step) at step 0, for steps (p,) of a covariance.
 
     Along each principal direction f is asked one standard deviation to both sides, which also holds
@@ -101,9 +93,7 @@ def propagate_covariance(f: Callable[[np.ndarray], float], covariance: np.ndarra
     return float(np.sqrt(variance))
 
 
-def scatter_covariance(
-    points: np.ndarray, jacobian: np.ndarray, residuals: np.ndarray
-) -> np.ndarray:
+def scatter_covariance(points: Floats, jacobian: Floats, residuals: Floats) -> Floats:
     """Return the covariance (p, p) of parameters fitted to points (n, 3) by least squares, from the
     fit's residuals.
 
@@ -115,13 +105,10 @@ def scatter_covariance(
     plain = inverse * float(residuals @ residuals) / max(n - p, 1)
     low = points.min(axis=0)
     side = max(float(np.ptp(points, axis=0).max()) / PATCHES, 1e-12)
-    cubes, patch = occupied_cubes(points - low, side)
-    count = len(cubes)
+    sums = sum_by_cube(jacobian * residuals[:, None], points - low, side)
+    count = len(sums)
     if count <= 2 * p:
         return plain
-    sums = np.stack(
-        [np.bincount(patch, jacobian[:, k] * residuals, count) for k in range(p)], axis=1
-    )
     together = inverse @ (sums.T @ sums) @ inverse * count / (count - p)
     # elementwise larger standard deviations, with the correlations of the patches
     ratio = np.sqrt(np.maximum(np.diag(plain) / np.maximum(np.diag(together), 1e-300), 1.0))
@@ -140,7 +127,7 @@ def splined_shared(
     motion = BestMotion.fit(reference.points)
     moved = motion.weights.T @ bundle.point_jacobian(axis, reference.pixels, reference.z).toarray()
 
-    def shared(points: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    def shared(points: np.ndarray, answers: Floats) -> Floats:
         """Return (k, p): the calibration's part of the parameters' covariance, as its square
         root."""
         places = np.asarray(points, np.float64) / scale
@@ -148,9 +135,8 @@ def splined_shared(
         jacobian = bundle.point_jacobian(axis, pixels, places[:, 2])
         jacobian.data[~np.isfinite(jacobian.data)] = 0.0
         volume = Volume(pixels, places[:, 2], *view_pixels(rig, pixels, places[:, 2]))
-        weighed = (answers * (scale * extrapolation_factor(bundle, volume))[None, :, None]).reshape(
-            len(answers), -1
-        )
+        weights = scale * extrapolation_factor(bundle, volume)
+        weighed = (answers * weights[:, None]).reshape(len(answers), -1)
         free = weighed @ jacobian - (weighed @ motion.displace(places)) @ moved
         larger = np.einsum("pni,ni->p", answers, scale_sigma * (places - motion.centre))
         return np.vstack([np.asarray(bundle.whiten(np.asarray(free)), np.float64), larger])
@@ -158,7 +144,7 @@ def splined_shared(
     return shared
 
 
-def _pixels(bundle: Bundle, points: np.ndarray) -> np.ndarray:
+def _pixels(bundle: Bundle, points: Floats) -> Floats:
     """Return the camera pixels (n, 2) of points (n, 3), by Newton steps on the rays of the
     pixels."""
     rig = bundle.state.rig

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from slviewer.errors import InputError, SlviewerError, UsageError
-from slviewer.geometry.rigid import move_points
+from slviewer.geometry.rigid import Uncertainty, move_points
 from slviewer.inspection.deviation import Deviation, deviation, judge_limits
 from slviewer.inspection.features import Feature, relation
 from slviewer.inspection.fitting import (
@@ -26,7 +26,7 @@ from slviewer.inspection.fitting import (
 from slviewer.inspection.form import form_error, orientation_error, position_error, profile_error
 from slviewer.inspection.nominal_surface import NominalSurface
 from slviewer.inspection.regions import Region
-from slviewer.inspection.uncertainty import RigidSpread, Shared
+from slviewer.inspection.uncertainty import Shared
 from slviewer.pipeline.feedback import Progress, Warn, ignore_progress, ignore_warnings, part
 from slviewer.pipeline.measure import MERGED, MeasuredSurface, load_feature, load_surface
 from slviewer.pipeline.models import ModelName
@@ -320,7 +320,7 @@ class AlignedPart:
         self._nominal_surface: NominalSurface | None = None
         self._reach = np.inf
         self.T_part_scan: np.ndarray = np.eye(4)
-        self.spread: RigidSpread | None = None
+        self.spread: Uncertainty | None = None
         if not len(self._scan_points):
             raise InputError(f"{surface.source} has no measured points: scan the part again.")
         if nominal is not None:

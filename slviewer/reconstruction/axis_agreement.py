@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis, Size
 from slviewer.geometry.lens import Lens
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import Floats, Floats32
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.triangulation import triangulate_pixels
 from slviewer.geometry.vectors import lengths
@@ -79,9 +79,7 @@ LEAST_WITHIN = 0.5
 class Calibration(Protocol):
     """Camera and projector rays of a calibration. ``rig``: its pinholes and their arrangement."""
 
-    def undistort_pairs(
-        self, pixels: np.ndarray, projector: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def undistort_pairs(self, pixels: Floats, projector: Floats) -> tuple[Floats, Floats]:
         """Undistorted normalised coordinates (n, 2) of camera ``pixels`` (n, 2) and of
         ``projector`` pixels (n, 2); NaN where not calibrated."""
 
@@ -108,7 +106,7 @@ class AxisAgreement:
     misfit_px: float
     predicted_px: float
     in_front: float
-    depths_mm: np.ndarray
+    depths_mm: Floats
     pixels: int
 
     @property
@@ -137,7 +135,7 @@ class CaptureCheck:
     sigma_factor: float = 1.0
     warnings: tuple[str, ...] = ()
     agreement: AxisAgreement | None = None
-    excess_px: NDArray[np.float32] | None = None
+    excess_px: Floats32 | None = None
 
 
 def check_sizes(name: str, camera: Size, projector: Size | None, calibrated: StereoRig) -> None:
@@ -239,8 +237,8 @@ def check_phases(
 
 
 def local_misfit(
-    calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
-) -> NDArray[np.float32] | None:
+    calibration: Calibration, pixels: Floats, measured: Floats, sigma: Floats
+) -> Floats32 | None:
     """Return the misfit of the axes in px of the projector for each of `TILES` of the image, beyond
     what is predicted there; 0 where noise and the calibration's residuals explain it, None where
     they do so everywhere.
@@ -251,18 +249,19 @@ def local_misfit(
     rig = calibration.pinholes
     known, distance, noise = _misfit(rig, *calibration.undistort_pairs(pixels, measured), sigma)
     tile = (pixels[known, ::-1] * TILES / rig.camera.size[::-1]).astype(int) @ (TILES[1], 1)
-    order = np.argsort(tile, kind="stable")
     excess = np.zeros(TILES, np.float32)
-    for group in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
-        predicted = float(np.median(noise[group])) + calibration.residual_px**2
-        misfit = robust_sigma(distance[group], about=0.0) ** 2
-        if len(group) >= LEAST_IN_TILE and misfit > RAISED_RATIO**2 * predicted:
-            excess.flat[tile[group[0]]] = np.sqrt(misfit - predicted)
+    for number in np.unique(tile):
+        is_inside = tile == number
+        predicted = float(np.median(noise[is_inside])) + calibration.residual_px**2
+        misfit = robust_sigma(distance[is_inside], about=0.0) ** 2
+        enough = np.count_nonzero(is_inside) >= LEAST_IN_TILE
+        if enough and misfit > RAISED_RATIO**2 * predicted:
+            excess.flat[number] = np.sqrt(misfit - predicted)
     return excess if excess.any() else None
 
 
 def measure_axis_agreement(
-    calibration: Calibration, pixels: np.ndarray, measured: np.ndarray, sigma: np.ndarray
+    calibration: Calibration, pixels: Floats, measured: Floats, sigma: Floats
 ) -> AxisAgreement | None:
     """How far camera ``pixels`` (n, 2) and the projector coordinates ``measured`` there (n, 2) px,
     of noise ``sigma`` (n, 2) px, miss each other; None where fewer than 200 are calibrated."""
@@ -273,9 +272,7 @@ def measure_axis_agreement(
     return agreement if agreement.pixels >= LEAST_PIXELS else None
 
 
-def epipolar_distance(
-    rig: StereoRig, camera: np.ndarray, projector: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def epipolar_distance(rig: StereoRig, camera: Floats, projector: Floats) -> tuple[Floats, Floats]:
     """Return signed distances (n,) px of projector points from the epipolar lines of their camera
     rays, and the lines' unit normals (n, 2). ``camera``, ``projector`` (n, 2): undistorted
     normalised coordinates."""
@@ -288,7 +285,7 @@ def epipolar_distance(
 
 
 def _misfit(
-    rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray
+    rig: StereoRig, camera: Floats, projector: Floats, sigma: Floats
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which pixels (n,) bool are calibrated, and the ``epipolar_distance`` (m,) px of these
     and its variance (m,) by the noise ``sigma`` (n, 2) px."""
@@ -297,7 +294,7 @@ def _misfit(
     return known, distance[known], np.sum((normal[known] * sigma[known]) ** 2, axis=1)
 
 
-def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.ndarray:
+def ray_depths(rig: StereoRig, camera: Floats, projector: Floats) -> Floats:
     """(n, 2) mm: depths before camera and projector at which the rays of undistorted normalised
     coordinates (n, 2) come nearest to each other; negative behind a device."""
     a, b = _rays(camera) @ rig.R.T, _rays(projector)
@@ -310,13 +307,13 @@ def ray_depths(rig: StereoRig, camera: np.ndarray, projector: np.ndarray) -> np.
         )
 
 
-def _rays(normalised: np.ndarray) -> np.ndarray:
+def _rays(normalised: Floats) -> Floats:
     """Return the rays (n, 3) of undistorted normalised coordinates (n, 2)."""
     return np.column_stack([normalised, np.ones(len(normalised))])
 
 
 def _compute_agreement(
-    rig: StereoRig, camera: np.ndarray, projector: np.ndarray, sigma: np.ndarray, residual_px: float
+    rig: StereoRig, camera: Floats, projector: Floats, sigma: Floats, residual_px: float
 ) -> AxisAgreement:
     """Return the axis agreement of undistorted coordinates (n, 2) with noise ``sigma`` (n, 2)
     px."""
@@ -341,7 +338,7 @@ def _sample_pixels(mask: np.ndarray) -> np.ndarray:
     return places[:, :: max(1, -(-places.shape[1] // SAMPLE))]
 
 
-def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[Floats, Floats, Floats]:
     """Camera pixels (n, 2) that both axes decoded, the coordinates (n, 2) px there, and their
     errors (n, 2) px by noise and by blur at edges."""
     v, u = _sample_pixels(np.logical_and.reduce([phase.mask for phase in phases.values()]))
@@ -351,7 +348,7 @@ def _samples(phases: Mapping[Axis, PhaseMap]) -> tuple[np.ndarray, np.ndarray, n
     return np.column_stack([u, v]).astype(float), measured, np.column_stack(errors).astype(float)
 
 
-def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.ndarray, float]:
+def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[Floats, float]:
     """Depths (n,) mm of one axis' points, and the share of the decoded pixels that have one."""
     ((axis, phase),) = phases.items()
     v, u = _sample_pixels(phase.mask)
@@ -365,7 +362,7 @@ def _single_axis(phases: Mapping[Axis, PhaseMap], rig: StereoRig) -> tuple[np.nd
 
 
 def _depth_warning(
-    name: str, depths: np.ndarray, depth_range: tuple[float, float] | None
+    name: str, depths: Floats, depth_range: tuple[float, float] | None
 ) -> tuple[str, ...]:
     """Return a warning, in a tuple, where many ``depths`` (n,) mm are outside the range of the
     target poses."""
@@ -397,7 +394,7 @@ def _describe_contradiction(agreement: AxisAgreement) -> str:
 
 
 def _likely_reason(
-    agreement: AxisAgreement, rig: StereoRig, pixels: np.ndarray, measured: np.ndarray
+    agreement: AxisAgreement, rig: StereoRig, pixels: Floats, measured: Floats
 ) -> str:
     """Return in words the hypothesis that explains the frames best."""
     best, reason = np.inf, ""
@@ -424,8 +421,8 @@ def _likely_reason(
 
 
 def _hypotheses(
-    rig: StereoRig, pixels: np.ndarray, measured: np.ndarray
-) -> Iterator[tuple[str, StereoRig, np.ndarray, np.ndarray]]:
+    rig: StereoRig, pixels: Floats, measured: Floats
+) -> Iterator[tuple[str, StereoRig, Floats, Floats]]:
     """Yield each hypothesis of what is wrong, in words, with rig, pixels and coordinates corrected
     accordingly."""
     size, image = np.array(rig.projector.size), np.array(rig.camera.size)
@@ -474,12 +471,8 @@ def _size(size: Size) -> str:
 def _scale(size: Size, calibrated: Size) -> str:
     """Describe the ratio of two sizes where it is a quarter, half, twice or four times; empty
     otherwise."""
-    for factor, words in (
-        (0.5, "half"),
-        (2.0, "twice"),
-        (0.25, "a quarter of"),
-        (4.0, "four times"),
-    ):
-        if size[0] == factor * calibrated[0] and size[1] == factor * calibrated[1]:
-            return f" (the capture's is {words} the calibrated size)"
+    words = {0.5: "half", 2.0: "twice", 0.25: "a quarter of", 4.0: "four times"}
+    ratio = size[0] / calibrated[0]
+    if ratio in words and size[1] == ratio * calibrated[1]:
+        return f" (the capture's is {words[ratio]} the calibrated size)"
     return ""

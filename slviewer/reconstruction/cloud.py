@@ -7,6 +7,12 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.layout import to_eight_bits
 from slviewer.fringe.sequence import Axis
+from slviewer.geometry.rigid import Mask
+
+Points = np.ndarray
+"""Of an organised cloud (h, w, 3), or some of its points (n, 3), mm; or directions there."""
+Map = np.ndarray
+"""(h, w): a value for each pixel of an organised cloud."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,13 +29,13 @@ class Cloud:
     or 16 bits, whichever holds its brightest pixel).
     """
 
-    points: np.ndarray
+    points: Points
     axis: Axis
     model: str
-    sigma_z: np.ndarray
+    sigma_z: Map
     texture: np.ndarray | None = None
-    sigma_calibration: np.ndarray | None = None
-    sigma_edges: np.ndarray | None = None
+    sigma_calibration: Map | None = None
+    sigma_edges: Map | None = None
 
     def __post_init__(self) -> None:
         for name in ("points", "sigma_z", "sigma_calibration", "sigma_edges"):
@@ -51,7 +57,7 @@ class Cloud:
             vars(self)["texture"] = _convert_texture(self.texture, shape)
 
     @property
-    def mask(self) -> np.ndarray:
+    def mask(self) -> Mask:
         """(h, w) bool: the measured pixels."""
         # `all` along a short axis takes ten times as long as a product
         with np.errstate(invalid="ignore"):
@@ -63,7 +69,7 @@ class Cloud:
         return choose_pixels(self.points, self.mask)
 
     @property
-    def sigma(self) -> np.ndarray:
+    def sigma(self) -> Map:
         """(h, w) float32 mm: standard deviation of z from the known ones of noise, calibration and
         edges; NaN where invalid."""
         systematic = self.sigma_systematic
@@ -72,14 +78,14 @@ class Cloud:
         )
 
     @property
-    def sigma_systematic(self) -> np.ndarray | None:
+    def sigma_systematic(self) -> Map | None:
         """(h, w) float32 mm: the part of `sigma` that averaging over exposures does not lessen;
         None if not known."""
         if self.sigma_calibration is None or self.sigma_edges is None:
             return self.sigma_edges if self.sigma_calibration is None else self.sigma_calibration
         return np.hypot(self.sigma_calibration, self.sigma_edges)
 
-    def sigmas(self, chosen: np.ndarray) -> dict[str, np.ndarray]:
+    def sigmas(self, chosen: Mask) -> dict[str, np.ndarray]:
         """Scalars (n,) of the pixels ``chosen`` (h, w) bool by the name that a file gives them:
         ``sigma_noise``, and where the model knows it ``sigma_calibration`` and ``sigma``, all
         together; mm of z."""
@@ -105,13 +111,13 @@ class Cloud:
         return None if self.texture is None else self.texture[self.mask]
 
 
-def choose_pixels(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+def choose_pixels(values: np.ndarray, chosen: Mask) -> np.ndarray:
     """The values (n, k) of the ``chosen`` pixels (h, w) bool of an image (h, w, k), as indexing
     gives them, in a sixth of its time."""
     return np.compress(chosen.ravel(), values.reshape(-1, values.shape[-1]), axis=0)
 
 
-def keep_pixels(points: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def keep_pixels(points: Points, kept: Mask) -> Points:
     """Return points (h, w, 3) float32 mm with NaN outside the pixels ``kept`` (h, w) bool."""
     return np.where(kept[..., None], points, np.float32(np.nan))
 

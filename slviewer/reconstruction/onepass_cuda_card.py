@@ -36,8 +36,7 @@ from slviewer.geometry.cuda_device import device_function
 from slviewer.geometry.rig import StereoRig
 from slviewer.geometry.triangulation import MARGIN, ray_depth
 from slviewer.reconstruction.onepass import LightLevels, OnePass, PassResult
-from slviewer.reconstruction.onepass_kernels import Maps
-from slviewer.reconstruction.pixel_depths import pixelwise_point, splined_point
+from slviewer.reconstruction.onepass_kernels import Maps, pixelwise_point, splined_point
 
 # its own annotations are not those of what a kernel may call
 cuda: Any = import_module("numba.cuda")
@@ -110,13 +109,13 @@ class Card:
 
     def repair_spikes(self) -> None:
         """Run the second pass on the device: see `OnePass.repair_spikes`."""
-        list_moves, move, list_masked, mask = self._spikes
+        list_changes, change = self._spikes
         phase, reason, _, points, sigma_z, _ = self._maps
-        if self._rules.is_plain:
-            list_moves[self._grid](self._phase_map, self._words)
-            move[self._grid](self._words, self._c, self._extra, phase, points, sigma_z)
-        list_masked[self._grid](self._phase_map, self._words)
-        mask[self._grid](self._words, phase, reason, points, sigma_z)
+        for masking in (False, True) if self._rules.is_plain else (True,):
+            list_changes[self._grid](self._phase_map, masking, self._words)
+            change[self._grid](
+                self._words, masking, self._c, self._extra, phase, reason, points, sigma_z
+            )
 
     def fetch(self, scan: PassResult) -> int:
         """Copy the maps into a scan's arrays, the texture only where it is computed from fringes;
@@ -131,9 +130,9 @@ class Card:
 
 
 def _depths(job: OnePass) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
-    """Return the device function (pixel, phase, c, extra) that measures a pixel like
-    `pixel_depths`, and two arrays: ``c`` (m, h, w) of the camera's pixels, and ``extra``. The pixel
-    is a uint64, so that indices are not tested for their sign."""
+    """Return the device function (pixel, phase, c, extra) that measures a pixel like those of
+    `onepass_kernels`, and two arrays: ``c`` (m, h, w) of the camera's pixels, and ``extra``. The
+    pixel is a uint64, so that indices are not tested for their sign."""
     width, d = job.shape[1], job.depths
     if isinstance(d, StereoRig):
         extra = np.zeros((6, 10))
@@ -192,72 +191,56 @@ def _compile_stereo(row: int, period_px: float) -> Callable[..., Any]:
 def spike_kernels(
     rules: SpikeRules, shape: tuple[int, int], measure: Callable[..., Any]
 ) -> tuple[Any, ...]:
-    """Kernels (list what is to be moved by a period, move it, list what is to be masked, mask it).
+    """Kernels (list what is to be changed, change it): move pixels by a period, or, where
+    ``masking``, mask them.
 
-    Those that list take the phase (h, w) and fill ``words`` (n,) uint8; the others take maps
+    The first takes the phase (h, w) and fills ``words`` (n,) uint8; the second takes maps
     flattened. ``measure`` is one of `_depths`. What changes is listed before the first pixel is
     changed, because each one's neighbours vote with the phase that they had.
     """
-    height, width = shape
+    pixels, width = shape[0] * shape[1], shape[1]
     per_cell = np.float32(1 / rules.cell_rad)
     is_suspect = device_function(kernels_spikes.is_suspect)
     period_change = device_function(kernels_spikes.period_change)
     masking_reason = device_function(kernels_spikes.masking_reason)
 
-    @cuda.jit(device=True)
-    def find_move(phase, row, x):
-        """Return whether the phase of a pixel moves up or down a period, if it is suspect."""
-        if is_suspect(phase, row, x, per_cell):
-            return period_change(phase, row, x, rules)
-        return UNCHANGED
-
-    @cuda.jit(device=True)
-    def find_mask(phase, row, x):
-        """Return the reason to mask a pixel, or UNCHANGED."""
-        return masking_reason(phase, row, x, is_suspect(phase, row, x, per_cell), rules)
-
-    def compile_list(find: Callable[..., Any]) -> Any:
-        """Compile the kernel that writes to ``words`` (h w,) what is found for each pixel."""
-
-        @cuda.jit
-        def list_changes(phase, words):
-            """Kernel: write one pixel's word."""
-            i = cuda.grid(1)
-            if i < height * width:
-                row = i // width
-                x = i - row * width
-                words[i] = UNCHANGED
-                if phase[row, x] == phase[row, x]:  # False for NaN
-                    words[i] = find(phase, row, x)
-
-        return list_changes
+    @cuda.jit
+    def list_changes(phase, masking, words):
+        """Kernel: write one pixel's word: the reason to mask it, or whether it moves up or down a
+        period; UNCHANGED without either."""
+        i = cuda.grid(1)
+        if i >= pixels:
+            return
+        row = i // width
+        x = i - row * width
+        words[i] = UNCHANGED
+        if phase[row, x] == phase[row, x]:  # False for NaN
+            suspect = is_suspect(phase, row, x, per_cell)
+            if masking:
+                words[i] = masking_reason(phase, row, x, suspect, rules)
+            elif suspect:
+                words[i] = period_change(phase, row, x, rules)
 
     @cuda.jit
-    def move(words, c, extra, phase, points, sigma_z):
-        """Kernel: move the phases listed in ``words`` by one period, and update their points and
-        sigma_z."""
+    def change(words, masking, c, extra, phase, reason, points, sigma_z):
+        """Kernel: change one pixel by its word: store the reason, set phase, point and sigma_z to
+        NaN, or move the phase by one period and update its point and sigma_z."""
         i = cuda.grid(1)
-        if i >= height * width or words[i] == UNCHANGED:
+        if i >= pixels or words[i] == UNCHANGED:
             return
-        before, at = phase[i], np.uint64(i)
-        after = before + (TURN if words[i] == UP else -TURN)
-        _, _, _, old_slope = measure(at, before, c, extra)
-        x, y, z, slope = measure(at, after, c, extra)
-        phase[i] = after
+        after, x, y, z, sigma = INVALID, INVALID, INVALID, INVALID, INVALID
+        if masking:
+            reason[i] = words[i]
+        else:
+            before, at = phase[i], np.uint64(i)
+            after = before + (TURN if words[i] == UP else -TURN)
+            _, _, _, old_slope = measure(at, before, c, extra)
+            x, y, z, slope = measure(at, after, c, extra)
+            sigma = sigma_z[i] * (slope / old_slope)
+        phase[i], sigma_z[i] = after, sigma
         points[i, 0], points[i, 1], points[i, 2] = x, y, z
-        sigma_z[i] = sigma_z[i] * (slope / old_slope)
 
-    @cuda.jit
-    def mask(words, phase, reason, points, sigma_z):
-        """Kernel: mask the pixels listed in ``words``: store the reason, set phase, point and
-        sigma_z to NaN."""
-        i = cuda.grid(1)
-        if i >= height * width or words[i] == UNCHANGED:
-            return
-        phase[i], reason[i] = INVALID, words[i]
-        points[i, 0] = points[i, 1] = points[i, 2] = sigma_z[i] = INVALID
-
-    return compile_list(find_move), move, compile_list(find_mask), mask
+    return list_changes, change
 
 
 def frame_slots(layout: Layout) -> list[int]:
@@ -373,49 +356,42 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
     origin = np.float32(layout.gray_origin_px / layout.period_px)
 
     @cuda.jit(device=True)
-    def height_of(stack, i, bit, threshold):
-        """Return the signed grey level of a Gray code bit: half the difference to its inverse
-        frame, or the level above the threshold."""
-        slot = np.uint64(bit)
-        value = np.float32(stack[(code_from + slot) * stride + i])
-        if inverses:
-            return (value - np.float32(stack[(inverse_from + slot) * stride + i])) * HALF
-        return value - threshold
-
-    @cuda.jit(device=True)
-    def misread(stack, i, threshold, top, bottom, code, part, mean):
-        """Return the correction (-1, 0 or 1) of a code whose bit that switches next to the pixel is
-        weak."""
+    def correction(part, top, bottom, lower, upper, mean):
+        """Return the correction (-1, 0 or 1) of a code whose bit that changes at the edge next to
+        the pixel is weak."""
         contrast = max(top / (ONE - mean), -bottom / mean)
-        middle = (HALF - mean) * contrast
-        zeros, ones = 0, 0
-        while zeros < bits and not (code >> zeros) & 1:
-            zeros += 1
-        while ones < bits and (code >> ones) & 1:
-            ones += 1
-        lower, upper = ENDLESS, ENDLESS
-        if zeros < bits:
-            lower = abs(height_of(stack, i, bits - 1 - zeros, threshold) - middle)
-        if ones < bits:
-            upper = abs(height_of(stack, i, bits - 1 - ones, threshold) - middle)
-        weak = WEAK * contrast
-        if part < HALF:
-            return 1 if upper < weak and upper < WEAKER * lower else 0
-        return -1 if lower < weak and lower < WEAKER * upper else 0
+        middle, weak = (HALF - mean) * contrast, WEAK * contrast
+        below, above = abs(lower - middle), abs(upper - middle)
+        if part < EDGE and above < weak and above < WEAKER * below:
+            return 1
+        if part >= FAR_EDGE and below < weak and below < WEAKER * above:
+            return -1
+        return 0
 
     @cuda.jit(device=True)
     def decode(stack, i, light):
         """Return (absolute phase, reason, modulation, background) of pixel ``i``."""
         psi, B, A, peak = shift(stack, i, 0, steps)
         code, digit = 0, 0
-        least, top, bottom = ENDLESS, ZERO, ZERO
+        least, top, bottom, lower, upper = ENDLESS, ZERO, ZERO, ENDLESS, ENDLESS
         for b in range(bits):
-            height = height_of(stack, i, b, A)
+            slot = np.uint64(b)
+            height = np.float32(stack[(code_from + slot) * stride + i])
+            if inverses:
+                inverse = np.float32(stack[(inverse_from + slot) * stride + i])
+                height = (height - inverse) * HALF
+            else:
+                height = height - A
             digit = digit ^ (1 if height > ZERO else 0)
             code = 2 * code + digit
             least = min(least, abs(height))
             top = max(top, height)
             bottom = min(bottom, height)
+            # the bits that change at the edges of the code, see `kernels_coded.code_row`
+            if digit:
+                lower = height
+            else:
+                upper = height
         turns = psi * PER_TURN - origin
         whole = np.float32(math.floor(turns))
         part = turns - whole
@@ -428,11 +404,8 @@ def _compile_coded(layout: Layout, pixels: int) -> Any:
             )
             unclear = (least if middle else abs(last)) < UNDECIDED * B
         else:
-            beside = part < EDGE or part >= FAR_EDGE
-            order = code
-            unclear = not beside and least < UNDECIDED * B
-            if beside:
-                order = code + misread(stack, i, A, top, bottom, code, part, light[MEAN])
+            unclear = EDGE <= part < FAR_EDGE and least < UNDECIDED * B
+            order = code + correction(part, top, bottom, lower, upper, light[MEAN])
         clipped = peak >= light[WHITE] and light[WHITE] <= A + B
         why = _verdict(B, A, clipped, unclear, light)
         absolute = np.float32(np.float64(psi) + TWO_PI * (np.float64(order) - np.float64(whole)))

@@ -7,16 +7,16 @@ Decoding is that of `fringe.kernels`, row by row; depth is that of the models, `
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from slviewer.calibration.splined.correction_grid import add_corrections, locate_layers
-from slviewer.fringe.kernels import ROWS
+from slviewer.fringe.kernels import ONE, ROWS, ZERO
 from slviewer.fringe.kernels_coded import coded_rows
 from slviewer.fringe.kernels_levels import levels_rows
 from slviewer.fringe.kernels_spikes import INVALID, TURN, UP
 from slviewer.geometry.jit import fma, kernel
 from slviewer.geometry.rays import fill_points
-from slviewer.reconstruction.pixel_depths import pixelwise_point, splined_point
 
 
 class Depths(NamedTuple):
@@ -163,26 +163,28 @@ def _brightest(stack, frames, first, last):
 @kernel()
 def measure_moved(columns, words, counts, depths, maps):
     """Measure again the pixels whose phases `kernels_spikes.move_phases` has moved."""
-    width, gain, centre = maps.phase.shape[1], np.float32(depths.gain), np.float32(depths.centre)
-    near, per_mm, c = np.float32(depths.near), np.float32(depths.per_mm), depths.c.reshape(5, -1)
-    bounds = depths.bounds.reshape(2, -1)
+    width = maps.phase.shape[1]
     for row in range(len(counts)):
         for k in range(counts[row]):
             x = columns[row, k]
             i, phase = row * width + x, maps.phase[row, x]
             before = phase - (TURN if words[row, k] == UP else -TURN)
-            if depths.grid.size:
-                _, _, _, old = splined_point(
-                    i, before, c, depths.grid, gain, centre, width, depths.step, near, per_mm
-                )
-                a, b, z, new = splined_point(
-                    i, phase, c, depths.grid, gain, centre, width, depths.step, near, per_mm
-                )
-            else:
-                _, _, _, old = pixelwise_point(i, before, c, bounds, gain, centre)
-                a, b, z, new = pixelwise_point(i, phase, c, bounds, gain, centre)
+            _, _, _, old = _measure_pixel(i, before, width, depths)
+            a, b, z, new = _measure_pixel(i, phase, width, depths)
             maps.points[row, x, 0], maps.points[row, x, 1], maps.points[row, x, 2] = a, b, z
             maps.sigma_z[row, x] *= new / old
+
+
+@numba.njit
+def _measure_pixel(i, phase, width, depths):
+    """Return (x, y, z, |dz/dphi|) of a pixel by the calibration's own function."""
+    gain, centre, c = np.float32(depths.gain), np.float32(depths.centre), depths.c.reshape(5, -1)
+    if depths.grid.size:
+        near, per_mm = np.float32(depths.near), np.float32(depths.per_mm)
+        return splined_point(
+            i, phase, c, depths.grid, gain, centre, width, depths.step, near, per_mm
+        )
+    return pixelwise_point(i, phase, c, depths.bounds.reshape(2, -1), gain, centre)
 
 
 @kernel()
@@ -194,3 +196,58 @@ def mask_points(columns, counts, maps):
             x = columns[row, k]
             maps.points[row, x, 0] = maps.points[row, x, 1] = maps.points[row, x, 2] = INVALID
             maps.sigma_z[row, x] = INVALID
+
+
+# A pixel's depth from its phase, compiled for the processor and for CUDA devices alike. A function
+# takes the pixel's number ``i`` (row by row), its phase in rad, and arrays of the camera's n
+# pixels. It returns (x, y, z, |dz/dphi|), mm and mm/rad; points that are not measured are NaN.
+# Arrays, ``gain``, ``centre`` and what belongs to the grid are those of `Depths`.
+
+
+@numba.njit
+def pixelwise_point(i, phase, c, bounds, gain, centre):
+    """Return (x, y, z, |dz/dphi|) of a pixel by its rational function alone; ``c`` (5, n),
+    ``bounds`` (2, n)."""
+    s, z, slope = _rational_depth(i, phase, c, gain, centre)
+    if not (s >= bounds[0, i] and s <= bounds[1, i] and z > ZERO):
+        z = INVALID
+    return c[3, i] * z, c[4, i] * z, z, slope
+
+
+@numba.njit
+def splined_point(i, phase, c, grid, gain, centre, width, step, near, per_mm):
+    """Return (x, y, z, |dz/dphi|) of a pixel by its rational function and the trilinear correction
+    of the ``grid`` (nv, nu, nz); ``c`` (5, n)."""
+    _, z, slope = _rational_depth(i, phase, c, gain, centre)
+    depth = (z - near) * per_mm
+    if not (depth >= ZERO and depth <= np.float32(grid.shape[2] - 1.0001)):
+        return INVALID, INVALID, INVALID, slope
+    v = np.int64(i) // width
+    u, per_px = np.int64(i) - v * width, np.float32(1.0 / step)
+    down, right = np.float32(v % step) * per_px, np.float32(u % step) * per_px
+    j, q, k, one = np.uint64(v // step), np.uint64(u // step), np.uint64(depth), np.uint64(1)
+    rest = depth - np.float32(k)
+    z += (
+        _blend_rows(grid, j, q, k, down, rest) * (ONE - right)
+        + _blend_rows(grid, j, q + one, k, down, rest) * right
+    )
+    return c[3, i] * z, c[4, i] * z, z, slope
+
+
+@numba.njit
+def _rational_depth(i, phase, c, gain, centre):
+    """(s, z, |dz/dphi|) of ``z = (c0 + c1 s)/(1 + c2 s)`` with ``s = gain phase - centre``."""
+    s = gain * phase - centre
+    c0, c1, c2 = c[0, i], c[1, i], c[2, i]
+    per = ONE / (ONE + c2 * s)
+    return s, (c0 + c1 * s) * per, abs(c1 - c0 * c2) * per * per * gain
+
+
+@numba.njit
+def _blend_rows(grid, j, q, k, down, rest):
+    """Interpolate the grid at column ``q`` between rows ``j``, ``j + 1`` and layers ``k``, ``k +
+    1``."""
+    row, layer = j + np.uint64(1), k + np.uint64(1)
+    a = grid[j, q, k] + down * (grid[row, q, k] - grid[j, q, k])
+    b = grid[j, q, layer] + down * (grid[row, q, layer] - grid[j, q, layer])
+    return a + rest * (b - a)

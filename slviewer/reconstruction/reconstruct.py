@@ -11,7 +11,7 @@ from slviewer.fringe.phase import PhaseMap
 from slviewer.fringe.sequence import Axis
 from slviewer.geometry.jit import kernel
 from slviewer.geometry.vectors import finite_rows
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, Map, Points
 
 EDGE_SIGMAS = 10.0
 """Standard deviations of noise, beyond which the error that blur makes at an edge masks a pixel;
@@ -34,10 +34,10 @@ class Model(Protocol):
     def axes(self) -> tuple[Axis, ...]:
         """The axes it was calibrated for."""
 
-    def points(self, phase: PhaseMap) -> np.ndarray:
+    def points(self, phase: PhaseMap) -> Points:
         """(h, w, 3) float32 mm in the camera's frame, NaN where invalid."""
 
-    def sigma_z(self, phase: PhaseMap, points: np.ndarray) -> np.ndarray:
+    def sigma_z(self, phase: PhaseMap, points: Points) -> Map:
         """(h, w) mm: predicted standard deviation of depth."""
 
 
@@ -48,7 +48,7 @@ class KnowsErrors(Protocol):
     def excess_px(self, axis: Axis) -> float:
         """Scatter of the phase beyond its predicted noise, in projector px (1 sigma)."""
 
-    def sigma_calibration(self, axis: Axis, points: np.ndarray) -> np.ndarray:
+    def sigma_calibration(self, axis: Axis, points: Points) -> Map:
         """(h, w) float32 mm: standard deviation of the depth of organised points due to the
         calibration."""
 
@@ -95,7 +95,7 @@ def reconstruct_cloud(
     return Cloud(points, axis, model.name, sigma_z, texture, sigma_calibration, edges)
 
 
-def normals(points: np.ndarray, reach: int = 2) -> np.ndarray:
+def normals(points: Points, reach: int = 2) -> Points:
     """Unit normals (h, w, 3) float32 of an organised cloud, towards the camera; NaN where
     neighbours are missing.
 
@@ -139,8 +139,6 @@ def _select_axis(measured: Mapping[Axis, Measured]) -> Axis:
     """Return the axis with the lowest median sigma where both are valid, else the one with most
     valid pixels."""
     axes = list(measured)
-    if len(axes) == 1:
-        return axes[0]
     valid = {
         axis: np.isfinite(points[..., 2]) & np.isfinite(sigma)
         for axis, (points, sigma, _) in measured.items()
@@ -201,7 +199,7 @@ def _normals(points, reach, out):
             out[y, x, 0], out[y, x, 1], out[y, x, 2] = n0 / length, n1 / length, n2 / length
 
 
-def triangulate_grid(points: np.ndarray, max_jump: float | None = None) -> np.ndarray:
+def triangulate_grid(points: Points, max_jump: float | None = None) -> np.ndarray:
     """Faces (m, 3) int32 of an organised cloud (h, w, 3) mm, numbering its valid points row by row.
 
     (The vertices are ``points[np.isfinite(points).all(axis=-1)]``.) Each square of four
@@ -216,20 +214,19 @@ def triangulate_grid(points: np.ndarray, max_jump: float | None = None) -> np.nd
     if max_jump is None:
         max_jump = JUMP * float(np.median(z[valid])) if valid.any() else 0.0
     corners = (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:])
-    z00, z01, z10, z11 = (z[corner] for corner in corners)
-    falling, rising = np.abs(z00 - z11), np.abs(z01 - z10)
+    depths, numbers = (np.stack([grid[corner] for corner in corners]) for grid in (z, index))
+    falling, rising = np.abs(depths[0] - depths[3]), np.abs(depths[1] - depths[2])
     # a diagonal with an invalid end has a NaN step: the other one is cut along
     along_rising = np.isfinite(rising) & ~(falling < rising)
     along_falling = np.isfinite(falling) & ~along_rising
     faces = []
-    for chosen, a, b, c in (
+    for chosen, *triangle in (
         (along_rising, 0, 2, 1),
         (along_rising, 1, 2, 3),
         (along_falling, 0, 2, 3),
         (along_falling, 0, 3, 1),
     ):
-        triangle = [corners[k] for k in (a, b, c)]
-        spread = np.ptp([z[corner] for corner in triangle], axis=0)
-        selected = chosen & (spread <= max_jump)  # False where a corner is NaN
-        faces.append(np.stack([index[corner][selected] for corner in triangle], axis=1))
-    return np.concatenate(faces)
+        # False where a corner is NaN
+        selected = chosen & (np.ptp(depths[triangle], axis=0) <= max_jump)
+        faces.append(numbers[triangle][:, selected])
+    return np.ascontiguousarray(np.concatenate(faces, axis=1).T)

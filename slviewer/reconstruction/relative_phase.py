@@ -8,6 +8,7 @@ import numpy as np
 from slviewer.errors import InputError
 from slviewer.fringe.phase import PhaseMap, Reason
 from slviewer.geometry.rig import StereoRig
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.triangulation import check_map, points_from_depth
 
 SAMPLE = 4000
@@ -77,8 +78,8 @@ def resolve_phase(rig: StereoRig, phase: PhaseMap, depth_range_mm: tuple[float, 
 
 
 def _coordinate_range(
-    rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str
-) -> tuple[np.ndarray, np.ndarray]:
+    rig: StereoRig, rays: Floats, near: float, far: float, axis: str
+) -> tuple[Floats, Floats]:
     """Return the lowest and the highest projector coordinate (...,) px of rays (..., 2) between two
     depths."""
     row = 0 if axis == "x" else 1
@@ -90,7 +91,7 @@ def _coordinate_range(
 
 
 def _unique_far(
-    rig: StereoRig, rays: np.ndarray, near: float, far: float, axis: str, reach: float
+    rig: StereoRig, rays: Floats, near: float, far: float, axis: str, reach: float
 ) -> float:
     """Return the depth in mm up to which the phase is unique from ``near`` on."""
     rays = rays[:: max(1, len(rays) // SAMPLE)]

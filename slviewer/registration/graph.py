@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.transform import Rotation
 
-from slviewer.geometry.rigid import Uncertainty, move_points, rigid_transform
+from slviewer.geometry.rigid import Floats, Uncertainty, move_points, rigid_transform
 from slviewer.registration.refusal import Refused
 
 _FLOOR_MM, _FLOOR_DEG = 0.003, 0.002
@@ -38,10 +38,15 @@ class Edge:
 
     scan: int
     onto: int
-    T: np.ndarray
-    covariance: np.ndarray
-    centre: np.ndarray
+    T: Floats
+    covariance: Floats
+    centre: Floats
     gate_mm: float = 1.0
+
+    @property
+    def ends(self) -> frozenset[int]:
+        """Both nodes."""
+        return frozenset((self.scan, self.onto))
 
     @property
     def variance(self) -> float:
@@ -58,48 +63,49 @@ class LoopGap(NamedTuple):
 
 
 def spanning_poses(
-    nodes: int, edges: Sequence[Edge], root: int, costs: np.ndarray | None = None
-) -> tuple[np.ndarray, list[int]]:
+    nodes: int, edges: Sequence[Edge], root: int, costs: Floats | None = None
+) -> tuple[Floats, Floats]:
     """Compute poses along the tree of shortest paths from the root, by the edges' variances or the
     given ``costs``.
 
-    Returns T_root_node (nodes, 4, 4) mm, NaN for unconnected nodes, and the index of the tree's
-    edge that leads to each node, -1 for the root and unconnected ones.
+    Returns T_root_node (nodes, 4, 4) mm, NaN for unconnected nodes, and the node before each in the
+    tree (nodes,), negative for the root and unconnected ones.
     """
     costs = np.array([edge.variance for edge in edges]) if costs is None else costs
     poses = np.full((nodes, 4, 4), np.nan)
     poses[root] = np.eye(4)
-    tree = [-1] * nodes
     ends = np.array([(edge.scan, edge.onto) for edge in edges], int).reshape(-1, 2)
-    index = {frozenset(pair): k for k, pair in enumerate(ends.tolist())}
+    between = {edge.ends: edge for edge in edges}
     graph = coo_matrix((costs, tuple(ends.T)), shape=(nodes, nodes)).tocsr()
     distance, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
-    for node in np.argsort(distance):
-        if node == root or not np.isfinite(distance[node]):
-            continue
-        child, parent = int(node), int(before[node])
-        k = index[frozenset((child, parent))]
-        step = edges[k].T if edges[k].scan == child else np.linalg.inv(edges[k].T)
-        poses[child], tree[child] = poses[parent] @ step, k
-    return poses, tree
+    for node in np.argsort(distance).tolist():
+        parent = int(before[node])
+        if parent >= 0:
+            edge = between[frozenset((node, parent))]
+            poses[node] = poses[parent] @ (edge.T if edge.scan == node else np.linalg.inv(edge.T))
+    return poses, before
 
 
-def loop_gap(edge: Edge, poses: np.ndarray) -> LoopGap:
+def closes_loop(edge: Edge, before: np.ndarray) -> bool:
+    """Whether an edge is none of the tree's of ``spanning_poses``."""
+    return bool(before[edge.scan] != edge.onto and before[edge.onto] != edge.scan)
+
+
+def loop_gap(edge: Edge, poses: Floats) -> LoopGap:
     """Return the gap between an edge and the relative pose of its nodes by ``poses`` (n, 4, 4)."""
     turn, shift = np.linalg.norm(edge_residuals([edge], poses).reshape(2, 3), axis=1)
     return LoopGap(float(shift), float(np.degrees(turn)))
 
 
-def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[int]:
-    """Return the nodes of the loop that an edge closes with the ``tree`` of ``spanning_poses``,
-    from end to end."""
+def loop_nodes(edge: Edge, before: np.ndarray) -> list[int]:
+    """Return the nodes of the loop that an edge closes with the tree ``before`` (nodes,) of
+    ``spanning_poses``, from end to end."""
 
     def path_to_root(node: int) -> list[int]:
         """Return the nodes from a node to the root, both included."""
         path = [node]
-        while tree[path[-1]] >= 0:
-            step = edges[tree[path[-1]]]
-            path.append(step.onto if step.scan == path[-1] else step.scan)
+        while before[path[-1]] >= 0:
+            path.append(int(before[path[-1]]))
         return path
 
     first, second = path_to_root(edge.scan), path_to_root(edge.onto)
@@ -109,7 +115,7 @@ def loop_nodes(edge: Edge, edges: Sequence[Edge], tree: Sequence[int]) -> list[i
 
 
 def select_consistent_edges(
-    nodes: int, edges: Sequence[Edge], root: int, is_good_fit: Callable[[Edge, np.ndarray], bool]
+    nodes: int, edges: Sequence[Edge], root: int, is_good_fit: Callable[[Edge, Floats], bool]
 ) -> tuple[list[int], dict[int, LoopGap]]:
     """Select the edges that are consistent with one another and still connect all nodes.
 
@@ -119,10 +125,6 @@ def select_consistent_edges(
     ``Refused`` where that does not decide.
     """
     hypotheses = _list_hypotheses(nodes, edges, root)
-    gaps = {
-        dropped: {k: loop_gap(edges[k], poses) for k in dropped}
-        for dropped, poses in hypotheses.items()
-    }
     fewest = min(map(len, hypotheses))
     best = [dropped for dropped in hypotheses if len(dropped) == fewest]
     if len(best) > 1:
@@ -132,19 +134,21 @@ def select_consistent_edges(
             if all(is_good_fit(edges[k], hypotheses[dropped]) for k in dropped)
         ]
     if len(best) != 1:
-        worst = max(gap for each in gaps.values() for gap in each.values())
+        worst = max(
+            loop_gap(edges[k], poses) for dropped, poses in hypotheses.items() for k in dropped
+        )
         raise Refused(
             "ambiguous",
             f"Pairs of scans contradict one another by {worst.shift_mm:.1f} mm and"
             f" {worst.turn_deg:.1f} degrees, and nothing tells which is wrong: take scans that"
             " overlap more, pick point pairs, or give the turntable's angle.",
         )
-    return [k for k in range(len(edges)) if k not in best[0]], gaps[best[0]]
+    (dropped,) = best
+    gaps = {k: loop_gap(edges[k], hypotheses[dropped]) for k in dropped}
+    return [k for k in range(len(edges)) if k not in dropped], gaps
 
 
-def _list_hypotheses(
-    nodes: int, edges: Sequence[Edge], root: int
-) -> dict[frozenset[int], np.ndarray]:
+def _list_hypotheses(nodes: int, edges: Sequence[Edge], root: int) -> dict[frozenset[int], Floats]:
     """Return the edges that are inconsistent with random spanning trees, with the poses (n, 4, 4)
     by the first of each.
 
@@ -155,11 +159,11 @@ def _list_hypotheses(
     hypotheses: dict[frozenset[int], np.ndarray] = {}
     for trial in range(_TREES):
         drawn = costs if trial == 0 else costs * np.exp(rng.normal(0, 3, len(edges)))
-        poses, tree = spanning_poses(nodes, edges, root, drawn)
+        poses, before = spanning_poses(nodes, edges, root, drawn)
         inconsistent = frozenset(
             k
             for k, edge in enumerate(edges)
-            if k not in tree and not _is_consistent(edge, edges, tree, poses)
+            if closes_loop(edge, before) and not _is_consistent(edge, edges, before, poses)
         )
         if not inconsistent:
             return {inconsistent: poses}
@@ -167,30 +171,24 @@ def _list_hypotheses(
     return hypotheses
 
 
-def _is_consistent(
-    edge: Edge, edges: Sequence[Edge], tree: Sequence[int], poses: np.ndarray
-) -> bool:
+def _is_consistent(edge: Edge, edges: Sequence[Edge], before: np.ndarray, poses: Floats) -> bool:
     """Whether the loop that an edge closes with the tree has a plausible gap at the rim of the
     overlap, for the variances of the loop's edges."""
-    pairs = {frozenset(pair) for pair in pairwise(loop_nodes(edge, edges, tree))}
-    variance = edge.variance + sum(
-        edges[k].variance
-        for k in tree
-        if k >= 0 and frozenset((edges[k].scan, edges[k].onto)) in pairs
-    )
+    pairs = {edge.ends, *map(frozenset, pairwise(loop_nodes(edge, before)))}
+    variance = sum(each.variance for each in edges if each.ends in pairs)
     gap = loop_gap(edge, poses)
     at_rim = gap.shift_mm + np.radians(gap.turn_deg) * _RIM_MM
     return bool(at_rim <= max(_GAP_SIGMAS * np.sqrt(variance), _GAP_GATES * edge.gate_mm))
 
 
-def optimise_poses(poses: np.ndarray, edges: Sequence[Edge], root: int) -> np.ndarray:
+def optimise_poses(poses: Floats, edges: Sequence[Edge], root: int) -> Floats:
     """Optimise approximate poses T_root_node (n, 4, 4) mm by weighted least squares over all
     edges."""
     apply_step, cost, _ = _build_problem(poses, edges, root)
     return apply_step(least_squares(cost, np.zeros(6 * (len(poses) - 1)), x_scale="jac").x)
 
 
-def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
+def pose_uncertainties(poses: Floats, edges: Sequence[Edge], root: int) -> list[Uncertainty]:
     """Return the uncertainty of each optimised pose T_root_node (n, 4, 4), at the mean of the
     edges' centres.
 
@@ -209,8 +207,8 @@ def pose_uncertainties(poses: np.ndarray, edges: Sequence[Edge], root: int) -> l
 
 
 def _build_problem(
-    poses: np.ndarray, edges: Sequence[Edge], root: int
-) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    poses: Floats, edges: Sequence[Edge], root: int
+) -> tuple[Callable[[Floats], Floats], Callable[[Floats], Floats], Floats]:
     """Return the least-squares problem of the poses T_root_node (n, 4, 4): (apply_step, cost,
     middle).
 
@@ -227,7 +225,7 @@ def _build_problem(
         [move_points(poses[edge.onto], edge.centre[None])[0] for edge in edges], axis=0
     )
 
-    def apply_step(x: np.ndarray) -> np.ndarray:
+    def apply_step(x: Floats) -> Floats:
         """Return the poses (n, 4, 4) moved by the unknowns."""
         rotation, translation = x.reshape(-1, 2, 3).transpose(1, 0, 2)
         R = Rotation.from_rotvec(rotation / _LEVER_MM).as_matrix()
@@ -235,14 +233,14 @@ def _build_problem(
         moved[free] = rigid_transform(R, translation + middle - R @ middle) @ poses[free]
         return moved
 
-    def cost(x: np.ndarray) -> np.ndarray:
+    def cost(x: Floats) -> Floats:
         """Return the whitened residuals (6 m,) of the edges."""
         return np.einsum("kij,kj->ki", whitening, edge_residuals(edges, apply_step(x))).ravel()
 
     return apply_step, cost, middle
 
 
-def edge_residuals(edges: Sequence[Edge], poses: np.ndarray) -> np.ndarray:
+def edge_residuals(edges: Sequence[Edge], poses: Floats) -> Floats:
     """Return (m, 6): rotation (rad) and translation (mm, at the edge's centre) from each edge to
     the poses' own."""
     scans, ontos = [edge.scan for edge in edges], [edge.onto for edge in edges]

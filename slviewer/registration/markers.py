@@ -11,9 +11,16 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Floats, Uncertainty, fit_rigid, motion_jacobian, move_points
+from slviewer.geometry.rigid import (
+    Floats,
+    Mask,
+    Uncertainty,
+    fit_rigid,
+    motion_jacobian,
+    move_points,
+)
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, lengths, rms_length
+from slviewer.geometry.vectors import diagonal, lengths, rms_length, subsample
 from slviewer.reconstruction.cloud import Cloud
 from slviewer.registration.refusal import Refused
 from slviewer.target.coded import detect_markers
@@ -99,26 +106,21 @@ def measure_markers(cloud: Cloud) -> MeasuredMarkers:
         else cv2.cvtColor(cloud.texture, cv2.COLOR_RGB2GRAY)
     )
     seen = detect_markers(np.asarray(grey, np.uint8))
-    ids, corners, sigmas = [], [], []
+    ids, corners = [], []
     for number, quad in zip(seen.ids, seen.corners, strict=True):
-        measured = [one for corner in quad if (one := _measure_corner(cloud, corner, quad))]
-        if len(measured) == len(quad):
+        measured = [_measure_corner(cloud, corner, quad) for corner in quad]
+        if all(corner is not None for corner in measured):
             ids.append(int(number))
-            corners.append([corner for corner, _ in measured])
-            sigmas.append([sigma for _, sigma in measured])
-    return MeasuredMarkers(
-        np.array(ids, int),
-        np.reshape(corners, (-1, 4, 3)).astype(float),
-        np.reshape(sigmas, (-1, 4)).astype(float),
-        seen.repeated,
-    )
+            corners.append(measured)
+    placed = np.reshape(np.array(corners, float), (-1, 4, 4))
+    return MeasuredMarkers(np.array(ids, int), placed[..., :3], placed[..., 3], seen.repeated)
 
 
 def _measure_corner(
-    cloud: Cloud, corner: np.ndarray, quad: np.ndarray
-) -> tuple[Floats, float] | None:
-    """Return the point (3,) mm at a corner (2,) px of a marker ``quad`` (4, 2) px, and its standard
-    deviation; None where too little of the surface around it was measured."""
+    cloud: Cloud, corner: Floats, quad: Floats
+) -> tuple[float, float, float, float] | None:
+    """Return the point mm at a corner (2,) px of a marker ``quad`` (4, 2) px: x, y, z, and its
+    standard deviation; None where too little of the surface around it was measured."""
     reach = _FIT_REACH * float(lengths(quad - np.roll(quad, 1, axis=0)).mean())
     left, top = np.maximum(np.floor(corner - reach).astype(int), 0)
     right, bottom = np.ceil(corner + reach).astype(int) + 1
@@ -149,7 +151,8 @@ def _measure_corner(
     sigma_z = spread * np.sqrt(covariance[0, 0]) * z**2
     rays, *_ = np.linalg.lstsq(basis, points[:, :2] / points[:, 2:], rcond=None)
     pitch = z * np.linalg.norm(rays[1:3]) / reach / np.sqrt(2)
-    return np.array([*(z * rays[0]), z]), float(np.hypot(sigma_z, CORNER_PX * pitch))
+    x, y = z * rays[0]
+    return x, y, z, float(np.hypot(sigma_z, CORNER_PX * pitch))
 
 
 def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> MarkerPose | None:
@@ -179,7 +182,7 @@ def fit_marker_pose(scan: MeasuredMarkers, reference: MeasuredMarkers) -> Marker
     return MarkerPose(T, ids, moved, p, q, s)
 
 
-def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
+def _select_steady(p: Floats, q: Floats, sigma: Floats) -> Mask:
     """Return which markers (n,) bool keep their places, by the least median of their gaps.
 
     A calibration that is not perfect leaves gaps too; so they are compared with the median one.
@@ -188,7 +191,7 @@ def _select_steady(p: Floats, q: Floats, sigma: Floats) -> np.ndarray:
     if n == 1:
         return np.ones(1, bool)
     pairs = np.stack(np.triu_indices(n, 1), axis=1)
-    pairs = pairs[:: -(-len(pairs) // _MOST_HYPOTHESES)]
+    pairs = subsample(pairs, _MOST_HYPOTHESES)
     starts = fit_rigid(p[pairs].reshape(-1, 8, 3), q[pairs].reshape(-1, 8, 3))
     gaps = _largest_gaps(starts, p, q)
     gap = gaps[np.median(gaps, axis=1).argmin()]

@@ -7,6 +7,7 @@ others are dropped; the poses are then optimised together.
 """
 
 import os
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -16,15 +17,16 @@ from threading import Lock
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Uncertainty, move_points
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.geometry.rigid import Floats, Uncertainty, move_points
+from slviewer.reconstruction.cloud import Cloud, choose_pixels
+from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.records.merge import LoopClosure
 from slviewer.registration import graph
 from slviewer.registration.graph import Edge
 from slviewer.registration.markers import MarkerPose, MeasuredMarkers, fit_marker_pose
 from slviewer.registration.pairwise import Progress, Registration, register_prepared
 from slviewer.registration.refusal import Refused
-from slviewer.registration.scan import LEAST_POINTS, PreparedScan, Scan, prepare_scan
+from slviewer.registration.scan import LEAST_POINTS, PreparedScan, away_from_edges, prepare_scan
 from slviewer.registration.start import (
     Candidate,
     TurntableAxis,
@@ -58,7 +60,7 @@ class Starts:
     ``markers``: coded markers by name, which give initial poses and constrain the registration.
     """
 
-    poses: Mapping[str, np.ndarray] | None = None
+    poses: Mapping[str, Floats] | None = None
     table_deg: Mapping[str, float] | None = None
     axis: TurntableAxis | None = None
     picked: Mapping[Pair, Candidate] | None = None
@@ -77,7 +79,7 @@ class MultiwayAlignment:
     """
 
     reference: str
-    T_reference_scan: Mapping[str, np.ndarray]
+    T_reference_scan: Mapping[str, Floats]
     uncertainties: Mapping[str, Uncertainty]
     pairs: Mapping[Pair, Registration]
     loops: list[LoopClosure]
@@ -106,7 +108,7 @@ class MultiwayAlignment:
 
 
 def register_all(
-    scans: Mapping[str, Scan | Cloud],
+    scans: Mapping[str, Cloud | PreparedScan],
     reference: str,
     starts: Starts | None = None,
     progress: Progress | None = None,
@@ -137,7 +139,11 @@ class _PoseGraphBuilder:
     """Builds the pose graph of one call of ``register_all``, pair by pair, and optimises it."""
 
     def __init__(
-        self, scans: Mapping[str, Scan | Cloud], reference: str, starts: Starts, progress: Progress
+        self,
+        scans: Mapping[str, Cloud | PreparedScan],
+        reference: str,
+        starts: Starts,
+        progress: Progress,
     ) -> None:
         self.names, self.reference = list(scans), reference
         self.starts, self._progress = starts, progress
@@ -156,14 +162,11 @@ class _PoseGraphBuilder:
 
     def build(self) -> MultiwayAlignment:
         """Register pairs until all scans are connected, close loops, and optimise the poses."""
-        for pair, start in (self.starts.picked or {}).items():
-            self._register(pair, start)
+        self._register(self.starts.picked or {})
         known = self._initial_poses()
-        self._register_all(
-            {pair: _relative_pose(known, *pair) for pair in self._list_first_pairs()}
-        )
+        self._register({pair: _relative_pose(known, *pair) for pair in self._list_first_pairs()})
         self._connect()
-        poses = self._spanning_poses()[0]
+        poses = self._spanning_poses()
         if len(self.names) > ALL_PAIRS:
             self._close_loops(poses)
         return self._optimise()
@@ -205,8 +208,9 @@ class _PoseGraphBuilder:
         given = {(b, a): shortest_turn(angles[b] - angles[a]) for a, b in pairwise(angles)}
         usable = {pair: deg for pair, deg in given.items() if determines_axis(deg)} or given
         for pair, deg in usable.items():
-            if (registration := self._register(pair)) is not None:
-                steps.append(registration.T_reference_scan)
+            self._register({pair: None})
+            if pair in self.registered:
+                steps.append(self.registered[pair].T_reference_scan)
                 steps_deg.append(deg)
             if len(steps) == 2:
                 break
@@ -236,18 +240,12 @@ class _PoseGraphBuilder:
                     poses[pair] = pose
         if len(self.names) <= ALL_PAIRS:
             return poses
-        count, chosen = dict.fromkeys(self.names, 0), {}
+        count, chosen = Counter[str](), {}
         for (a, b), pose in sorted(poses.items(), key=lambda item: -len(item[1].ids)):
             if min(count[a], count[b]) < _MARKER_PAIRS:
-                count[a], count[b] = count[a] + 1, count[b] + 1
+                count.update((a, b))
                 chosen[a, b] = pose
         return chosen
-
-    def _get_markers(self, pair: Pair) -> MarkerPose | None:
-        """Return the pose of a pair by its common markers, whichever way round it was fitted; None
-        without these."""
-        turned = self.markers.get(pair[::-1])
-        return self.markers.get(pair) or (None if turned is None else turned.inverse())
 
     def _connect(self) -> None:
         """Register further pairs, the most promising first, until every scan is connected to the
@@ -256,7 +254,7 @@ class _PoseGraphBuilder:
         Raises ``Refused`` where no pair is left to try.
         """
         while True:
-            joined = np.isfinite(self._spanning_poses()[0]).all(axis=(1, 2))
+            joined = np.isfinite(self._spanning_poses()).all(axis=(1, 2))
             if joined.all():
                 return
             candidates = {}
@@ -266,7 +264,8 @@ class _PoseGraphBuilder:
                     if not self._was_tried(pair):
                         candidates[pair] = search_starts(self.scans[a], self.scans[b], self.size)
             for pair, starts in sorted(candidates.items(), key=lambda item: -item[1][0].score):
-                if self._register(pair, starts):
+                self._register({pair: starts})
+                if pair in self.registered:
                     break
             else:
                 names = [self.names[k] for k in np.flatnonzero(~joined)]
@@ -279,7 +278,7 @@ class _PoseGraphBuilder:
                     f" {self.reference}."
                 )
 
-    def _close_loops(self, poses: np.ndarray) -> None:
+    def _close_loops(self, poses: Floats) -> None:
         """Register the pairs that overlap most at ``poses`` (n, 4, 4), up to a number per scan."""
         overlaps = []
         for i, a in enumerate(self.names):
@@ -288,12 +287,12 @@ class _PoseGraphBuilder:
                     self._report(self._share)  # it may raise to cancel
                     T = np.linalg.inv(poses[j]) @ poses[i]
                     overlaps.append((_estimate_overlap(self.scans[i], self.scans[j], T), (a, b), T))
-        count, pairs = dict.fromkeys(self.names, 0), {}
+        count, pairs = Counter[str](), {}
         for overlap, (a, b), T in sorted(overlaps, key=lambda entry: -entry[0]):
             if overlap >= _LOOP_OVERLAP and max(count[a], count[b]) < _LOOP_PAIRS:
-                count[a], count[b] = count[a] + 1, count[b] + 1
+                count.update((a, b))
                 pairs[a, b] = Candidate(T, "initial")
-        self._register_all(pairs)
+        self._register(pairs)
 
     # registration of pairs
 
@@ -301,42 +300,46 @@ class _PoseGraphBuilder:
         """Whether a pair, either way round, was registered or refused."""
         return bool({pair, pair[::-1]} & {*self.registered, *self.refused})
 
-    def _prepare(self, name: str, scan: Scan | Cloud) -> PreparedScan:
+    def _prepare(self, name: str, cloud: Cloud | PreparedScan) -> PreparedScan:
         """Prepare a named scan for registration, using only its points away from edges; InputError
         where these are too few, so that it would fail later."""
-        scan = scan if isinstance(scan, Scan) else Scan.from_cloud(scan)
-        points, normals = scan.points, scan.normals
-        if scan.trusted is not None:
-            points = points[scan.trusted]
-            normals = None if normals is None else normals[scan.trusted]
-        if len(points) < LEAST_POINTS <= len(scan.points):
+        if isinstance(cloud, PreparedScan):
+            return cloud
+        measured = np.count_nonzero(cloud.mask)
+        trusted = away_from_edges(cloud.points, cloud.sigma_z)
+        points = choose_pixels(cloud.points, trusted)
+        if len(points) < LEAST_POINTS <= measured:
             raise InputError(
-                f"{name} has {len(scan.points)} points, and all but {len(points)} lie beside holes"
+                f"{name} has {measured} points, and all but {len(points)} lie beside holes"
                 " or depth steps: the cloud is too sparse or too noisy to be aligned; capture it"
                 " with more light and longer exposure, or with more phase steps"
             )
-        prepared = prepare_scan(name, points, normals, scan.sigma_mm)
+        sigma = cloud.sigma_z[cloud.mask & np.isfinite(cloud.sigma_z)]
+        prepared = prepare_scan(
+            name,
+            points,
+            choose_pixels(grid_normals(cloud.points), trusted),
+            float(np.median(sigma)) if sigma.size else None,
+        )
         self._report(self._share + 0.2 / len(self.names))
         return prepared
 
-    def _register_all(self, starts: Mapping[Pair, Candidate | None]) -> None:
-        """Register independent pairs from their initial poses in parallel, and store the results in
-        their order."""
+    def _register(self, starts: Mapping[Pair, Candidate | list[Candidate] | None]) -> None:
+        """Register independent pairs in parallel, and store the results in their order in
+        ``registered`` or ``refused``.
+
+        ``starts``: the initial pose of each, or the candidate poses of an earlier search.
+        """
         pending = [pair for pair in starts if not {pair, pair[::-1]} & set(self.registered)]
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             results = list(threads.map(lambda pair: self._align(pair, starts[pair]), pending))
         for pair, result in zip(pending, results, strict=True):
-            self._store(pair, result)
-
-    def _register(
-        self, pair: Pair, start: Candidate | list[Candidate] | None = None
-    ) -> Registration | None:
-        """Register a pair unless it is, and store the result; None where it is refused.
-
-        ``start``: its initial pose, or the candidate poses of an earlier search.
-        """
-        done = self.registered.get(pair) or self.registered.get(pair[::-1])
-        return done or self._store(pair, self._align(pair, start))
+            if isinstance(result, Refused):
+                self.refused[pair] = result
+            else:
+                self.registered[pair] = result
+                self.refused.pop(pair, None)
+                self.refused.pop(pair[::-1], None)
 
     def _align(
         self, pair: Pair, start: Candidate | list[Candidate] | None
@@ -346,28 +349,19 @@ class _PoseGraphBuilder:
         before = 0.2 + 0.7 * min(1.0, tried / (self.expected + 1))
         step = 0.7 / (self.expected + 1)
         a, b = (self.scans[self.names.index(name)] for name in pair)
+        turned = self.markers.get(pair[::-1])
+        markers = self.markers.get(pair) or (None if turned is None else turned.inverse())
         try:
             return register_prepared(
                 a,
                 b,
-                size=self.size,
-                start=start,
-                markers=self._get_markers(pair),
-                progress=lambda share: self._report(before + step * share),
+                self.size,
+                start,
+                markers,
+                lambda share: self._report(before + step * share),
             )
         except Refused as error:
             return error
-
-    def _store(self, pair: Pair, result: Registration | Refused) -> Registration | None:
-        """Store the result of a pair in ``registered`` or ``refused``; return the registration if
-        it is one."""
-        if isinstance(result, Refused):
-            self.refused[pair] = result
-            return None
-        self.registered[pair] = result
-        self.refused.pop(pair, None)
-        self.refused.pop(pair[::-1], None)
-        return result
 
     def _report(self, share: float) -> None:
         """Report the completed share of the work, never less than before; the receiver may raise to
@@ -388,9 +382,9 @@ class _PoseGraphBuilder:
             for (scan, onto), result in self.registered.items()
         ]  # fmt: skip
 
-    def _spanning_poses(self) -> tuple[np.ndarray, list[int]]:
-        """Return ``graph.spanning_poses`` of all registered pairs."""
-        return graph.spanning_poses(len(self.names), self._edges(), self.root)
+    def _spanning_poses(self) -> Floats:
+        """Return the poses of ``graph.spanning_poses`` by all registered pairs."""
+        return graph.spanning_poses(len(self.names), self._edges(), self.root)[0]
 
     def _optimise(self) -> MultiwayAlignment:
         """Drop contradicting pairs and optimise the poses of all scans."""
@@ -407,18 +401,18 @@ class _PoseGraphBuilder:
             for k, gap in gaps.items()
         }
         edges = [edges[k] for k in consistent]
-        start, tree = graph.spanning_poses(len(self.names), edges, self.root)
+        start, before = graph.spanning_poses(len(self.names), edges, self.root)
         poses = start
         if len(edges) >= len(self.names):
             poses = graph.optimise_poses(start, edges, self.root)
         loops = [
             LoopClosure(
-                [self.names[node] for node in graph.loop_nodes(edge, edges, tree)],
+                [self.names[node] for node in graph.loop_nodes(edge, before)],
                 *graph.loop_gap(edge, start),
                 *graph.loop_gap(edge, poses),
             )
-            for k, edge in enumerate(edges)
-            if k not in tree
+            for edge in edges
+            if graph.closes_loop(edge, before)
         ]
         self._report(1.0)
         return MultiwayAlignment(
@@ -432,7 +426,7 @@ class _PoseGraphBuilder:
             self.markers,
         )
 
-    def _is_good_fit(self, edge: Edge, poses: np.ndarray) -> bool:
+    def _is_good_fit(self, edge: Edge, poses: Floats) -> bool:
         """Whether ICP of an edge's scans from ``poses`` (n, 4, 4) succeeds and stays within its
         gate."""
         T = np.linalg.inv(poses[edge.onto]) @ poses[edge.scan]
@@ -455,7 +449,7 @@ def _relative_pose(known: Mapping[str, Candidate], scan: str, onto: str) -> Cand
     return Candidate(np.linalg.inv(known[onto].T) @ known[scan].T, known[scan].start)
 
 
-def _estimate_overlap(scan: PreparedScan, reference: PreparedScan, T: np.ndarray) -> float:
+def _estimate_overlap(scan: PreparedScan, reference: PreparedScan, T: Floats) -> float:
     """Estimate the share of the scan within a voxel of the reference at the pose ``T`` (4, 4), from
     thinned clouds."""
     voxel = reference.size / 80.0

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from slviewer.errors import SlviewerError
+from slviewer.geometry.rigid import Floats
 
 _NOTEBOOK_DRAWING = "open3d.visualization.draw_plotly"
 """Imports Dash and Plotly: nearly half of Open3D's import time."""
@@ -97,7 +98,7 @@ def _supply_libusb() -> None:
             return  # the import of Open3D says what is missing, in its own words
 
 
-def point_cloud(points: np.ndarray, normals: np.ndarray | None = None) -> Any:
+def point_cloud(points: Floats, normals: Floats | None = None) -> Any:
     """Return Open3D's cloud of points (n, 3), with normals (n, 3) if they are given."""
     to_vectors = open3d().utility.Vector3dVector
     cloud = open3d().geometry.PointCloud(to_vectors(points))
@@ -116,12 +117,12 @@ def raycasting_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
 def align_icp(
     scan: Any,
     reference: Any,
-    T: np.ndarray,
+    T: Floats,
     gate: float,
     loss: Any,
     settled: float,
     iterations: int,
-) -> np.ndarray:
+) -> Floats:
     """(4, 4): Open3D's point-to-plane ICP of two of its clouds from the pose ``T``, with pairs up
     to ``gate`` mm apart.
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slviewer.geometry.rigid import Uncertainty, move_points
-from slviewer.geometry.vectors import rms
+from slviewer.geometry.rigid import Floats, Uncertainty, move_points
+from slviewer.geometry.vectors import rms, subsample
 from slviewer.registration.markers import MOVED_MM, MarkerPose
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.refine import (
@@ -61,7 +61,7 @@ class Registration:
     spheres, and always far larger than the pose's error, which ``uncertainty`` estimates.
     """
 
-    T_reference_scan: np.ndarray
+    T_reference_scan: Floats
     rms_mm: float
     inlier_rmse_mm: float
     overlap: float
@@ -175,7 +175,7 @@ def _compute_figures(
     overlap."""
     T, spacing = pose.T, reference.spacing
     gate = max(pose.gate_mm, 2.0 * spacing)
-    points = move_points(T, scan.points[:: -(-len(scan.points) // _STATISTICS_POINTS)])
+    points = move_points(T, subsample(scan.points, _STATISTICS_POINTS))
     distance, nearest = reference.tree.query(points, distance_upper_bound=4.0 * gate, workers=-1)
     near = np.isfinite(distance)
     points, distance, counterpart = points[near], distance[near], reference.points[nearest[near]]

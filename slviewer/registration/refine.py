@@ -19,9 +19,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points, turn_about
+from slviewer.geometry.rigid import Floats, Uncertainty, distance_jacobian, move_points, turn_about
 from slviewer.geometry.robust import robust_sigma, tukey_weights
-from slviewer.geometry.vectors import diagonal, occupied_cubes, rms_length
+from slviewer.geometry.vectors import diagonal, rms_length, subsample, sum_by_cube, unit_vectors
 from slviewer.registration.markers import MarkerPose
 from slviewer.registration.scan import PreparedScan
 
@@ -53,7 +53,7 @@ class RefinedPose:
     ``gate_mm``: largest distance of a pair along its normal in the last iteration.
     """
 
-    T: np.ndarray
+    T: Floats
     gate_mm: float
     uncertainty: Uncertainty
 
@@ -76,26 +76,25 @@ def refine_pose(
     stride, least = (
         max(1, len(scan.fine_points) // points) for points in (_FIRST_POINTS, _MOST_POINTS)
     )
-    for _ in range(_STEPS):
+    steps_left = _STEPS
+    while True:
         pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
         if pairs is None:
             return RefinedPose(T, gate, _UNKNOWN)
         e = _linearise(*pairs, T, markers)
-        gradient = e.gradients.sum(axis=0) + e.gradient_markers
-        step = -np.linalg.lstsq(e.H + e.H_markers, gradient, rcond=1e-10)[0]
+        if not steps_left:
+            return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], e))
+        steps_left -= 1
+        step = -np.linalg.lstsq(e.H, e.gradient, rcond=1e-10)[0]
         T = turn_about(step[:3], e.centre, step[3:]) @ T
         next_gate = min(gate, max(3.0 * e.sigma, narrowest))
         motion = np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * diagonal(pairs[0])
         if next_gate > 0.99 * gate and motion < (_SETTLED_MM if stride == least else _NEAR_MM):
             if stride == least:
-                break
+                steps_left = 0
+                continue
             stride = least  # the last iterations use many more points
         gate = next_gate
-    pairs = _match_pairs(scan, reference, T, gate, lateral, stride)
-    if pairs is None:
-        return RefinedPose(T, gate, _UNKNOWN)
-    equations = _linearise(*pairs, T, markers)
-    return RefinedPose(T, gate, _estimate_uncertainty(pairs[0], equations))
 
 
 def _match_pairs(
@@ -105,7 +104,7 @@ def _match_pairs(
     gate: float,
     lateral: float,
     stride: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+) -> tuple[Floats, Floats, Floats] | None:
     """Match every ``stride``-th point of the scan, moved by ``T`` (4, 4), with the nearest point of
     the reference.
 
@@ -123,8 +122,7 @@ def _match_pairs(
     scan_normals = scan.fine_normals[::stride][near] @ T[:3, :3].T
     is_pair = np.einsum("ij,ij->i", reference_normals, scan_normals) > _MIN_COSINE
     gap = points - reference.fine_points[nearest]
-    normal = reference_normals + scan_normals
-    normal /= np.maximum(np.sqrt(np.einsum("ij,ij->i", normal, normal)), 1e-9)[:, None]
+    normal = unit_vectors(reference_normals + scan_normals)
     residual = np.einsum("ij,ij->i", gap, normal)
     across = np.sqrt(np.maximum(np.einsum("ij,ij->i", gap, gap) - residual**2, 0.0))
     # beyond the rim the nearest point is far across
@@ -139,25 +137,23 @@ class _Equations:
     """Normal equations of pairs and markers, of a small rotation (rad) about ``centre`` (3,) mm and
     a translation (mm).
 
-    ``sigma``: noise of the residuals, mm; ``gradients`` (n, 6) of each pair, ``H`` (6, 6) of all;
-    ``alike``: how many pairs count as one measurement beside markers, because what a calibration
-    leaves bent is alike over a good part of the surface, and a plane would slide until it fits.
+    ``sigma``: noise of the residuals, mm; ``H`` (6, 6) and ``gradient`` (6,) of all; ``gradients``
+    (n, 6) of each pair; ``scatter`` (6, 6): covariance of the markers' gradient.
     """
 
-    centre: np.ndarray
+    centre: Floats
     sigma: float
     H: np.ndarray
-    gradients: np.ndarray
-    alike: float
-    H_markers: np.ndarray
-    gradient_markers: np.ndarray
+    gradient: Floats
+    gradients: Floats
+    scatter: Floats
 
 
 def _linearise(
-    points: np.ndarray,
-    normal: np.ndarray,
-    residual: np.ndarray,
-    T: np.ndarray,
+    points: Floats,
+    normal: Floats,
+    residual: Floats,
+    T: Floats,
     markers: MarkerPose | None,
 ) -> _Equations:
     """Return the normal equations of pairs, as of ``_match_pairs``, and of markers at a pose ``T``
@@ -165,40 +161,35 @@ def _linearise(
     centre = points.mean(axis=0)
     sigma = max(robust_sigma(residual, about=0.0), 1e-6)
     J, weight = distance_jacobian(points - centre, normal), tukey_weights(residual, sigma)
-    alike = max(1.0, len(points) / _INDEPENDENT)
-    of_markers = np.zeros((6, 6)), np.zeros(6)
-    if markers is not None:
-        of_markers = markers.normal_equations(T, centre, sigma * np.sqrt(alike))
     gradients = J * (weight * residual)[:, None]
-    return _Equations(centre, sigma, (J * weight[:, None]).T @ J, gradients, alike, *of_markers)
+    H, gradient = (J * weight[:, None]).T @ J, gradients.sum(axis=0)
+    scatter = np.zeros((6, 6))
+    if markers is not None:
+        # So many pairs count as one measurement: what a calibration leaves bent is alike over a
+        # good part of the surface, and a plane would slide until it fits.
+        alike = max(1.0, len(points) / _INDEPENDENT)
+        of_markers = markers.normal_equations(T, centre, sigma * np.sqrt(alike))
+        H, gradient = H + of_markers[0], gradient + of_markers[1]
+        scatter = alike * sigma**2 * of_markers[0]
+    return _Equations(centre, sigma, H, gradient, gradients, scatter)
 
 
-def _estimate_uncertainty(points: np.ndarray, e: _Equations) -> Uncertainty:
+def _estimate_uncertainty(points: Floats, e: _Equations) -> Uncertainty:
     """Estimate the uncertainty of a pose by a cluster-robust covariance of the pairs' points (n,
     3), and from the standard deviations of markers."""
     arm = points - e.centre
     diameter = 2.0 * rms_length(arm)
-    inverse = np.linalg.pinv(e.H + e.H_markers, rcond=1e-12, hermitian=True)
+    inverse = np.linalg.pinv(e.H, rcond=1e-12, hermitian=True)
     covariances: list[np.ndarray] = []
     for share in _PATCHES:
-        patches = _sum_by_cube(e.gradients, arm, diameter / share)
+        patches = sum_by_cube(e.gradients, arm, diameter / share)
         if len(patches) < _LEAST_PATCHES and covariances:
             break
-        meat = (
-            patches.T @ patches * len(patches) / max(len(patches) - 6, 1)
-            + e.alike * e.sigma**2 * e.H_markers
-        )
+        meat = patches.T @ patches * len(patches) / max(len(patches) - 6, 1) + e.scatter
         covariances.append(inverse @ meat @ inverse)
     # errors that are correlated over more than one patch show in larger patches only
     largest = max(covariances, key=lambda covariance: float(np.trace(covariance[3:, 3:])))
     return Uncertainty(_UNSEEN**2 * (largest + largest.T) / 2, e.centre)
-
-
-def _sum_by_cube(values: np.ndarray, points: np.ndarray, side: float) -> np.ndarray:
-    """Return the sums (m, k) of ``values`` (n, k) over the m occupied cubes of ``side`` mm of
-    ``points`` (n, 3)."""
-    _, which = occupied_cubes(points, side)
-    return np.stack([np.bincount(which, column) for column in values.T], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +201,8 @@ class Freedom:
     the overlap's radius.
     """
 
-    slack_mm: np.ndarray
-    motions: np.ndarray
+    slack_mm: Floats
+    motions: Floats
 
     @property
     def loosest_mm(self) -> float:
@@ -242,7 +233,7 @@ WORDS: dict[Shape, str] = {
 
 
 def estimate_freedom(
-    scan: PreparedScan, reference: PreparedScan, T: np.ndarray, points: np.ndarray, rms: float
+    scan: PreparedScan, reference: PreparedScan, T: Floats, points: Floats, rms: float
 ) -> Freedom:
     """Estimate which motions of the scan the overlap leaves undetermined.
 
@@ -251,7 +242,7 @@ def estimate_freedom(
     """
     if len(points) < 6:
         return Freedom(np.full(6, np.inf), np.eye(6))
-    points = points[:: -(-len(points) // _FREEDOM_POINTS)]
+    points = subsample(points, _FREEDOM_POINTS)
     smooth_points, normals = reference.smooth
     reference_normals = normals[cKDTree(smooth_points).query(points)[1]]
     smooth_points, normals = scan.smooth

@@ -10,9 +10,8 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats
 from slviewer.geometry.vectors import lengths, median_spacing
-from slviewer.reconstruction.cloud import Cloud, choose_pixels
-from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.registration.open3d_loader import open3d, point_cloud
 
 LEAST_POINTS = 500
@@ -27,35 +26,6 @@ _STEEPEST = 6.0
 too obliquely."""
 _NOISE = 4.0
 """Standard deviations that noise alone may add to a step."""
-
-
-@dataclass(frozen=True)
-class Scan:
-    """The valid points of one scan, in its camera's frame.
-
-    ``points`` (n, 3) mm and ``normals`` (n, 3) towards the camera, float32 without NaN in the
-    points; a normal is NaN where the grid gives none. ``sigma_mm``: the median expected error of a
-    point. ``trusted`` (n,) bool: the points away from edges, which alone decide how the scan lies;
-    None trusts all.
-    """
-
-    points: np.ndarray
-    normals: np.ndarray | None = None
-    sigma_mm: float | None = None
-    trusted: np.ndarray | None = None
-
-    @classmethod
-    def from_cloud(cls, cloud: Cloud) -> "Scan":
-        """Return the measured pixels of an organised cloud, with the normals of its grid."""
-        mask = cloud.mask
-        sigma = cloud.sigma_z[mask]
-        sigma = sigma[np.isfinite(sigma)]
-        return cls(
-            points=choose_pixels(cloud.points, mask),
-            normals=choose_pixels(grid_normals(cloud.points), mask),
-            sigma_mm=float(np.median(sigma)) if sigma.size else None,
-            trusted=away_from_edges(cloud.points, cloud.sigma_z)[mask],
-        )
 
 
 def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np.ndarray:
@@ -83,13 +53,15 @@ def away_from_edges(points: np.ndarray, sigma_z: np.ndarray | None = None) -> np
 
 @dataclass(frozen=True, eq=False)
 class PreparedScan:
-    """``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of
+    """One scan's points away from edges, which alone decide how it lies.
+
+    ``points`` (n, 3) float64 mm in the frame of the scan's camera; ``fine``: Open3D's cloud of
     them, thinned to ``voxel`` mm, with unit normals towards the camera, without what is seen at
     grazing angles; ``spacing``: median distance in mm of a point to the next; ``size``: longest
     side in mm; ``sigma_mm``: expected error of a point.
     """
 
-    points: np.ndarray
+    points: Floats
     fine: Any
     voxel: float
     spacing: float
@@ -104,12 +76,12 @@ class PreparedScan:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     @cached_property
-    def fine_points(self) -> np.ndarray:
+    def fine_points(self) -> Floats:
         """(m, 3) float64 mm: points of the thinned cloud."""
         return np.asarray(self.fine.points)
 
     @cached_property
-    def fine_normals(self) -> np.ndarray:
+    def fine_normals(self) -> Floats:
         """(m, 3) float64: normals of the thinned cloud."""
         return np.asarray(self.fine.normals)
 
@@ -124,7 +96,7 @@ class PreparedScan:
         return median_spacing(self.fine_tree, 2000)
 
     @cached_property
-    def smooth(self) -> tuple[np.ndarray, np.ndarray]:
+    def smooth(self) -> tuple[Floats, Floats]:
         """Points (k, 3) mm, thinned to an eightieth of the size, and normals (k, 3) fitted to some
         thirty of them, which show the shape and not the noise; towards either side."""
         geometry = open3d().geometry
@@ -162,7 +134,21 @@ def prepare_scan(
     ``normals`` ``(n, 3)`` point to the camera and are estimated where missing; ``name`` is for
     errors. Raises ``InputError`` for points that cannot be used.
     """
-    _check_arrays(name, points, normals)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
+    if len(points) < LEAST_POINTS:
+        raise InputError(
+            f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it."
+        )
+    if not np.isfinite(points).all():
+        raise InputError(
+            f"The {name} holds points that are not finite: exclude its invalid pixels first."
+        )
+    if normals is not None and normals.shape != points.shape:
+        raise InputError(
+            f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one"
+            " each."
+        )
     points = np.ascontiguousarray(points, dtype=np.float64)
     size = measure_size(points)
     if not size > 0:
@@ -187,26 +173,6 @@ def scale_of(size: float) -> float:
     return size / float(np.clip(size, 75.0, 300.0))
 
 
-def _check_arrays(name: str, points: np.ndarray, normals: np.ndarray | None) -> None:
-    """Raise InputError for arrays of wrong shapes, too few points, or points that are not
-    finite."""
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"The {name} has shape {points.shape}: give its valid points as (n, 3).")
-    if len(points) < LEAST_POINTS:
-        raise InputError(
-            f"The {name} has {len(points)} points: at least {LEAST_POINTS} are needed to align it."
-        )
-    if not np.isfinite(points).all():
-        raise InputError(
-            f"The {name} holds points that are not finite: exclude its invalid pixels first."
-        )
-    if normals is not None and normals.shape != points.shape:
-        raise InputError(
-            f"The {name} has {len(points)} points and normals of shape {normals.shape}: give one"
-            " each."
-        )
-
-
 def measure_size(points: np.ndarray) -> float:
     """Return the longest side in mm of the points' bounding box between their 1st and 99th
     percentiles."""
@@ -214,20 +180,19 @@ def measure_size(points: np.ndarray) -> float:
     return float((high - low).max())
 
 
-def _make_cloud(points: np.ndarray, normals: np.ndarray | None, voxel: float) -> Any:
+def _make_cloud(points: Floats, normals: np.ndarray | None, voxel: float) -> Any:
     """Return Open3D's cloud thinned to ``voxel`` mm, with unit normals towards the camera at the
     origin."""
-    if normals is not None:
-        # a NaN normal weighs nothing in a voxel's mean
-        finite = np.nan_to_num(np.asarray(normals, dtype=np.float64))
-        cloud = point_cloud(points, finite).voxel_down_sample(voxel)
+    # a NaN normal weighs nothing in a voxel's mean
+    finite = None if normals is None else np.nan_to_num(np.asarray(normals, dtype=np.float64))
+    cloud = point_cloud(points, finite).voxel_down_sample(voxel)
+    if normals is None:
+        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
+        cloud.orient_normals_towards_camera_location(np.zeros(3))
+    else:
         known = lengths(np.asarray(cloud.normals)) > 0.1
         cloud = cloud.select_by_index(np.flatnonzero(known))
         cloud.normalize_normals()
-    else:
-        cloud = point_cloud(points).voxel_down_sample(voxel)
-        cloud.estimate_normals(open3d().geometry.KDTreeSearchParamKNN(30))
-        cloud.orient_normals_towards_camera_location(np.zeros(3))
     seen = np.asarray(cloud.points)
     facing = -np.sum(np.asarray(cloud.normals) * seen, axis=1) / lengths(seen)
     return cloud.select_by_index(np.flatnonzero(facing > _GRAZING))

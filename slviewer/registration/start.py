@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import fit_rigid, move_points, rigid_transform, turn_about
+from slviewer.geometry.rigid import Floats, fit_rigid, move_points, rigid_transform, turn_about
 from slviewer.geometry.vectors import diagonal, lengths, unit_vectors
 from slviewer.registration.open3d_loader import align_icp, open3d
 from slviewer.registration.refusal import Refused
@@ -49,7 +49,7 @@ class Candidate:
     evaluated.
     """
 
-    T: np.ndarray
+    T: Floats
     start: Start
     score: float = float("nan")
 
@@ -88,13 +88,13 @@ def search_starts(
     return sorted(found, key=lambda candidate: -candidate.score)
 
 
-def pose_distance(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
+def pose_distance(points: Floats, T: Floats, other: Floats) -> float:
     """Return the largest coordinate difference in mm of some 20 of the points (n, 3) between two
     poses (4, 4)."""
     return float(np.abs(move_points(T - other, points[:: max(1, len(points) // 20)])).max())
 
 
-def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: float) -> float:
+def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: Floats, voxel: float) -> float:
     """Return the share of the scan that overlaps the reference, times the share of agreement where
     the two face each other."""
     points = move_points(T, np.asarray(scan.points))
@@ -112,7 +112,7 @@ def _score_pose(scan: Any, reference: Any, tree: cKDTree, T: np.ndarray, voxel: 
     return float(on.sum() / len(points) * on.sum() / near.sum())
 
 
-def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) -> list[np.ndarray]:
+def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) -> list[Floats]:
     """Return up to six different poses, those on which most feature matches agree; none without
     matches."""
     scan, reference = scanned.thinned(voxel), referred.thinned(voxel)
@@ -135,11 +135,9 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     normal_products = np.einsum("ni,nj->nij", m, n).reshape(-1, 9)
     votes = np.empty(len(motions), dtype=np.int64)
     for chunk in np.array_split(np.arange(len(motions)), max(1, len(motions) * len(p) // 100_000)):
-        R, t = motions[chunk, :3, :3], motions[chunk, :3, 3]
-        gap = R.reshape(-1, 3) @ p.T
-        gap = gap.reshape(len(chunk), 3, len(p)) + (t[:, :, None] - q.T)
-        close = np.einsum("kin,kin->kn", gap, gap) < (1.5 * voxel) ** 2
-        alike = R.reshape(-1, 9) @ normal_products.T > 0.8
+        gap = move_points(motions[chunk], p) - q
+        close = np.einsum("kni,kni->kn", gap, gap) < (1.5 * voxel) ** 2
+        alike = motions[chunk, :3, :3].reshape(-1, 9) @ normal_products.T > 0.8
         votes[chunk] = np.count_nonzero(close & alike, axis=1)
 
     poses: list[np.ndarray] = []
@@ -152,7 +150,7 @@ def _feature_poses(scanned: PreparedScan, referred: PreparedScan, voxel: float) 
     return poses
 
 
-def _match_triangles(p: np.ndarray, q: np.ndarray, shortest: float, slack: float) -> np.ndarray:
+def _match_triangles(p: Floats, q: Floats, shortest: float, slack: float) -> np.ndarray:
     """Return which pairs of triangles ``(k, 3, 3)`` have sides longer than ``shortest`` that agree
     within ``slack`` mm."""
     a, b = (lengths(x - np.roll(x, 1, axis=1)) for x in (p, q))
@@ -161,7 +159,7 @@ def _match_triangles(p: np.ndarray, q: np.ndarray, shortest: float, slack: float
 
 def fit_picked_start(
     scan_points: np.ndarray, reference_points: np.ndarray
-) -> tuple[Candidate, np.ndarray]:
+) -> tuple[Candidate, Floats]:
     """The pose that brings three or more picked points (n, 3) mm of the scan onto those of the
     reference, in order, and how far each pair (n,) stays apart in mm.
 
@@ -214,9 +212,9 @@ class TurntableAxis:
     """
 
     point: np.ndarray
-    direction: np.ndarray
+    direction: Floats
 
-    def rotation(self, deg: float) -> np.ndarray:
+    def rotation(self, deg: float) -> Floats:
         """Return the motion (4, 4) of an object on the table when the table turns by an angle."""
         return turn_about(np.radians(deg) * unit_vectors(self.direction), self.point)
 
@@ -232,7 +230,7 @@ def determines_axis(deg: float) -> bool:
     return _MAX_ANGLE_ERROR_DEG < abs(deg) < 180.0 - _MAX_ANGLE_ERROR_DEG
 
 
-def fit_turntable_axis(steps: Sequence[np.ndarray], step_deg: ArrayLike) -> TurntableAxis:
+def fit_turntable_axis(steps: Sequence[Floats], step_deg: ArrayLike) -> TurntableAxis:
     """Fit the axis to registrations of scans, T_before_after (4, 4) mm each, ``step_deg`` apart:
     one angle, or (n,).
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import move_points
+from slviewer.geometry.rigid import Floats, Mask, move_points
 from slviewer.geometry.vectors import lengths
-from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.cloud import Cloud, Points, choose_pixels, keep_pixels
 from slviewer.registration.multiway import MultiwayAlignment, Pair, Starts, register_all
 from slviewer.registration.open3d_loader import open3d, point_cloud
 from slviewer.registration.pairwise import Progress
@@ -58,13 +58,13 @@ class SurfaceSamples:
     results of ``heights_above``.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
+    points: Points
+    normals: Points
     ray_tree: cKDTree
     ray_distance: np.ndarray
     point_tree: cKDTree
     neighbours: np.ndarray
-    heights: dict[tuple["SurfaceSamples", bytes], np.ndarray] = field(default_factory=dict)
+    heights: dict[tuple["SurfaceSamples", bytes], Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class ObjectAlignment:
 
     alignment: MultiwayAlignment
     clouds: Mapping[str, Cloud]
-    static: Mapping[str, np.ndarray]
+    static: Mapping[str, Mask]
     contradictions: Mapping[Pair, SceneContradiction]
 
 
@@ -156,7 +156,7 @@ def _register_once(
     reference: str,
     starts: Starts,
     report: Progress,
-) -> tuple[MultiwayAlignment, dict[str, np.ndarray]]:
+) -> tuple[MultiwayAlignment, dict[str, Mask]]:
     """Register the scans without what agrees without motion, or as they are where that does not
     separate two motions.
 
@@ -181,7 +181,7 @@ def _sample_clouds(clouds: Mapping[str, Cloud]) -> dict[str, SurfaceSamples]:
     return {name: sample_surface(_select_precise(cloud)) for name, cloud in clouds.items()}
 
 
-def _select_precise(cloud: Cloud) -> np.ndarray:
+def _select_precise(cloud: Cloud) -> Points:
     """Return the points (n, 3) mm of a cloud but the noisiest, which on dark print lie further off
     than the others."""
     mask = cloud.mask
@@ -190,9 +190,7 @@ def _select_precise(cloud: Cloud) -> np.ndarray:
     return choose_pixels(cloud.points, mask)[~(sigma > NOISY * usual)]
 
 
-def remove_points(
-    clouds: Mapping[str, Cloud], static: Mapping[str, np.ndarray]
-) -> dict[str, Cloud]:
+def remove_points(clouds: Mapping[str, Cloud], static: Mapping[str, Mask]) -> dict[str, Cloud]:
     """Return the clouds with the points at ``static`` (h, w) bool replaced by NaN."""
     return {
         name: replace(cloud, points=keep_pixels(cloud.points, ~static[name]))
@@ -212,7 +210,7 @@ def _try_register(
 
 def _detect_unmoved_points(
     clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples]
-) -> dict[str, np.ndarray]:
+) -> dict[str, Mask]:
     """Detect the points, (h, w) bool by scan, that agree with the next scan's or the previous one's
     without any motion.
 
@@ -236,7 +234,7 @@ def _detect_unmoved_points(
     return static
 
 
-def sample_surface(points: np.ndarray) -> SurfaceSamples:
+def sample_surface(points: Points) -> SurfaceSamples:
     """Downsample the measured points (n, 3) mm of a scan in its camera's frame; grazing samples are
     removed."""
     points = np.asarray(points, np.float64)
@@ -255,7 +253,7 @@ def sample_surface(points: np.ndarray) -> SurfaceSamples:
     return SurfaceSamples(samples, normals, ray_tree, ray_distance, point_tree, neighbours)
 
 
-def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> np.ndarray:
+def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> Floats:
     """Return the heights (n,) mm of a scan's samples, moved by ``T`` (4, 4), above another scan's
     surface.
 
@@ -287,7 +285,7 @@ def heights_above(scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray) -> 
 
 
 def measure_contradiction(
-    scan: SurfaceSamples, onto: SurfaceSamples, T: np.ndarray, widest_mm: float
+    scan: SurfaceSamples, onto: SurfaceSamples, T: Floats, widest_mm: float
 ) -> SceneContradiction:
     """Measure the free-space violations between two scans with ``T_onto_scan`` (4, 4), in both
     directions.
@@ -302,7 +300,7 @@ def measure_contradiction(
     return SceneContradiction(len(known), float(np.mean(known > gate)) if len(known) else 0.0, gate)
 
 
-def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
+def estimate_gate(height: Floats, widest_mm: float) -> float:
     """Estimate the gate in mm, SIGMAS times the scatter of heights (n,) of overlapping surfaces, up
     to ``widest_mm``.
 
@@ -316,7 +314,7 @@ def estimate_gate(height: np.ndarray, widest_mm: float) -> float:
 
 def detect_static_points(
     clouds: Mapping[str, Cloud], samples: Mapping[str, SurfaceSamples], alignment: MultiwayAlignment
-) -> dict[str, np.ndarray]:
+) -> dict[str, Mask]:
     """Detect the points, (h, w) bool by scan, that are static in the camera's frame while the
     object moves.
 
@@ -345,14 +343,14 @@ def detect_static_points(
 def _classify_pixels(
     clouds: Mapping[str, Cloud],
     samples: Mapping[str, SurfaceSamples],
-    votes: Mapping[str, np.ndarray],
-) -> dict[str, np.ndarray]:
+    votes: Mapping[str, Floats],
+) -> dict[str, Mask]:
     """Return the static pixels (h, w) bool by scan; {} without any."""
     static = {name: _classify_scan(clouds[name], samples[name], votes[name]) for name in clouds}
     return static if any(mask.any() for mask in static.values()) else {}
 
 
-def _classify_scan(cloud: Cloud, samples: SurfaceSamples, votes: np.ndarray) -> np.ndarray:
+def _classify_scan(cloud: Cloud, samples: SurfaceSamples, votes: Floats) -> Mask:
     """Return the static pixels (h, w) bool of a cloud, by the majority of the votes (n,) nearest to
     each sample.
 

@@ -8,7 +8,7 @@ nothing is smoothed beyond one scan's resolution.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
 
@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import Uncertainty, distance_jacobian, move_points
+from slviewer.geometry.rigid import Mask, Uncertainty, distance_jacobian, move_points
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.vectors import lengths, rms, unit_vectors
-from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.cloud import Cloud, Points, choose_pixels, keep_pixels
 from slviewer.surface.overlap_kernels import FIELDS, add_surface, add_votes, measure_heights
 from slviewer.surface.shapes import PointSet
 from slviewer.surface.view import View, prepare_view, viewing_cosines
@@ -39,15 +39,14 @@ _GATE_SIGMAS = 6.0
 class SurfaceAgreement:
     """Comparison of two scans where they overlap.
 
-    ``places``: number of compared points; ``rms_mm`` and ``bias_mm`` (median): height of the second
-    scan's surface above the first's along the normal; ``gate_mm``: height within which both are one
+    ``places``: number of compared points; ``rms_mm``: height of the second scan's surface
+    above the first's along the normal; ``gate_mm``: height within which both are one
     surface; ``log_gain``: median logarithm of the second's brightness over the first's, None
     without colours.
     """
 
     places: int
     rms_mm: float
-    bias_mm: float
     gate_mm: float
     log_gain: float | None
 
@@ -107,7 +106,7 @@ def fuse(
         views[name] = prepare_view(name, cloud, T_reference_scan[name])
     names = tuple(views)
     pairs = compare_views(views, lambda share: report(0.3 + 0.1 * share))
-    excluded = {name: asdict(view.cleaned) for name, view in views.items()}
+    excluded = {name: dict(view.cleaned) for name, view in views.items()}
     for name, violations in _detect_violations(
         views, pairs, lambda share: report(0.4 + 0.1 * share)
     ).items():
@@ -138,9 +137,7 @@ def fuse(
     )
 
 
-def _detect_violations(
-    views: Views, pairs: Agreements, progress: Progress
-) -> dict[str, np.ndarray]:
+def _detect_violations(views: Views, pairs: Agreements, progress: Progress) -> dict[str, Mask]:
     """Detect the points, (h, w) bool by scan, in the free space of more scans than the number that
     confirm them."""
     witnesses = {name: _select_witnesses(view) for name, view in views.items()}
@@ -155,9 +152,7 @@ def _detect_violations(
                 T = np.linalg.inv(there.T) @ view.T
                 # along the viewing direction two surfaces may be farther apart than along their
                 # normal
-                gate = 2.0 * max(
-                    _gate_mm(pairs, name, other, view, there), view.spacing, there.spacing
-                )
+                gate = 2.0 * max(_gate_mm(pairs, views, name, other), view.spacing, there.spacing)
                 moved = move_points(T, points)
                 add_votes(moved, gate, there.points, witnesses[other], there.to_pixel, votes)
         violations[name] = np.zeros(mask.shape, bool)
@@ -165,7 +160,7 @@ def _detect_violations(
     return violations
 
 
-def _select_witnesses(view: View) -> np.ndarray:
+def _select_witnesses(view: View) -> Mask:
     """Select the pixels (h, w) bool whose free space is certain: inside the surface, and not at
     grazing angles."""
     inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
@@ -173,11 +168,11 @@ def _select_witnesses(view: View) -> np.ndarray:
     return inside & (view.inner > MIN_WITNESS_WEIGHT) & facing
 
 
-def _gate_mm(pairs: Agreements, a: str, b: str, first: View, second: View) -> float:
+def _gate_mm(pairs: Agreements, views: Views, a: str, b: str) -> float:
     """Return the gate of two scans by their agreement, or the larger of their point spacings
     without one."""
     pair = pairs.get((a, b)) or pairs.get((b, a))
-    return pair.gate_mm if pair else max(first.spacing, second.spacing)
+    return pair.gate_mm if pair else max(views[a].spacing, views[b].spacing)
 
 
 def _fuse_scan(
@@ -215,7 +210,7 @@ def _fuse_scan(
             view.quality[mask],
             np.ascontiguousarray(there.T[:3, :3]),
             max(view.spacing, there.spacing),
-            _gate_mm(pairs, name, other, view, there),
+            _gate_mm(pairs, views, name, other),
             there.grid,
             there.colours if own_colours is not None else np.zeros((0, 0, 3), np.uint8),
             1.0 if gains is None else gains[other],
@@ -229,7 +224,7 @@ def _fuse_scan(
 
 
 def _average(
-    view: View, points: np.ndarray, normals: np.ndarray, sums: np.ndarray, coloured: bool
+    view: View, points: Points, normals: Points, sums: np.ndarray, coloured: bool
 ) -> PointSet:
     """Return the averages of a scan's points (n, 3) in the reference's frame from their ``sums``
     (n, FIELDS)."""
@@ -252,17 +247,14 @@ def _add_pose_error(points: PointSet, pose: Uncertainty) -> PointSet:
     return replace(points, sigma_mm=np.sqrt(points.sigma_mm**2 + np.maximum(variance, 0.0)))
 
 
-def compare_views(
-    views: Views, progress: Callable[[float], None]
-) -> dict[tuple[str, str], SurfaceAgreement]:
+def compare_views(views: Views, progress: Progress) -> dict[tuple[str, str], SurfaceAgreement]:
     """Compare every ordered pair of scans; pairs that overlap in too few points are missing from
     the result."""
-    agreements: dict[tuple[str, str], SurfaceAgreement] = {}
+    agreements = {}
     pairs = list(permutations(views, 2))
     for i, (a, b) in enumerate(pairs):
         progress(i / len(pairs))
-        agreement = _compare_pair(views[a], views[b])
-        if agreement is not None:
+        if agreement := _compare_pair(views[a], views[b]):
             agreements[a, b] = agreement
     return agreements
 
@@ -295,7 +287,6 @@ def _compare_pair(first: View, second: View) -> SurfaceAgreement | None:
     return SurfaceAgreement(
         places=int(overlaps.sum()),
         rms_mm=rms(height[np.abs(height) <= gate]),
-        bias_mm=float(np.median(height)),
         gate_mm=gate,
         log_gain=log_gain,
     )

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from slviewer.errors import InputError
-from slviewer.geometry.rigid import rigid_transform
+from slviewer.geometry.rigid import Floats, Mask, rigid_transform
 from slviewer.geometry.vectors import finite_rows
 
 MARGIN = 0.05
@@ -67,19 +67,19 @@ class RegionOfInterest:
         return cls(_triple(T_camera_box[:3, 3]), size_mm, _triple(angles))
 
     @property
-    def T_camera_box(self) -> NDArray[np.float64]:
+    def T_camera_box(self) -> Floats:
         """(4, 4): from the frame of the box, in its middle along its sides, to the camera's."""
         turn = Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
         return rigid_transform(turn.as_matrix(), np.array(self.centre_mm))
 
-    def contains(self, points: np.ndarray) -> NDArray[np.bool_]:
+    def contains(self, points: np.ndarray) -> Mask:
         """Bool like points (..., 3) mm without their last axis: whether they lie in the box; False
         for NaN."""
         T = self.T_camera_box
         inside = np.abs((points - T[:3, 3]) @ T[:3, :3]) <= np.array(self.size_mm) / 2
         return np.asarray(inside.all(axis=-1))
 
-    def edges(self) -> NDArray[np.float64]:
+    def edges(self) -> Floats:
         """(12, 2, 3) mm: the edges of the box, in the camera's frame."""
         T = self.T_camera_box
         return box_edges(T[:3, 3], np.array(self.size_mm), T[:3, :3].T)
@@ -94,7 +94,7 @@ class RegionOfInterest:
         return f"{_times(self.size_mm)} mm about ({centre}) mm{turned}"
 
 
-def crop_mask(name: str, points: np.ndarray, region: RegionOfInterest) -> NDArray[np.bool_]:
+def crop_mask(name: str, points: np.ndarray, region: RegionOfInterest) -> Mask:
     """Bool (...): the points (..., 3) mm of a scan in the region. InputError, with where they are,
     if none is."""
     inside = region.contains(points)

@@ -15,9 +15,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slviewer.errors import InputError
+from slviewer.geometry.rigid import Floats, Mask
 from slviewer.geometry.robust import robust_sigma
 from slviewer.geometry.shapes import ransac_plane
 from slviewer.geometry.vectors import finite_rows, lengths
@@ -31,7 +31,6 @@ PLANE_TOLERANCE = 0.002
 them farther."""
 _RASTER = 2048
 _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class ViewCamera:
     fov_rad: float
     aspect: float
 
-    def project(self, points: np.ndarray) -> NDArray[np.float64]:
+    def project(self, points: np.ndarray) -> Floats:
         """Project points (..., 3) mm to (..., 2): 0 ... 1 from the left and from the top; NaN
         behind the view."""
         local = (points - self.position) @ self.R_scene_view
@@ -295,7 +294,7 @@ def make_edit(
     return Edit(what, count, selected if plane is None else None, plane, made)
 
 
-def pack_mask(mask: Mask) -> NDArray[np.uint8]:
+def pack_mask(mask: Mask) -> np.ndarray:
     """Compress a mask (h, w) to bytes (n,), which `unpack_mask` reads."""
     return np.frombuffer(zlib.compress(np.packbits(mask).tobytes(), 6), np.uint8)
 

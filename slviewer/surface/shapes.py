@@ -207,16 +207,10 @@ def face_groups(faces: np.ndarray, n_vertices: int, chosen: np.ndarray | None = 
     return groups
 
 
-def face_vectors(mesh: Mesh) -> np.ndarray:
-    """Return a vector (m, 3) along the normal of each face, as long as twice its area is large,
-    mm2."""
-    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).swapaxes(0, 1)
-    return np.cross(b - a, c - a)
-
-
 def face_areas(mesh: Mesh) -> np.ndarray:
     """Return the area (m,) mm2 of each face."""
-    return lengths(face_vectors(mesh)) / 2
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).swapaxes(0, 1)
+    return lengths(np.cross(b - a, c - a)) / 2
 
 
 def extent_across(points: np.ndarray) -> float:

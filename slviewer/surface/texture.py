@@ -7,7 +7,7 @@ light's place is known: what a scan sees falls with the cosine of the projector'
 square of its distance, which is divided out.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +19,9 @@ from slviewer.errors import InputError, SlviewerError
 from slviewer.geometry.polynomial import monomials
 from slviewer.geometry.rigid import move_points
 from slviewer.geometry.vectors import finite_rows, lengths, unit_vectors
-from slviewer.reconstruction.cloud import Cloud
+from slviewer.reconstruction.cloud import Cloud, Points
 from slviewer.registration.open3d_loader import open3d
-from slviewer.surface.fuse import Views, colour_gains, compare_views
+from slviewer.surface.fuse import Progress, Views, colour_gains, compare_views
 from slviewer.surface.shapes import Mesh, count_edges, face_areas, pick_attributes
 from slviewer.surface.view import View, prepare_view
 
@@ -75,7 +75,7 @@ def texture_mesh(
     *,
     size: int = 2048,
     light: np.ndarray | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = lambda share: None,
 ) -> TexturedMesh:
     """Unfold a mesh, and project the scans' textures onto it.
 
@@ -118,8 +118,9 @@ def texture_mesh(
     image = image[tuple(nearest)]
     image *= 250.0 / max(float(np.percentile(image[seen], 99.5)), 1e-6)
     progress(0.95)
-    vertices, faces, uv, kept = _split_vertices(mesh, corners)
-    split = Mesh(vertices, faces, **(pick_attributes(mesh, kept) | {"colours": None}))
+    faces, uv, kept = _split_vertices(mesh, corners)
+    split = Mesh(mesh.vertices[kept], faces, **(pick_attributes(mesh, kept) | {"colours": None}))
+    edges, split_edges = (len(count_edges(each)[1]) for each in (mesh.faces, faces))
     progress(1.0)
     return TexturedMesh(
         split,
@@ -128,7 +129,7 @@ def texture_mesh(
         share,
         float(np.sqrt(face_areas(mesh).sum() / np.count_nonzero(chart))),
         charts,
-        _seam_share(mesh.faces, faces),
+        (split_edges - edges) / edges,
     )
 
 
@@ -149,7 +150,7 @@ def _unfold(mesh: Mesh, size: int) -> tuple[Any, np.ndarray, int]:
     return unfolded, unfolded.triangle.texture_uvs.numpy().astype(np.float64), int(charts)
 
 
-def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _bake_places(unfolded: Any, size: int) -> tuple[Points, Points]:
     """Return the place (h, w, 3) mm of each texel and the unit normal there; NaN outside of the
     charts."""
     unfolded.compute_vertex_normals()
@@ -161,12 +162,12 @@ def _bake_places(unfolded: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blend(
-    places: np.ndarray,
-    normals: np.ndarray,
+    places: Points,
+    normals: Points,
     views: Views,
     gains: Mapping[str, float],
     light: np.ndarray | None,
-    report: Callable[[float], None],
+    report: Progress,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean colours (n, 3) float32 of texels and their weights (n,), 0 where no view sees
     them."""
@@ -182,7 +183,7 @@ def _blend(
 
 
 def _look(
-    places: np.ndarray, normals: np.ndarray, view: View, light: np.ndarray | None
+    places: Points, normals: Points, view: View, light: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a view shows of places (n, 3) with normals: colours (n, 3), and weights (n,), 0
     of what it misses."""
@@ -221,26 +222,12 @@ def _look(
     return np.where(sees[:, None], colours, 0.0), np.where(sees, weight, 0.0)
 
 
-def _split_vertices(
-    mesh: Mesh, corners: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, one for every uv of the mesh's, faces, uv (n, 2), and which of the mesh's
-    vertices each is."""
+def _split_vertices(mesh: Mesh, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the faces over vertices of which there is one for every uv of the mesh's, their uv (n,
+    2), and which of the mesh's vertices each is."""
     every = np.column_stack(
         [mesh.faces.ravel(), np.round(corners.reshape(-1, 2) * (1 << 20))]
     ).astype(np.int64)
     unique, first, inverse = np.unique(every, axis=0, return_index=True, return_inverse=True)
-    kept = unique[:, 0]
-    return (
-        mesh.vertices[kept],
-        inverse.reshape(-1, 3),
-        corners.reshape(-1, 2)[first].astype(np.float32),
-        kept,
-    )
-
-
-def _seam_share(before: np.ndarray, after: np.ndarray) -> float:
-    """Return the share of a mesh's edges along which its unfolded triangles ``after`` (m, 3) come
-    apart."""
-    whole, split = (len(count_edges(faces)[1]) for faces in (before, after))
-    return (split - whole) / whole
+    uv = corners.reshape(-1, 2)[first].astype(np.float32)
+    return inverse.reshape(-1, 3), uv, unique[:, 0]

@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from slviewer.errors import InputError
 from slviewer.geometry.polynomial import monomials
-from slviewer.geometry.rigid import move_points
+from slviewer.geometry.rigid import Mask, move_points
 from slviewer.geometry.vectors import lengths, median_spacing, occupied_cubes, rms
-from slviewer.reconstruction.cloud import Cloud, choose_pixels, keep_pixels
+from slviewer.reconstruction.cloud import Cloud, Map, Points, choose_pixels, keep_pixels
 from slviewer.reconstruction.reconstruct import normals as grid_normals
 from slviewer.surface.overlap_kernels import SurfaceGrid
 from slviewer.surface.shapes import label_connected
@@ -36,22 +36,6 @@ LEAST_GROUP = 2e-4
 """Least share of a scan's pixels in a connected group."""
 
 
-@dataclass(frozen=True)
-class ExcludedPixels:
-    """Numbers of excluded pixels: ``edges`` (border and depth jumps), ``grazing`` or without a
-    normal, in small ``groups``, and in ``far`` clusters."""
-
-    edges: int
-    grazing: int
-    groups: int
-    far: int
-
-    @property
-    def total(self) -> int:
-        """Number of all excluded pixels."""
-        return self.edges + self.grazing + self.groups + self.far
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """A cleaned scan, cropped to its surface.
@@ -66,19 +50,19 @@ class View:
     """
 
     T: np.ndarray
-    points: np.ndarray
-    normals: np.ndarray
-    noise: np.ndarray
-    systematic: np.ndarray
-    inner: np.ndarray
-    quality: np.ndarray
+    points: Points
+    normals: Points
+    noise: Map
+    systematic: Map
+    inner: Map
+    quality: Map
     colours: np.ndarray | None
     to_pixel: np.ndarray
     spacing: float
-    cleaned: ExcludedPixels
+    cleaned: dict[str, int]
 
     @property
-    def mask(self) -> np.ndarray:
+    def mask(self) -> Mask:
         """(h, w) bool: pixels with a point."""
         return np.isfinite(self.points[..., 2])
 
@@ -88,7 +72,7 @@ class View:
         return SurfaceGrid(*(getattr(self, name) for name in SurfaceGrid._fields))
 
     def move_into(
-        self, other: "View", points: np.ndarray, normals: np.ndarray
+        self, other: "View", points: Points, normals: Points
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return points and normals (n, 3) of this view's frame in the frame of another one,
         contiguous."""
@@ -147,9 +131,7 @@ def prepare_view(name: str, cloud: Cloud, T_reference_scan: np.ndarray) -> View:
     )
 
 
-def _fill_noise(
-    sigma_z: np.ndarray, points: np.ndarray, cosine: np.ndarray, surface: np.ndarray
-) -> np.ndarray:
+def _fill_noise(sigma_z: Map, points: Points, cosine: Map, surface: Mask) -> Map:
     """Return the depth noise (h, w) mm with unknown values filled in, in proportion to z^2 /
     cosine.
 
@@ -173,7 +155,7 @@ def _fill_noise(
     return np.where(known, sigma_z, scale * shape)
 
 
-def _border_weights(surface: np.ndarray) -> np.ndarray:
+def _border_weights(surface: Mask) -> Map:
     """(h, w) float32: weights that rise smoothly from 0 at the border of a mask (h, w) to 1;
     pinholes are closed."""
     distance = cv2.distanceTransform(np.pad(close_pinholes(surface), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -184,7 +166,7 @@ def _border_weights(surface: np.ndarray) -> np.ndarray:
     )
 
 
-def _pixel_areas(points: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+def _pixel_areas(points: Points, cosine: Map) -> Map:
     """(h, w) mm2: the area of surface that each pixel covers."""
     z = points[..., 2]
     across, down = (
@@ -193,7 +175,7 @@ def _pixel_areas(points: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     return across * down * z**2 / np.maximum(cosine, 0.05)
 
 
-def _smooth(quality: np.ndarray, surface: np.ndarray) -> np.ndarray:
+def _smooth(quality: Map, surface: Mask) -> Map:
     """Average the quality (h, w) over 9 by 9 pixels of the surface, so that the best scan does not
     change by pixel."""
     size = (9, 9)
@@ -202,7 +184,7 @@ def _smooth(quality: np.ndarray, surface: np.ndarray) -> np.ndarray:
     return np.where(surface, total / np.maximum(share, 1e-9), 0).astype(np.float32)
 
 
-def _fit_pixel_map(name: str, points: np.ndarray, surface: np.ndarray) -> np.ndarray:
+def _fit_pixel_map(name: str, points: Points, surface: Mask) -> np.ndarray:
     """Fit the map from rays (x/z, y/z) to pixels: a polynomial of degree 5, accurate to a fraction
     of a pixel.
 
@@ -230,8 +212,10 @@ def _fit_pixel_map(name: str, points: np.ndarray, surface: np.ndarray) -> np.nda
     return np.concatenate([middle, half, coefficients.T.ravel()])
 
 
-def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels]:
-    """Select the pixels of a cloud on a surface, (h, w) bool, and count the excluded ones.
+def clean(cloud: Cloud, normals: Points) -> tuple[Mask, dict[str, int]]:
+    """Select the pixels of a cloud on a surface, (h, w) bool, and count the excluded ones: at
+    ``edges`` (border and depth jumps), ``grazing`` or without a normal, in small ``groups``, and in
+    ``far`` clusters.
 
     ``normals``: (h, w, 3), towards the camera, NaN where unknown.
     """
@@ -244,11 +228,12 @@ def clean(cloud: Cloud, normals: np.ndarray) -> tuple[np.ndarray, ExcludedPixels
     facing = inside & (np.abs(viewing_cosines(cloud.points, normals)) > MIN_VIEWING_COSINE)
     grouped = _select_large_groups(facing)
     surface = grouped & ~detect_far_clusters(cloud.points, grouped)
-    counts = [np.count_nonzero(each) for each in (mask, inside, facing, grouped, surface)]
-    return surface, ExcludedPixels(*(int(a - b) for a, b in pairwise(counts)))
+    counts = [int(np.count_nonzero(each)) for each in (mask, inside, facing, grouped, surface)]
+    reasons = "edges", "grazing", "groups", "far"
+    return surface, {why: a - b for why, (a, b) in zip(reasons, pairwise(counts), strict=True)}
 
 
-def viewing_cosines(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def viewing_cosines(points: Points, normals: Points) -> Map:
     """(h, w): cosine between normals (h, w, 3) and directions from points (h, w, 3) to the camera
     at the origin."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -261,7 +246,7 @@ def close_pinholes(mask: np.ndarray) -> np.ndarray:
     return cv2.morphologyEx(np.pad(mask, 2).astype(np.uint8), cv2.MORPH_CLOSE, disc)[2:-2, 2:-2]
 
 
-def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
+def detect_jumps(points: Points, sigma_z: Map) -> Mask:
     """Detect the pixels (h, w) bool of organised points (h, w, 3) mm on either side of a depth
     jump.
 
@@ -283,7 +268,7 @@ def detect_jumps(points: np.ndarray, sigma_z: np.ndarray) -> np.ndarray:
     return jumps
 
 
-def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def detect_far_clusters(points: Points, mask: Mask) -> Mask:
     """(h, w) bool: of the points (h, w, 3) mm in a ``mask`` (h, w), those in small clusters far
     from all others."""
     far = np.zeros(mask.shape, bool)
@@ -300,7 +285,7 @@ def detect_far_clusters(points: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return far
 
 
-def _select_large_groups(mask: np.ndarray) -> np.ndarray:
+def _select_large_groups(mask: Mask) -> Mask:
     """Select the connected groups of a mask (h, w) bool with at least 20 pixels and a share of
     LEAST_GROUP."""
     least = max(20.0, LEAST_GROUP * np.count_nonzero(mask))

@@ -331,9 +331,7 @@ def test_kernels_compile_for_real_devices(monkeypatch, model, cc):
         whole,
         types.int32[::1],
     )
-    list_moves, move, list_masked, mask = card.spike_kernels(
-        spike_rules(job.layout), (HEIGHT, WIDTH), measure
-    )
-    assert compiled(list_moves, maps, words) and compiled(list_masked, maps, words)
-    assert compiled(move, words, *tables, single, points, single)
-    assert compiled(mask, words, single, words, points, single)
+    list_changes, change = card.spike_kernels(spike_rules(job.layout), (HEIGHT, WIDTH), measure)
+    flag = types.boolean
+    assert compiled(list_changes, maps, flag, words)
+    assert compiled(change, words, flag, *tables, single, words, points, single)
