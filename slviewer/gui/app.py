@@ -89,6 +89,7 @@ class App:
         self._changed.set()
         self._unsubscribe()
         self._context.executor.shutdown(wait=False, cancel_futures=True)
+        self.shell.close()
         self._thread.join(5.0)
         self.server.stop()
 
@@ -122,15 +123,16 @@ class App:
             self._folder = folder
             self._context.clear_downloads()
         if snapshot.version != self._version or self.shell.needs_drawing:
-            with self.server.viser.atomic():
-                self.shell.draw(snapshot)
+            with self._context.lock, self.server.viser.atomic():
+                self.shell.update(snapshot)
             for notice in snapshot.notices:
                 if notice.number > self._notified:
                     self._notified = notice.number
                     self._context.notify(notice.level, notice.text)
         self._version = snapshot.version
         if preview is not None and preview.number != self._number:
-            self.shell.draw_preview(preview)
+            with self._context.lock:
+                self.shell.draw_preview(preview)
             self._number = preview.number
 
     def _greet_client(self, client: viser.ClientHandle) -> None:

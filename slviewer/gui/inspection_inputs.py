@@ -2,15 +2,14 @@
 passes."""
 
 from slviewer.errors import InputError
-from slviewer.gui.panel import NO_SESSION, Choice, PanelPart
+from slviewer.gui.panel import PanelPart
 from slviewer.gui.widgets import DECISION_TONES, Html, Text, alert, coloured, note, paragraph, table
 from slviewer.pipeline.inspect_parts import FILES
 from slviewer.pipeline.stored_records import Stored
 from slviewer.records.inspection import RULE, Characteristic, CharacteristicResult, Inspection
 from slviewer.session.inspection_plan import OWN_PLAN
-from slviewer.wizard.snapshot import Snapshot
 
-SHOWN, ALL = "shown", "all"
+ALL = "all"
 TABLE_PX = 320
 """Greatest height of the table."""
 
@@ -20,44 +19,43 @@ class InspectionInputs(PanelPart):
     came of it."""
 
     _surface = ""
-    _scans: tuple[str, ...] = ()
 
     def build(self) -> None:
         """Create the inputs."""
-        gui, context, operator = self._gui, self._context, self._operator
+        gui = self._gui
         with gui.add_folder("Inspection plan", expand_by_default=False) as self._folder:
-            self._plan = Choice(
-                context, "Plan", hint="Make one from the results above, or upload one"
-            )
-            context.upload_button("Upload plan", operator.upload_plan, ".toml")
-            self._parts = Choice(context, "Parts")
-            self._run = context.button("Run plan", self._request_run, "list-check", None)
+            self._plan = self.choice("Plan", "Make one from the results above, or upload one")
+            self.upload_button("Upload plan", self._operator.upload_plan, ".toml")
+            self._parts = self.choice("Parts")
+            self._run = self.button("Run plan", self._request_run, "list-check", None)
             self._result = Text(gui)
             self._files = Text(gui)
 
-    def offer(self, snapshot: Snapshot, surface: str) -> None:
+    def offer(self, surface: str) -> None:
         """Offer the session's plans for the shown surface and for all scans, and show the latest
         results."""
-        session = snapshot.session or NO_SESSION
+        session = self.panel.session
         self._surface = surface
         self._folder.visible = bool(surface)
         self._plan.offer(
-            (plan, "made here" if plan == OWN_PLAN else plan.partition("/")[2])
-            for plan in session.plans
+            {
+                "made here" if plan == OWN_PLAN else plan.partition("/")[2]: plan
+                for plan in session.plans
+            }
         )
-        self._scans = tuple(scan.name for scan in session.scans if scan.cloud == "fresh")
-        every = [(ALL, f"all {len(self._scans)} scans")] if len(self._scans) > 1 else []
-        self._parts.offer([(SHOWN, "the surface shown"), *every], SHOWN)
-        self._run.disabled = snapshot.is_busy or not session.plans
+        self._scans = [scan.name for scan in session.scans if scan.cloud == "fresh"]
+        every = {f"all {len(self._scans)} scans": ALL} if len(self._scans) > 1 else {}
+        self._parts.offer({"the surface shown": ""} | every)
+        self._run.disabled = self.panel.snapshot.is_busy or not session.plans
         runs = session.list_records(Inspection)
         self._result.set(inspection_html(runs[-1]) if runs else "")
-        self._files.set(self._context.links_html(session.exports, *FILES) if runs else "")
+        self._files.set(self.context.links_html(session.exports, *FILES) if runs else "")
 
     def _request_run(self) -> None:
         """Request that the chosen plan be run."""
-        parts = self._scans if self._parts.value == ALL else (self._surface,)
         if not self._plan.value:
             raise InputError("there is no plan yet: press Make plan, or upload one")
+        parts = self._scans if self._parts.value == ALL else [self._surface]
         self._operator.run_plan(self._plan.value, *parts)
 
 
