@@ -55,7 +55,7 @@ class App:
         self.operator = operator
         self.server: SafeServer = serve(serving, label="slviewer")
         try:
-            if pages is not None:
+            if pages:
                 serve_device_pages(self.server, pages)
             self._context = PanelContext(operator, self.server, pages, print_links)
             page = self.server.viser
@@ -130,7 +130,7 @@ class App:
                     self._notified = notice.number
                     self._context.notify(notice.level, notice.text)
         self._version = snapshot.version
-        if preview is not None and preview.number != self._number:
+        if preview and preview.number != self._number:
             with self._context.lock:
                 self.shell.draw_preview(preview)
             self._number = preview.number
@@ -202,7 +202,7 @@ def print_links(server: SafeServer) -> None:
         )
     if server.certificate is None and not server.loopback:
         print("The connection is not encrypted: use --tls, or a network that you trust.")
-    elif server.certificate is not None and server.certificate.self_made:
+    elif server.certificate and server.certificate.self_made:
         print(
             "Browsers warn of the self-made certificate. Compare its SHA-256 fingerprint before you"
             " continue:"

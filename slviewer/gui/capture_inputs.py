@@ -184,11 +184,11 @@ class TurnInputs(PanelPart):
         rig, scans = self.panel.snapshot.rig, self.panel.session.scans
         self._folder.visible = bool(rig.turntable)
         self._scan.disabled = self._resume.disabled = not rig.is_idle or self.panel.is_blocked
-        turned = [(scan.created, scan.turn_step) for scan in scans if scan.turn_step is not None]
+        turned = [(scan.created, scan.turn_step) for scan in scans if scan.turn_step]
         last = max(turned, key=lambda each: each[0], default=("", None))[1]
         captured = sum(last is not None and step.turn == last.turn for _, step in turned)
         self._resume.visible = last is not None and captured < last.steps
-        if last is not None:
+        if last:
             self._resume.label = f"Resume {last.turn}"
         text = f"{last.turn}: {captured} of {last.steps} steps captured." if last else ""
         self._note.write(text if self._resume.visible else "", "warning")
@@ -246,7 +246,7 @@ class SimulatedObject(PanelPart):
 
     def _place(self, T: np.ndarray) -> None:
         """Request that the object in view be moved to T (4, 4) mm."""
-        if (world := self.panel.snapshot.world) is not None:
+        if world := self.panel.snapshot.world:
             self._operator.place(world.standing, T)
 
     def _request_choice(self, thing: Any) -> None:
@@ -318,7 +318,7 @@ class ImportInputs(PanelPart):
         self._description.write(f"Contains {layout.holds}." if layout else "", "dim")
         self._codec.visible = name == "slstudio"
         size = layout.projector if layout else None
-        if size is not None:
+        if size:
             empty = f"of the session, else {size[0]}x{size[1]}"
         elif name == "frames":
             empty = "of the TOML"

@@ -65,7 +65,7 @@ class LiveScreen:
             with self._condition:
                 cloud = self._cloud
             try:
-                drawn = self._draw_cloud(cloud) if cloud is not None else self._remove_cloud()
+                drawn = self._draw_cloud(cloud) if cloud else self._remove_cloud()
             except Exception as error:
                 self._context.report_failure(error)
                 drawn = False

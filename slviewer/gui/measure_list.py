@@ -67,10 +67,10 @@ def drawn(
 
     ``others``: all measurements by id; ``lines`` (k, 2) mm: of a section.
     """
-    if measured.ends is not None:
+    if measured.ends:
         a, b = (np.array(end) for end in measured.ends)
         return _draw_dimension(a, b)
-    if measured.plane is not None:
+    if measured.plane:
         return _draw_section(from_plain(to_plain(measured.plane), CutPlane), lines)
     if measured.what == "relation":
         return _draw_relation([feature_of(others[each]) for each in measured.of if each in others])
@@ -105,7 +105,7 @@ def _draw_section(plane: CutPlane, lines: Sequence[np.ndarray]) -> tuple[np.ndar
 
 def _draw_relation(features: Sequence[Feature | None]) -> tuple[np.ndarray, np.ndarray] | None:
     """Draw the dimension line between two features; None unless there are two."""
-    ends = [feature for feature in features if feature is not None]
+    ends = [feature for feature in features if feature]
     if len(ends) != 2:
         return None
     # outside of both; a point is on the surface already
@@ -265,7 +265,7 @@ class MeasurementList(PanelPart):
         chosen = next((each for each in measured if each.name == self._choice.value), None)
         self.chosen, self.is_other = chosen, (chosen and chosen.name) != before
         labels = scan_labels(session)
-        if (merge := session.merge) is not None:
+        if merge := session.merge:
             labels[f"merge/{merge.name}"] = f"merge of {len(merge.record.scans)} scans"
         self._table.set(measurements_table(measured, labels) if measured else "")
         self._details.set(measurement_html(chosen, labels) if chosen else "")
@@ -335,7 +335,7 @@ class MeasurementList(PanelPart):
         self._section.set(figure)
         self._values.set(cursor_html(cursors))
         self._layer.remove(*_MARKS)
-        if plane is not None:
+        if plane:
             for cursor, mark, point in zip(CURSORS, _MARKS, lifted(plane, cursors), strict=True):
                 self._layer.mark(mark, point, cursor)
 
@@ -350,7 +350,7 @@ class MeasurementList(PanelPart):
             for each in measured
             if on_surface & {each.name, *each.record.of}
         }
-        sections = [each.name for each in measured if each.record.plane is not None]
+        sections = [each.name for each in measured if each.record.plane]
 
         def make() -> Drawings:
             """Load the plane and the lines of each section that is not loaded yet."""
@@ -374,7 +374,7 @@ class MeasurementList(PanelPart):
             if look is None or look == self._drawn.get(each.name):
                 continue
             cut = lines[each.name][1] if each.name in lines else ()
-            if (drawing := drawn(each.record, records, cut)) is not None:
+            if drawing := drawn(each.record, records, cut):
                 segments, place = drawing
                 colour = STALE if each.stale else CHOSEN if look[2] else OTHER
                 self._layer.lines(each.name, segments, colour, label=(label(each), place))
@@ -434,7 +434,7 @@ def measurement_html(measured: Stored[Measurement], labels: Mapping[str, str]) -
     about = f"{record.what} on {labels.get(record.source, record.source)}, by {record.model}"
     about += f"; {record.where}." if record.where else "."
     html = records_html([measured], labels, named=False) + note(about)
-    if record.deviation is not None and (verdict := record.deviation.verdict) is not None:
+    if record.deviation and (verdict := record.deviation.verdict) is not None:
         html = (
             alert(Html(f"<b>{to_html(verdict.text())}</b>"), DECISION_TONES[verdict.decision])
             + html

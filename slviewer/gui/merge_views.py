@@ -354,14 +354,14 @@ class PointPicker(PanelPart):
     def _show_view(self) -> None:
         """Move the browsers' views to the two clouds, if they are shown."""
         shown = self._shown
-        if self._on and shown is not None and shown.key == self._key:
+        if self._on and shown and shown.key == self._key:
             self.panel.show_points(str(shown.key[0]), shown.points)
 
     def _draw_marks(self) -> None:
         """Draw the numbered points on both clouds."""
         shown = self._shown
         wanted: dict[tuple[Side, int], tuple[float, ...]] = {}
-        if shown is not None and shown.key == self._key:
+        if shown and shown.key == self._key:
             picks = self._picks[shown.key]
             for k, pair in enumerate([*picks.pairs, picks.begun], 1):
                 for side, point in pair.items():
@@ -429,7 +429,7 @@ class PointPicker(PanelPart):
 
         def add(met: tuple[Side, np.ndarray] | None) -> None:
             """Add the point that was met, unless another pair is shown by now."""
-            if met is not None and shown.key == self._key and self._on:
+            if met and shown.key == self._key and self._on:
                 self._picks[shown.key].add(*met)
                 self.redraw()
 
@@ -437,7 +437,7 @@ class PointPicker(PanelPart):
 
     def _undo_point(self) -> None:
         """Remove the last point or pair of the shown scans."""
-        if (key := self._key) is not None:
+        if key := self._key:
             self._picks[key].undo()
 
 

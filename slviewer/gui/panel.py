@@ -88,7 +88,7 @@ class PanelContext:
         """Return the download address of a file of the session, cached by path."""
         if path not in self._offers:
             session = self.operator.snapshot().session
-            folder = session.folder if session is not None else path.parent
+            folder = session.folder if session else path.parent
             self._offers[path] = self.server.downloads.offer(path, within=folder)
         return self._offers[path]
 
@@ -470,7 +470,7 @@ class StepPanel(View):
 
     def show_view(self) -> None:
         """Move the browsers' views to what is shown, if the panel is visible."""
-        if self._visible and self._shown is not None:
+        if self._visible and self._shown:
             name, points = self._shown
             self.context.viewpoints.show(f"{self.key} {name}", points)
 
@@ -479,7 +479,7 @@ class StepPanel(View):
 
         def look(event: Any) -> None:
             """Move the view of the browser that clicked to the points."""
-            if self._shown is not None and self._shown[1] is not None:
+            if self._shown and self._shown[1] is not None:
                 look_at_points(event.client, self._shown[1])
 
         button = self._gui.add_button("Zoom to fit", icon=viser.Icon.FOCUS_2, color="gray")

@@ -236,7 +236,7 @@ class PointEditing(PanelPart):
         """Select the part that a click meets."""
         clouds = [scan.shown_points for scan in self._scans]
         met = click.find_first(clouds)
-        if met is not None:
+        if met:
             i, (v, u) = met
             masks = [np.zeros_like(scan.selected) for scan in self._scans]
             masks[i] = select_connected(clouds[i], (u, v))
@@ -402,13 +402,13 @@ class RegionInputs(PanelPart):
 
     def _preview(self, T: np.ndarray) -> None:
         """Draw the box at T (4, 4) while its handle is dragged."""
-        if self._region is not None:
+        if self._region:
             moved = RegionOfInterest.placed(T, self._region.size_mm)
             self._layer.lines(_BOX, moved.edges(), REGION_ON)
 
     def _place(self, T: np.ndarray) -> None:
         """Request the region at T (4, 4), where its handle was dragged to."""
-        if self._region is not None:
+        if self._region:
             self._operator.set_region(RegionOfInterest.placed(T, self._region.size_mm))
 
     def _switch(self, on: bool) -> None:

@@ -45,7 +45,7 @@ def draw_preview(
     to_picture = preview.scale * PICTURE_PX / preview.image.shape[1]
     if ghost_px is not None and np.isfinite(ghost_px).all():
         _draw_dashed_outline(picture, ghost_px * to_picture)
-    if preview.board is not None:
+    if preview.board:
         _draw_features(picture, preview.board.pixels * to_picture, board)
         corners = np.round(preview.board.outline * to_picture * 16).astype(np.int32)
         cv2.polylines(picture, [corners], True, _DETECTED, 2, cv2.LINE_AA, shift=4)
@@ -111,7 +111,7 @@ def histogram_chart(preview: PreviewView) -> Html:
 def _draw_features(picture: np.ndarray, pixels: np.ndarray, board: Board | None) -> None:
     """Draw the detected features (n, 2) px, joined row by row where all were detected."""
     at = np.round(pixels * 16).astype(np.int32)
-    if board is not None and len(pixels) == len(board.points):
+    if board and len(pixels) == len(board.points):
         columns = board.features[0]
         for row in at.reshape(-1, columns, 2):
             cv2.polylines(picture, [row], False, _DETECTED, 1, cv2.LINE_AA, shift=4)

@@ -77,7 +77,7 @@ class SceneLayer:
     def remove(self, *names: str) -> None:
         """Remove those of these objects that exist."""
         for name in names:
-            if (node := self._nodes.pop(name, None)) is not None:
+            if node := self._nodes.pop(name, None):
                 node.remove()
 
     def clear(self) -> None:
@@ -181,7 +181,7 @@ class SceneLayer:
 
     def move(self, name: str, T: np.ndarray) -> None:
         """Move an existing object to T (4, 4), without calling its callbacks."""
-        if (node := self._nodes.get(name)) is not None:
+        if node := self._nodes.get(name):
             node.wxyz, node.position = _split_pose(T)
 
     def cloud(

@@ -225,7 +225,7 @@ class Shell(View):
             + "".join(alert(problem, "error") for problem in problems)
         )
         following = steps[at + 1] if at + 1 < len(steps) else None
-        if following is not None:
+        if following:
             self._following_key = following.key
             self._next.label = f"Continue to {following.title}"
         self._next.visible = bool(
@@ -264,7 +264,7 @@ class Shell(View):
                 f'<span style="overflow-wrap:anywhere">{coloured(session.folder, "dim")}</span>',
                 ", ".join(counts),
             ]
-            if space is not None:
+            if space:
                 text = f"{format_bytes(space.free_bytes)} free"
                 if space.capture_bytes:
                     text += f"; a capture needs {format_bytes(space.capture_bytes)}"
@@ -298,10 +298,10 @@ class Shell(View):
         self._drawn_devices = (calibration, camera)
         self._devices.clear()
         rig = calibration.stereo.rig if calibration else None
-        if camera is not None:
+        if camera:
             K = (rig.camera if rig else nominal_lens(camera)).K
             self._devices.device("camera", K, camera, np.eye(4), CAMERA)
-        if projector is not None and rig is not None:
+        if projector and rig is not None:
             T_camera_projector = np.eye(4)  # the inverse of X_p = R X_c + t
             T_camera_projector[:3, :3], T_camera_projector[:3, 3] = rig.R.T, -rig.R.T @ rig.t
             self._devices.device(
@@ -349,13 +349,13 @@ def _object_step(session: SessionView) -> str:
 def _running_work(snapshot: Snapshot) -> list[tuple[str, float]]:
     """List (description, share done) of the running capture and of the requested job."""
     job, capture, work = snapshot.job, snapshot.rig.capture, []
-    if capture is not None:
+    if capture:
         waiting = f", {capture.waiting} waiting" if capture.waiting else ""
         text = f"Capturing {capture.name}: frame {capture.frame} of {capture.frames}{waiting}"
         if capture.stage:
             text = f"{capture.name}: {capture.stage}{waiting}"
         work.append((text, capture.frame / max(capture.frames, 1)))
-    if job is not None and not job.background:
+    if job and not job.background:
         waiting = f", {job.waiting} waiting" if job.waiting else ""
         stage = job.stage or "starting"
         work.append((f"{job.name}: {stage}{waiting} ({job.seconds:.0f} s)", job.share))

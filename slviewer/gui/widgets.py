@@ -324,7 +324,7 @@ class Plot:
 
     def set(self, figure: Figure | None) -> None:
         """Show a figure with its caption; None: hide both."""
-        if figure is not None:
+        if figure:
             self._image.image = figure.pixels
         self._image.visible = figure is not None
         self._caption.set(note(figure.caption) if figure else "")

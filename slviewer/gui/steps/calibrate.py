@@ -315,7 +315,7 @@ class CalibratePanel(StepPanel):
     def _toggle_pose(self) -> None:
         """Request that the chosen pose be excluded, or included again."""
         pose = self.snapshot.pose(self._pose.value)
-        if pose is not None:
+        if pose:
             is_excluded = pose.state == "excluded"
             (self._operator.include if is_excluded else self._operator.exclude)(pose.name)
 
@@ -343,7 +343,7 @@ class CalibratePanel(StepPanel):
     def _pick_pixel(self, click: Click) -> None:
         """Choose the pixel whose point is closest to the clicked ray."""
         cloud = self._cloud
-        if cloud is not None and (pixel := cloud.nearest(click.origin, click.direction)):
+        if cloud and (pixel := cloud.nearest(click.origin, click.direction)):
             u, v = self._column.value, self._row.value = pixel
             self.layer.mark("picked", cloud.points[v, u], f"pixel ({u}, {v})")
             self.redraw()

@@ -58,7 +58,7 @@ class SurfaceView(PanelPart):
             for scan in scans
         }
         merge = session.merge
-        if merge is not None and not merge.stale:
+        if merge and not merge.stale:
             name = offered[f"Merge of {len(merge.record.scans)} scans"] = f"{MERGED}{merge.name}"
             self._versions[name] = (session.folder, merge.record.points)
         self._choice.offer(offered)
@@ -67,7 +67,7 @@ class SurfaceView(PanelPart):
     def show_measurement(self, measured: Stored[Measurement] | None) -> None:
         """Show the surface on which a measurement was made, coloured by its deviation if it has
         one; None: as chosen."""
-        if measured is not None:
+        if measured:
             self._choice.choose(measured.record.source)
             if measured.record.deviation is None:
                 measured = None
@@ -75,7 +75,7 @@ class SurfaceView(PanelPart):
         options = COLOURS if measured is None else (*COLOURS, DEVIATION)
         if self._colour.options != options:
             self._colour.options = options  # a colour that is no longer offered becomes the first
-        if measured is not None:
+        if measured:
             self._colour.value = DEVIATION
         self._request()
 
@@ -102,7 +102,7 @@ class SurfaceView(PanelPart):
             self._layer.remove("surface")
             self._legend.set("")
             return
-        if shown is not None and (shown.record.source != name or colour != DEVIATION):
+        if shown and (shown.record.source != name or colour != DEVIATION):
             shown = None
         key = (name, self._versions.get(name), colour if shown is None else shown.name)
 
@@ -364,7 +364,7 @@ class MeasurePanel(StepPanel):
             return
         places = self._tool.pick(place)
         self.redraw()
-        if places is not None:
+        if places:
             self._operator.measure(self._surface.name, self._tool.what, places)
 
     def _draw_tool(self) -> None:
@@ -455,7 +455,7 @@ class MeasurePanel(StepPanel):
 
     def _request_fit(self) -> None:
         """Request the fit of the tool's shape to the region."""
-        if (region := self._make_region()) is not None:
+        if region := self._make_region():
             self._operator.measure(self._surface.name, self._tool.what, region=region)
 
     def _request_comparison(self) -> None:

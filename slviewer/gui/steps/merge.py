@@ -97,7 +97,7 @@ class MergePanel(StepPanel):
         )
         self._propose_start()
         self._offer_views()
-        number = int(merge.name) if merge is not None else 0
+        number = int(merge.name) if merge else 0
         if self._merged is not None and number > self._merged:
             self._view.choose(AFTER)  # show what was just merged
         self._merged = number
@@ -219,7 +219,7 @@ class MergePanel(StepPanel):
         merge, view, context = self.session.merge, self._view.value, self.context
         poses = (
             {n: np.array(p.T_reference_scan) for n, p in merge.record.pairs.items()}
-            if merge is not None and view == AFTER
+            if merge and view == AFTER
             else {}
         )
         key = (
@@ -231,7 +231,7 @@ class MergePanel(StepPanel):
 
         def make() -> ColouredClouds:
             """Load and colour the merged surface or the scans."""
-            if merge is not None and view in MERGED:
+            if merge and view in MERGED:
                 titles = [labels.get(name, name) for name in merge.record.scans]
                 return colour_merge(context.session, merge.name, view, titles)
             return colour_scans(context.session, shown, poses, labels)
@@ -240,7 +240,7 @@ class MergePanel(StepPanel):
 
     def _redraw(self) -> None:
         """Draw the clouds again, as other points of them are hidden."""
-        if self._clouds is not None:
+        if self._clouds:
             self._draw_clouds(self._clouds)
 
     def _draw_clouds(self, clouds: ColouredClouds) -> None:
@@ -264,7 +264,7 @@ class MergePanel(StepPanel):
         self._picker.show(self._visible and picking)
         self._editing.show(shown)
         self._legend.set("" if picking or self._clouds is None else self._clouds.legend)
-        if shown and self._clouds is not None:
+        if shown and self._clouds:
             self.show_points(self._clouds.view, self._clouds.points)
 
     def _request_merge(self) -> None:

@@ -178,7 +178,7 @@ class PosesPanel(StepPanel):
         if session.target != self._target:
             self._target = session.target
             self._board = Board.parse(self._target) if self._target else None
-            if self._board is not None:
+            if self._board:
                 self._T_board_centre[:3, 3] = self._board.outline().mean(axis=0)
             self._world = None
         self._capture.disabled = snapshot.rig.state != "open" or self._board is None
@@ -225,9 +225,9 @@ class PosesPanel(StepPanel):
     def _draw_accuracy(self, session: SessionView) -> None:
         """Show the predicted standard deviation and the goal."""
         plan, text = session.plan, ""
-        if plan is not None:
+        if plan:
             self._wanted.update(round(session.wanted_mm, 3))
-        if plan is not None and plan.sigma_mm is not None:
+        if plan and plan.sigma_mm is not None:
             text = f"Predicted sigma {plan.sigma_mm:.3f} mm, goal {session.wanted_mm:.3f} mm"
             if session.enough:
                 text += ": reached."
@@ -279,7 +279,7 @@ class PosesPanel(StepPanel):
         ]
         if pose.why:
             lines.append(to_html(pose.why))
-        if pose.rms_px is not None:
+        if pose.rms_px:
             camera, projector = pose.rms_px
             rms = f"Reprojection RMS: camera {camera:.3f} px, projector {projector:.3f} px"
             lines.append(to_html(rms))
@@ -302,7 +302,7 @@ class PosesPanel(StepPanel):
             del self._drawn_poses[name]
         for name, pose in known.items():
             T, is_chosen = pose.T_camera_board, name == chosen
-            assert T is not None and board is not None
+            assert T is not None and board
             key = (pose.state, T.tobytes(), bool(pose.thumbnail), is_chosen, str(board))
             if self._drawn_poses.get(name) != key:
                 self._drawn_poses[name] = key
@@ -355,7 +355,7 @@ def pose_table(poses: Sequence[PoseView]) -> Html:
         return note("None yet.")
     rows = []
     for pose in reversed(poses):
-        rms = f"{pose.rms_px[0]:.2f} / {pose.rms_px[1]:.2f} px" if pose.rms_px is not None else ""
+        rms = f"{pose.rms_px[0]:.2f} / {pose.rms_px[1]:.2f} px" if pose.rms_px else ""
         state = coloured(pose.state, _STATES[pose.state][0], bold=True)
         why = f'<div style="color:var(--mantine-color-dimmed)">{to_html(pose.why or rms)}</div>'
         rows.append(

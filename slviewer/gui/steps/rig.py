@@ -179,12 +179,12 @@ class RigChoice(PanelPart):
         for role, driver in self._drivers.items():
             choices[role] = {"driver": driver.name}
             page = self.context.page_state(role) if driver.page else None
-            if page is not None and page.size is not None:
+            if page and page.size is not None:
                 # saved, since the page may be opened after the session
                 choices[role]["size"] = list(page.size)
         camera, projector = self._drivers["camera"], self._drivers["projector"]
         option, address = _address_option(camera), self._source.value.strip()
-        if option is not None and address:
+        if option and address:
             is_number = address.isdecimal() and option == "source"
             choices["camera"][option] = int(address) if is_number else address
         if self._size.value.strip():
@@ -225,7 +225,7 @@ def _rig_html(rig: RigView) -> str:
     sizes = [
         f"{what} {size[0]} × {size[1]} px"
         for what, size in (("camera", rig.camera), ("projector", rig.projector))
-        if size is not None
+        if size
     ]
     html = paragraph(
         Html(f"{coloured('●', 'good')} {to_html(rig.name)} · {to_html(', '.join(sizes))}")

@@ -146,7 +146,7 @@ class ScanPanel(StepPanel):
         self._capture.disabled = not ready
         self._draw_live(snapshot.live, ready)
         self._patterns.handle.disabled = not rig.is_idle
-        if snapshot.session is not None:
+        if snapshot.session:
             self._patterns.update(session.patterns)
         self._restore.offer(session.deleted_scans)
         self._align.update(session.aligns_scans)
@@ -163,7 +163,7 @@ class ScanPanel(StepPanel):
             if self._known:  # show what was just reconstructed
                 self._scan.choose(new[0])
             self._known = tuple(reconstructed)
-        if calibration is not None:
+        if calibration:
             self._model.offer_names(calibration.models, calibration.best)
         else:
             self._model.offer_names(())
@@ -309,7 +309,7 @@ class ScanPanel(StepPanel):
 
     def _redraw(self) -> None:
         """Draw the cloud again, as other points of it are hidden."""
-        if self._made is not None:
+        if self._made:
             self._draw_cloud(self._made)
 
     def _draw_cloud(self, made: tuple[ScanCloud, ScanCloud, str, str]) -> None:
@@ -333,7 +333,7 @@ class ScanPanel(StepPanel):
     def _show_point(self, click: Click) -> None:
         """Show the values of the point closest to the clicked ray."""
         cloud = self._made and self._made[1]
-        if cloud is not None and (pixel := cloud.nearest(click.origin, click.direction)):
+        if cloud and (pixel := cloud.nearest(click.origin, click.direction)):
             u, v = pixel
             self._point.set(point_html(cloud, u, v))
             text = f"({u}, {v}): z {cloud.points[v, u, 2]:.3f} mm"

@@ -67,7 +67,7 @@ class TargetPanel(StepPanel):
         if session.target != self._target:
             self._target = session.target
             self._board = Board.parse(self._target) if self._target else None
-            if self._board is not None:
+            if self._board:
                 self._fill_fields(self._board)
         self._marker.visible = self._dictionary.visible = self._kind.value == "charuco"
         try:
