@@ -121,7 +121,7 @@ class App:
         folder = snapshot.session.folder if snapshot.session else None
         if folder != self._folder:
             self._folder = folder
-            self._context.clear_downloads()
+            self.server.downloads.clear()
         if snapshot.version != self._version or self.shell.needs_drawing:
             with self._context.lock, self.server.viser.atomic():
                 self.shell.update(snapshot)

@@ -57,7 +57,6 @@ class PanelContext:
         self.viewpoints = Viewpoints(server.viser)
         self.executor = ThreadPoolExecutor(1, "slviewer requests")
         self.lock = threading.RLock()
-        self._offers: dict[Path, str] = {}
 
     @property
     def session(self) -> Session:
@@ -85,17 +84,10 @@ class PanelContext:
         self.notify("error", describe_failure("This", error))
 
     def offer_download(self, path: Path) -> str:
-        """Return the download address of a file of the session, cached by path."""
-        if path not in self._offers:
-            session = self.operator.snapshot().session
-            folder = session.folder if session else path.parent
-            self._offers[path] = self.server.downloads.offer(path, within=folder)
-        return self._offers[path]
-
-    def clear_downloads(self) -> None:
-        """Offer no file any more."""
-        self._offers.clear()
-        self.server.downloads.clear()
+        """Return the download address of a file of the session."""
+        session = self.operator.snapshot().session
+        folder = session.folder if session else path.parent
+        return self.server.downloads.offer(path, within=folder)
 
     def links_html(self, exports: Iterable[ExportView], *names: str) -> str:
         """Return download links to those of the exported files that have one of these names."""

@@ -239,9 +239,7 @@ class ExportPanel(StepPanel):
     def _draw_cloud(self, made: tuple[np.ndarray, np.ndarray | None]) -> None:
         """Draw a loaded cloud, grey where it has no colours."""
         points, colours = made
-        self.show_cloud(
-            self._source.value, points, (150, 150, 150) if colours is None else colours
-        )
+        self.show_cloud(self._source.value, points, (150, 150, 150) if colours is None else colours)
 
     # requests
 
