@@ -276,7 +276,7 @@ class PointPicker(PanelPart):
         self._labels: Mapping[str, str] = {}
         self._reference = ""
         self._shown: _SideBySide | None = None
-        self._marked: dict[tuple[Side, int], tuple[float, ...]] = {}
+        self._marked: list[tuple[Side, str, tuple[float, ...], float]] = []
         self._offered = False
         self._on: bool | None = None
         self._scan = self.choice("Scan", "To be picked on together with the reference")
@@ -333,9 +333,7 @@ class PointPicker(PanelPart):
         if not on or key is None:
             return
         self._painter.request(
-            self._draw_clouds,
-            key,
-            lambda: _load_side_by_side(self.context.session, key),
+            self._draw_clouds, key, lambda: _load_side_by_side(self.context.session, key)
         )
         self._draw_marks()
         self._show_view()
@@ -359,20 +357,18 @@ class PointPicker(PanelPart):
 
     def _draw_marks(self) -> None:
         """Draw the numbered points on both clouds."""
-        shown = self._shown
-        wanted: dict[tuple[Side, int], tuple[float, ...]] = {}
+        shown, self._marked, marked = self._shown, [], self._marked
         if shown and shown.key == self._key:
             picks = self._picks[shown.key]
-            for k, pair in enumerate([*picks.pairs, picks.begun], 1):
-                for side, point in pair.items():
-                    place = point + shown.offset(side)
-                    wanted[side, k] = tuple(place)
-                    if wanted[side, k] != self._marked.get((side, k)):
-                        ball = _BALL * shown.wide_mm
-                        self._layer.mark(f"{side} {k}", place, str(k), _MARKS[side], ball)
-        gone = self._marked.keys() - wanted.keys()
-        self._layer.remove(*(f"{side} {k}" for side, k in gone))
-        self._marked = wanted
+            self._marked = [
+                (side, str(k), tuple(point + shown.offset(side)), _BALL * shown.wide_mm)
+                for k, pair in enumerate([*picks.pairs, picks.begun], 1)
+                for side, point in pair.items()
+            ]
+        if self._marked != marked:
+            self._layer.remove(*(f"{side} {k}" for side, k, *_ in marked))
+            for side, k, place, ball in self._marked:
+                self._layer.mark(f"{side} {k}", np.array(place), k, _MARKS[side], ball)
 
     def _draw_note(self) -> None:
         """Show what to click next, and the residuals of the pairs."""

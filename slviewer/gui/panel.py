@@ -491,6 +491,10 @@ class StepPanel(View):
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the latest frame; called while the panel is shown, at most ten times a second."""
 
+    def close(self) -> None:
+        """Make no more pictures."""
+        self.painter.close()
+
     def show(self, visible: bool) -> None:
         """Show or hide the panel and its layers of the scene."""
         self._visible = self._container.visible = visible

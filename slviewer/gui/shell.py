@@ -151,7 +151,7 @@ class Shell(View):
     def close(self) -> None:
         """Make no more pictures."""
         for panel in self._panels.values():
-            panel.painter.close()
+            panel.close()
 
     # drawing
 

@@ -191,11 +191,11 @@ class ExportPanel(StepPanel):
             self._shape_note.write("Nothing reconstructed yet: scan an object first.", "warning")
             return
         file = _get_export(session, default_file_name(what, name, chosen))
-        predicted = estimate_file_bytes(
-            what, chosen, *_points(session, name), self._mesh.triangles if mesh else None
-        )
+        points, model = _points(session, name)
+        triangles = self._mesh.triangles if mesh else None
+        predicted = estimate_file_bytes(what, chosen, points, model, triangles)
         shown_type: What = "merged-mesh" if mesh and self._mesh.plan().method != "grid" else what
-        text = describe_shape_file(session, shown_type, name, chosen, None if file else predicted)
+        text = describe_shape_file(shown_type, points, chosen, None if file else predicted)
         result = self._result_text(file) if file and mesh else ""
         self._shape_note.set(note(text) + self._link_html(file) + note(result))
         # a merge's PLY is its own file
@@ -313,11 +313,8 @@ def _name_formats(what: What) -> dict[str, str]:
     return {FORMAT_NAMES.get(each, each.upper()): each for each in formats(what)}
 
 
-def describe_shape_file(
-    session: SessionView, what: What, name: str, file_format: str, size_bytes: int | None
-) -> str:
+def describe_shape_file(what: What, points: int, file_format: str, size_bytes: int | None) -> str:
     """Describe a file of a scan or merge: its content, units, and approximate size, where known."""
-    points, _ = _points(session, name)
     content = {
         "cloud": f"{points:,} points",
         "merge": f"{points:,} merged points",

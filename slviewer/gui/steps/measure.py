@@ -7,8 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from slviewer.gui.inspection_inputs import InspectionInputs
-from slviewer.gui.measure_list import MeasurementList
+from slviewer.gui.measure_list import InspectionInputs, MeasurementList
 from slviewer.gui.panel import NO_SESSION, PanelPart, StepPanel, scan_options
 from slviewer.gui.scene import Click
 from slviewer.gui.steps.scan import sort_scans

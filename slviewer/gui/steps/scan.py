@@ -173,6 +173,11 @@ class ScanPanel(StepPanel):
         """Show the live image."""
         self._picture.draw(preview)
 
+    def close(self) -> None:
+        """Make no more pictures, and draw no more live clouds."""
+        super().close()
+        self._screen.close()
+
     def show(self, visible: bool) -> None:
         """Show or hide the layers; hiding stops a live scan."""
         super().show(visible)
