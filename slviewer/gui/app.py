@@ -88,8 +88,6 @@ class App:
         self._closing = True
         self._changed.set()
         self._unsubscribe()
-        self._context.executor.shutdown(wait=False, cancel_futures=True)
-        self.shell.close()
         self._thread.join(5.0)
         self.server.stop()
 

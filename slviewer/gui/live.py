@@ -3,14 +3,13 @@
 A browser that stalls gets nothing more until it has caught up, and delays no other.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
 
-from slviewer.gui.panel import PanelContext
+from slviewer.gui.panel import PanelContext, start_worker
 from slviewer.gui.scene import add_points, spacing, thin
 from slviewer.server.viewers import Viewers
 from slviewer.wizard.live_scan import LiveCloud
@@ -28,7 +27,7 @@ class LiveScreen:
         self._context = context
         context.scene.layer(LAYER)
         self._viewers = Viewers(context.server.viser, self._wake)
-        self._executor = ThreadPoolExecutor(1, "slviewer live screen")
+        self._pass_on = start_worker("slviewer live screen")
         self._cloud: LiveCloud | None = None
         self._nodes: dict[int, Any] = {}
         self._drawn: dict[int, int] = {}
@@ -47,14 +46,9 @@ class LiveScreen:
         self._cloud, self._is_in_view = None, False
         self._wake()
 
-    def close(self) -> None:
-        """Draw nothing more."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
-
     def _wake(self) -> None:
         """Draw soon: there is another cloud, or a browser has drawn what it was sent."""
-        with suppress(RuntimeError):  # the wizard ends
-            self._executor.submit(self._context.run, self._draw)
+        self._pass_on(partial(self._context.run, self._draw))
 
     def _draw(self) -> None:
         """Send the latest cloud to the browsers that are ready for it, or remove it from all."""

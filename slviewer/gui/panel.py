@@ -5,10 +5,10 @@ import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -34,14 +34,27 @@ NO_SESSION = SessionView(Path(), "", "")
 ButtonColour = Literal["gray", "red", "orange", "green", "teal", "cyan"]
 
 
+def start_worker(name: str) -> Callable[[Callable[[], Any]], None]:
+    """Start a thread that calls what is passed to the returned function, one after the other, and
+    ends with the program."""
+    jobs = SimpleQueue[Callable[[], Any]]()
+
+    def work() -> None:
+        """Call what is passed on, forever."""
+        while True:
+            jobs.get()()
+
+    threading.Thread(target=work, name=name, daemon=True).start()
+    return jobs.put
+
+
 class PanelContext:
     """Services that a panel uses.
 
     `gui` builds inputs, `scene` draws in 3D, `viewpoints` moves the browsers' views, `operator`
-    takes requests. `executor` runs one callback after the other. `lock` is held by whatever reads
-    or changes the panels: drawing, callbacks, and the pictures that a painter shows. `pages` are
-    the pages of devices; None where none is served. `print_links` is called when the links were
-    replaced.
+    takes requests. `lock` is held by whatever reads or changes the panels: drawing, callbacks, and
+    the pictures that a painter shows. `pages` are the pages of devices; None where none is served.
+    `print_links` is called when the links were replaced.
     """
 
     def __init__(
@@ -55,7 +68,7 @@ class PanelContext:
         self.print_links = print_links
         self.gui, self.scene = server.viser.gui, ViewerScene(server.viser.scene, self.submit)
         self.viewpoints = Viewpoints(server.viser)
-        self.executor = ThreadPoolExecutor(1, "slviewer requests")
+        self._pass_on = start_worker("slviewer requests")
         self.lock = threading.RLock()
 
     @property
@@ -118,8 +131,7 @@ class PanelContext:
             with self.lock:
                 do()
 
-        with suppress(RuntimeError):  # the wizard ends
-            self.executor.submit(self.run, call)
+        self._pass_on(partial(self.run, call))
 
 
 class Setting:
@@ -234,14 +246,13 @@ class Painter:
 
     Whatever is slow (reading a cloud, a figure of matplotlib) is never done by the thread that
     draws panels. `failed(error)` is called for failures; `lock` is held while something is shown.
-    The thread begins with the first request, and ends with `close`.
     """
 
     def __init__(
         self, failed: Callable[[BaseException], None], lock: AbstractContextManager[Any]
     ) -> None:
         self._failed, self._lock = failed, lock
-        self._executor = ThreadPoolExecutor(1, "slviewer painter")
+        self._pass_on = start_worker("slviewer painter")
         self._requested: dict[Callable[[Any], Any], Hashable] = {}
 
     def request(self, show: Callable[[Any], Any], key: Hashable, make: Callable[[], Any]) -> None:
@@ -266,8 +277,7 @@ class Painter:
             except Exception as error:
                 self._failed(error)
 
-        with suppress(RuntimeError):  # the wizard ends
-            self._executor.submit(paint)
+        self._pass_on(paint)
 
     def request_once(self, show: Callable[[Any], Any], make: Callable[[], Any]) -> None:
         """Call `show(make())` on the painter's thread, whatever else is requested."""
@@ -282,10 +292,6 @@ class Painter:
     def cancel(self, show: Callable[[Any], Any]) -> None:
         """Drop the request to `show` something; the next one is computed whatever its key."""
         self._requested.pop(show, None)
-
-    def close(self) -> None:
-        """Compute nothing more."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
 
 
 class View:
@@ -490,10 +496,6 @@ class StepPanel(View):
 
     def draw_preview(self, preview: PreviewView) -> None:
         """Show the latest frame; called while the panel is shown, at most ten times a second."""
-
-    def close(self) -> None:
-        """Make no more pictures."""
-        self.painter.close()
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel and its layers of the scene."""

@@ -148,11 +148,6 @@ class Shell(View):
                 module = importlib.import_module(f"slviewer.gui.steps.{key}")
                 self._panels[key] = getattr(module, f"{key.title()}Panel")(self.context)
 
-    def close(self) -> None:
-        """Make no more pictures."""
-        for panel in self._panels.values():
-            panel.close()
-
     # drawing
 
     def update(self, snapshot: Snapshot) -> None:

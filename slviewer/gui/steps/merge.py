@@ -88,7 +88,7 @@ class MergePanel(StepPanel):
         self._reference.offer(scan_options(scans), preferred)
         self._alignment_folder.visible = len(scans) > 1
         self._undo.visible = merge is not None
-        labels = {scan.name: scan.label for scan in scans}
+        labels = scan_labels(session)
         self._result.set(merge_html(merge, labels) if merge else "")
         self._failure.set(
             merge_failure_html(failure, labels, merge, self.snapshot.merge_refusal)
@@ -101,7 +101,7 @@ class MergePanel(StepPanel):
         if self._merged is not None and number > self._merged:
             self._view.choose(AFTER)  # show what was just merged
         self._merged = number
-        self._draw_choice()
+        self._draw_choice(labels)
 
     def show(self, visible: bool) -> None:
         """Show or hide the panel's layers."""
@@ -176,7 +176,7 @@ class MergePanel(StepPanel):
         """Whether points are picked on two scans side by side."""
         return bool(self._start.value == PICKED and self._view.value == SIDE_BY_SIDE)
 
-    def _draw_choice(self) -> None:
+    def _draw_choice(self, labels: dict[str, str]) -> None:
         """Update inputs and notes for the current choice, and request the clouds."""
         session = self.session
         scans, start = self._list_chosen(), self._start.value
@@ -186,7 +186,6 @@ class MergePanel(StepPanel):
             for scan in session.scans
             if scan.cloud != "absent"
         }
-        labels = scan_labels(session)
         self._draw_start(scans, labels)
         chosen = {name: self._versions[name] for name in names}
         self._picker.offer(chosen, self._reference.value, labels, start == PICKED)

@@ -61,7 +61,6 @@ class ScanPanel(StepPanel):
     _loaded: tuple[Any, ScanCloud] | None = None
     _made: tuple[ScanCloud, ScanCloud, str, str] | None = None
     """The cloud that is drawn, what is used of it, its colours, and why nothing is used."""
-    _is_live = False
 
     def build(self) -> None:
         """Create the inputs of capture, live scan, gallery and cloud."""
@@ -173,11 +172,6 @@ class ScanPanel(StepPanel):
         """Show the live image."""
         self._picture.draw(preview)
 
-    def close(self) -> None:
-        """Make no more pictures, and draw no more live clouds."""
-        super().close()
-        self._screen.close()
-
     def show(self, visible: bool) -> None:
         """Show or hide the layers; hiding stops a live scan."""
         super().show(visible)
@@ -195,11 +189,15 @@ class ScanPanel(StepPanel):
         button.disabled = live is None and not ready
         save.visible, save.disabled = live is not None, live is None or not live.clouds_per_s
         self._live_status.set("" if live is None else live_html(live, self._screen.points))
-        if live is None and self._is_live:
-            self._screen.clear()
-        self._is_live = live is not None
-        if self._is_live:
+        if live:
             self._clear_cloud()
+        else:
+            self._screen.clear()
+
+    @property
+    def _is_live(self) -> bool:
+        """Whether a live scan runs."""
+        return self.snapshot.live is not None
 
     def _toggle_live(self) -> None:
         """Start the live scan, or stop it where it runs."""
