@@ -12,10 +12,10 @@ import viser
 from slviewer.calibration.next_pose import GOAL_POSES, Coverage
 from slviewer.gui.capture_inputs import ImportInputs
 from slviewer.gui.panel import RestoreButton, StepPanel
-from slviewer.gui.preview import LiveImage
 from slviewer.gui.scene import GHOST, Colour
 from slviewer.gui.widgets import (
     Html,
+    LiveImage,
     Sound,
     Text,
     Tone,

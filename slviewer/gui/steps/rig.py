@@ -12,14 +12,15 @@ from slviewer.devices.page_channel import PageState
 from slviewer.errors import InputError
 from slviewer.gui.capture_inputs import ExposureInputs
 from slviewer.gui.panel import PanelPart, StepPanel
-from slviewer.gui.preview import LiveImage, histogram_chart
 from slviewer.gui.widgets import (
     Html,
+    LiveImage,
     Text,
     Tone,
     alert,
     coloured,
     help_link,
+    histogram_chart,
     note,
     paragraph,
     to_html,

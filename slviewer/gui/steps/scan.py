@@ -12,11 +12,11 @@ from slviewer.gui.capture_inputs import ExposureInputs, ImportInputs, SimulatedO
 from slviewer.gui.live import LiveScreen
 from slviewer.gui.panel import RestoreButton, StepPanel, display_name, scan_options
 from slviewer.gui.point_editing import PointEditing, RegionInputs
-from slviewer.gui.preview import LiveImage
 from slviewer.gui.scene import Click
 from slviewer.gui.steps.verify import MUCH_MASKED, shape_of
 from slviewer.gui.widgets import (
     Html,
+    LiveImage,
     Text,
     Tone,
     alert,

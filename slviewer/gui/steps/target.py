@@ -6,8 +6,7 @@ import numpy as np
 
 from slviewer.errors import InputError
 from slviewer.gui.panel import StepPanel
-from slviewer.gui.preview import LiveImage
-from slviewer.gui.widgets import Html, Text, alert, coloured, link, paragraph, to_html
+from slviewer.gui.widgets import Html, LiveImage, Text, alert, coloured, link, paragraph, to_html
 from slviewer.pipeline.printouts import target as write_target
 from slviewer.target.board import EXAMPLES, Board, board_examples, plugin_boards
 from slviewer.wizard.snapshot import PreviewView

@@ -5,8 +5,7 @@ from functools import partial
 
 from slviewer.gui.capture_inputs import SimulatedObject
 from slviewer.gui.panel import StepPanel, display_name, scan_options
-from slviewer.gui.preview import LiveImage
-from slviewer.gui.widgets import PLOT_PX, Plot, Text, colour_bar, colours, records_html
+from slviewer.gui.widgets import PLOT_PX, LiveImage, Plot, Text, colour_bar, colours, records_html
 from slviewer.pipeline.stored_records import Stored, load_arrays
 from slviewer.records.verification import Shape, Verification
 from slviewer.report.maps import SIGN, error_limit, verification_maps
