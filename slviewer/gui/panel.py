@@ -439,7 +439,6 @@ class StepPanel(View):
         self.painter = Painter(context.report_failure, context.lock)
         self.parts: list[PanelPart] = []
         self.layer = context.scene.layer(self.key)
-        self.layers = [self.layer]
         with context.gui.add_folder(None, visible=False) as self._container:
             self.build()
 
@@ -498,10 +497,9 @@ class StepPanel(View):
         """Show the latest frame; called while the panel is shown, at most ten times a second."""
 
     def show(self, visible: bool) -> None:
-        """Show or hide the panel and its layers of the scene."""
+        """Show or hide the panel, its layer of the scene, and the layers in that one."""
         self._visible = self._container.visible = visible
-        for layer in self.layers:
-            layer.show(visible)
+        self.layer.show(visible)
 
 
 class PanelPart(View):

@@ -25,9 +25,8 @@ from slviewer.server.credentials import (
     self_made_certificate,
 )
 from slviewer.server.downloads import Downloads
-from slviewer.server.gate import ViserGate
+from slviewer.server.gate import UploadBudget, ViserGate
 from slviewer.server.limits import Admissions, limit_log, raise_descriptor_limit
-from slviewer.server.uploads import UploadBudget
 from slviewer.server.viser_internals import ViserClient
 
 MESSAGE_LIMIT = 32 * 2**20

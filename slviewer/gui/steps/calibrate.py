@@ -69,8 +69,7 @@ class CalibratePanel(StepPanel):
     def build(self) -> None:
         """Create the inputs, plots and tables."""
         gui, operator = self._gui, self._operator
-        self._boards = self._scene.layer("calibrated boards")
-        self.layers.append(self._boards)
+        self._boards = self._scene.layer("calibrate/boards")
         self._calibrate = self.button("Calibrate", operator.calibrate, "target", None)
         self._verdict = Text(gui)
         self._anyway = self.setting(

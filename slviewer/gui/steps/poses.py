@@ -118,8 +118,7 @@ class PosesPanel(StepPanel):
     def build(self) -> None:
         """Create the live image, the buttons, the coverage and the list of poses."""
         gui, operator = self._gui, self._operator
-        self._world_layer = self._scene.layer("board")
-        self.layers.append(self._world_layer)
+        self._world_layer = self._scene.layer("poses/simulated board")
         self._T_board_centre = np.eye(4)  # mm; the board's handle is at its centre
         self._states: dict[str, str] = {}
         self._drawn_poses: dict[str, Any] = {}
