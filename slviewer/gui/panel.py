@@ -229,12 +229,6 @@ def scan_options(scans: Iterable[ScanView]) -> dict[str, str]:
     return {display_name(scan.name, scan.label): scan.name for scan in scans}
 
 
-def scan_version(session: SessionView, scan: ScanView) -> tuple[Hashable, ...]:
-    """Return what the points of a scan depend on."""
-    figures, used = scan.figures, session.restriction(scan.name)
-    return session.folder, figures.points, figures.model, figures.noise_mm, used
-
-
 def scan_labels(session: SessionView) -> dict[str, str]:
     """Return {name of a scan: the operator's label for it}."""
     return {scan.name: scan.label for scan in session.scans}

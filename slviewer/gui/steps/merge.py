@@ -17,7 +17,7 @@ from slviewer.gui.merge_views import (
     merge_html,
     turntable_html,
 )
-from slviewer.gui.panel import StepPanel, display_name, scan_labels, scan_options, scan_version
+from slviewer.gui.panel import StepPanel, display_name, scan_labels, scan_options
 from slviewer.gui.point_editing import PointEditing
 from slviewer.gui.steps.verify import shape_of
 from slviewer.gui.widgets import Text
@@ -182,7 +182,7 @@ class MergePanel(StepPanel):
         scans, start = self._list_chosen(), self._start.value
         names = [scan.name for scan in scans]
         self._versions = {
-            scan.name: scan_version(session, scan)
+            scan.name: (scan.figures.points, scan.figures.model, session.restriction(scan.name))
             for scan in session.scans
             if scan.cloud != "absent"
         }
