@@ -53,7 +53,7 @@ class App:
         be served.
         """
         self.operator = operator
-        self.server: SafeServer = serve(serving, label="slviewer")
+        self.server: SafeServer = serve(serving)
         try:
             if pages:
                 serve_device_pages(self.server, pages)

@@ -163,9 +163,7 @@ class SafeServer:
         return ipaddress.ip_address(self.viser.get_host().partition("%")[0])
 
 
-def serve(
-    serving: Serving, *, label: str | None = None, upload_limit: int = 256 * 10**6
-) -> SafeServer:
+def serve(serving: Serving, *, upload_limit: int = 256 * 10**6) -> SafeServer:
     """Start the server of viser's page. `upload_limit` bounds the bytes of all unfinished uploads.
 
     Raises SlviewerError within two seconds where the address can't be served, where viser is not
@@ -229,7 +227,7 @@ def serve(
                 options.update(ssl=context, ssl_handshake_timeout=REQUEST_SECONDS)
             return serve_websockets(handle, **options)
 
-        server = viser_internals.start(serve_viser, address, port, label)
+        server = viser_internals.start(serve_viser, address, port)
         started.append(server)
     except BaseException:
         sock.close()
